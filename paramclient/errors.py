@@ -1,0 +1,178 @@
+"""Every exception of paramclient.
+
+The tree says who is to blame::
+
+    ParamClientError
+    ├── UsageError(ValueError)        the caller: a name, value, link name or argument that cannot be right
+    ├── VehicleError                  the vehicle answered, and the answer is no
+    │   ├── UnknownParameter          it has no parameter of that name or index
+    │   ├── Refused                   it gave a reason: PARAM_ERROR, or ArduPilot's text
+    │   ├── TypeMismatch              it holds the parameter in a type that the value cannot take
+    │   └── ValueNotApplied           it kept another value and gave no reason
+    ├── NoReply(TimeoutError)         nobody answered in time
+    ├── LinkError(OSError)            the socket or the device
+    │   └── ClientClosed              the client was closed while a call waited, or is not open
+    └── CacheError                    the cache on disk
+
+Each carries what is known as attributes, so that a program need not read its text.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+
+__all__ = [
+    "CacheError",
+    "ClientClosed",
+    "LinkError",
+    "NoReply",
+    "ParamClientError",
+    "ParamErrorCode",
+    "Refused",
+    "TypeMismatch",
+    "UnknownParameter",
+    "UsageError",
+    "ValueNotApplied",
+    "VehicleError",
+]
+
+
+class ParamErrorCode(IntEnum):
+    """MAV_PARAM_ERROR: the reasons that a PARAM_ERROR message can give (MAVLink common message set)."""
+
+    NO_ERROR = 0
+    DOES_NOT_EXIST = 1
+    VALUE_OUT_OF_RANGE = 2
+    PERMISSION_DENIED = 3
+    COMPONENT_NOT_FOUND = 4
+    READ_ONLY = 5
+    TYPE_UNSUPPORTED = 6
+    TYPE_MISMATCH = 7
+    READ_FAIL = 8
+
+    @staticmethod
+    def name_of(code: int) -> str:
+        """The code in words; a code that this version does not know is kept as its number."""
+        try:
+            return ParamErrorCode(code).name.lower().replace("_", " ")
+        except ValueError:
+            return f"error code {code}"
+
+
+class ParamClientError(Exception):
+    """The base of everything that paramclient raises on purpose."""
+
+
+class UsageError(ParamClientError, ValueError):
+    """The caller asked for something that cannot be right. Nothing was sent."""
+
+
+class VehicleError(ParamClientError):
+    """The vehicle answered, and the answer is no.
+
+    Attributes:
+        system, component: who answered.
+        name: the parameter, or None where it was asked for by index.
+        index: the index that was asked for, or None.
+    """
+
+    def __init__(
+        self, message: str, *, system: int, component: int, name: str | None = None, index: int | None = None
+    ) -> None:
+        super().__init__(message)
+        self.system = system
+        self.component = component
+        self.name = name
+        self.index = index
+
+
+class UnknownParameter(VehicleError):
+    """The vehicle has no such parameter: it said so, or kept silent on it while it answered other reads."""
+
+
+class Refused(VehicleError):
+    """The vehicle gave a reason for not doing it.
+
+    Attributes:
+        code: the number in PARAM_ERROR (a `ParamErrorCode` where it is known), READ_ONLY for ArduPilot's
+            "Param write denied" text.
+        reason: the same in words.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        system: int,
+        component: int,
+        code: int,
+        name: str | None = None,
+        index: int | None = None,
+    ) -> None:
+        super().__init__(message, system=system, component=component, name=name, index=index)
+        self.code = code
+        self.reason = ParamErrorCode.name_of(code)
+
+
+class TypeMismatch(VehicleError):
+    """The vehicle holds the parameter in another type than the one that was sent."""
+
+
+class ValueNotApplied(VehicleError):
+    """The vehicle was asked, answers, and keeps another value without a reason.
+
+    Attributes:
+        requested: the value that was to be written.
+        actual: the value that the vehicle reports.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        system: int,
+        component: int,
+        name: str,
+        requested: float | int | bytes,
+        actual: float | int | bytes,
+    ) -> None:
+        super().__init__(message, system=system, component=component, name=name)
+        self.requested = requested
+        self.actual = actual
+
+
+class NoReply(ParamClientError, TimeoutError):
+    """Nobody answered in time.
+
+    Attributes:
+        awaited: what was awaited, in words.
+        attempts: how many times it was asked for (0 where there was nothing to ask).
+        waited: seconds from the first request to giving up.
+    """
+
+    def __init__(self, awaited: str, *, attempts: int, waited: float) -> None:
+        tries = f" after {attempts} {'try' if attempts == 1 else 'tries'}" if attempts else ""
+        super().__init__(f"no reply: {awaited}{tries} in {waited:.1f} s")
+        self.awaited = awaited
+        self.attempts = attempts
+        self.waited = waited
+
+
+class LinkError(ParamClientError, OSError):
+    """The link failed; `__cause__` is the operating system's error where there is one.
+
+    Attributes:
+        link: the link's name as it was given.
+    """
+
+    def __init__(self, message: str, *, link: str) -> None:
+        super().__init__(message)
+        self.link = link
+
+
+class ClientClosed(LinkError):
+    """The client was closed while the call waited, or had not been opened."""
+
+
+class CacheError(ParamClientError):
+    """The cache on disk could not do what was asked of it."""

@@ -1,0 +1,500 @@
+"""Bytes to frames, frames to messages, messages to bytes. The only room that knows pymavlink.
+
+pymavlink gives the CRC_EXTRA byte of every message of its `all` dialect. Framing, checking and the few
+messages of this protocol are done here, on raw bytes, because a parameter's value must not pass through
+a Python float (see `paramclient.values`) and because most frames on a link need no decoding at all.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable, Collection
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Final, NamedTuple, TypeAlias
+
+from fastcrc.crc16 import mcrf4xx
+from pymavlink.dialects.v20 import all as dialect
+
+__all__ = [
+    "AutopilotVersion",
+    "CommandAck",
+    "CommandLong",
+    "Frame",
+    "Framer",
+    "Heartbeat",
+    "Message",
+    "ParamError",
+    "ParamRequestList",
+    "ParamRequestRead",
+    "ParamSet",
+    "ParamValue",
+    "StatusText",
+    "decode",
+    "encode",
+]
+
+NO_INDEX: Final = 65535
+"""param_index of a PARAM_VALUE that has no place in the list (PX4: `_HASH_CHECK` and parameters not in use;
+ArduPilot: replies by name and unasked updates)."""
+HASH_CHECK: Final = "_HASH_CHECK"
+"""param_id under which PX4 gives the hash of its table."""
+COMP_ID_ALL: Final = 0
+AUTOPILOT_COMPONENT: Final = 1
+
+MAV_TYPE_GCS: Final = 6
+MAV_AUTOPILOT_GENERIC: Final = 0
+MAV_AUTOPILOT_ARDUPILOTMEGA: Final = 3
+MAV_AUTOPILOT_INVALID: Final = 8
+MAV_AUTOPILOT_PX4: Final = 12
+MAV_STATE_ACTIVE: Final = 4
+MAV_CMD_REQUEST_MESSAGE: Final = 512
+MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: Final = 520
+MAV_RESULT_ACCEPTED: Final = 0
+MAV_RESULT_UNSUPPORTED: Final = 3
+CAPABILITY_PARAM_ENCODE_BYTEWISE: Final = 16
+CAPABILITY_PARAM_ENCODE_C_CAST: Final = 131072
+
+_MAGIC_V1 = 0xFE
+_MAGIC_V2 = 0xFD
+_SIGNED = 0x01
+_SIGNATURE_LENGTH = 13
+_LONGEST_FRAME = 10 + 255 + 2 + _SIGNATURE_LENGTH
+
+
+class Frame(NamedTuple):
+    """One frame, its checksum proven. A named tuple, because making one is part of the hot path.
+
+    Attributes:
+        message_id: 24 bits.
+        system, component: who sent it.
+        sequence: 0 to 255.
+        payload: as sent; MAVLink 2 cuts trailing zero bytes.
+        version: 1 or 2.
+    """
+
+    message_id: int
+    system: int
+    component: int
+    sequence: int
+    payload: bytes
+    version: int
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    type: int
+    autopilot: int
+    base_mode: int = 0
+    custom_mode: int = 0
+    system_status: int = 0
+    mavlink_version: int = 3
+
+
+@dataclass(frozen=True, slots=True)
+class AutopilotVersion:
+    """AUTOPILOT_VERSION; `git_hash` is flight_custom_version, `uid2` has 18 bytes."""
+
+    capabilities: int
+    flight_sw_version: int = 0
+    git_hash: bytes = bytes(8)
+    board_version: int = 0
+    vendor_id: int = 0
+    product_id: int = 0
+    uid: int = 0
+    uid2: bytes = bytes(18)
+
+
+@dataclass(frozen=True, slots=True)
+class CommandLong:
+    target_system: int
+    target_component: int
+    command: int
+    params: tuple[float, ...] = (0.0,) * 7
+    confirmation: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class CommandAck:
+    command: int
+    result: int
+    target_system: int = 0
+    target_component: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ParamRequestRead:
+    """PARAM_REQUEST_READ by `param_index`, or by `param_id` where the index is −1."""
+
+    target_system: int
+    target_component: int
+    param_id: str
+    param_index: int = -1
+
+
+@dataclass(frozen=True, slots=True)
+class ParamRequestList:
+    target_system: int
+    target_component: int
+
+
+class ParamValue(NamedTuple):
+    """PARAM_VALUE; `raw` is the four value bytes, undecoded. A named tuple for the same reason as `Frame`."""
+
+    param_id: str
+    raw: bytes
+    param_type: int
+    param_count: int
+    param_index: int
+
+
+@dataclass(frozen=True, slots=True)
+class ParamSet:
+    """PARAM_SET; `raw` is the four value bytes."""
+
+    target_system: int
+    target_component: int
+    param_id: str
+    raw: bytes
+    param_type: int
+
+
+@dataclass(frozen=True, slots=True)
+class ParamError:
+    """PARAM_ERROR; `param_index` −1 says that `param_id` counts; the id may be empty for a read by index."""
+
+    target_system: int
+    target_component: int
+    param_id: str
+    param_index: int
+    error: int
+
+
+@dataclass(frozen=True, slots=True)
+class StatusText:
+    severity: int
+    text: str
+
+
+Message: TypeAlias = (
+    Heartbeat
+    | AutopilotVersion
+    | CommandLong
+    | CommandAck
+    | ParamRequestRead
+    | ParamRequestList
+    | ParamValue
+    | ParamSet
+    | ParamError
+    | StatusText
+)
+
+
+class Framer:
+    """Finds the frames in what a link delivers.
+
+    Every frame whose message id is known is checked by its CRC; one with an unknown id cannot be checked
+    and is passed over. A candidate that fails is retried from its second byte, so that no noise can hide a
+    frame that stands whole outside a longer valid one.
+
+    Args:
+        wanted: the message ids to give out; None for every known one. Frames with other ids are still
+            checked and stepped over, but no object is made of them.
+        stream: whether a frame may be spread over several calls (TCP, serial). Datagrams are taken one by
+            one and never joined.
+
+    Attributes:
+        frames: frames that were found whole, wanted or not.
+        skipped: bytes that belonged to no such frame.
+    """
+
+    def __init__(self, wanted: Collection[int] | None = None, *, stream: bool = True) -> None:
+        ids = _CRC_EXTRA if wanted is None else wanted
+        self._wanted = frozenset(number.to_bytes(3, "little") for number in ids)
+        self._stream = stream
+        self._tail = b""
+        self.frames = 0
+        self.skipped = 0
+
+    def receive(self, data: bytes) -> list[Frame]:
+        """Take bytes from the link; give the frames that are complete now, in order.
+
+        At most one unfinished frame (280 bytes) is kept between calls.
+        """
+        if self._tail:
+            data = self._tail + data
+            self._tail = b""
+        found, rest = self._scan(data)
+        if self._stream:
+            self._tail = data[rest:]
+        elif rest < len(data):
+            found += self._rescan(data, rest)
+        return found
+
+    def flush(self) -> list[Frame]:
+        """The stream has ended or was interrupted: give what stands behind the unfinished candidate."""
+        tail, self._tail = self._tail, b""
+        return self._rescan(tail, 0) if tail else []
+
+    def _rescan(self, data: bytes, start: int) -> list[Frame]:
+        """Look behind candidates that will never be finished; `data` ends here."""
+        found: list[Frame] = []
+        while start < len(data):
+            start += 1
+            self.skipped += 1
+            more, offset = self._scan(data[start:])
+            found += more
+            start += offset
+        return found
+
+    def _scan(self, data: bytes) -> tuple[list[Frame], int]:
+        """The frames in `data`, and where the first candidate starts that its end cuts off."""
+        found: list[Frame] = []
+        wanted = self._wanted
+        extra_of = _EXTRA_BY_ID_BYTES.get
+        from_bytes = int.from_bytes
+        length = len(data)
+        good = 0
+        skipped = 0
+        at = 0
+        try:
+            while at < length:
+                magic = data[at]
+                if magic == _MAGIC_V2:
+                    end = at + 12 + data[at + 1]
+                    flags = data[at + 2]
+                    if flags:
+                        if flags != _SIGNED:
+                            at += 1
+                            skipped += 1
+                            continue
+                        end += _SIGNATURE_LENGTH
+                        crc_at = end - 15
+                    else:
+                        crc_at = end - 2
+                    key = data[at + 7 : at + 10]
+                elif magic == _MAGIC_V1:
+                    end = at + 8 + data[at + 1]
+                    crc_at = end - 2
+                    key = data[at + 5 : at + 6] + b"\0\0"
+                else:
+                    skipped += 1
+                    at += 1
+                    continue
+                extra = extra_of(key)
+                if extra is None:
+                    if len(key) < 3 or at + 6 > length:
+                        break  # the header is cut off
+                    skipped += 1
+                    at += 1
+                    continue
+                if end > length:
+                    break
+                if mcrf4xx(data[at + 1 : crc_at] + extra) != data[crc_at] | data[crc_at + 1] << 8:
+                    skipped += 1
+                    at += 1
+                    continue
+                good += 1
+                if key in wanted:
+                    if magic == _MAGIC_V2:
+                        sequence, system, component = data[at + 4 : at + 7]
+                        payload = data[at + 10 : crc_at]
+                        found.append(
+                            Frame(from_bytes(key, "little"), system, component, sequence, payload, 2)
+                        )
+                    else:
+                        sequence, system, component, number = data[at + 2 : at + 6]
+                        found.append(Frame(number, system, component, sequence, data[at + 6 : crc_at], 1))
+                at = end
+        except IndexError:
+            pass  # a header that the end of the data cuts off: `at` stands on its first byte
+        self.frames += good
+        self.skipped += skipped
+        return found, at
+
+
+def decode(frame: Frame) -> Message | None:
+    """The message in a frame, or None where this library has no use for its id.
+
+    Missing trailing bytes count as zero and further ones are passed over, as MAVLink 2 asks.
+    """
+    decoder = _DECODERS.get(frame.message_id)
+    return None if decoder is None else decoder(frame.payload)
+
+
+def encode(message: Message, *, system: int, component: int, sequence: int, version: int = 2) -> bytes:
+    """Pack a message into a frame.
+
+    Args:
+        message: any of this room's messages.
+        system, component: the sender, 1 to 255.
+        sequence: 0 to 255.
+        version: 2, or 1 for peers that know only that; ids above 255 (PARAM_ERROR) exist in 2 alone.
+    """
+    number, payload = _ENCODERS[type(message)](message)
+    if version == 1:
+        body = bytes((len(payload), sequence, system, component, number)) + payload
+        magic = b"\xfe"
+    else:
+        payload = payload.rstrip(b"\0") or b"\0"
+        body = (
+            bytes((len(payload), 0, 0, sequence, system, component)) + number.to_bytes(3, "little") + payload
+        )
+        magic = b"\xfd"
+    crc: int = mcrf4xx(body + bytes((_CRC_EXTRA[number],)))
+    return magic + body + crc.to_bytes(2, "little")
+
+
+@lru_cache(maxsize=4096)
+def text_of(field: bytes) -> str:
+    """A text field: cut at the first NUL. Latin-1 keeps every byte, so that odd names can be told apart.
+
+    Remembered, because the same names come again and again: equal names are then one object.
+    """
+    return field.split(b"\0", 1)[0].decode("latin-1")
+
+
+_CRC_EXTRA: dict[int, int] = {number: message.crc_extra for number, message in dialect.mavlink_map.items()}
+_EXTRA_BY_ID_BYTES = {number.to_bytes(3, "little"): bytes((extra,)) for number, extra in _CRC_EXTRA.items()}
+
+_HEARTBEAT = struct.Struct("<IBBBBB")
+_AUTOPILOT_VERSION = struct.Struct("<QQIIIIHH8s8s8s18s")
+_COMMAND_LONG = struct.Struct("<7fHBBB")
+_COMMAND_ACK = struct.Struct("<HBBiBB")
+_PARAM_REQUEST_READ = struct.Struct("<hBB16s")
+_PARAM_REQUEST_LIST = struct.Struct("<BB")
+_PARAM_VALUE = struct.Struct("<4sHH16sB")
+_PARAM_SET = struct.Struct("<4sBB16sB")
+_STATUSTEXT = struct.Struct("<B50s")
+_PARAM_ERROR = struct.Struct("<hBB16sB")
+
+
+def _fields(layout: struct.Struct, payload: bytes) -> tuple:  # type: ignore[type-arg]  # struct gives no types
+    if len(payload) < layout.size:
+        payload = payload.ljust(layout.size, b"\0")
+    return layout.unpack_from(payload)
+
+
+def _decode_heartbeat(payload: bytes) -> Heartbeat:
+    custom_mode, kind, autopilot, base_mode, status, version = _fields(_HEARTBEAT, payload)
+    return Heartbeat(kind, autopilot, base_mode, custom_mode, status, version)
+
+
+def _decode_autopilot_version(payload: bytes) -> AutopilotVersion:
+    capabilities, uid, flight, _, _, board, vendor, product, git, _, _, uid2 = _fields(
+        _AUTOPILOT_VERSION, payload
+    )
+    return AutopilotVersion(capabilities, flight, git, board, vendor, product, uid, uid2)
+
+
+def _decode_command_long(payload: bytes) -> CommandLong:
+    *params, command, system, component, confirmation = _fields(_COMMAND_LONG, payload)
+    return CommandLong(system, component, command, tuple(params), confirmation)
+
+
+def _decode_command_ack(payload: bytes) -> CommandAck:
+    command, result, _, _, system, component = _fields(_COMMAND_ACK, payload)
+    return CommandAck(command, result, system, component)
+
+
+def _decode_param_request_read(payload: bytes) -> ParamRequestRead:
+    index, system, component, name = _fields(_PARAM_REQUEST_READ, payload)
+    return ParamRequestRead(system, component, text_of(name), index)
+
+
+def _decode_param_request_list(payload: bytes) -> ParamRequestList:
+    return ParamRequestList(*_fields(_PARAM_REQUEST_LIST, payload))
+
+
+def _decode_param_value(payload: bytes) -> ParamValue:
+    if len(payload) < 25:
+        payload = payload.ljust(25, b"\0")
+    raw, count, index, name, number = _PARAM_VALUE.unpack_from(payload)
+    return ParamValue(text_of(name), raw, number, count, index)
+
+
+def _decode_param_set(payload: bytes) -> ParamSet:
+    raw, system, component, name, number = _fields(_PARAM_SET, payload)
+    return ParamSet(system, component, text_of(name), raw, number)
+
+
+def _decode_statustext(payload: bytes) -> StatusText:
+    severity, text = _fields(_STATUSTEXT, payload)
+    return StatusText(severity, text_of(text))
+
+
+def _decode_param_error(payload: bytes) -> ParamError:
+    index, system, component, name, error = _fields(_PARAM_ERROR, payload)
+    return ParamError(system, component, text_of(name), index, error)
+
+
+_DECODERS: dict[int, Callable[[bytes], Message]] = {
+    0: _decode_heartbeat,
+    20: _decode_param_request_read,
+    21: _decode_param_request_list,
+    22: _decode_param_value,
+    23: _decode_param_set,
+    76: _decode_command_long,
+    77: _decode_command_ack,
+    148: _decode_autopilot_version,
+    253: _decode_statustext,
+    345: _decode_param_error,
+}
+
+UNDERSTOOD: Final = frozenset(_DECODERS)
+"""The message ids that `decode` knows."""
+
+
+def _name(param_id: str) -> bytes:
+    return param_id.encode("latin-1")
+
+
+_ENCODERS: dict[type, Callable[..., tuple[int, bytes]]] = {
+    Heartbeat: lambda m: (
+        0,
+        _HEARTBEAT.pack(m.custom_mode, m.type, m.autopilot, m.base_mode, m.system_status, m.mavlink_version),
+    ),
+    ParamRequestRead: lambda m: (
+        20,
+        _PARAM_REQUEST_READ.pack(m.param_index, m.target_system, m.target_component, _name(m.param_id)),
+    ),
+    ParamRequestList: lambda m: (21, _PARAM_REQUEST_LIST.pack(m.target_system, m.target_component)),
+    ParamValue: lambda m: (
+        22,
+        _PARAM_VALUE.pack(m.raw, m.param_count, m.param_index, _name(m.param_id), m.param_type),
+    ),
+    ParamSet: lambda m: (
+        23,
+        _PARAM_SET.pack(m.raw, m.target_system, m.target_component, _name(m.param_id), m.param_type),
+    ),
+    CommandLong: lambda m: (
+        76,
+        _COMMAND_LONG.pack(*m.params, m.command, m.target_system, m.target_component, m.confirmation),
+    ),
+    CommandAck: lambda m: (
+        77,
+        _COMMAND_ACK.pack(m.command, m.result, 0, 0, m.target_system, m.target_component),
+    ),
+    AutopilotVersion: lambda m: (
+        148,
+        _AUTOPILOT_VERSION.pack(
+            m.capabilities,
+            m.uid,
+            m.flight_sw_version,
+            0,
+            0,
+            m.board_version,
+            m.vendor_id,
+            m.product_id,
+            m.git_hash,
+            b"",
+            b"",
+            m.uid2,
+        ),
+    ),
+    StatusText: lambda m: (253, _STATUSTEXT.pack(m.severity, m.text.encode("latin-1"))),
+    ParamError: lambda m: (
+        345,
+        _PARAM_ERROR.pack(m.param_index, m.target_system, m.target_component, _name(m.param_id), m.error),
+    ),
+}

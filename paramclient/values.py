@@ -1,0 +1,322 @@
+"""Parameter types, the two wire encodings, float32 comparison, and the PX4 hash.
+
+A PARAM_VALUE has four bytes for the value, whatever its type. Two encodings are in use (MAVLink guide,
+"Parameter Protocol"): *byte-wise*, the standard, lays the value's own bytes into the field; *C-cast*,
+ArduPilot's, converts the value to a float32. Nothing here turns the four bytes into a Python float and
+back on the way to an integer: a byte-wise integer whose bytes form a signalling NaN would change.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from enum import IntEnum, StrEnum
+from typing import SupportsFloat, SupportsIndex, TypeAlias
+
+from paramclient.errors import UsageError
+
+__all__ = [
+    "Encoding",
+    "Param",
+    "ParamType",
+    "Trust",
+    "Value",
+    "check_name",
+    "check_value",
+    "crc32_px4",
+    "decode",
+    "encode",
+    "format_value",
+    "from_bits",
+    "known_type",
+    "px4_hash",
+    "same_bits",
+    "shortest_float",
+    "type_name",
+]
+
+Value: TypeAlias = int | float | bytes
+"""A parameter's value. `bytes` only where the four wire bytes cannot be read as a number of the type: a
+64-bit type in the byte-wise encoding, an unknown type, a C-cast float that the integer type cannot hold."""
+
+NAME_LENGTH = 16
+"""Bytes in param_id; shorter names end with a NUL, names of 16 have none."""
+
+
+class ParamType(IntEnum):
+    """MAV_PARAM_TYPE."""
+
+    UINT8 = 1
+    INT8 = 2
+    UINT16 = 3
+    INT16 = 4
+    UINT32 = 5
+    INT32 = 6
+    UINT64 = 7
+    INT64 = 8
+    REAL32 = 9
+    REAL64 = 10
+
+    @property
+    def size(self) -> int:
+        """Bytes of a value of this type."""
+        return _LAYOUT[self].size
+
+    @property
+    def is_integer(self) -> bool:
+        return self < ParamType.REAL32
+
+    @property
+    def bounds(self) -> tuple[int, int]:
+        """Smallest and largest value of an integer type."""
+        bits = 8 * self.size
+        return (0, (1 << bits) - 1) if self % 2 else (-(1 << (bits - 1)), (1 << (bits - 1)) - 1)
+
+
+_LAYOUT = {ParamType(number): struct.Struct("<" + code) for number, code in enumerate("BbHhIiQqfd", start=1)}
+_FLOAT32 = _LAYOUT[ParamType.REAL32]
+
+
+class Encoding(StrEnum):
+    """How a component lays values into the four bytes."""
+
+    BYTEWISE = "bytewise"
+    C_CAST = "c-cast"
+
+
+class Trust(StrEnum):
+    """How far a value in a table can be relied upon."""
+
+    LIVE = "live"
+    """Heard from the vehicle on this link."""
+    VERIFIED = "verified"
+    """From the cache, and the vehicle's hash has confirmed it in this session."""
+    CACHED = "cached"
+    """From the cache: the last value known."""
+
+
+@dataclass(frozen=True, slots=True)
+class Param:
+    """One parameter as a component holds it.
+
+    Attributes:
+        name: param_id, 1 to 16 characters.
+        value: int for integer types, float for REAL32 and REAL64, and the raw four bytes where they cannot
+            be read as the type (see `Value`). A REAL32 is the exact float32 value as a Python float.
+        type: a `ParamType`, or the bare number of a type that MAVLink does not define.
+        index: the component's index for it, or None while unknown (PX4 gives none to parameters not in
+            use, ArduPilot none in replies by name).
+        bits: the value's own bytes in its type, read as a little-endian unsigned number. Two values are
+            the same parameter value when `same_bits` says so; `value` does not take part in equality.
+        trust: where the value comes from.
+    """
+
+    name: str
+    value: Value = field(compare=False)
+    type: ParamType | int
+    index: int | None
+    bits: int
+    trust: Trust = Trust.LIVE
+
+    @property
+    def is_raw(self) -> bool:
+        """Whether `value` holds the undecoded wire bytes."""
+        return isinstance(self.value, bytes)
+
+    def with_trust(self, trust: Trust) -> Param:
+        """The same parameter, trusted differently."""
+        return self if self.trust is trust else replace(self, trust=trust)
+
+    def same_value(self, other: Param) -> bool:
+        """Whether both hold the same value in the same type (−0 equals 0, NaN by its bits)."""
+        return self.type == other.type and same_bits(self.type, self.bits, other.bits)
+
+    def __str__(self) -> str:
+        return f"{self.name} = {format_value(self.value, self.type)}"
+
+
+def known_type(number: int) -> ParamType | int:
+    """The `ParamType` of a number, or the number itself where MAVLink defines none."""
+    return _TYPES[number] if number < len(_TYPES) else number
+
+
+_TYPES: tuple[ParamType | int, ...] = (0, *ParamType)
+
+
+def type_name(number: ParamType | int) -> str:
+    """`INT32`, `REAL32`, …; an unknown type is shown as `TYPE_77`."""
+    return number.name if isinstance(number, ParamType) else f"TYPE_{number}"
+
+
+def check_name(name: str) -> str:
+    """Give the name back if it can be a param_id: 1 to 16 printable ASCII characters; else UsageError."""
+    if not isinstance(name, str):
+        raise UsageError(f"a parameter name is a string, not {type(name).__name__}")
+    if not name:
+        raise UsageError("a parameter name has at least one character")
+    if not (name.isascii() and name.isprintable()):
+        raise UsageError(f"parameter name {name!r}: only printable ASCII characters can stand in a param_id")
+    if len(name) > NAME_LENGTH:
+        raise UsageError(f"parameter name {name!r} has {len(name)} bytes; a param_id holds {NAME_LENGTH}")
+    return name
+
+
+def check_value(value: SupportsIndex | SupportsFloat | bytes) -> Value:
+    """Turn what a caller gives into an int, a float or four raw bytes; else UsageError.
+
+    Numbers of other libraries (numpy's, Decimal) are taken through `__index__` or `__float__`. Text is not:
+    who reads text knows better what was meant.
+    """
+    if isinstance(value, bytes):
+        if len(value) != 4:
+            raise UsageError(f"raw bytes for a parameter are the 4 bytes of the message, not {len(value)}")
+        return value
+    if isinstance(value, str):
+        raise UsageError(f"a parameter value is a number, not the text {value!r}")
+    if isinstance(value, SupportsIndex):
+        return value.__index__()
+    if isinstance(value, SupportsFloat):
+        return float(value)
+    raise UsageError(f"a parameter value is a number, not {type(value).__name__}")
+
+
+def decode(raw: bytes, number: int, encoding: Encoding) -> tuple[Value, int]:
+    """Read the four wire bytes of a value: the value, and its own bits (see `Param.bits`).
+
+    Args:
+        raw: exactly 4 bytes.
+        number: param_type as it stood in the message.
+        encoding: how the component writes values.
+    """
+    if number == ParamType.REAL32:
+        return _FLOAT32.unpack(raw)[0], int.from_bytes(raw, "little")
+    if not 1 <= number <= ParamType.REAL64:
+        return raw, int.from_bytes(raw, "little")
+    kind = ParamType(number)
+    if encoding is Encoding.BYTEWISE:
+        if kind.size > 4:
+            return raw, int.from_bytes(raw, "little")
+        own = raw[: kind.size]
+        return _LAYOUT[kind].unpack(own)[0], int.from_bytes(own, "little")
+    number32: float = _FLOAT32.unpack(raw)[0]
+    if kind is ParamType.REAL64:
+        return number32, int.from_bytes(_LAYOUT[kind].pack(number32), "little")
+    if math.isfinite(number32):
+        whole = int(number32)
+        low, high = kind.bounds
+        if low <= whole <= high:
+            return whole, whole & ((1 << (8 * kind.size)) - 1)
+    return raw, int.from_bytes(raw, "little")
+
+
+def encode(value: Value, number: int, encoding: Encoding) -> bytes:
+    """Lay a value into the four wire bytes.
+
+    Raises:
+        UsageError: the value does not fit. A fraction for an integer type fits only in the C-cast encoding,
+            where the vehicle itself does the conversion (ArduPilot cuts 1234.7 to 1234). An integer that a
+            float32 cannot hold exactly does not fit in the C-cast encoding. A 64-bit type does not fit in
+            the byte-wise encoding, and an unknown type takes raw bytes only.
+    """
+    if isinstance(value, bytes):
+        return value
+    if not 1 <= number <= ParamType.REAL64:
+        raise UsageError(f"{type_name(number)} is not a type that MAVLink defines; give the 4 raw bytes")
+    kind = ParamType(number)
+    if not kind.is_integer:
+        if kind is ParamType.REAL64 and encoding is Encoding.BYTEWISE:
+            raise UsageError("REAL64 takes 8 bytes and PARAM_SET has 4; it cannot be written this way")
+        return _to_float32(value, kind)
+    if isinstance(value, float):
+        if value.is_integer():
+            value = int(value)
+        elif encoding is Encoding.BYTEWISE or not math.isfinite(value):
+            raise UsageError(f"{value!r} is not a whole number, and the parameter is {kind.name}")
+    low, high = kind.bounds
+    if not low <= int(value) <= high:
+        raise UsageError(f"{value} does not fit {kind.name}, which holds {low} to {high}")
+    if encoding is Encoding.BYTEWISE:
+        if kind.size > 4:
+            raise UsageError(f"{kind.name} takes 8 bytes and PARAM_SET has 4; it cannot be written this way")
+        return _LAYOUT[kind].pack(value).ljust(4, b"\0")
+    raw = _to_float32(value, kind)
+    if isinstance(value, int) and _FLOAT32.unpack(raw)[0] != value:
+        raise UsageError(
+            f"{value} cannot be sent exactly: this vehicle takes integers as float32, "
+            f"and the nearest is {int(_FLOAT32.unpack(raw)[0])}"
+        )
+    return raw
+
+
+def from_bits(bits: int, number: int, *, is_raw: bool = False) -> Value:
+    """The value whose own bits these are: the inverse of `Param.bits`, for what was kept on disk.
+
+    Args:
+        bits: as in `Param.bits`.
+        number: param_type.
+        is_raw: whether `Param.is_raw` was true.
+    """
+    if is_raw or not 1 <= number <= ParamType.REAL64:
+        return bits.to_bytes(4, "little")
+    kind = ParamType(number)
+    value: int | float = _LAYOUT[kind].unpack(bits.to_bytes(kind.size, "little"))[0]
+    return value
+
+
+def same_bits(number: int, a: int, b: int) -> bool:
+    """Whether two values of a type are equal, given by their bits: −0 equals 0, a NaN equals only itself."""
+    if a == b:
+        return True
+    if number == ParamType.REAL32:
+        return a | b == 0x80000000
+    return number == ParamType.REAL64 and a | b == 0x8000000000000000
+
+
+def format_value(value: Value, number: int = ParamType.REAL32) -> str:
+    """The shortest text that reads back as the same value: floats as float32, raw bytes as hexadecimal."""
+    if isinstance(value, bytes):
+        return f"0x{int.from_bytes(value, 'little'):08x}"
+    if isinstance(value, int):
+        return str(value)
+    return repr(shortest_float(value) if number == ParamType.REAL32 else value)
+
+
+def shortest_float(value: float) -> float:
+    """The float with the shortest decimal form among those that round to the same float32."""
+    if not math.isfinite(value):
+        return value
+    for digits in range(6, 9):
+        candidate = float(f"{value:.{digits}g}")
+        if abs(candidate) <= _FLOAT32_MAX and _FLOAT32.pack(candidate) == _FLOAT32.pack(value):
+            return candidate
+    return float(f"{value:.9g}")
+
+
+_FLOAT32_MAX = 3.4028235677973366e38  # values below this round to a finite float32
+
+
+def crc32_px4(data: bytes, crc: int = 0) -> int:
+    """PX4's CRC-32: reflected polynomial 0xEDB88320, start value 0, no final xor (PX4 crc.c, `crc32part`)."""
+    return zlib.crc32(data, crc ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
+
+
+def px4_hash(params: Iterable[Param], *, leave_out: Iterable[str] = ()) -> int:
+    """The value of PX4's `_HASH_CHECK` for a table.
+
+    Args:
+        params: the parameters in use, in any order; PX4's types have 4 bytes each.
+        leave_out: names of volatile parameters, which PX4 does not count in.
+    """
+    without = frozenset(leave_out)
+    kept = sorted((p.name.encode("latin-1"), p.bits) for p in params if p.name not in without)
+    return crc32_px4(b"".join(name + (bits & 0xFFFFFFFF).to_bytes(4, "little") for name, bits in kept))
+
+
+def _to_float32(value: int | float, kind: ParamType) -> bytes:
+    try:
+        return _FLOAT32.pack(value)
+    except OverflowError:
+        raise UsageError(f"{value} is beyond the range of a float32, in which {kind.name} is sent") from None
