@@ -94,7 +94,7 @@ class Refused(VehicleError):
     """The vehicle gave a reason for not doing it.
 
     Attributes:
-        code: the number in PARAM_ERROR (a `ParamErrorCode` where it is known), READ_ONLY for ArduPilot's
+        code: the number in PARAM_ERROR, to compare with `ParamErrorCode`; READ_ONLY for ArduPilot's
             "Param write denied" text.
         reason: the same in words.
     """

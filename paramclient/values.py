@@ -31,6 +31,7 @@ __all__ = [
     "encode",
     "format_value",
     "from_bits",
+    "hash_chunk",
     "known_type",
     "px4_hash",
     "same_bits",
@@ -132,7 +133,11 @@ class Param:
 
     def same_value(self, other: Param) -> bool:
         """Whether both hold the same value in the same type (−0 equals 0, NaN by its bits)."""
-        return self.type == other.type and same_bits(self.type, self.bits, other.bits)
+        return (
+            self.type == other.type
+            and self.is_raw == other.is_raw
+            and same_bits(self.type, self.bits, other.bits)
+        )
 
     def __str__(self) -> str:
         return f"{self.name} = {format_value(self.value, self.type)}"
@@ -176,10 +181,13 @@ def check_value(value: SupportsIndex | SupportsFloat | bytes) -> Value:
         return value
     if isinstance(value, str):
         raise UsageError(f"a parameter value is a number, not the text {value!r}")
-    if isinstance(value, SupportsIndex):
-        return value.__index__()
-    if isinstance(value, SupportsFloat):
-        return float(value)
+    try:
+        if isinstance(value, SupportsIndex):
+            return value.__index__()
+        if isinstance(value, SupportsFloat):
+            return float(value)
+    except (ArithmeticError, TypeError, ValueError) as error:
+        raise UsageError(f"a parameter value is one number of ordinary size: {error}") from error
     raise UsageError(f"a parameter value is a number, not {type(value).__name__}")
 
 
@@ -243,11 +251,14 @@ def encode(value: Value, number: int, encoding: Encoding) -> bytes:
             raise UsageError(f"{kind.name} takes 8 bytes and PARAM_SET has 4; it cannot be written this way")
         return _LAYOUT[kind].pack(value).ljust(4, b"\0")
     raw = _to_float32(value, kind)
-    if isinstance(value, int) and _FLOAT32.unpack(raw)[0] != value:
+    sent = _FLOAT32.unpack(raw)[0]
+    if isinstance(value, int) and sent != value:
         raise UsageError(
             f"{value} cannot be sent exactly: this vehicle takes integers as float32, "
-            f"and the nearest is {int(_FLOAT32.unpack(raw)[0])}"
+            f"and the nearest is {int(sent)}"
         )
+    if not low <= int(sent) <= high:
+        raise UsageError(f"{value!r} rounds to {sent!r} as float32; {kind.name} holds {low} to {high}")
     return raw
 
 
@@ -286,16 +297,22 @@ def format_value(value: Value, number: int = ParamType.REAL32) -> str:
 
 def shortest_float(value: float) -> float:
     """The float with the shortest decimal form among those that round to the same float32."""
-    if not math.isfinite(value):
+    if not abs(value) < _FLOAT32_END:
         return value
-    for digits in range(6, 9):
-        candidate = float(f"{value:.{digits}g}")
-        if abs(candidate) <= _FLOAT32_MAX and _FLOAT32.pack(candidate) == _FLOAT32.pack(value):
-            return candidate
+    same = _FLOAT32.pack(value)
+    value = _FLOAT32.unpack(same)[0]
+    # Below a power of two the floats lie closer: the middle of what rounds to it is a little above it.
+    middle = value * (1 + 2**-26) if abs(math.frexp(value)[0]) == 0.5 else value
+    for digits in range(6 if abs(value) >= _FLOAT32_NORMAL else 1, 9):
+        for point in (value, middle):
+            candidate = float(f"{point:.{digits}g}")
+            if abs(candidate) < _FLOAT32_END and _FLOAT32.pack(candidate) == same:
+                return candidate
     return float(f"{value:.9g}")
 
 
-_FLOAT32_MAX = 3.4028235677973366e38  # values below this round to a finite float32
+_FLOAT32_END = 2.0**128 - 2.0**103  # what is smaller rounds to a finite float32
+_FLOAT32_NORMAL = 2.0**-126  # from here on, all decimals of up to 6 digits are different floats
 
 
 def crc32_px4(data: bytes, crc: int = 0) -> int:
@@ -311,12 +328,17 @@ def px4_hash(params: Iterable[Param], *, leave_out: Iterable[str] = ()) -> int:
         leave_out: names of volatile parameters, which PX4 does not count in.
     """
     without = frozenset(leave_out)
-    kept = sorted((p.name.encode("latin-1"), p.bits) for p in params if p.name not in without)
-    return crc32_px4(b"".join(name + (bits & 0xFFFFFFFF).to_bytes(4, "little") for name, bits in kept))
+    kept = sorted((param for param in params if param.name not in without), key=lambda param: param.name)
+    return crc32_px4(b"".join(map(hash_chunk, kept)))
+
+
+def hash_chunk(param: Param) -> bytes:
+    """What PX4's hash takes in of one parameter: its name without NUL, and its 4 value bytes."""
+    return param.name.encode("latin-1") + (param.bits & 0xFFFFFFFF).to_bytes(4, "little")
 
 
 def _to_float32(value: int | float, kind: ParamType) -> bytes:
     try:
-        return _FLOAT32.pack(value)
+        return _FLOAT32.pack(float(value))
     except OverflowError:
         raise UsageError(f"{value} is beyond the range of a float32, in which {kind.name} is sent") from None

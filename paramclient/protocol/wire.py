@@ -7,6 +7,7 @@ a Python float (see `paramclient.values`) and because most frames on a link need
 
 from __future__ import annotations
 
+import re
 import struct
 from collections.abc import Callable, Collection
 from dataclasses import dataclass
@@ -30,6 +31,7 @@ __all__ = [
     "ParamSet",
     "ParamValue",
     "StatusText",
+    "build_frame",
     "decode",
     "encode",
 ]
@@ -48,6 +50,7 @@ MAV_AUTOPILOT_ARDUPILOTMEGA: Final = 3
 MAV_AUTOPILOT_INVALID: Final = 8
 MAV_AUTOPILOT_PX4: Final = 12
 MAV_STATE_ACTIVE: Final = 4
+AUTOPILOT_VERSION_ID: Final = 148
 MAV_CMD_REQUEST_MESSAGE: Final = 512
 MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: Final = 520
 MAV_RESULT_ACCEPTED: Final = 0
@@ -59,7 +62,11 @@ _MAGIC_V1 = 0xFE
 _MAGIC_V2 = 0xFD
 _SIGNED = 0x01
 _SIGNATURE_LENGTH = 13
-_LONGEST_FRAME = 10 + 255 + 2 + _SIGNATURE_LENGTH
+_MAGIC = re.compile(b"[\xfd\xfe]").search
+_START = struct.Struct("<BBB4x3s").unpack_from  # magic, payload length, incompatibility flags, message id
+_CRC_AT = struct.Struct("<H").unpack_from
+_PADDING = bytes(10)  # behind the data: a header can be read at its last byte
+_NO_KEY = b""  # of no message
 
 
 class Frame(NamedTuple):
@@ -195,7 +202,8 @@ class Framer:
 
     Every frame whose message id is known is checked by its CRC; one with an unknown id cannot be checked
     and is passed over. A candidate that fails is retried from its second byte, so that no noise can hide a
-    frame that stands whole outside a longer valid one.
+    frame that stands whole outside a longer valid one. Signatures are not verified: the 13 bytes behind the
+    checksum of a signed frame count as its signature, whatever they are.
 
     Args:
         wanted: the message ids to give out; None for every known one. Frames with other ids are still
@@ -210,7 +218,7 @@ class Framer:
 
     def __init__(self, wanted: Collection[int] | None = None, *, stream: bool = True) -> None:
         ids = _CRC_EXTRA if wanted is None else wanted
-        self._wanted = frozenset(number.to_bytes(3, "little") for number in ids)
+        self._wanted = {number.to_bytes(3, "little"): number for number in ids}
         self._stream = stream
         self._tail = b""
         self.frames = 0
@@ -219,95 +227,73 @@ class Framer:
     def receive(self, data: bytes) -> list[Frame]:
         """Take bytes from the link; give the frames that are complete now, in order.
 
-        At most one unfinished frame (280 bytes) is kept between calls.
+        Of a stream, at most one unfinished frame (less than 280 bytes) is kept between calls.
         """
         if self._tail:
             data = self._tail + data
-            self._tail = b""
-        found, rest = self._scan(data)
-        if self._stream:
-            self._tail = data[rest:]
-        elif rest < len(data):
-            found += self._rescan(data, rest)
+        found, rest = self._scan(data, final=not self._stream)
+        self._tail = data[rest:]
         return found
 
     def flush(self) -> list[Frame]:
         """The stream has ended or was interrupted: give what stands behind the unfinished candidate."""
-        tail, self._tail = self._tail, b""
-        return self._rescan(tail, 0) if tail else []
-
-    def _rescan(self, data: bytes, start: int) -> list[Frame]:
-        """Look behind candidates that will never be finished; `data` ends here."""
-        found: list[Frame] = []
-        while start < len(data):
-            start += 1
-            self.skipped += 1
-            more, offset = self._scan(data[start:])
-            found += more
-            start += offset
+        found, _ = self._scan(self._tail, final=True)
+        self._tail = b""
         return found
 
-    def _scan(self, data: bytes) -> tuple[list[Frame], int]:
-        """The frames in `data`, and where the first candidate starts that its end cuts off."""
+    def _scan(self, data: bytes, *, final: bool) -> tuple[list[Frame], int]:
+        """The frames in `data`, and where the first candidate starts that its end cuts off.
+
+        Where `data` is final, nothing will complete such a candidate, and it is passed over like any other
+        that fails. The loop is the hot path of the library: about ten operations for each frame, nothing
+        for each byte.
+        """
         found: list[Frame] = []
         wanted = self._wanted
         extra_of = _EXTRA_BY_ID_BYTES.get
-        from_bytes = int.from_bytes
         length = len(data)
+        padded = data + _PADDING
         good = 0
         skipped = 0
         at = 0
-        try:
-            while at < length:
-                magic = data[at]
-                if magic == _MAGIC_V2:
-                    end = at + 12 + data[at + 1]
-                    flags = data[at + 2]
-                    if flags:
-                        if flags != _SIGNED:
-                            at += 1
-                            skipped += 1
-                            continue
-                        end += _SIGNATURE_LENGTH
-                        crc_at = end - 15
-                    else:
-                        crc_at = end - 2
-                    key = data[at + 7 : at + 10]
-                elif magic == _MAGIC_V1:
-                    end = at + 8 + data[at + 1]
-                    crc_at = end - 2
-                    key = data[at + 5 : at + 6] + b"\0\0"
-                else:
-                    skipped += 1
-                    at += 1
-                    continue
-                extra = extra_of(key)
-                if extra is None:
-                    if len(key) < 3 or at + 6 > length:
-                        break  # the header is cut off
-                    skipped += 1
-                    at += 1
-                    continue
-                if end > length:
+        while at < length:
+            magic, size, flags, key = _START(padded, at)
+            if magic == _MAGIC_V2:
+                crc_at = at + 10 + size
+                end = crc_at + 2
+                if flags:
+                    end += _SIGNATURE_LENGTH
+                    if flags != _SIGNED:
+                        key = _NO_KEY  # a format that is not defined yet
+            elif magic == _MAGIC_V1:
+                crc_at = at + 6 + size
+                end = crc_at + 2
+                key = padded[at + 5 : at + 6] + b"\0\0"
+            else:
+                crc_at = end = at
+                key = _NO_KEY
+            extra = extra_of(key)
+            if end > length:
+                header_is_cut = crc_at - size > length
+                if not final and (header_is_cut or extra is not None):
                     break
-                if mcrf4xx(data[at + 1 : crc_at] + extra) != data[crc_at] | data[crc_at + 1] << 8:
-                    skipped += 1
-                    at += 1
-                    continue
+            elif extra is not None and _CRC_AT(data, crc_at)[0] == mcrf4xx(data[at + 1 : crc_at] + extra):
                 good += 1
                 if key in wanted:
                     if magic == _MAGIC_V2:
                         sequence, system, component = data[at + 4 : at + 7]
                         payload = data[at + 10 : crc_at]
-                        found.append(
-                            Frame(from_bytes(key, "little"), system, component, sequence, payload, 2)
-                        )
+                        found.append(Frame(wanted[key], system, component, sequence, payload, 2))
                     else:
-                        sequence, system, component, number = data[at + 2 : at + 6]
-                        found.append(Frame(number, system, component, sequence, data[at + 6 : crc_at], 1))
+                        sequence, system, component = data[at + 2 : at + 5]
+                        payload = data[at + 6 : crc_at]
+                        found.append(Frame(wanted[key], system, component, sequence, payload, 1))
                 at = end
-        except IndexError:
-            pass  # a header that the end of the data cuts off: `at` stands on its first byte
+                continue
+            candidate = _MAGIC(data, at + 1)
+            next_at = candidate.start() if candidate else length
+            skipped += next_at - at
+            at = next_at
         self.frames += good
         self.skipped += skipped
         return found, at
@@ -333,15 +319,28 @@ def encode(message: Message, *, system: int, component: int, sequence: int, vers
     """
     number, payload = _ENCODERS[type(message)](message)
     if version == 1:
-        body = bytes((len(payload), sequence, system, component, number)) + payload
+        payload = payload[: _V1_LENGTHS.get(number)]
+    return build_frame(
+        number, payload, system=system, component=component, sequence=sequence, version=version
+    )
+
+
+def build_frame(
+    message_id: int, payload: bytes, *, system: int, component: int, sequence: int, version: int = 2
+) -> bytes:
+    """Put a payload into a frame; for messages that have no class here, any id of the dialect.
+
+    MAVLink 2 drops the payload's trailing zeros. The other arguments are those of `encode`.
+    """
+    if version == 1:
+        body = bytes((len(payload), sequence, system, component, message_id)) + payload
         magic = b"\xfe"
     else:
         payload = payload.rstrip(b"\0") or b"\0"
-        body = (
-            bytes((len(payload), 0, 0, sequence, system, component)) + number.to_bytes(3, "little") + payload
-        )
+        head = bytes((len(payload), 0, 0, sequence, system, component))
+        body = head + message_id.to_bytes(3, "little") + payload
         magic = b"\xfd"
-    crc: int = mcrf4xx(body + bytes((_CRC_EXTRA[number],)))
+    crc: int = mcrf4xx(body + bytes((_CRC_EXTRA[message_id],)))
     return magic + body + crc.to_bytes(2, "little")
 
 
@@ -365,8 +364,9 @@ _PARAM_REQUEST_READ = struct.Struct("<hBB16s")
 _PARAM_REQUEST_LIST = struct.Struct("<BB")
 _PARAM_VALUE = struct.Struct("<4sHH16sB")
 _PARAM_SET = struct.Struct("<4sBB16sB")
-_STATUSTEXT = struct.Struct("<B50s")
+_STATUSTEXT = struct.Struct("<B50s")  # its extension fields, for long texts in pieces, are not read
 _PARAM_ERROR = struct.Struct("<hBB16sB")
+_V1_LENGTHS = {77: 3, 148: 60}  # extension fields exist in MAVLink 2 only
 
 
 def _fields(layout: struct.Struct, payload: bytes) -> tuple:  # type: ignore[type-arg]  # struct gives no types

@@ -1,0 +1,277 @@
+"""The rules that keep the rooms apart, read from the source: who may import whom, what the core may touch."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+PACKAGE = ROOT / "paramclient"
+
+MAY_IMPORT = {
+    "errors": set[str](),
+    "version": set[str](),
+    "values": {"errors"},
+    "params": {"errors", "values"},
+    "identity": {"errors", "values"},
+    "protocol.wire": {"errors", "values"},
+    "protocol.pack": {"errors", "values"},
+    "protocol": {"errors", "values", "identity", "params", "protocol", "protocol.wire", "protocol.pack"},
+    "sim": {"errors", "values", "protocol.wire", "protocol.pack", "sim"},
+    "links": {"errors", "values", "sim", "links"},
+    "cache": {"errors", "values", "identity", "params", "cache"},
+}
+"""Which rooms of the package a room may know; the longest name that fits counts. A room that is not named
+here belongs to the shell: it may know all of these and the rest of the shell, and none of these knows it."""
+
+PURE = ("errors", "values", "params", "identity", "protocol", "sim")
+"""Rooms without input and output: time comes in as an argument, bytes as bytes."""
+
+IMPURE_MODULES = {
+    *("anyio", "asyncio", "trio", "sniffio", "concurrent", "multiprocessing", "threading", "queue", "sched"),
+    *("socket", "socketserver", "select", "selectors", "ssl", "http", "urllib", "serialx", "serial"),
+    *("time", "datetime", "calendar", "zoneinfo", "signal"),
+    *("os", "io", "pathlib", "shutil", "tempfile", "glob", "fileinput", "sqlite3", "dbm", "mmap", "fcntl"),
+    *("subprocess", "platform", "platformdirs", "getpass", "secrets", "uuid", "pydantic"),
+}
+IMPURE_CALLS = {"open", "input", "print", "exec", "eval", "__import__"}
+
+COMMAND = ("cli", "__main__")
+COMMAND_LIBRARIES = {"rich", "cyclopts"}
+LONGEST_ROOM = 550
+
+
+@dataclass(frozen=True)
+class Import:
+    """One module that another imports. `runs_at_import` is false inside functions and for types only."""
+
+    module: str
+    names: tuple[str, ...]
+    runs_at_import: bool
+    for_types_only: bool
+    line: int
+
+    @property
+    def top(self) -> str:
+        return self.module.split(".", 1)[0]
+
+
+MODULES = {
+    ".".join(path.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): path
+    for path in sorted(PACKAGE.rglob("*.py"))
+}
+EVERY_MODULE = pytest.mark.parametrize("module", MODULES)
+
+
+@cache
+def source_of(module: str) -> ast.Module:
+    return ast.parse(MODULES[module].read_text(encoding="utf-8"), filename=str(MODULES[module]))
+
+
+@cache
+def imports_of(module: str) -> tuple[Import, ...]:
+    return tuple(walk_imports(source_of(module)))
+
+
+def walk_imports(node: ast.AST, *, at_import: bool = True, for_types: bool = False) -> Iterator[Import]:
+    for child in ast.iter_child_nodes(node):
+        if isinstance(child, ast.Import):
+            for alias in child.names:
+                yield Import(alias.name, (), at_import and not for_types, for_types, child.lineno)
+        elif isinstance(child, ast.ImportFrom):
+            names = tuple(alias.name for alias in child.names)
+            origin = "." * child.level + (child.module or "")
+            yield Import(origin, names, at_import and not for_types, for_types, child.lineno)
+        elif isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test):
+            yield from walk_imports(child, at_import=at_import, for_types=True)
+        else:
+            inside = at_import and not isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef | ast.Lambda)
+            yield from walk_imports(child, at_import=inside, for_types=for_types)
+
+
+def own_imports_of(module: str) -> Iterator[tuple[str, Import]]:
+    """The package's own modules that one imports: `from package import module` counts as the module."""
+    for each in imports_of(module):
+        if each.top == "paramclient":
+            submodules = [f"{each.module}.{name}" for name in each.names]
+            targets = {name if name in MODULES else each.module for name in submodules} or {each.module}
+            for target in targets:
+                yield target, each
+
+
+def room_of(module: str) -> str:
+    """The longest entry of the table that the module belongs to, or its name inside the package."""
+    name = module.removeprefix("paramclient").removeprefix(".")
+    parts = name.split(".")
+    for length in range(len(parts), 0, -1):
+        if (room := ".".join(parts[:length])) in MAY_IMPORT:
+            return room
+    return name
+
+
+def is_pure(module: str) -> bool:
+    return room_of(module).split(".")[0] in PURE
+
+
+def is_command(module: str) -> bool:
+    return room_of(module).split(".")[0] in COMMAND
+
+
+@EVERY_MODULE
+def test_imports_are_absolute_and_point_one_way(module: str) -> None:
+    assert all(each.top for each in imports_of(module))
+    room = room_of(module)
+    for target, each in own_imports_of(module):
+        where = f"{module}:{each.line} imports {target}"
+        if room in MAY_IMPORT:
+            assert room_of(target) in MAY_IMPORT[room], where
+        elif not is_command(module):
+            assert not is_command(target), where
+
+
+def test_no_module_imports_itself_through_others() -> None:
+    """Modules that only name each other's types do not count."""
+    graph = {
+        module: {
+            target for target, each in own_imports_of(module) if not each.for_types_only and target != module
+        }
+        for module in MODULES
+    }
+    TopologicalSorter(graph).prepare()
+
+
+def test_the_simulators_load_only_when_a_link_asks_for_them() -> None:
+    for module in MODULES:
+        if not is_pure(module) and not is_command(module):
+            for target, each in own_imports_of(module):
+                assert not (each.runs_at_import and room_of(target) == "sim"), f"{module}:{each.line}"
+
+
+def test_only_the_wire_knows_pymavlink() -> None:
+    uses = {
+        (module, each.module) for module in MODULES for each in imports_of(module) if each.top == "pymavlink"
+    }
+    assert uses == {("paramclient.protocol.wire", "pymavlink.dialects.v20")}
+
+
+@pytest.mark.parametrize("module", [module for module in MODULES if is_pure(module)])
+def test_the_core_touches_nothing_outside(module: str) -> None:
+    for each in imports_of(module):
+        assert each.top not in IMPURE_MODULES, f"{module}:{each.line} imports {each.module}"
+    for node in ast.walk(source_of(module)):
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+            assert node.func.id not in IMPURE_CALLS, f"{module}:{node.lineno} calls {node.func.id}"
+
+
+@pytest.mark.parametrize("module", [module for module in MODULES if is_pure(module)])
+def test_randomness_of_the_core_is_seeded(module: str) -> None:
+    for each in imports_of(module):
+        if each.module == "random":
+            assert set(each.names) <= {"Random"}, f"{module}:{each.line}"
+    for node in ast.walk(source_of(module)):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "random":
+            assert node.attr == "Random", f"{module}:{node.lineno} uses random.{node.attr}"
+        if isinstance(node, ast.Call) and ast.unparse(node.func) in {"random.Random", "Random"}:
+            assert node.args or node.keywords, f"{module}:{node.lineno}: Random() without a seed"
+
+
+@EVERY_MODULE
+def test_only_the_command_loads_its_libraries(module: str) -> None:
+    for each in imports_of(module):
+        if each.top in COMMAND_LIBRARIES:
+            assert is_command(module), f"{module}:{each.line} imports {each.module}"
+
+
+@EVERY_MODULE
+def test_every_module_says_what_it_is(module: str) -> None:
+    assert ast.get_docstring(source_of(module))
+
+
+@EVERY_MODULE
+def test_a_room_that_outgrows_itself_becomes_a_folder(module: str) -> None:
+    lines = len(MODULES[module].read_text(encoding="utf-8").splitlines())
+    assert lines <= LONGEST_ROOM, f"{module} has {lines} lines"
+
+
+@EVERY_MODULE
+def test_what_a_module_offers_exists(module: str) -> None:
+    """`__all__`, where there is one, is a plain list without repetitions, of names that the module binds."""
+    offered = offers_of(module)
+    bound = bound_names(source_of(module))
+    assert len(offered) == len(set(offered))
+    assert set(offered) <= bound or "__getattr__" in bound
+
+
+def test_the_package_offers_what_it_imports_and_nothing_else() -> None:
+    source = source_of("paramclient")
+    offered = offers_of("paramclient")
+    assert "__version__" in offered
+    imported = {
+        alias.asname or alias.name
+        for node in source.body
+        if isinstance(node, ast.ImportFrom) and node.module != "__future__"
+        for alias in node.names
+    }
+    assert imported <= set(offered)
+
+    import paramclient
+
+    assert sorted(paramclient.__all__) == sorted(offered)
+    for name in offered:
+        assert getattr(paramclient, name) is not None
+
+
+def offers_of(module: str) -> list[str]:
+    for node in source_of(module).body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+            names: list[str] = ast.literal_eval(node.value)
+            return names
+    return []
+
+
+def bound_names(source: ast.Module) -> set[str]:
+    """The names that a module binds at its top."""
+    names: set[str] = set()
+    for node in source.body:
+        match node:
+            case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
+                names.add(node.name)
+            case ast.Import() | ast.ImportFrom():
+                names.update(alias.asname or alias.name for alias in node.names)
+            case ast.Assign(targets=targets):
+                names.update(ast.unparse(target) for target in targets)
+            case ast.AnnAssign(target=target):
+                names.add(ast.unparse(target))
+    return names
+
+
+def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
+    """Start-up is part of the command's promise; mavutil, besides, changes the process that imports it."""
+    unwanted = ["rich", "cyclopts", "pydantic", "pymavlink.mavutil", "paramclient.sim", "paramclient.cli"]
+    program = f"import sys, paramclient; print([name for name in {unwanted!r} if name in sys.modules])"
+    run = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert run.stdout.strip() == "[]"
+
+
+def test_the_version_stands_in_one_place() -> None:
+    from paramclient.version import __version__
+
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
+    assert "version" not in project["project"]
+    assert project["project"]["dynamic"] == ["version"]
+    assert project["tool"]["hatch"]["version"]["path"] == "paramclient/version.py"
+    for module in MODULES:
+        for node in ast.walk(source_of(module)):
+            if isinstance(node, ast.Constant) and node.value == __version__:
+                assert module == "paramclient.version", f"{module}:{node.lineno} repeats the version"

@@ -1,0 +1,100 @@
+"""The exception tree: what catches what, what each carries, and how it reads."""
+
+from __future__ import annotations
+
+import pytest
+from pymavlink.dialects.v20 import all as dialect
+
+from paramclient import errors
+from paramclient.errors import (
+    CacheError,
+    ClientClosed,
+    LinkError,
+    NoReply,
+    ParamClientError,
+    ParamErrorCode,
+    Refused,
+    TypeMismatch,
+    UnknownParameter,
+    UsageError,
+    ValueNotApplied,
+    VehicleError,
+)
+
+
+@pytest.mark.parametrize(
+    ("kind", "base"),
+    [
+        (UsageError, ValueError),
+        (UnknownParameter, VehicleError),
+        (Refused, VehicleError),
+        (TypeMismatch, VehicleError),
+        (ValueNotApplied, VehicleError),
+        (NoReply, TimeoutError),
+        (LinkError, OSError),
+        (ClientClosed, LinkError),
+        (CacheError, ParamClientError),
+    ],
+)
+def test_each_error_is_caught_as_what_it_is(kind: type[Exception], base: type[Exception]) -> None:
+    assert issubclass(kind, base)
+    assert issubclass(kind, ParamClientError)
+
+
+def test_what_the_vehicle_says_is_not_what_the_link_or_the_caller_did() -> None:
+    assert not issubclass(VehicleError, OSError | ValueError)
+    assert not issubclass(NoReply, LinkError | VehicleError)
+
+
+def test_every_error_of_the_module_is_offered() -> None:
+    defined = {
+        name for name, thing in vars(errors).items() if getattr(thing, "__module__", "") == errors.__name__
+    }
+    assert defined == set(errors.__all__)
+
+
+def test_codes_are_mavlinks() -> None:
+    """As far as pymavlink's dialect knows them: 6 to 8 are newer."""
+    names = {
+        name.removeprefix("MAV_PARAM_ERROR_"): value
+        for name, value in vars(dialect).items()
+        if name.startswith("MAV_PARAM_ERROR_") and not name.endswith("ENUM_END")
+    }
+    assert len(names) >= 6
+    assert names.items() <= {code.name: code.value for code in ParamErrorCode}.items()
+
+
+@pytest.mark.parametrize(
+    ("code", "words"), [(5, "read only"), (2, "value out of range"), (99, "error code 99")]
+)
+def test_codes_in_words(code: int, words: str) -> None:
+    assert ParamErrorCode.name_of(code) == words
+    refused = Refused("no", system=1, component=2, code=code, name="A", index=3)
+    assert (refused.code, refused.reason) == (code, words)
+    assert (refused.system, refused.component, refused.name, refused.index) == (1, 2, "A", 3)
+    assert str(refused) == "no"
+
+
+def test_a_value_that_was_not_applied_carries_both_values() -> None:
+    error = ValueNotApplied("kept", system=1, component=1, name="A", requested=2.0, actual=1.0)
+    assert (error.name, error.requested, error.actual, error.index) == ("A", 2.0, 1.0, None)
+
+
+@pytest.mark.parametrize(
+    ("attempts", "text"),
+    [
+        (0, "no reply: A in 1.5 s"),
+        (1, "no reply: A after 1 try in 1.5 s"),
+        (4, "no reply: A after 4 tries in 1.5 s"),
+    ],
+)
+def test_no_reply_says_what_was_tried(attempts: int, text: str) -> None:
+    error = NoReply("A", attempts=attempts, waited=1.49)
+    assert str(error) == text
+    assert (error.awaited, error.attempts, error.waited) == ("A", attempts, 1.49)
+
+
+def test_a_link_error_names_its_link() -> None:
+    error = ClientClosed("the client was closed", link="udpin:0.0.0.0:14550")
+    assert str(error) == "the client was closed"
+    assert error.link == "udpin:0.0.0.0:14550"
