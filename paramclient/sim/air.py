@@ -1,0 +1,285 @@
+"""What lies between a program and its vehicles: a link that loses, delays, reorders and damages."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Sequence
+from heapq import heappop, heappush
+from typing import Protocol
+
+from paramclient.errors import UsageError
+
+__all__ = ["Air", "Endpoint", "FaultyLink"]
+
+
+class Endpoint(Protocol):
+    """The far side of a link: a vehicle, or an `Air` with several.
+
+    Time is any monotonic clock in seconds; the first call fixes when it starts. After `receive` and `tick`
+    the caller sends what `data_to_send` gives and calls `tick` again when `next_deadline` has come::
+
+        endpoint.tick(now)
+        for datagram in endpoint.data_to_send(): ...
+        wake_at = endpoint.next_deadline()
+    """
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take one datagram (or whatever a byte stream delivered) at the time `now`. Never raises."""
+
+    def tick(self, now: float) -> None:
+        """Do what has become due by `now`, later than by the moment it was due if the call comes late."""
+
+    def next_deadline(self) -> float | None:
+        """When `tick` is wanted next; None while there is nothing to wait for, as before the first call."""
+
+    def data_to_send(self) -> list[bytes]:
+        """Hand over what is to be sent, and forget it: each item one frame, to be sent as one datagram."""
+
+
+class FaultyLink:
+    """One direction of a link, with the faults that are asked for and the same ones for the same seed.
+
+    A datagram first waits for its turn at `rate`; then it may be lost; then it travels for `delay` plus up
+    to `jitter`. Datagrams keep their order whatever the jitter. Only those that `reorder` picks are held
+    back by up to 30 ms more while the ones behind pass them.
+
+    Args:
+        loss: the share of datagrams that never arrive, 0 to 1.
+        delay: seconds on the way.
+        jitter: further seconds on the way, uniform between 0 and this.
+        duplicate: the share that arrives twice, 0 to 1.
+        reorder: the share that is overtaken, 0 to 1.
+        bit_errors: the chance of each single bit to arrive turned over, 0 to 1.
+        rate: bytes per second; None for no limit.
+        queue: bytes that may wait for their turn at `rate`, those being sent included; a datagram that
+            finds the link busy and no room is lost. None for no limit.
+        seed: of this link's own random numbers.
+
+    Attributes:
+        sent: datagrams given to `send`.
+        lost: those of them that will not arrive, by `loss` or because the queue was full.
+        duplicated: those of them that arrive twice.
+        delivered: datagrams given out; in the end `sent - lost + duplicated`.
+
+    Raises:
+        UsageError: an argument is outside its range.
+    """
+
+    def __init__(
+        self,
+        *,
+        loss: float = 0.0,
+        delay: float = 0.0,
+        jitter: float = 0.0,
+        duplicate: float = 0.0,
+        reorder: float = 0.0,
+        bit_errors: float = 0.0,
+        rate: float | None = None,
+        queue: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        shares = {"loss": loss, "duplicate": duplicate, "reorder": reorder, "bit_errors": bit_errors}
+        for name, share in shares.items():
+            if not 0.0 <= share <= 1.0:
+                raise UsageError(f"{name} is a share between 0 and 1, not {share}")
+        for name, seconds in {"delay": delay, "jitter": jitter}.items():
+            if not (math.isfinite(seconds) and seconds >= 0.0):
+                raise UsageError(f"{name} is a number of seconds from 0 up, not {seconds}")
+        if rate is not None and not (math.isfinite(rate) and rate > 0.0):
+            raise UsageError(f"rate is a number of bytes per second above 0, not {rate}")
+        if queue is not None and (rate is None or queue < 0):
+            raise UsageError("queue is a number of bytes from 0 up, and needs a rate")
+        self._loss = loss
+        self._delay = delay
+        self._jitter = jitter
+        self._duplicate = duplicate
+        self._reorder = reorder
+        self._bit_errors = bit_errors
+        self._rate = rate
+        self._queue = queue
+        self._random = random.Random(seed)
+        self._flying: list[tuple[float, int, bytes]] = []
+        self._number = 0
+        self._free_at = -math.inf
+        self._last_arrival = -math.inf
+        self.sent = 0
+        self.lost = 0
+        self.duplicated = 0
+        self.delivered = 0
+
+    def send(self, data: bytes, now: float) -> None:
+        """Put one datagram on the way."""
+        self.sent += 1
+        leaves_at = now
+        if self._rate is not None:
+            starts_at = max(now, self._free_at)
+            waiting = (starts_at - now) * self._rate
+            if self._queue is not None and waiting and waiting + len(data) > self._queue:
+                self.lost += 1
+                return
+            leaves_at = self._free_at = starts_at + len(data) / self._rate
+        chance = self._random.random
+        if self._loss and chance() < self._loss:
+            self.lost += 1
+            return
+        arrives_at = leaves_at + self._delay
+        if self._jitter:
+            arrives_at += self._jitter * chance()
+        arrives_at = max(arrives_at, self._last_arrival)
+        if self._reorder and chance() < self._reorder:
+            arrives_at += _HELD_BACK * chance()
+        else:
+            self._last_arrival = arrives_at
+        copies = 1
+        if self._duplicate and chance() < self._duplicate:
+            self.duplicated += 1
+            copies = 2
+        for _ in range(copies):
+            self._number += 1
+            heappush(self._flying, (arrives_at, self._number, self._damaged(data)))
+
+    def deliver(self, now: float) -> list[bytes]:
+        """What has arrived by `now`, in the order of arrival."""
+        arrived = []
+        while self._flying and self._flying[0][0] <= now:
+            arrived.append(heappop(self._flying)[2])
+        self.delivered += len(arrived)
+        return arrived
+
+    def next_deadline(self) -> float | None:
+        """When the next datagram arrives; None while none is on the way."""
+        return self._flying[0][0] if self._flying else None
+
+    def _damaged(self, data: bytes) -> bytes:
+        if not self._bit_errors:
+            return data
+        damaged = bytearray(data)
+        at = self._gap()
+        while at < 8 * len(damaged):
+            damaged[at // 8] ^= 1 << at % 8
+            at += 1 + self._gap()
+        return bytes(damaged)
+
+    def _gap(self) -> int:
+        """How many bits stay whole before the next one that does not."""
+        if self._bit_errors == 1.0:
+            return 0
+        # 1 - random() is above 0. Without the ceiling a tiny error rate gives numbers without meaning.
+        return int(min(math.log(1.0 - self._random.random()) / math.log1p(-self._bit_errors), _FAR))
+
+
+class Air:
+    """Several vehicles behind one faulty link, itself an `Endpoint`.
+
+    Everything that is received goes to every vehicle, as on one radio channel. Between two calls all that
+    falls due happens at its own time, so the outcome does not depend on how often `tick` is called.
+
+    Args:
+        vehicles: any endpoints.
+        uplink: from the program to the vehicles; None for a perfect one.
+        downlink: from the vehicles to the program; None for a perfect one.
+
+    Attributes:
+        vehicles, uplink, downlink: as given.
+    """
+
+    def __init__(
+        self,
+        vehicles: Sequence[Endpoint],
+        *,
+        uplink: FaultyLink | None = None,
+        downlink: FaultyLink | None = None,
+    ) -> None:
+        self.vehicles = tuple(vehicles)
+        self.uplink = FaultyLink() if uplink is None else uplink
+        self.downlink = FaultyLink() if downlink is None else downlink
+        self._out: list[bytes] = []
+
+    @classmethod
+    def symmetric(
+        cls,
+        vehicles: Sequence[Endpoint],
+        *,
+        loss: float = 0.0,
+        delay: float = 0.0,
+        jitter: float = 0.0,
+        duplicate: float = 0.0,
+        reorder: float = 0.0,
+        bit_errors: float = 0.0,
+        rate: float | None = None,
+        queue: int | None = None,
+        seed: int = 0,
+    ) -> Air:
+        """An air with the same faults in both directions; `delay` is for one way.
+
+        The arguments are those of `FaultyLink`. The two directions draw different random numbers, both
+        from this seed.
+        """
+
+        def link(own_seed: int) -> FaultyLink:
+            return FaultyLink(
+                loss=loss,
+                delay=delay,
+                jitter=jitter,
+                duplicate=duplicate,
+                reorder=reorder,
+                bit_errors=bit_errors,
+                rate=rate,
+                queue=queue,
+                seed=own_seed,
+            )
+
+        return cls(vehicles, uplink=link(2 * seed), downlink=link(2 * seed + 1))
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take one datagram for all vehicles."""
+        self.tick(now)
+        self.uplink.send(data, now)
+        self._step(now, self._deadlines())
+
+    def tick(self, now: float) -> None:
+        """Let everything happen that falls due by `now`."""
+        due = self._deadlines()
+        while (first := min(*due, _at(self.uplink), _at(self.downlink), now)) < now:
+            self._step(first, due)
+        self._step(now, [now] * len(due))
+
+    def next_deadline(self) -> float | None:
+        """The first deadline of the vehicles and the two links."""
+        first = min(*self._deadlines(), _at(self.uplink), _at(self.downlink))
+        return None if first == math.inf else first
+
+    def data_to_send(self) -> list[bytes]:
+        """Hand over the datagrams that came down."""
+        out, self._out = self._out, []
+        return out
+
+    def _deadlines(self) -> list[float]:
+        return [_at(vehicle) for vehicle in self.vehicles]
+
+    def _step(self, now: float, due: list[float]) -> None:
+        """Move everything on to `now`; a vehicle with nothing due and nothing to receive is left alone."""
+        up = self.uplink.deliver(now)
+        for place, vehicle in enumerate(self.vehicles):
+            if up or due[place] <= now:
+                vehicle.tick(now)
+                for data in up:
+                    vehicle.receive(data, now)
+                for data in vehicle.data_to_send():
+                    self.downlink.send(data, now)
+                due[place] = _at(vehicle)
+        arrived = self.downlink.deliver(now)
+        self._out += arrived[: OUT_LIMIT - len(self._out)]
+
+
+OUT_LIMIT = 20_000
+"""Frames that an endpoint keeps for a caller who does not fetch them; further ones are dropped."""
+
+_HELD_BACK = 0.03
+_FAR = 1e9
+
+
+def _at(part: Endpoint | FaultyLink) -> float:
+    deadline = part.next_deadline()
+    return math.inf if deadline is None else deadline

@@ -1,0 +1,258 @@
+"""A simulated ArduPilot autopilot."""
+
+from __future__ import annotations
+
+import math
+import struct
+from bisect import bisect_right
+from collections import deque
+from collections.abc import Iterable, Mapping
+
+from paramclient.errors import ParamErrorCode, UsageError
+from paramclient.protocol import wire
+from paramclient.sim.table import Table, ardupilot_table, as_table, bits_of, ek2_group
+from paramclient.sim.vehicle import Entry, Vehicle
+from paramclient.values import Encoding, ParamType
+
+__all__ = ["ArduPilotVehicle"]
+
+
+class ArduPilotVehicle(Vehicle):
+    """An ArduPilot autopilot, ArduCopter 4.6, as it was measured; with `param_error` as newer ones are.
+
+    - Values are sent as float32 whatever their type; type and value are kept exactly on board.
+    - PARAM_REQUEST_LIST: a banner, then all parameters by index from the next slot on (slots come every
+      100 ms), 10 every 5.9 ms. Asked for again it starts again. It goes on with the count that it began
+      with, also when a group is shown or hidden meanwhile.
+    - Reads wait for the next slot, which serves 5; 20 more can wait, what comes on top is dropped without a
+      word. By name the answer has index 65535 and the spelling that was asked for; case does not matter.
+    - A set converts the value to the parameter's own type (cut to whole numbers, kept within its range) and
+      is answered within 6 ms, index 65535, even if nothing changed; sets of one name meanwhile share one
+      answer. NaN, infinity and unknown names are met with silence. Of a read-only parameter the old value
+      is sent, and a STATUSTEXT.
+    - A parameter that switches a group shows it while it is not 0 and hides it at 0: count and indices move.
+      Hidden parameters can be read and set by name.
+    - Some values change by themselves and are sent unasked, index 65535.
+
+    Args:
+        table: its parameters (see `Table`), in the order of their indices; None for those of a real quad,
+            `ardupilot_table()`.
+        system, component: its own ids, 1 to 255.
+        uid2: the hardware id that it reports, up to 18 bytes; by default its own for every system.
+        groups: by the name of a switch in the table, the parameters that follow it while it is not 0.
+            None: with the table of the real quad, the 52 of EK2_ENABLE; with another table, none.
+        read_only: names that cannot be set.
+        live: names of parameters that change by themselves: whole numbers count seconds, others waver in
+            their last bit. Names that are not in the table are passed over.
+        live_period: seconds between two such changes; 0 for none.
+        burst, period: by default UDP. On 57600 baud it is 1 every 0.025 s.
+        boot_time: seconds from switching on, in which PARAM_REQUEST_LIST is ignored.
+        param_error, telemetry, mavlink_version, stream: see `Vehicle`.
+
+    Raises:
+        UsageError: an argument cannot be.
+    """
+
+    _read_at: float
+    _answer_at: float
+
+    def __init__(
+        self,
+        *,
+        system: int = 1,
+        component: int = 1,
+        uid2: bytes | None = None,
+        table: Table | None = None,
+        groups: Mapping[str, Table] | None = None,
+        read_only: Iterable[str] = (),
+        live: Iterable[str] = ("STAT_RUNTIME", "BARO1_GND_PRESS"),
+        live_period: float = 30.0,
+        burst: int = 10,
+        period: float = 0.0059,
+        boot_time: float = 0.0,
+        param_error: bool = False,
+        telemetry: float = 0.0,
+        mavlink_version: int = 2,
+        stream: bool = False,
+    ) -> None:
+        if groups is None:
+            groups = {"EK2_ENABLE": ek2_group()} if table is None else {}
+        rows = ardupilot_table() if table is None else as_table(table)
+        members = {switch: as_table(group) for switch, group in groups.items()}
+        if unknown := (members.keys() | frozenset(read_only)).difference(row.name for row in rows):
+            raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
+        if uid2 is None:
+            uid2 = (int.from_bytes(_UID2, "little") + system - 1).to_bytes(18, "little")
+        if len(uid2) > 18:
+            raise UsageError(f"uid2 has up to 18 bytes, not {len(uid2)}")
+        if not 0.0 <= live_period < math.inf:
+            raise UsageError(f"live_period is a number of seconds from 0 up, not {live_period}")
+        self._switch_of = {row.name: switch for switch, group in members.items() for row in group}
+        self._switches = members.keys()
+        self._read_only = frozenset(read_only)
+        self._live = frozenset(live)
+        self._live_period = live_period
+        super().__init__(
+            as_table(member for row in rows for member in (row, *members.get(row.name, ()))),
+            system=system,
+            component=component,
+            encoding=Encoding.C_CAST,
+            heartbeat=wire.Heartbeat(
+                _QUADROTOR, wire.MAV_AUTOPILOT_ARDUPILOTMEGA, base_mode=81, system_status=_STANDBY
+            ),
+            version=wire.AutopilotVersion(
+                64495, flight_sw_version=67502080, git_hash=b"fbb78585", uid2=uid2.ljust(18, b"\0")
+            ),
+            burst=burst,
+            period=period,
+            boot_time=boot_time,
+            param_error=param_error,
+            telemetry=telemetry,
+            mavlink_version=mavlink_version,
+            stream=stream,
+        )
+
+    def _key(self, name: str) -> str:
+        return name.upper()
+
+    def _is_listed(self, entry: Entry) -> bool:
+        switch = self._switch_of.get(entry.name)
+        return switch is None or self._entry(switch).bits != 0
+
+    def _timers(self) -> tuple[float, ...]:
+        return self._read_at, self._answer_at, self._live_at
+
+    def _on_list(self) -> None:
+        if self._now < self._on_at + self._boot_time:
+            return
+        for text in _BANNER:
+            self._send(wire.StatusText(_INFO, text))
+        self._list_count = len(self._listed)
+        self._last_order = -1
+        self._start_list(self._next(_SLOT) if self._position is None else self._next_burst)
+
+    def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
+        if len(self._waiting) < _READ_QUEUE:
+            self._waiting.append((request, sender))
+            self._look_up()
+            if self._ready and self._read_at == math.inf:
+                self._read_at = self._next(_SLOT)
+
+    def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
+        entry = self._find(request.param_id)
+        (value,) = struct.unpack("<f", request.raw)
+        if entry is None:
+            self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
+        elif not math.isfinite(value):
+            self._refuse(ParamErrorCode.VALUE_OUT_OF_RANGE, request, sender)
+        elif entry.name in self._read_only:
+            self._send_value(entry, index=wire.NO_INDEX)
+            self._send(wire.StatusText(_WARNING, f"Param write denied ({entry.name})"))
+            self._refuse(ParamErrorCode.READ_ONLY, request, sender)
+        else:
+            self._write(entry, _converted(value, entry.type))
+
+    def _write(self, entry: Entry, bits: int) -> None:
+        entry.store(bits)
+        if entry.name in self._switches:
+            self._relist()
+        self._answers[entry.name] = entry
+        self._answer_at = min(self._answer_at, self._next(_LOOP))
+
+    def _send_next(self) -> bool:
+        if self._position is None:
+            return False
+        at = bisect_right(self._listed, self._last_order, key=lambda entry: entry.order)
+        if at == len(self._listed):  # the rest was hidden since the last one
+            self._position = None
+            return False
+        entry = self._listed[at]
+        self._send_value(entry, index=self._position, count=self._list_count)
+        self._last_order = entry.order
+        self._position = None if at + 1 == len(self._listed) else self._position + 1
+        return True
+
+    def _switch_on(self, at: float) -> None:
+        self._waiting: deque[tuple[wire.ParamRequestRead, wire.Frame]] = deque()
+        self._ready: list[wire.ParamValue] = []
+        self._answers: dict[str, Entry] = {}
+        self._read_at = math.inf
+        self._answer_at = math.inf
+        self._live_at = at + self._live_period if self._live_period else math.inf
+        self._list_count = 0
+        self._last_order = -1
+        super()._switch_on(at)
+
+    def _work(self, now: float) -> None:
+        if self._live_at <= now:
+            self._live_at += self._live_period
+            if self._live_at <= now:
+                self._live_at = now + self._live_period
+            self._change_live()
+        super()._work(now)
+        while self._read_at <= now:
+            for answer in self._ready:
+                self._send(answer)
+            self._ready.clear()
+            self._look_up()
+            self._read_at = self._read_at + _SLOT if self._ready else math.inf
+        if self._answer_at <= now:
+            self._answer_at = math.inf
+            for entry in self._answers.values():
+                self._send_value(entry, index=wire.NO_INDEX)
+            self._answers.clear()
+
+    def _next(self, period: float) -> float:
+        """When the next turn of something begins that comes every `period` seconds since switching on."""
+        if self._now < self._on_at:
+            return self._on_at
+        turns = (self._now - self._on_at) / period
+        return self._on_at + (math.floor(turns + _ROUNDING) + 1) * period
+
+    def _look_up(self) -> None:
+        """Make answers to waiting reads until those for the next slot are complete.
+
+        A value is taken at this moment, so an answer may be older than a set that came before it is sent.
+        """
+        while self._waiting and len(self._ready) < _READS_PER_SLOT:
+            request, sender = self._waiting.popleft()
+            if request.param_index == -1:
+                entry, name, index = self._find(request.param_id), request.param_id, wire.NO_INDEX
+            else:
+                entry = self._by_index(request.param_index)
+                name, index = ("" if entry is None else entry.name), request.param_index
+            if entry is None:
+                self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
+            else:
+                self._ready.append(wire.ParamValue(name, entry.raw, entry.type, len(self._listed), index))
+
+    def _change_live(self) -> None:
+        for entry in self._entries:
+            if entry.name in self._live:
+                value = entry.value
+                if isinstance(value, int) and isinstance(entry.type, ParamType):
+                    later = value + max(1, int(self._live_period))
+                    self._write(entry, bits_of(later if later <= entry.type.bounds[1] else 0, entry.type))
+                else:
+                    self._write(entry, entry.bits ^ 1)
+
+
+_QUADROTOR = 2
+_STANDBY = 3
+_UID2 = b"3d1219c7c4c5404aa\0"
+_BANNER = ("ArduCopter V4.6.0-dev (fbb78585)", "3d1219c7c4c5404aaa1f6d2a48adfda4", "Frame: QUAD/PLUS")
+_INFO = 6
+_WARNING = 4
+_LOOP = 0.0058  # seconds from one turn of the main loop to the next, which answers sets
+_SLOT = 0.1  # seconds from one turn of the parameter task to the next, which answers reads
+_ROUNDING = 1e-6  # a turn that begins at `now` may come out a little less than whole
+_READS_PER_SLOT = 5
+_READ_QUEUE = 20
+
+
+def _converted(value: float, kind: ParamType | int) -> int:
+    """The bits of a finite float32 in another type: integers are cut to whole numbers, within their range."""
+    if isinstance(kind, ParamType) and kind.is_integer:
+        low, high = kind.bounds
+        return bits_of(min(max(int(value), low), high), kind)
+    return bits_of(struct.pack("<f", value) if kind != ParamType.REAL64 else value, kind)

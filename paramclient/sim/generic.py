@@ -1,0 +1,102 @@
+"""A component that keeps to the standard."""
+
+from __future__ import annotations
+
+from paramclient.errors import ParamErrorCode
+from paramclient.protocol import wire
+from paramclient.sim.table import Table, as_table
+from paramclient.sim.vehicle import Entry, Vehicle
+from paramclient.values import Encoding, ParamType
+
+__all__ = ["BytewiseVehicle", "GenericVehicle"]
+
+
+class BytewiseVehicle(Vehicle):
+    """The part that PX4 and the standard share: values lie byte-wise, requests are answered at once."""
+
+    def _on_list(self) -> None:
+        self._start_list(self._now)
+
+    def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
+        entry = self._wanted(request)
+        if entry is None:
+            self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
+        else:
+            self._send_value(entry)
+
+    def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
+        entry = self._find(request.param_id)
+        if entry is None:
+            self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
+        elif entry.type != request.param_type:
+            self._on_wrong_type(entry, request, sender)
+        else:
+            size = entry.type.size if isinstance(entry.type, ParamType) else 4
+            self._write(entry, int.from_bytes(request.raw[:size], "little"))
+            self._send_value(entry)
+
+    def _on_wrong_type(self, entry: Entry, request: wire.ParamSet, sender: wire.Frame) -> None:
+        if self._param_error:
+            self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
+        else:
+            self._send_value(entry)
+
+    def _wanted(self, request: wire.ParamRequestRead) -> Entry | None:
+        if request.param_index < 0:
+            return self._find(request.param_id)
+        return self._by_index(request.param_index)
+
+    def _write(self, entry: Entry, bits: int) -> None:
+        entry.store(bits)
+
+
+class GenericVehicle(BytewiseVehicle):
+    """A component as the MAVLink guide describes it: byte-wise, every type, no hash, answers at once.
+
+    A set of another type changes nothing: it is answered with the value that stands or, with
+    `param_error`, with PARAM_ERROR. Of a 64-bit type the lower four bytes are sent.
+
+    Args:
+        table: its parameters (see `Table`), listed in the order given.
+        system, component: its own ids, 1 to 255.
+        uid: the hardware id that it reports; by default its own for every system.
+        autopilot: MAV_AUTOPILOT in its heartbeat.
+        capabilities: as in AUTOPILOT_VERSION; by default MAVLink 2 and byte-wise parameters.
+        burst, period, boot_time, param_error, telemetry, mavlink_version, stream: see `Vehicle`.
+
+    Raises:
+        UsageError: an argument cannot be.
+    """
+
+    def __init__(
+        self,
+        table: Table,
+        *,
+        system: int = 1,
+        component: int = 1,
+        uid: int | None = None,
+        autopilot: int = wire.MAV_AUTOPILOT_GENERIC,
+        capabilities: int = 8192 | wire.CAPABILITY_PARAM_ENCODE_BYTEWISE,
+        burst: int = 10,
+        period: float = 0.01,
+        boot_time: float = 0.0,
+        param_error: bool = False,
+        telemetry: float = 0.0,
+        mavlink_version: int = 2,
+        stream: bool = False,
+    ) -> None:
+        super().__init__(
+            as_table(table),
+            system=system,
+            component=component,
+            encoding=Encoding.BYTEWISE,
+            heartbeat=wire.Heartbeat(0, autopilot, system_status=wire.MAV_STATE_ACTIVE),
+            version=wire.AutopilotVersion(capabilities, uid=0x5EED_0000 + system if uid is None else uid),
+            burst=burst,
+            period=period,
+            boot_time=boot_time,
+            param_error=param_error,
+            telemetry=telemetry,
+            mavlink_version=mavlink_version,
+            stream=stream,
+        )

@@ -1,0 +1,241 @@
+"""A simulated PX4 autopilot."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Mapping
+
+from paramclient.errors import ParamErrorCode, UsageError
+from paramclient.protocol import wire
+from paramclient.sim.generic import BytewiseVehicle
+from paramclient.sim.table import SimParam, Table, as_table, px4_table
+from paramclient.sim.vehicle import Entry
+from paramclient.values import Encoding, ParamType, px4_hash
+
+__all__ = ["PX4Vehicle"]
+
+
+class PX4Vehicle(BytewiseVehicle):
+    """A PX4 autopilot, version 1.17, as it was measured; with `param_error` as newer ones are.
+
+    - PARAM_REQUEST_LIST: `_HASH_CHECK` first (type UINT32, index 65535), then all parameters in use in the
+      order of their names, 20 messages every 20 ms. While the list is being sent it starts again without
+      the hash.
+    - A read of `_HASH_CHECK` gives the hash alone; a set of it, to any value, stops the list.
+    - A set with exactly the right type is acknowledged at once, whatever the value. If it changed the
+      value, 20 ms later that value is sent again, and with it every other one that is not yet saved; both
+      wait for the end of a list.
+    - A wrong type, an unknown name and an unknown index are met with silence.
+    - A parameter that is not in use can be read and set by name (index 65535) and is neither in the list
+      nor in the hash.
+    - It answers to its own system only, and to component 0.
+
+    Args:
+        table: its parameters (see `Table`), in any order; None for those of a real quad, `px4_table()`.
+        system, component: its own ids, 1 to 255.
+        uid: the hardware id that it reports; by default its own for every system.
+        hash_check: whether it has `_HASH_CHECK` at all; the parameter MAV_HASH_CHK_EN at 0 also turns it off.
+        not_in_use: names in the table that nothing in the firmware has used yet.
+        late_use: by the name of one parameter, those that come into use 20 ms after it changes. Until then
+            they are not in use. None: with the table of the real quad, CAL_MAG2_ID brings 16 more of
+            CAL_MAG2_*; with another table, nothing.
+        unsaved: names that the firmware itself has changed while it booted and not saved.
+        autosave: seconds from a change until all that was unsaved is saved.
+        burst, period: by default UDP and USB. A serial port has a burst of 3, the low-bandwidth mode 1
+            every 0.125 s.
+        boot_time: seconds from switching on; a list asked for before starts then.
+        param_error, telemetry, mavlink_version, stream: see `Vehicle`.
+
+    Raises:
+        UsageError: an argument cannot be.
+    """
+
+    _ack_first = False
+    _push_at: float
+    _save_at: float
+
+    def __init__(
+        self,
+        *,
+        system: int = 1,
+        component: int = 1,
+        uid: int | None = None,
+        table: Table | None = None,
+        hash_check: bool = True,
+        not_in_use: Iterable[str] = (),
+        late_use: Mapping[str, Iterable[str]] | None = None,
+        unsaved: Iterable[str] = (),
+        autosave: float = 0.3,
+        burst: int = 20,
+        period: float = 0.020,
+        boot_time: float = 0.0,
+        param_error: bool = False,
+        telemetry: float = 0.0,
+        mavlink_version: int = 2,
+        stream: bool = False,
+    ) -> None:
+        rows = px4_table() if table is None else as_table(table)
+        if table is None and late_use is None:
+            compass = _third_compass(rows)
+            late_use = {"CAL_MAG2_ID": [row.name for row in compass]}
+            rows += compass
+        self._late_use = {name: frozenset(more) for name, more in (late_use or {}).items()}
+        self._first_unused = frozenset(not_in_use).union(*self._late_use.values())
+        self._first_unsaved = frozenset(unsaved)
+        unknown = self._first_unused | self._first_unsaved | self._late_use.keys()
+        if unknown := unknown.difference(row.name for row in rows):
+            raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
+        if not autosave >= 0.0:
+            raise UsageError(f"autosave is a number of seconds from 0 up, not {autosave}")
+        self._hash: int | None = None
+        self._hash_check = hash_check
+        self._autosave = autosave
+        super().__init__(
+            sorted(rows, key=lambda row: row.name),
+            system=system,
+            component=component,
+            encoding=Encoding.BYTEWISE,
+            heartbeat=wire.Heartbeat(
+                _QUADROTOR, wire.MAV_AUTOPILOT_PX4, base_mode=29, custom_mode=50593792, system_status=_STANDBY
+            ),
+            version=wire.AutopilotVersion(
+                59647,
+                flight_sw_version=17891392,
+                git_hash=bytes.fromhex("0000009383550aa7"),
+                board_version=1,
+                uid=_UID + system - 1 if uid is None else uid,
+            ),
+            burst=burst,
+            period=period,
+            boot_time=boot_time,
+            param_error=param_error,
+            telemetry=telemetry,
+            mavlink_version=mavlink_version,
+            stream=stream,
+        )
+
+    def announced_hash(self) -> int | None:
+        """The hash that it gives for its table now; None where it has no `_HASH_CHECK`."""
+        switch = self._find("MAV_HASH_CHK_EN")
+        if not self._hash_check or (switch is not None and switch.bits == 0):
+            return None
+        if self._hash is None:
+            self._hash = px4_hash(entry.param for entry in self._listed if not entry.volatile)
+        return self._hash
+
+    def use(self, *names: str) -> None:
+        """Let the firmware use parameters for the first time: they join the list, and indices shift.
+
+        Raises:
+            UsageError: it has no parameter of such a name.
+        """
+        self._unused.difference_update([self._entry(name).name for name in names])
+        self._relist()
+
+    def _answers_system(self, target: int) -> bool:
+        return target == self.system
+
+    def _is_listed(self, entry: Entry) -> bool:
+        return entry.name not in self._unused
+
+    def _timers(self) -> tuple[float, ...]:
+        return self._push_at, self._save_at
+
+    def _on_list(self) -> None:
+        self._hash_next = self._position is None and self.announced_hash() is not None
+        self._start_list(self._now)
+
+    def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
+        if request.param_index < 0 and request.param_id == wire.HASH_CHECK:
+            self._send_hash()
+        else:
+            super()._on_read(request, sender)
+
+    def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
+        if request.param_id != wire.HASH_CHECK:
+            super()._on_set(request, sender)
+        elif self.announced_hash() is not None:
+            self._position = None
+            self._hash_next = False
+
+    def _on_wrong_type(self, entry: Entry, request: wire.ParamSet, sender: wire.Frame) -> None:
+        self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
+
+    def _write(self, entry: Entry, bits: int) -> None:
+        if bits == entry.bits:
+            return
+        super()._write(entry, bits)
+        self._hash = None
+        self._unsaved.add(entry.name)
+        self._waking |= self._late_use.get(entry.name, frozenset())
+        self._push_at = min(self._push_at, self._now + _PUSH_DELAY)
+        self._save_at = min(self._save_at, self._now + self._autosave)
+
+    def _relist(self) -> None:
+        super()._relist()
+        self._hash = None
+
+    def _switch_on(self, at: float) -> None:
+        self._unused = set(self._first_unused)
+        self._unsaved = set(self._first_unsaved)
+        self._waking: frozenset[str] = frozenset()
+        self._hash_next = False
+        self._push_from: int | None = None
+        self._push_at = math.inf
+        self._save_at = math.inf
+        super()._switch_on(at)
+
+    def _work(self, now: float) -> None:
+        if self._push_at <= now:
+            self._push_at = math.inf
+            if self._waking & self._unused:
+                self.use(*self._waking)
+            self._push_from = 0
+            self._next_burst = min(self._next_burst, now)
+        super()._work(now)
+        if self._save_at <= now:
+            self._save_at = math.inf
+            self._unsaved.clear()
+
+    def _send_next(self) -> bool:
+        if self._hash_next:
+            self._hash_next = False
+            self._send_hash()
+            return True
+        return super()._send_next() or self._push_next()
+
+    def _push_next(self) -> bool:
+        """Send the next unsaved parameter; False when there is none, or nothing has changed."""
+        if self._push_from is not None:
+            for index in range(self._push_from, len(self._listed)):
+                if self._listed[index].name in self._unsaved:
+                    self._push_from = index + 1
+                    self._send_value(self._listed[index])
+                    return True
+        self._push_from = None
+        return False
+
+    def _send_hash(self) -> None:
+        value = self.announced_hash()
+        if value is not None:
+            raw = value.to_bytes(4, "little")
+            self._send(
+                wire.ParamValue(wire.HASH_CHECK, raw, ParamType.UINT32, len(self._listed), wire.NO_INDEX)
+            )
+
+
+_QUADROTOR = 2
+_STANDBY = 3
+_UID = 5283920058631409231
+_PUSH_DELAY = 0.020
+
+
+def _third_compass(rows: tuple[SimParam, ...]) -> tuple[SimParam, ...]:
+    """What the third compass has and the real quad, which has two, does not use; values as of the second."""
+    names = {row.name for row in rows}
+    return tuple(
+        SimParam(name, row.type, row.value, row.volatile)
+        for row in rows
+        if row.name.startswith("CAL_MAG1_")
+        and (name := row.name.replace("CAL_MAG1_", "CAL_MAG2_")) not in names
+    )

@@ -1,0 +1,138 @@
+"""Parameter tables for simulated vehicles: the two that ship with the package, and the caller's own."""
+
+from __future__ import annotations
+
+import csv
+import struct
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from importlib import resources
+from typing import TypeAlias
+
+from paramclient.errors import UsageError
+from paramclient.values import (
+    Encoding,
+    ParamType,
+    Value,
+    check_name,
+    check_value,
+    encode,
+    from_bits,
+    known_type,
+)
+
+__all__ = ["SimParam", "Table", "ardupilot_table", "as_table", "bits_of", "ek2_group", "px4_table"]
+
+
+@dataclass(frozen=True, slots=True)
+class SimParam:
+    """One parameter of a simulated vehicle's table, as it stands when the vehicle is made.
+
+    Attributes:
+        name: 1 to 16 printable ASCII characters.
+        type: any MAV_PARAM_TYPE, or the number of one that MAVLink does not define.
+        value: within the type; four raw bytes for a type that MAVLink does not define.
+        volatile: whether PX4 leaves it out of the hash.
+        bits: the value's own bytes, as in `paramclient.Param.bits`.
+
+    Raises:
+        UsageError: the name or the value cannot be.
+    """
+
+    name: str
+    type: ParamType | int
+    value: Value = field(compare=False)
+    volatile: bool = False
+    bits: int = field(init=False)
+
+    def __post_init__(self) -> None:
+        check_name(self.name)
+        object.__setattr__(self, "type", known_type(self.type))
+        object.__setattr__(self, "bits", bits_of(self.value, self.type))
+
+
+Table: TypeAlias = Iterable[SimParam] | Mapping[str, Value | tuple[ParamType | int, Value]]
+"""A table as a caller may give it: `SimParam`s, or a mapping from names to values, where an int becomes an
+INT32, a float a REAL32, and `(type, value)` is for the other types."""
+
+
+def as_table(table: Table) -> tuple[SimParam, ...]:
+    """Any form of `Table` as a tuple of `SimParam`, in the order given.
+
+    Raises:
+        UsageError: a name or value cannot be, a name comes twice, or the table is longer than an index.
+    """
+    if isinstance(table, Mapping):
+        rows = tuple(_row(name, entry) for name, entry in table.items())
+    else:
+        rows = tuple(table)
+    names = {row.name for row in rows}
+    if len(names) < len(rows):
+        raise UsageError("a parameter name stands twice in the table")
+    if len(rows) > _LONGEST:
+        raise UsageError(f"a table holds at most {_LONGEST} parameters, not {len(rows)}")
+    return rows
+
+
+def bits_of(value: Value, number: int) -> int:
+    """The value's own bytes in its type, read as a little-endian unsigned number.
+
+    Raises:
+        UsageError: the value does not fit the type.
+    """
+    value = check_value(value)
+    if number in (ParamType.UINT64, ParamType.INT64) and isinstance(value, int):
+        kind = ParamType(number)
+        low, high = kind.bounds
+        if not low <= value <= high:
+            raise UsageError(f"{value} does not fit {kind.name}, which holds {low} to {high}")
+        return value & 0xFFFFFFFF_FFFFFFFF
+    if number == ParamType.REAL64 and not isinstance(value, bytes):
+        return int.from_bytes(struct.pack("<d", value), "little")
+    size = ParamType(number).size if 1 <= number <= ParamType.REAL64 else 4
+    return int.from_bytes(encode(value, number, Encoding.BYTEWISE)[:size], "little")
+
+
+@cache
+def px4_table() -> tuple[SimParam, ...]:
+    """The 903 parameters of a PX4 1.17 quad, read from a real one; 58 of them are volatile."""
+    rows = []
+    for row in _read("px4.csv"):
+        kind = ParamType[row["type"]]
+        rows.append(
+            SimParam(row["name"], kind, from_bits(int(row["bits"], 16), kind), row["volatile"] == "1")
+        )
+    return tuple(rows)
+
+
+@cache
+def ardupilot_table() -> tuple[SimParam, ...]:
+    """The 1382 parameters of an ArduCopter 4.6 quad, read from a real one."""
+    return tuple(map(_plain, _read("ardupilot.csv")))
+
+
+@cache
+def ek2_group() -> tuple[SimParam, ...]:
+    """The 52 parameters that EK2_ENABLE shows on that quad. Only their number is measured."""
+    return tuple(map(_plain, _read("ardupilot_ek2.csv")))
+
+
+_LONGEST = 65535  # param_count has 16 bits, and index 65535 means none
+
+
+def _row(name: str, entry: Value | tuple[ParamType | int, Value]) -> SimParam:
+    if isinstance(entry, tuple):
+        return SimParam(name, *entry)
+    value = check_value(entry)
+    return SimParam(name, ParamType.REAL32 if isinstance(value, float) else ParamType.INT32, value)
+
+
+def _plain(row: dict[str, str]) -> SimParam:
+    kind = ParamType[row["type"]]
+    return SimParam(row["name"], kind, int(row["value"]) if kind.is_integer else float(row["value"]))
+
+
+def _read(name: str) -> Iterable[dict[str, str]]:
+    text = resources.files(__package__).joinpath("tables", name).read_text(encoding="ascii")
+    return csv.DictReader(text.splitlines())

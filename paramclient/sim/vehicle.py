@@ -1,0 +1,401 @@
+"""What every simulated vehicle has in common: a table, a list that is sent in bursts, identity, heartbeat."""
+
+from __future__ import annotations
+
+import math
+import struct
+from abc import ABC, abstractmethod
+from collections import Counter
+from collections.abc import Iterable
+
+from paramclient.errors import ParamErrorCode, UsageError
+from paramclient.protocol import wire
+from paramclient.sim.air import OUT_LIMIT
+from paramclient.sim.table import SimParam, bits_of
+from paramclient.values import Encoding, Param, ParamType, Value, from_bits
+
+__all__ = ["Entry", "Vehicle"]
+
+
+class Entry:
+    """A parameter as the vehicle holds it now.
+
+    Attributes:
+        name, type, volatile: as in `SimParam`.
+        bits: the value, as in `SimParam.bits`.
+        order: its place among all that the vehicle has, listed or not.
+        index: its place in the list, or None while it is not listed.
+        raw: the four bytes that stand for it in a message.
+    """
+
+    __slots__ = ("_encoding", "bits", "index", "name", "order", "raw", "type", "volatile")
+
+    def __init__(self, row: SimParam, order: int, encoding: Encoding) -> None:
+        self._encoding = encoding
+        self.name = row.name
+        self.type = row.type
+        self.volatile = row.volatile
+        self.order = order
+        self.index: int | None = None
+        self.store(row.bits)
+
+    @property
+    def value(self) -> Value:
+        return from_bits(self.bits, self.type)
+
+    @property
+    def param(self) -> Param:
+        return Param(self.name, self.value, self.type, self.index, self.bits)
+
+    def store(self, bits: int) -> None:
+        """Hold another value."""
+        self.bits = bits
+        value = self.value
+        if self._encoding is Encoding.BYTEWISE or self.type == ParamType.REAL32 or isinstance(value, bytes):
+            self.raw = (bits & 0xFFFFFFFF).to_bytes(4, "little")
+        else:
+            self.raw = _cast(value)
+
+
+class Vehicle(ABC):
+    """A simulated component that speaks the parameter protocol in bytes; an `Endpoint`.
+
+    It does no input or output and reads no clock. What it is asked at `now` it answers in its own time;
+    `next_deadline` says when. The first call of `tick` or `receive` switches it on.
+
+    Attributes:
+        system, component: its own ids.
+        requests: how many messages of each kind were received that were for this vehicle, by their MAVLink
+            names (`requests["PARAM_REQUEST_READ"]`).
+
+    Args of every vehicle:
+        burst, period: parameters in one go of the list, and the seconds from one go to the next.
+        boot_time: seconds from switching on in which it does not yet send its list.
+        param_error: answer what cannot be done with PARAM_ERROR, as newer firmware does.
+        telemetry: other messages per second (ATTITUDE), which a client has to step over.
+        mavlink_version: 2, or 1 to speak like an old vehicle.
+        stream: whether it hangs on a byte stream, where a frame may be spread over several `receive`
+            calls; datagrams are never joined.
+    """
+
+    _ack_first = True  # whether COMMAND_ACK comes before what the command asked for
+    _position: int | None  # where the list stands, None while it is not being sent
+
+    def __init__(
+        self,
+        table: Iterable[SimParam],
+        *,
+        system: int,
+        component: int,
+        encoding: Encoding,
+        heartbeat: wire.Heartbeat,
+        version: wire.AutopilotVersion,
+        burst: int,
+        period: float,
+        boot_time: float,
+        param_error: bool,
+        telemetry: float,
+        mavlink_version: int,
+        stream: bool,
+    ) -> None:
+        for what, number in (("system", system), ("component", component)):
+            if not 1 <= number <= 255:
+                raise UsageError(f"{what} is a number from 1 to 255, not {number}")
+        if mavlink_version not in (1, 2):
+            raise UsageError(f"mavlink_version is 1 or 2, not {mavlink_version}")
+        if param_error and mavlink_version == 1:
+            raise UsageError("PARAM_ERROR does not exist in MAVLink 1")
+        if burst < 1 or not (math.isfinite(period) and period > 0.0):
+            raise UsageError("burst is a number from 1 up, and period a number of seconds above 0")
+        if not boot_time >= 0.0:
+            raise UsageError(f"boot_time is a number of seconds from 0 up, not {boot_time}")
+        if not 0.0 <= telemetry <= 10_000.0:
+            raise UsageError(f"telemetry is a number of messages per second from 0 to 10000, not {telemetry}")
+        self.system = system
+        self.component = component
+        self.requests: Counter[str] = Counter()
+        self._entries = [Entry(row, order, encoding) for order, row in enumerate(table)]
+        self._by_name = {self._key(entry.name): entry for entry in self._entries}
+        self._listed: list[Entry] = []
+        self._heartbeat = heartbeat
+        self._version = version
+        self._burst = burst
+        self._period = period
+        self._boot_time = boot_time
+        self._param_error = param_error
+        self._telemetry_period = 1.0 / telemetry if telemetry else math.inf
+        self._mavlink_version = mavlink_version
+        self._framer = wire.Framer(wire.UNDERSTOOD, stream=stream)
+        self._sequence = 0
+        self._out: list[bytes] = []
+        self._started = False
+        self._now = -math.inf
+        self._switch_on(math.inf)
+
+    # The public face
+
+    def param(self, name: str) -> Param:
+        """One parameter as the vehicle really holds it, listed or not.
+
+        Raises:
+            UsageError: it has no parameter of that name.
+        """
+        return self._entry(name).param
+
+    @property
+    def params(self) -> dict[str, Param]:
+        """The listed parameters by name, in the order of their indices: what a full download should give."""
+        return {entry.name: entry.param for entry in self._listed}
+
+    @property
+    def values(self) -> dict[str, Value]:
+        """The listed values by name, in the order of their indices."""
+        return {entry.name: entry.value for entry in self._listed}
+
+    def set_param(self, name: str, value: Value) -> None:
+        """Change a value as if on board or by another station; the vehicle tells of it if its kind does.
+
+        Raises:
+            UsageError: it has no parameter of that name, or the value does not fit its type.
+        """
+        entry = self._entry(name)
+        self._write(entry, bits_of(value, entry.type))
+
+    def reboot(self, now: float, *, down: float = 0.0) -> None:
+        """Switch off at `now` and on again `down` seconds later, never if that is `math.inf`.
+
+        All that was going on ends and what is received while it is off is gone; the values stay.
+        """
+        self._out.clear()
+        self._framer.flush()
+        self._started = True
+        self._switch_on(now + down)
+        self.tick(now)
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take what the link delivered at `now`."""
+        self.tick(now)
+        if now >= self._on_at:
+            for frame in self._framer.receive(data):
+                self._take(frame)
+            self._work(now)
+
+    def tick(self, now: float) -> None:
+        """Do what has become due by `now`."""
+        self._now = now
+        if not self._started:
+            self._started = True
+            self._switch_on(now)
+        if now >= self._on_at:
+            self._work(now)
+
+    def next_deadline(self) -> float | None:
+        """When `tick` is wanted next; None before the first call and when switched off for good."""
+        if self._now < self._on_at:
+            return None if self._on_at == math.inf else self._on_at
+        return min(self._next_heartbeat, self._next_telemetry, self._next_burst, *self._timers())
+
+    def data_to_send(self) -> list[bytes]:
+        """Hand over the frames to send, and forget them."""
+        out, self._out = self._out, []
+        return out
+
+    # What a kind of vehicle does in its own way
+
+    @abstractmethod
+    def _on_list(self) -> None:
+        """PARAM_REQUEST_LIST has come."""
+
+    @abstractmethod
+    def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
+        """PARAM_REQUEST_READ has come."""
+
+    @abstractmethod
+    def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
+        """PARAM_SET has come."""
+
+    @abstractmethod
+    def _write(self, entry: Entry, bits: int) -> None:
+        """Hold another value, by whomever, and see to what follows from that."""
+
+    def _answers_system(self, target: int) -> bool:
+        return target in (0, self.system)
+
+    def _is_listed(self, entry: Entry) -> bool:
+        return True
+
+    def _key(self, name: str) -> str:
+        """What two names have in common that mean one parameter."""
+        return name
+
+    def _timers(self) -> tuple[float, ...]:
+        """Deadlines besides those of the heartbeat, the telemetry and the list."""
+        return ()
+
+    def _send_next(self) -> bool:
+        """Send the next item of the list; False when there is none."""
+        if self._position is None or self._position >= len(self._listed):
+            self._position = None
+            return False
+        self._send_value(self._listed[self._position])
+        self._position += 1
+        if self._position >= len(self._listed):
+            self._position = None
+        return True
+
+    def _switch_on(self, at: float) -> None:
+        """Begin anew, with nothing going on, at the time `at`; `math.inf` leaves it off."""
+        self._on_at = at
+        self._sequence = 0
+        self._next_heartbeat = at
+        self._next_telemetry = at + self._telemetry_period
+        self._next_burst = math.inf
+        self._position = None
+        self._relist()
+
+    def _work(self, now: float) -> None:
+        """Do what is due, each thing at its own pace; of what repeats for ever, a late call skips some."""
+        if self._next_heartbeat <= now:
+            self._send(self._heartbeat)
+            self._next_heartbeat += 1.0
+            if self._next_heartbeat <= now:
+                self._next_heartbeat = now + 1.0
+        if self._next_telemetry <= now:
+            late = now - self._next_telemetry
+            for _ in range(int(min(late, 1.0) / self._telemetry_period) + 1):
+                self._send_attitude()
+            self._next_telemetry += (int(late / self._telemetry_period) + 1) * self._telemetry_period
+            if self._next_telemetry <= now:
+                self._next_telemetry = now + self._telemetry_period
+        while self._next_burst <= now:
+            self._next_burst += self._period
+            for _ in range(self._burst):
+                if not self._send_next():
+                    self._next_burst = math.inf
+                    break
+
+    # Tools for the kinds
+
+    def _start_list(self, at: float) -> None:
+        """Send the list from its start, from `at` on, and not before the vehicle has booted."""
+        self._position = 0
+        self._next_burst = max(at, self._on_at + self._boot_time)
+
+    def _entry(self, name: str) -> Entry:
+        entry = self._find(name)
+        if entry is None:
+            raise UsageError(f"this vehicle has no parameter {name!r}")
+        return entry
+
+    def _find(self, name: str) -> Entry | None:
+        return self._by_name.get(self._key(name))
+
+    def _by_index(self, index: int) -> Entry | None:
+        return self._listed[index] if 0 <= index < len(self._listed) else None
+
+    def _relist(self) -> None:
+        """Number the listed parameters anew."""
+        for entry in self._listed:
+            entry.index = None
+        self._listed = [entry for entry in self._entries if self._is_listed(entry)]
+        for index, entry in enumerate(self._listed):
+            entry.index = index
+
+    def _send_value(self, entry: Entry, *, index: int | None = None, count: int | None = None) -> None:
+        """Send a PARAM_VALUE with the entry's own index and the list's count, or others."""
+        if index is None:
+            index = wire.NO_INDEX if entry.index is None else entry.index
+        if count is None:
+            count = len(self._listed)
+        self._send(wire.ParamValue(entry.name, entry.raw, entry.type, count, index))
+
+    def _refuse(
+        self, code: ParamErrorCode, request: wire.ParamRequestRead | wire.ParamSet, sender: wire.Frame
+    ) -> None:
+        """Send PARAM_ERROR, if this vehicle does that."""
+        if self._param_error:
+            index = request.param_index if isinstance(request, wire.ParamRequestRead) else -1
+            name = request.param_id if index < 0 else ""
+            self._send(wire.ParamError(sender.system, sender.component, name, index, code))
+
+    def _send(self, message: wire.Message) -> None:
+        self._queue(
+            wire.encode(
+                message,
+                system=self.system,
+                component=self.component,
+                sequence=self._sequence,
+                version=self._mavlink_version,
+            )
+        )
+
+    # The rest
+
+    def _send_attitude(self) -> None:
+        self._queue(
+            wire.build_frame(
+                _ATTITUDE,
+                _LEVEL_FLIGHT,
+                system=self.system,
+                component=self.component,
+                sequence=self._sequence,
+                version=self._mavlink_version,
+            )
+        )
+
+    def _queue(self, frame: bytes) -> None:
+        self._sequence = (self._sequence + 1) & 0xFF
+        if len(self._out) < OUT_LIMIT:
+            self._out.append(frame)
+
+    def _take(self, frame: wire.Frame) -> None:
+        message = wire.decode(frame)
+        if isinstance(message, wire.Heartbeat):
+            self.requests["HEARTBEAT"] += 1
+            return
+        if not isinstance(
+            message, wire.ParamRequestRead | wire.ParamRequestList | wire.ParamSet | wire.CommandLong
+        ):
+            return
+        if not self._answers_system(message.target_system):
+            return
+        if message.target_component not in (wire.COMP_ID_ALL, self.component):
+            return
+        self.requests[_NAMES[type(message)]] += 1
+        if isinstance(message, wire.ParamRequestRead):
+            self._on_read(message, frame)
+        elif isinstance(message, wire.ParamRequestList):
+            self._on_list()
+        elif isinstance(message, wire.ParamSet):
+            self._on_set(message, frame)
+        else:
+            self._on_command(message, frame)
+
+    def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
+        wanted = request.command == wire.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES or (
+            request.command == wire.MAV_CMD_REQUEST_MESSAGE and request.params[0] == _AUTOPILOT_VERSION
+        )
+        result = wire.MAV_RESULT_ACCEPTED if wanted else wire.MAV_RESULT_UNSUPPORTED
+        ack = wire.CommandAck(request.command, result, sender.system, sender.component)
+        answers: list[wire.Message] = [ack, self._version] if wanted else [ack]
+        for answer in answers if self._ack_first else reversed(answers):
+            self._send(answer)
+
+
+_NAMES = {
+    wire.ParamRequestRead: "PARAM_REQUEST_READ",
+    wire.ParamRequestList: "PARAM_REQUEST_LIST",
+    wire.ParamSet: "PARAM_SET",
+    wire.CommandLong: "COMMAND_LONG",
+}
+_AUTOPILOT_VERSION = 148
+_ATTITUDE = 30
+_LEVEL_FLIGHT = struct.pack("<I6f", 0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.01)
+
+
+def _cast(value: float) -> bytes:
+    """What a C-cast to float gives; a REAL64 beyond its range becomes infinite."""
+    try:
+        return struct.pack("<f", value)
+    except OverflowError:
+        return struct.pack("<f", math.copysign(math.inf, value))
