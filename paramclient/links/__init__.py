@@ -1,0 +1,64 @@
+"""Bytes in and out: UDP, TCP, and simulated vehicles in this process.
+
+A link is named as in pymavlink, MAVProxy and MAVSDK; `parse_link` reads the name, `create_link` makes the
+link. Every kind offers the same five things, see `Link`; a program can bring one of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING
+
+from paramclient.errors import UsageError
+from paramclient.links.base import Link, Peer
+from paramclient.links.names import FORMS, LinkKind, LinkSpec, parse_link
+from paramclient.links.sim import SimLink, serve_endpoint, simulated
+from paramclient.links.tcp import TcpIn, TcpOut
+from paramclient.links.udp import UdpIn, UdpOut
+
+if TYPE_CHECKING:
+    from paramclient.sim import Endpoint
+
+__all__ = [
+    "FORMS",
+    "Link",
+    "LinkKind",
+    "LinkSpec",
+    "Peer",
+    "SimLink",
+    "create_link",
+    "parse_link",
+    "serve_endpoint",
+]
+
+
+def create_link(link: str | LinkSpec | Link | Endpoint) -> Link:
+    """Make a link, not yet opened.
+
+    Args:
+        link: a name, a name already read, an endpoint of `paramclient.sim` (see `SimLink`), or a link,
+            which is given back as it is.
+
+    Raises:
+        UsageError: it is none of these, or names a serial link, which this version cannot open.
+    """
+    if isinstance(link, str):
+        link = parse_link(link)
+    if isinstance(link, LinkSpec):
+        if link.kind is LinkKind.SERIAL:
+            raise UsageError(f"{link.name}: serial links are not part of this version")
+        return _MAKERS[link.kind](link)
+    if isinstance(link, Link):
+        return link
+    if hasattr(link, "data_to_send"):
+        return SimLink(link)
+    raise UsageError(f"a link is given by its name, not by {type(link).__name__}; accepted forms:\n{FORMS}")
+
+
+_MAKERS: dict[LinkKind, Callable[[LinkSpec], Link]] = {
+    LinkKind.UDPIN: UdpIn,
+    LinkKind.UDPOUT: UdpOut,
+    LinkKind.TCP: TcpOut,
+    LinkKind.TCPIN: TcpIn,
+    LinkKind.SIM: simulated,
+}

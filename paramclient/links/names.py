@@ -1,0 +1,241 @@
+"""Link names: the spellings of pymavlink, MAVProxy and MAVSDK, read into one form.
+
+The three programs disagree on few points, and where they do the meaning that all of them share is taken:
+`udp:` listens, as it does in pymavlink and in MAVSDK; `HOST:PORT` alone listens too, as in MAVProxy.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import StrEnum
+from ipaddress import AddressValueError, IPv4Address, IPv6Address
+from math import isfinite
+from typing import Final, NoReturn
+from urllib.parse import parse_qsl
+
+from paramclient.errors import UsageError
+
+__all__ = ["FORMS", "LinkKind", "LinkSpec", "parse_link"]
+
+FORMS: Final = """\
+  udpin:HOST:PORT     listen for vehicles; also udp:HOST:PORT, udpin:PORT, HOST:PORT
+  udpout:HOST:PORT    speak to one address
+  tcp:HOST:PORT       connect; also tcpout:HOST:PORT
+  tcpin:HOST:PORT     let vehicles connect; also tcpin:PORT
+  serial:DEVICE:BAUD  a serial port; also /dev/ttyACM0,57600 and COM5:115200
+  sim:px4             a simulated vehicle in this process; also sim:ardupilot, sim:px4?loss=0.05&seed=1
+  udpin://HOST:PORT   // may follow the first colon of each; an IPv6 address stands in brackets"""
+"""The accepted forms, for people."""
+
+DEFAULT_BAUD: Final = 57600
+"""For a serial device without a rate: the rate of telemetry radios, and MAVSDK's default."""
+
+
+class LinkKind(StrEnum):
+    """How bytes travel."""
+
+    UDPIN = "udpin"
+    UDPOUT = "udpout"
+    TCP = "tcp"
+    TCPIN = "tcpin"
+    SERIAL = "serial"
+    SIM = "sim"
+
+
+@dataclass(frozen=True, slots=True)
+class LinkSpec:
+    """A link name, read.
+
+    Attributes:
+        kind: how bytes travel.
+        host: a host name or an address without brackets; the device of a serial link; the autopilot of a
+            simulated one.
+        port: 1 to 65535; 0 where a listening link lets the system choose; the baud rate of a serial link.
+        options: of a simulated link, sorted by name.
+    """
+
+    kind: LinkKind
+    host: str
+    port: int = 0
+    options: tuple[tuple[str, int | float], ...] = ()
+
+    @property
+    def name(self) -> str:
+        """The canonical spelling; `parse_link` reads it back to an equal object."""
+        if self.kind is LinkKind.SIM:
+            query = "&".join(f"{key}={value}" for key, value in self.options)
+            return f"sim:{self.host}?{query}" if query else f"sim:{self.host}"
+        host = f"[{self.host}]" if ":" in self.host and self.kind is not LinkKind.SERIAL else self.host
+        return f"{self.kind}:{host}:{self.port}"
+
+    def __str__(self) -> str:
+        return self.name
+
+
+def parse_link(text: str) -> LinkSpec:
+    """Read a link name.
+
+    Raises:
+        UsageError: the name has none of the accepted forms; the text of the error lists them.
+    """
+    if not isinstance(text, str):
+        raise UsageError(f"a link name is a string, not {type(text).__name__}")
+    name = text.strip()
+    try:
+        return _parse(name)
+    except _BadName as problem:
+        shown = name if len(name) <= 80 else name[:80] + "…"
+        raise UsageError(f"link name {shown!r}: {problem}\naccepted forms:\n{FORMS}") from None
+
+
+class _BadName(Exception):
+    """What is wrong with a name, in words."""
+
+
+_SCHEMES: dict[str, LinkKind] = {
+    **{kind.value: kind for kind in LinkKind},
+    "udp": LinkKind.UDPIN,
+    "tcpout": LinkKind.TCP,
+}
+_LISTENING = frozenset({LinkKind.UDPIN, LinkKind.TCPIN})
+
+_SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*):(.*)")
+_HOST_PORT = re.compile(r"(?:\[([^\[\]]*)\]|([^:\[\]]*)):([^:]*)")
+_HOST_LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
+_DEVICE = re.compile(r"(/[!-~]+?|COM[0-9]{1,3})(?:[:,]([0-9]{1,8}))?", re.IGNORECASE)
+_BARE_DEVICE = re.compile(r"/dev/|COM[0-9]", re.IGNORECASE)
+
+
+def _parse(name: str) -> LinkSpec:
+    if _BARE_DEVICE.match(name):
+        return _serial(name)
+    scheme = _SCHEME.fullmatch(name)
+    kind = _SCHEMES.get(scheme[1].lower()) if scheme else None
+    if scheme is None or kind is None:
+        if "/" in name or not _HOST_PORT.fullmatch(name):
+            _fail(f"{scheme[1]!r} is no kind of link" if scheme else "it names no kind of link")
+        return _network(LinkKind.UDPIN, name)
+    rest = scheme[2].removeprefix("//")
+    if kind is LinkKind.SERIAL:
+        return _serial(rest)
+    if kind is LinkKind.SIM:
+        return _sim(rest)
+    if kind in _LISTENING and rest.isdecimal():
+        rest = f":{rest}"
+    return _network(kind, rest)
+
+
+def _network(kind: LinkKind, rest: str) -> LinkSpec:
+    parts = _HOST_PORT.fullmatch(rest)
+    if parts is None:
+        if rest.count(":") > 1:
+            _fail("an IPv6 address stands in brackets, as in udpin:[::1]:14550")
+        _fail("the host is missing" if rest.isdecimal() else "the port is missing")
+    bracketed, host, digits = parts.groups()
+    listening = kind in _LISTENING
+    if bracketed is not None:
+        try:
+            host = str(IPv6Address(bracketed))
+        except AddressValueError:
+            _fail(f"{bracketed!r} is no IPv6 address")
+    elif host:
+        host = _host(host)
+    elif listening:
+        host = "0.0.0.0"
+    else:
+        _fail("the host is missing")
+    return LinkSpec(kind, host, _port(digits, smallest=0 if listening else 1))
+
+
+def _host(host: str) -> str:
+    if re.fullmatch(r"[0-9.]+", host):
+        try:
+            return str(IPv4Address(host))
+        except AddressValueError:
+            _fail(f"{host!r} is no IPv4 address")
+    if len(host) > 253 or not all(map(_HOST_LABEL.fullmatch, host.removesuffix(".").split("."))):
+        _fail(f"{host!r} is no host name")
+    return host.lower()
+
+
+def _port(digits: str, *, smallest: int) -> int:
+    if not digits:
+        _fail("the port is missing")
+    if not re.fullmatch("[0-9]{1,5}", digits) or not smallest <= int(digits) <= 65535:
+        _fail(f"{digits!r} is no port; ports go from {smallest} to 65535")
+    return int(digits)
+
+
+def _serial(rest: str) -> LinkSpec:
+    parts = _DEVICE.fullmatch(rest)
+    if parts is None:
+        _fail("a serial link is a device and a baud rate")
+    device, digits = parts.groups()
+    baud = int(digits) if digits else DEFAULT_BAUD
+    if not baud:
+        _fail("a baud rate is above 0")
+    return LinkSpec(LinkKind.SERIAL, device if device.startswith("/") else device.upper(), baud)
+
+
+def _sim(rest: str) -> LinkSpec:
+    autopilot, _, query = rest.partition("?")
+    if autopilot.lower() not in ("px4", "ardupilot"):
+        _fail("simulated are px4 and ardupilot")
+    options: dict[str, int | float] = {}
+    try:
+        pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True, max_num_fields=32)
+    except ValueError:
+        _fail("options are written as NAME=VALUE with & between them")
+    for key, value in pairs:
+        if key not in _SIM_OPTIONS:
+            _fail(f"{key!r} is no option of a simulated link; there are {', '.join(_SIM_OPTIONS)}")
+        if key in options:
+            _fail(f"option {key} is given twice")
+        options[key] = _SIM_OPTIONS[key](key, value)
+    if "queue" in options and "rate" not in options:
+        _fail("option queue needs a rate")
+    return LinkSpec(LinkKind.SIM, autopilot.lower(), options=tuple(sorted(options.items())))
+
+
+def _fail(problem: str) -> NoReturn:
+    raise _BadName(problem)
+
+
+def _real(smallest: float, largest: float) -> Callable[[str, str], float]:
+    def read(key: str, text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            _fail(f"option {key}: {text!r} is no number")
+        if not (isfinite(value) and smallest <= value <= largest):
+            _fail(f"option {key} goes from {smallest:g} to {largest:g}")
+        return abs(value)  # −0.0 is 0.0
+
+    return read
+
+
+def _whole(smallest: int, largest: int) -> Callable[[str, str], int]:
+    def read(key: str, text: str) -> int:
+        if not re.fullmatch("[0-9]{1,20}", text) or not smallest <= int(text) <= largest:
+            _fail(f"option {key} is a whole number from {smallest} to {largest}")
+        return int(text)
+
+    return read
+
+
+_SIM_OPTIONS: dict[str, Callable[[str, str], int | float]] = {
+    "loss": _real(0, 1),
+    "delay": _real(0, 3600),
+    "jitter": _real(0, 3600),
+    "duplicate": _real(0, 1),
+    "reorder": _real(0, 1),
+    "bit_errors": _real(0, 1),
+    "rate": _real(1, 1e9),
+    "queue": _whole(0, 2**31),
+    "seed": _whole(0, 2**63),
+    "system": _whole(1, 255),
+    "param_error": _whole(0, 1),
+}
+"""Options of `sim:` links: probabilities, seconds one way, bytes per second, bytes in the queue, numbers."""

@@ -1,0 +1,236 @@
+"""Links over TCP: `tcp` connects, `tcpin` lets others connect."""
+
+from __future__ import annotations
+
+import errno
+import os
+import selectors
+import socket
+import sys
+from contextlib import suppress
+from typing import Final, NamedTuple
+
+import anyio
+import anyio.lowlevel
+
+from paramclient.links.base import OPEN_TIMEOUT, Address, Peer, SocketLink, close_socket, reason
+from paramclient.links.names import LinkSpec
+
+__all__ = ["Connection", "TcpIn", "TcpOut"]
+
+SEND_TIMEOUT: Final = 5.0
+"""Seconds that a peer may leave the system's buffers full before it counts as gone."""
+
+SILENCE_TIMEOUT: Final = 15.0
+"""Seconds without an acknowledgement after which a connection counts as gone (Linux; its own default is a
+quarter of an hour). The heartbeat that every station sends each second needs one."""
+
+CLIENTS: Final = 64
+"""Connections that `tcpin` holds at once; further ones are closed at once. Strangers cannot make it grow."""
+
+READ_SIZE: Final = 65536
+"""Bytes that are read from one connection before the others have their turn."""
+
+
+class Connection(NamedTuple):
+    """A TCP connection as a peer. The number makes it another one when the same address comes again."""
+
+    number: int
+    host: str
+    port: int
+
+
+class TcpOut(SocketLink):
+    """`tcp`: one outgoing connection; `open` makes a new one after it has dropped."""
+
+    is_stream = True
+    reconnects = True
+
+    def __init__(self, spec: LinkSpec) -> None:
+        super().__init__(spec)
+        self._far = Connection(0, spec.host, spec.port)
+
+    async def receive(self) -> list[tuple[Peer, bytes]]:
+        """See `Link.receive`: one chunk of up to `READ_SIZE` bytes."""
+        sock = self._open_socket()
+        while True:
+            await self._readable(sock)
+            try:
+                data = sock.recv(READ_SIZE)
+            except BlockingIOError:
+                continue
+            except OSError as error:
+                self._fail(f"connection to {self._target} lost: {reason(error)}", error)
+            if not data:
+                self._fail(f"connection closed by {self._target}")
+            return [(self._far, data)]
+
+    async def send(self, data: bytes, peer: Peer | None) -> None:
+        """See `Link.send`. Waits at most `SEND_TIMEOUT` for room; then the connection counts as dropped.
+
+        Cancelled, it may have sent a part.
+        """
+        await anyio.lowlevel.checkpoint()
+        sock = self._open_socket()
+        opening = self._openings
+        if peer is not None and peer != self._far:
+            return
+        try:
+            await _send_all(sock, data)
+        except OSError as error:
+            self._check(opening)
+            self._fail(f"connection to {self._target} lost: {reason(error)}", error)
+
+    async def _open(self, opening: int) -> None:
+        candidates = await self._resolve(socket.SOCK_STREAM)
+        for family, address in candidates:
+            sock = socket.socket(family, socket.SOCK_STREAM)
+            self._adopt(sock, opening)
+            _set_up(sock)
+            try:
+                with anyio.fail_after(OPEN_TIMEOUT / len(candidates)):
+                    await _connect(sock, address)
+            except OSError:
+                self._check(opening)
+                if address is candidates[-1][1]:
+                    raise
+            else:
+                break
+        self._far = self._far._replace(number=self._far.number + 1)
+
+
+class TcpIn(SocketLink):
+    """`tcpin`: listens; speaks to every connection. One that ends takes no other with it."""
+
+    is_stream = True
+    reconnects = False
+
+    def __init__(self, spec: LinkSpec) -> None:
+        super().__init__(spec)
+        self._selector: selectors.DefaultSelector | None = None
+        self._clients: dict[Peer, socket.socket] = {}
+        self._accepted = 0
+
+    async def receive(self) -> list[tuple[Peer, bytes]]:
+        """See `Link.receive`: up to `READ_SIZE` bytes from each connection that has some."""
+        listener, selector = self._open_socket(), self._selector
+        assert selector is not None
+        batch: list[tuple[Peer, bytes]] = []
+        while not batch:
+            # The selector is itself a file that becomes readable: one wait for all connections.
+            await self._readable(selector.fileno())
+            for key, _ in selector.select(0):
+                if key.data is None:
+                    self._accept(listener, selector)
+                else:
+                    batch += self._read(key.data, selector)
+        return batch
+
+    async def send(self, data: bytes, peer: Peer | None) -> None:
+        """See `Link.send`. A connection that has no room for `SEND_TIMEOUT` is ended.
+
+        Cancelled, it may have sent a part.
+        """
+        await anyio.lowlevel.checkpoint()
+        self._open_socket()
+        opening = self._openings
+        for client in self._destinations(peer):
+            try:
+                await _send_all(client, data)
+            except OSError:
+                self._check(opening)
+                with suppress(OSError):
+                    client.shutdown(socket.SHUT_RDWR)  # `receive` finds its end, tells of it and closes it
+
+    async def _open(self, opening: int) -> None:
+        family, address = (await self._resolve(socket.SOCK_STREAM))[0]
+        listener = socket.socket(family, socket.SOCK_STREAM)
+        self._adopt(listener, opening)
+        listener.setblocking(False)
+        # Not for a second listener, but to bind again while old connections linger in TIME_WAIT.
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.bind(address)
+        listener.listen()
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(listener, selectors.EVENT_READ)
+
+    def _discard(self) -> None:
+        super()._discard()
+        if self._selector is not None:
+            anyio.notify_closing(self._selector.fileno())
+            self._selector.close()
+            self._selector = None
+        while self._clients:
+            _, client = self._clients.popitem()
+            close_socket(client)
+
+    def _destinations(self, peer: Peer | None) -> list[socket.socket]:
+        if peer is None:
+            return list(self._clients.values())
+        return [self._clients[peer]] if peer in self._clients else []
+
+    def _accept(self, listener: socket.socket, selector: selectors.DefaultSelector) -> None:
+        try:
+            client, (host, port, *_) = listener.accept()
+        except (BlockingIOError, ConnectionError):
+            return  # it left before its turn
+        except OSError as error:
+            raise self._error(f"cannot accept: {reason(error)}") from error
+        if len(self._clients) >= CLIENTS:
+            client.close()
+            return
+        _set_up(client)
+        self._accepted += 1
+        peer = Connection(self._accepted, host, port)
+        self._clients[peer] = client
+        selector.register(client, selectors.EVENT_READ, peer)
+
+    def _read(self, peer: Peer, selector: selectors.DefaultSelector) -> list[tuple[Peer, bytes]]:
+        client = self._clients[peer]
+        try:
+            data = client.recv(READ_SIZE)
+        except BlockingIOError:
+            return []
+        except OSError:
+            data = b""
+        if not data:
+            selector.unregister(client)
+            del self._clients[peer]
+            close_socket(client)
+        return [(peer, data)]
+
+
+def _set_up(sock: socket.socket) -> None:
+    sock.setblocking(False)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    if sys.platform == "linux":
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(SILENCE_TIMEOUT * 1000))
+
+
+async def _connect(sock: socket.socket, address: Address) -> None:
+    status = sock.connect_ex(address)
+    if status == errno.EINPROGRESS:
+        await _writable(sock)
+        status = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
+    if status:
+        raise OSError(status, os.strerror(status))
+
+
+async def _send_all(sock: socket.socket, data: bytes) -> None:
+    """Send everything; OSError when the connection is gone, closed here, or has had no room for long."""
+    view = memoryview(data)
+    with anyio.move_on_after(SEND_TIMEOUT):
+        while view:
+            try:
+                view = view[sock.send(view) :]
+            except BlockingIOError:
+                await _writable(sock)
+        return
+    raise OSError(errno.ETIMEDOUT, f"the other side has not read for {SEND_TIMEOUT:g} s")
+
+
+async def _writable(sock: socket.socket) -> None:
+    try:
+        await anyio.wait_writable(sock)
+    except anyio.ClosedResourceError:
+        raise OSError(errno.EBADF, os.strerror(errno.EBADF)) from None
