@@ -8,8 +8,8 @@ from typing import Final
 __all__ = ["Identity", "autopilot_name"]
 
 SHARED_UIDS: Final = frozenset({"4954414c44494e4f"})
-"""Hardware ids that name no single vehicle. Every simulated PX4 reports the text SIMULATIONID (measured), so
-that two of them on one machine would share a table."""
+"""Hardware ids that name no single vehicle: every simulated PX4 reports this one (measured). Their system ids
+tell them apart, as PX4 numbers the simulated vehicles on one machine."""
 
 _AUTOPILOTS = {0: "generic", 3: "ardupilot", 8: "no autopilot", 12: "px4"}
 _HEX_DIGITS = frozenset(b"0123456789abcdefABCDEF")
@@ -91,10 +91,13 @@ class Identity:
     def key(self) -> str:
         """The name under which its tables are kept.
 
-        `uid:<hex>` where a hardware id tells it apart; else `system:<n>@<link>`, which holds only as long
-        as no other vehicle comes to the same link with the same system id.
+        `uid:<hex>` where there is a hardware id, with the system id behind it for one that many have; else
+        `system:<n>@<link>`, which holds only as long as no other vehicle comes to the same link with the
+        same system id.
         """
-        if self.uid is not None and self.uid not in SHARED_UIDS:
+        if self.uid in SHARED_UIDS:
+            return f"uid:{self.uid}/{self.system}"
+        if self.uid is not None:
             return f"uid:{self.uid}"
         return f"system:{self.system}@{self.link}"
 

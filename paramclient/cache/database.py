@@ -1,0 +1,463 @@
+"""The file: opened when needed, shared with other processes, and set aside when it cannot be trusted.
+
+SQLite in WAL mode with synchronous=NORMAL. What was committed survives the death of a process at any moment;
+a power cut may take the last transactions, never the file.
+
+The structure of the file is checked when it is opened; each table has a checksum of its own, checked when it
+is read. Under an open connection, another process may find the file damaged and rename it, or somebody may
+delete it: every operation looks whether its file still stands under the path. SQLite does so too before it
+would touch the `-wal` of the file that came in its place. Opening, creating, upgrading and renaming happen
+under a lock on the folder (`flock`), so that two processes never do it at once. The file itself is opened by
+SQLite alone: to close another descriptor of it would drop SQLite's locks.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import logging
+import os
+import sqlite3
+import stat
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager
+from functools import cache
+from itertools import count
+from pathlib import Path
+from typing import Final, TypeAlias, TypeVar
+
+from paramclient.errors import CacheError
+
+__all__ = ["APPLICATION_ID", "Damaged", "Database", "MIGRATIONS"]
+
+APPLICATION_ID: Final = 0x5041524D
+"""Stands in the file's header and says whose database it is: `PARM`."""
+
+BUSY_TIMEOUT: Final = 5.0
+"""Seconds to wait for another process. Its transactions take milliseconds; who holds the file for longer is
+stuck, and the cache is not worth the wait."""
+
+MIGRATIONS: tuple[tuple[str, ...], ...] = (
+    (
+        """CREATE TABLE vehicle (
+            key TEXT NOT NULL PRIMARY KEY,
+            system INTEGER NOT NULL,
+            link TEXT NOT NULL,
+            uid TEXT,
+            autopilot INTEGER NOT NULL,
+            vehicle_type INTEGER NOT NULL,
+            firmware INTEGER NOT NULL,
+            git_hash TEXT NOT NULL,
+            board INTEGER NOT NULL,
+            vendor_id INTEGER NOT NULL,
+            product_id INTEGER NOT NULL,
+            capabilities INTEGER NOT NULL,
+            first_seen REAL NOT NULL,
+            last_seen REAL NOT NULL
+        )""",
+        """CREATE TABLE component (
+            id INTEGER PRIMARY KEY,
+            vehicle TEXT NOT NULL REFERENCES vehicle (key) ON DELETE CASCADE,
+            component INTEGER NOT NULL,
+            own_autopilot INTEGER NOT NULL,
+            hash INTEGER,
+            count INTEGER,
+            complete INTEGER NOT NULL DEFAULT 0,
+            volatile_known INTEGER NOT NULL DEFAULT 0,
+            synced_at REAL,
+            checksum INTEGER NOT NULL,
+            updated_at REAL NOT NULL,
+            UNIQUE (vehicle, component)
+        )""",
+        """CREATE TABLE param (
+            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
+            name TEXT NOT NULL,
+            type INTEGER NOT NULL,
+            bits INTEGER NOT NULL,
+            is_raw INTEGER NOT NULL,
+            param_index INTEGER,
+            volatile INTEGER NOT NULL,
+            heard_at REAL NOT NULL,
+            PRIMARY KEY (owner, name)
+        ) WITHOUT ROWID""",
+        """CREATE TABLE history (
+            id INTEGER PRIMARY KEY,
+            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
+            at REAL NOT NULL,
+            name TEXT NOT NULL,
+            old_type INTEGER NOT NULL,
+            old_bits INTEGER NOT NULL,
+            old_is_raw INTEGER NOT NULL,
+            new_type INTEGER,
+            new_bits INTEGER,
+            new_is_raw INTEGER,
+            by TEXT NOT NULL
+        )""",
+        "CREATE INDEX history_of_component ON history (owner)",
+    ),
+)
+"""The statements that lead from each schema version to the next; the version is the number of steps taken."""
+
+_TRIES: Final = 3
+"""Rounds of one operation: the file may be renamed under it by another process, and be damaged, once each."""
+_LOCK_POLL: Final = 0.01
+
+# So a place shows itself where no -wal or -shm can be made: a folder is read-only, a disk is full.
+_UNWRITABLE: Final = frozenset(
+    {
+        sqlite3.SQLITE_CANTOPEN,
+        sqlite3.SQLITE_IOERR_SHMSIZE,
+        sqlite3.SQLITE_READONLY_DIRECTORY,
+    }
+)
+
+_DAMAGE: Final = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
+
+_log = logging.getLogger("paramclient.cache")
+
+T = TypeVar("T")
+Work: TypeAlias = Callable[[sqlite3.Connection], T]
+
+
+class Damaged(Exception):
+    """The file does not hold what was written to it. Work may raise this; it never reaches a caller."""
+
+    kind = "damaged"
+
+
+class _Newer(Damaged):
+    """The file was written by a later version."""
+
+    kind = "newer"
+
+
+class _Moved(Exception):
+    """The file that was looked at, or written to, no longer stands under the path."""
+
+
+class Database:
+    """One SQLite file, opened at the first operation. Safe to use from several threads.
+
+    A file that is damaged, or newer than this version, is renamed to say why and when (with its `-wal` and
+    `-shm`), a warning is logged and remembered, and a fresh one takes its place. Nothing is ever deleted.
+
+    Args:
+        path: the file, absolute, with links followed.
+
+    Attributes:
+        path: the same.
+        notes: the warnings so far.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.notes: list[str] = []
+        self._lock = threading.Lock()
+        self._closed = False
+        self._connection: sqlite3.Connection | None = None
+        self._close_connection: Callable[[], object] = _nothing
+        self._file: tuple[int, int] | None = None
+        self._for_once = False
+        self._without_locks = False
+
+    def read(self, work: Work[T]) -> T:
+        """Do work that only reads, in one transaction.
+
+        Creates nothing: without a file, the work finds an empty database. Works on a file, or in a folder,
+        that cannot be written to.
+
+        Raises:
+            CacheError: the file cannot be read, or another process holds it for too long.
+        """
+        return self._run(work, writing=False)
+
+    def write(self, work: Work[T]) -> T:
+        """Do work in one transaction that holds the file's only write lock; all of it happens, or nothing.
+
+        Creates the file (mode 0600) and its folder (0700). The work is done again, from the start, where the
+        file had to be set aside.
+
+        Raises:
+            CacheError: the file cannot be written: read-only, disk full, held for too long by another
+                process.
+        """
+        return self._run(work, writing=True)
+
+    def close(self) -> None:
+        """Close the file; every later operation raises CacheError. Closing again does nothing."""
+        with self._lock:
+            self._closed = True
+            self._drop()
+
+    def _run(self, work: Work[T], *, writing: bool) -> T:
+        with self._lock:
+            if self._closed:
+                raise CacheError(f"the cache {self.path} is closed")
+            for _ in range(_TRIES):
+                try:
+                    if not writing and self._is_absent():
+                        with _fresh(MIGRATIONS) as nothing:
+                            return work(nothing)
+                    return self._transact(work, writing=writing)
+                except _Moved:
+                    self._drop()
+                except Damaged as damage:
+                    self._set_aside(damage)
+                except OSError as error:
+                    self._drop()
+                    raise CacheError(f"the cache {self.path} cannot be used: {error}") from error
+                except BaseException:
+                    self._drop()
+                    raise
+            raise CacheError(f"the cache {self.path} is damaged or replaced again and again")
+
+    def _transact(self, work: Work[T], *, writing: bool) -> T:
+        """One try. Where it fails the connection is left as it is; to close it takes the transaction back."""
+        try:
+            connection = self._connected(writing=writing)
+            connection.execute("BEGIN IMMEDIATE" if writing else "BEGIN")
+            result = work(connection)
+            connection.execute("COMMIT")
+        except (sqlite3.ProgrammingError, sqlite3.InterfaceError):
+            raise  # the program's mistake, not the file's
+        except sqlite3.Error as error:
+            raise self._judged(error) from error
+        except UnicodeDecodeError as error:
+            raise Damaged(str(error)) from error
+        if writing and self._which() != self._file:
+            raise _Moved
+        if self._for_once:
+            self._drop()
+        return result
+
+    def _connected(self, *, writing: bool) -> sqlite3.Connection:
+        if self._connection is not None:
+            if self._which() == self._file:
+                return self._connection
+            self._drop()
+        if writing:
+            self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        with _locked(self.path.parent):
+            self._file = self._which()
+            if self._is_absent():
+                if not writing:
+                    raise _Moved
+                if _size(self._companion("-wal")):
+                    raise Damaged("only its write-ahead log is left")
+                os.close(os.open(self.path, os.O_CREAT | os.O_WRONLY, 0o600))
+                self._file = self._which()
+            if _size(self.path) == 1:  # SQLite would take it for empty and write over it
+                raise Damaged("file is not a database")
+            may_write = self._may_write()
+            if writing and not may_write:
+                raise PermissionError("it is read-only")
+            if may_write or self._companion("-shm").exists():
+                try:
+                    connection = self._open_with_locks()
+                    self._for_once = not may_write
+                    return connection
+                except sqlite3.OperationalError as error:
+                    if writing or _code(error) not in _UNWRITABLE:
+                        raise
+                self._drop()
+            self._for_once = self._without_locks = True
+            return self._open_without_locks()
+
+    def _open_with_locks(self) -> sqlite3.Connection:
+        connection = self._connect("mode=rw")
+        version = self._inspect(connection)
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA synchronous = NORMAL")
+        connection.execute("PRAGMA foreign_keys = ON")
+        if version < len(MIGRATIONS):
+            connection.execute("BEGIN IMMEDIATE")
+            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
+            _migrate(connection, MIGRATIONS[version:])
+            connection.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
+            connection.execute("COMMIT")
+        return connection
+
+    def _open_without_locks(self) -> sqlite3.Connection:
+        """Open a file beside which no -wal and -shm can, or should, be made.
+
+        None is in use, so nobody else is writing. Made for a read-only file, they would be read-only too and
+        stay behind.
+        """
+        if _size(self._companion("-wal")):
+            # A killed process left transactions in it. Without locks, SQLite reads it with no -shm.
+            connection = self._connect("mode=ro&vfs=unix-none")
+            connection.execute("PRAGMA locking_mode = EXCLUSIVE")
+        else:
+            connection = self._connect("mode=ro&immutable=1")
+        if self._inspect(connection) < len(MIGRATIONS):
+            raise CacheError(
+                f"the cache {self.path} is of an older version and cannot be upgraded where it is"
+            )
+        return connection
+
+    def _connect(self, how: str) -> sqlite3.Connection:
+        connection = sqlite3.connect(
+            f"{self.path.as_uri()}?{how}",
+            uri=True,
+            timeout=BUSY_TIMEOUT,
+            isolation_level=None,
+            check_same_thread=False,
+        )
+        self._connection = connection
+        self._close_connection = weakref.finalize(self, connection.close)
+        return connection
+
+    def _inspect(self, connection: sqlite3.Connection) -> int:
+        """The schema version of the file, 0 for one that is still empty; `Damaged` where it is not ours.
+
+        The integrity check takes a few milliseconds for each megabyte. Without it a flipped bit can make
+        SQLite miss a row that is there, and nothing would tell.
+        """
+        [(application,)] = connection.execute("PRAGMA application_id")
+        [(version,)] = connection.execute("PRAGMA user_version")
+        try:
+            tables = _schema_of(connection)
+        except sqlite3.OperationalError as error:
+            if _code(error) != sqlite3.SQLITE_ERROR:
+                raise
+            raise Damaged(str(error)) from error  # the statement cannot be wrong: the header is
+        if not (application or version or tables):
+            return 0
+        if application != APPLICATION_ID:
+            if tables and not _schema_after(MIGRATIONS) & tables:
+                raise CacheError(f"{self.path} is another program's database; name another file")
+            raise Damaged(f"its application id is {application:#x}")
+        if version > len(MIGRATIONS):
+            raise _Newer(f"its schema has version {version}, this program knows {len(MIGRATIONS)}")
+        if version < 1 or not _schema_after(MIGRATIONS[:version]) <= tables:
+            raise Damaged(f"its tables are not those of version {version}")
+        [(verdict,)] = connection.execute("PRAGMA integrity_check(1)")
+        if verdict != "ok":
+            raise Damaged(verdict)
+        return int(version)
+
+    def _judged(self, error: sqlite3.Error) -> Exception:
+        """What an error of SQLite means: damage, or a trouble of the surroundings or of ours."""
+        code = _code(error)
+        if code is None or code & 0xFF in _DAMAGE:
+            return Damaged(str(error))
+        if code == sqlite3.SQLITE_READONLY and self._may_write():
+            return Damaged("its header forbids writing")
+        return CacheError(f"the cache {self.path} cannot be used: {error}")
+
+    def _set_aside(self, damage: Damaged) -> None:
+        what = f"the cache {self.path} is {damage.kind} ({' '.join(str(damage).split()):.200})"
+        # The file is renamed before it is closed: SQLite then leaves its -wal as it is.
+        try:
+            if self._without_locks:
+                raise PermissionError("nothing can be written there")
+            with _locked(self.path.parent):
+                if self._which() == self._file:
+                    kept = self._free_path(damage.kind)
+                    for suffix in ("-journal", "-wal", "-shm", ""):
+                        if self._companion(suffix).exists():
+                            self._companion(suffix).rename(f"{kept}{suffix}")
+                    self.notes.append(f"{what}; it is kept as {kept.name}")
+                    _log.warning("%s", self.notes[-1])
+        except OSError as error:
+            raise CacheError(f"{what} and cannot be set aside: {error}") from error
+        finally:
+            self._drop()
+
+    def _free_path(self, kind: str) -> Path:
+        stamp = time.strftime("%Y%m%dT%H%M%SZ", time.gmtime())
+        paths = (self._companion(f".{kind}-{stamp}-{number}") for number in count(1))
+        return next(path for path in paths if not path.exists())
+
+    def _companion(self, suffix: str) -> Path:
+        return self.path.with_name(self.path.name + suffix)
+
+    def _is_absent(self) -> bool:
+        return not _size(self.path)
+
+    def _which(self) -> tuple[int, int] | None:
+        """Which file stands under the path now: a file that took another's place has another number."""
+        status = _status(self.path)
+        return status and (status.st_dev, status.st_ino)
+
+    def _may_write(self) -> bool:
+        files = filter(Path.exists, map(self._companion, ("", "-wal", "-shm")))
+        return all(os.access(file, os.W_OK, effective_ids=True) for file in files)
+
+    def _drop(self) -> None:
+        self._close_connection()
+        self._connection = None
+        self._close_connection = _nothing
+        self._for_once = self._without_locks = False
+
+
+def _nothing() -> None:
+    """What there is to close without a connection."""
+
+
+def _status(path: Path) -> os.stat_result | None:
+    try:
+        status = path.stat()
+    except (FileNotFoundError, NotADirectoryError):
+        return None
+    if not stat.S_ISREG(status.st_mode):
+        raise CacheError(f"{path} cannot be a cache: it is not a regular file")
+    return status
+
+
+def _size(path: Path) -> int:
+    status = _status(path)
+    return status.st_size if status else 0
+
+
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Hold the folder against every other process and thread that would open, create or rename a cache."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
+        deadline = time.monotonic() + BUSY_TIMEOUT
+        while True:
+            try:
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                break
+            except BlockingIOError:
+                if time.monotonic() > deadline:
+                    raise CacheError(f"another process holds the folder {folder}") from None
+            time.sleep(_LOCK_POLL)
+        yield
+    finally:
+        os.close(descriptor)
+
+
+def _code(error: sqlite3.Error) -> int | None:
+    """SQLite's extended result code; None where its module found text that is not UTF-8."""
+    code: int | None = getattr(error, "sqlite_errorcode", None)
+    return code
+
+
+def _migrate(connection: sqlite3.Connection, steps: tuple[tuple[str, ...], ...]) -> None:
+    for statements in steps:
+        for statement in statements:
+            connection.execute(statement)
+
+
+def _schema_of(connection: sqlite3.Connection) -> frozenset[tuple[str, ...]]:
+    """Every table and index with the statement that made it."""
+    rows = connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_master WHERE sql IS NOT NULL")
+    return frozenset(rows.fetchall())
+
+
+@contextmanager
+def _fresh(steps: tuple[tuple[str, ...], ...]) -> Iterator[sqlite3.Connection]:
+    """An empty database in memory."""
+    with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
+        _migrate(connection, steps)
+        yield connection
+
+
+@cache
+def _schema_after(steps: tuple[tuple[str, ...], ...]) -> frozenset[tuple[str, ...]]:
+    with _fresh(steps) as connection:
+        return _schema_of(connection)

@@ -1,0 +1,120 @@
+"""Records to cells and back. Whatever does not look like what was written is damage, not a value."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import astuple, replace
+from typing import Any, Final, NamedTuple
+
+from paramclient.cache.database import Damaged
+from paramclient.errors import UsageError
+from paramclient.identity import Identity
+from paramclient.values import Param, Trust, from_bits, known_type, same_bits
+
+__all__ = [
+    "Row",
+    "cells",
+    "checksum",
+    "identity_cells",
+    "read_identity",
+    "read_param",
+    "time_cell",
+]
+
+_YEAR_10000: Final = 253402300800.0
+_KINDS: Final[dict[str, tuple[type, ...]]] = {
+    "i": (int,),
+    "f": (float,),
+    "s": (str,),
+    "I": (int, type(None)),
+    "F": (float, type(None)),
+    "S": (str, type(None)),
+}
+_MASK_64: Final = (1 << 64) - 1
+
+
+def cells(row: Sequence[object], kinds: str) -> Any:
+    """Give a row back whose cells are what they should be; else `Damaged`.
+
+    Args:
+        kinds: a letter for each cell: i integer, f time, s text; in capitals where NULL is possible.
+    """
+    for cell, kind in zip(row, kinds, strict=True):
+        if not isinstance(cell, _KINDS[kind]) or (isinstance(cell, float) and not 0 <= cell < _YEAR_10000):
+            raise Damaged(f"a cell holds {cell!r:.40}")
+    return row
+
+
+def time_cell(at: float) -> float:
+    """A time to be stored: unix seconds, before the year 10000; else UsageError."""
+    if not 0 <= at < _YEAR_10000:
+        raise UsageError(f"{at!r} is not a time in unix seconds")
+    return float(at)
+
+
+def identity_cells(identity: Identity) -> tuple[object, ...]:
+    """A vehicle's cells, in the order of the attributes."""
+    *described, capabilities = astuple(identity)
+    return (*described, _signed(capabilities))
+
+
+def read_identity(row: Sequence[object]) -> Identity:
+    """The inverse of `identity_cells`."""
+    identity = Identity(*cells(row, "isSiiisiiii"))
+    return replace(identity, capabilities=identity.capabilities & _MASK_64)
+
+
+class Row(NamedTuple):
+    """A parameter's cells, without its name. Two rows are equal when nothing of them needs to be written."""
+
+    type: int
+    bits: int
+    is_raw: int
+    param_index: int | None
+    volatile: int
+    heard_at: float
+
+    @classmethod
+    def of(cls, param: Param, index: int | None, volatile: bool, heard_at: float) -> Row:
+        """The cells of a parameter."""
+        bits = _signed(param.bits)
+        return cls(int(param.type), bits, int(param.is_raw), index, int(volatile), time_cell(heard_at))
+
+    @property
+    def value(self) -> tuple[int, int, int]:
+        """type, bits, is_raw: what `read_param` takes."""
+        return self[:3]
+
+    @property
+    def hashed(self) -> tuple[int, int, int] | None:
+        """What the vehicle's hash covers of it: its value, or nothing where it is volatile or not in use."""
+        return None if self.volatile or self.param_index is None else self.value
+
+    def same_value(self, other: Row) -> bool:
+        """Whether both hold the same value in the same type (−0 equals 0)."""
+        return (self.type, self.is_raw) == (other.type, other.is_raw) and same_bits(
+            self.type, self.bits & _MASK_64, other.bits & _MASK_64
+        )
+
+
+def checksum(rows: Mapping[str, Row]) -> int:
+    """A CRC-32 of all that is kept of a table's parameters, whatever their order."""
+    return zlib.crc32(repr(sorted((name, *row) for name, row in rows.items())).encode())
+
+
+def read_param(name: str, number: int, bits: int, is_raw: int, index: int | None = None) -> Param:
+    """The parameter of a row's `value`; its trust is CACHED."""
+    bits &= _MASK_64
+    try:
+        value = from_bits(bits, number, is_raw=bool(is_raw))
+    except OverflowError:
+        raise Damaged(f"{bits} is not a value of type {number}") from None
+    if not 0 <= number <= 255:
+        raise Damaged(f"{number} is not a type")
+    return Param(name, value, known_type(number), index, bits, Trust.CACHED)
+
+
+def _signed(number: int) -> int:
+    """A 64-bit unsigned number as SQLite's integers, which are signed, can hold it."""
+    return number - (1 << 64) if number >> 63 else number

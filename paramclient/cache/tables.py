@@ -1,0 +1,275 @@
+"""Tables in the database: written, compared, read. Each function works inside its caller's transaction.
+
+One mechanism writes history: `save` compares every value that it is given with the one that is stored, and
+where they differ it writes a line in the same transaction. So no change of a stored value can miss its line,
+and when two processes hear the same change, the second finds nothing to write.
+"""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
+from types import MappingProxyType
+from typing import Final
+
+from paramclient.cache.database import Damaged
+from paramclient.cache.records import (
+    BY_VEHICLE,
+    CachedComponent,
+    CachedSummary,
+    CachedVehicle,
+    HistoryEntry,
+    StoredParam,
+    TableState,
+    TableUpdate,
+)
+from paramclient.cache.rows import Row, cells, checksum, identity_cells, read_identity, read_param, time_cell
+from paramclient.params import ParamMap
+
+__all__ = ["HISTORY_LINES", "component", "history", "remove", "save", "summaries", "vehicles"]
+
+HISTORY_LINES: Final = 10_000
+"""Lines of history kept for each table, the newest ones: about a megabyte, and years of tuning by hand. Each
+`save` writes a line for each value that changed, so what a vehicle changes many times a second should be
+gathered before it is saved."""
+
+# In the order of `identity_cells`.
+_IDENTITY: Final = (
+    "system, link, uid, autopilot, vehicle_type, firmware, git_hash,"
+    " board, vendor_id, product_id, capabilities"
+)
+
+
+def save(connection: sqlite3.Connection, updates: Iterable[TableUpdate]) -> None:
+    """Write what was learnt, in the order given."""
+    for update in updates:
+        owner = _owner(connection, update)
+        before = _rows(connection, owner)
+        after, lines = _applied(update, before)
+        if after != before:
+            _write_rows(connection, owner, before, after)
+        _write_history(connection, owner, lines)
+        if update.table is not None:
+            _write_state(connection, owner, update.table)
+        elif _hashed(before) != _hashed(after):
+            connection.execute("UPDATE component SET hash = NULL WHERE id = ?", (owner,))
+
+
+def remove(connection: sqlite3.Connection, key: str, component: int | None) -> int:
+    """Delete tables with all that belongs to them; give their number."""
+    removed = connection.execute(
+        "DELETE FROM component WHERE vehicle = ? AND component = ifnull(?, component)", (key, component)
+    ).rowcount
+    connection.execute("DELETE FROM vehicle WHERE key NOT IN (SELECT vehicle FROM component)")
+    return removed
+
+
+def vehicles(connection: sqlite3.Connection) -> list[CachedVehicle]:
+    """Every vehicle, the one seen last first."""
+    components: dict[str, list[int]] = {}
+    for row in connection.execute("SELECT vehicle, component FROM component ORDER BY component"):
+        key, component = cells(row, "si")
+        components.setdefault(key, []).append(component)
+    found = []
+    for row in connection.execute(
+        f"SELECT key, first_seen, last_seen, {_IDENTITY} FROM vehicle ORDER BY last_seen DESC, key"
+    ):
+        key, first, last = cells(row[:3], "sff")
+        known = tuple(components.get(key, ()))
+        found.append(CachedVehicle(key, read_identity(row[3:]), first, last, known))
+    return found
+
+
+def summaries(
+    connection: sqlite3.Connection, key: str | None = None, component: int | None = None
+) -> list[tuple[int, CachedSummary]]:
+    """Tables with their ids in the database, without parameters; of one vehicle or component where given."""
+    rows = connection.execute(
+        "SELECT id, component, own_autopilot, (SELECT count(*) FROM param WHERE owner = c.id), hash, count,"
+        f" complete, volatile_known, synced_at, updated_at, key, {_IDENTITY}"
+        " FROM component c JOIN vehicle ON key = vehicle"
+        " WHERE key = ifnull(?, key) AND component = ifnull(?, component)"
+        " ORDER BY last_seen DESC, key, component",
+        (key, component),
+    )
+    return [_summary(row) for row in rows]
+
+
+def component(
+    connection: sqlite3.Connection,
+    key: str,
+    number: int,
+    *,
+    history: Callable[[str | None, int | None], list[HistoryEntry]],
+) -> CachedComponent | None:
+    """One table with its parameters, or None."""
+    for owner, summary in summaries(connection, key, number):
+        rows = _rows(connection, owner)
+        return CachedComponent(
+            **{field.name: getattr(summary, field.name) for field in fields(summary)},
+            params=ParamMap(
+                {name: read_param(name, *row.value, row.param_index) for name, row in rows.items()}
+            ),
+            volatile=frozenset(name for name, row in rows.items() if row.volatile),
+            heard_at=MappingProxyType({name: row.heard_at for name, row in rows.items()}),
+            _history=history,
+        )
+    return None
+
+
+def history(
+    connection: sqlite3.Connection, key: str, component: int | None, name: str | None, limit: int | None
+) -> list[HistoryEntry]:
+    """The changes of a vehicle's values, newest last."""
+    rows = connection.execute(
+        "SELECT at, component, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
+        " FROM history h JOIN component c ON c.id = owner"
+        " WHERE vehicle = ? AND component = ifnull(?, component) AND name = ifnull(?, name)"
+        " ORDER BY h.id DESC LIMIT ?",
+        (key, component, name, -1 if limit is None else limit),
+    ).fetchall()
+    return [_entry(row) for row in reversed(rows)]
+
+
+def _owner(connection: sqlite3.Connection, update: TableUpdate) -> int:
+    """Write whose table it is; give the id of the table, which is made where there is none."""
+    at = time_cell(update.at)
+    key = update.identity.key
+    columns = f"{_IDENTITY}, last_seen"
+    values = ", ".join(f"excluded.{column}" for column in columns.split(", "))
+    connection.execute(
+        f"INSERT INTO vehicle (key, first_seen, {columns}) VALUES (?{', ?' * 13})"
+        f" ON CONFLICT (key) DO UPDATE SET ({columns}) = ({values})",
+        (key, at, *identity_cells(update.identity), at),
+    )
+    connection.execute(
+        "INSERT INTO component (vehicle, component, own_autopilot, checksum, updated_at)"
+        " VALUES (?, ?, ?, ?, ?)"
+        " ON CONFLICT (vehicle, component) DO UPDATE"
+        " SET own_autopilot = excluded.own_autopilot, updated_at = excluded.updated_at",
+        (key, update.component, update.autopilot, checksum({}), at),
+    )
+    [(owner,)] = connection.execute(
+        "SELECT id FROM component WHERE vehicle = ? AND component = ?", (key, update.component)
+    )
+    return int(owner)
+
+
+def _applied(
+    update: TableUpdate, before: Mapping[str, Row]
+) -> tuple[dict[str, Row], list[tuple[object, ...]]]:
+    """The rows after an update, and the lines of history that it causes."""
+    after = dict(before)
+    heard = {item.param.name for item in update.params}
+    lines: list[tuple[object, ...]] = [
+        (update.at, name, BY_VEHICLE, *after.pop(name).value, None, None, None)
+        for name in dict.fromkeys(before if update.replace else update.removed)
+        if name in before and name not in heard
+    ]
+    for item in update.params:
+        name = item.param.name
+        old = after.get(name)
+        new = after[name] = _merged(item, old, whole=update.replace)
+        if old and not old.same_value(new):
+            lines.append((new.heard_at, name, item.by, *old.value, *new.value))
+    return after, lines
+
+
+def _merged(item: StoredParam, old: Row | None, *, whole: bool) -> Row:
+    index, volatile = item.param.index, item.volatile
+    if index is None and old and not whole:
+        index = old.param_index
+    if volatile is None:
+        volatile = bool(old and old.volatile)
+    return Row.of(item.param, index, volatile, item.heard_at)
+
+
+def _hashed(rows: Mapping[str, Row]) -> dict[str, tuple[int, int, int]]:
+    """What the vehicle's hash covers of a table."""
+    return {name: row.hashed for name, row in rows.items() if row.hashed is not None}
+
+
+def _write_rows(
+    connection: sqlite3.Connection, owner: int, before: Mapping[str, Row], after: Mapping[str, Row]
+) -> None:
+    connection.executemany(
+        "DELETE FROM param WHERE owner = ? AND name = ?",
+        [(owner, name) for name in before.keys() - after.keys()],
+    )
+    connection.executemany(
+        "REPLACE INTO param (owner, name, type, bits, is_raw, param_index, volatile, heard_at)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+        [(owner, name, *row) for name, row in after.items() if before.get(name) != row],
+    )
+    connection.execute("UPDATE component SET checksum = ? WHERE id = ?", (checksum(after), owner))
+
+
+def _write_history(connection: sqlite3.Connection, owner: int, lines: Sequence[tuple[object, ...]]) -> None:
+    if not lines:
+        return
+    connection.executemany(
+        "INSERT INTO history"
+        " (owner, at, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+        [(owner, *line) for line in lines],
+    )
+    connection.execute(
+        "DELETE FROM history WHERE owner = ?1 AND id <="
+        " (SELECT id FROM history WHERE owner = ?1 ORDER BY id DESC LIMIT 1 OFFSET ?2)",
+        (owner, HISTORY_LINES),
+    )
+
+
+def _write_state(connection: sqlite3.Connection, owner: int, state: TableState) -> None:
+    synced = None if state.synced_at is None else time_cell(state.synced_at)
+    connection.execute(
+        "UPDATE component SET hash = ?, count = ?, complete = ?, volatile_known = ?, synced_at = ?"
+        " WHERE id = ?",
+        (state.hash, state.count, state.complete, state.volatile_known, synced, owner),
+    )
+
+
+def _rows(connection: sqlite3.Connection, owner: int) -> dict[str, Row]:
+    """A table's parameters by index, then name, those without an index last; `Damaged` where one changed."""
+    found = connection.execute(
+        "SELECT name, type, bits, is_raw, param_index, volatile, heard_at FROM param WHERE owner = ?"
+        " ORDER BY param_index IS NULL, param_index, name",
+        (owner,),
+    )
+    rows = {name: Row(*row) for name, *row in (cells(row, "siiiIif") for row in found)}
+    [(expected,)] = connection.execute("SELECT checksum FROM component WHERE id = ?", (owner,))
+    if checksum(rows) != expected:
+        raise Damaged("a table is not what was written")
+    return rows
+
+
+def _summary(row: Sequence[object]) -> tuple[int, CachedSummary]:
+    owner, component, autopilot, size, *state, key = cells(row[:11], "iiiiIIiiFfs")
+    crc, count, complete, volatile_known, synced_at, updated_at = state
+    return owner, CachedSummary(
+        key=key,
+        identity=read_identity(row[11:]),
+        component=component,
+        autopilot=autopilot,
+        size=size,
+        hash=crc,
+        count=count,
+        complete=bool(complete),
+        volatile_known=bool(volatile_known),
+        synced_at=synced_at,
+        updated_at=updated_at,
+    )
+
+
+def _entry(row: Sequence[object]) -> HistoryEntry:
+    at, component, name, by, *values = cells(row, "fissiiiIII")
+    old, new = values[:3], values[3:]
+    return HistoryEntry(
+        at=at,
+        component=component,
+        name=name,
+        old=read_param(name, *old),
+        new=None if None in new else read_param(name, *new),
+        by=by,
+    )
