@@ -1,0 +1,364 @@
+"""Bring a component's table up to date the cheapest sure way: by the vehicle's hash, or by its list."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from paramclient.errors import NoReply, UnknownParameter
+from paramclient.protocol.download import Download
+from paramclient.protocol.hashing import find_volatile
+from paramclient.protocol.operation import Operation
+from paramclient.protocol.reads import Read, Reads
+from paramclient.protocol.table import Change, Table
+from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.wire import HASH_CHECK, Message, ParamValue
+from paramclient.values import Param
+
+__all__ = ["Announcement", "Fetch", "FetchResult", "Progress"]
+
+FRESH_HASH: Final = 1.0
+"""Seconds for which an announced hash answers the question what the hash is. It is asked for when a component
+is found, so that a fetch right after that need not wait for another round trip."""
+
+
+@dataclass(frozen=True, slots=True)
+class Announcement:
+    """A `_HASH_CHECK` that the vehicle has sent: its hash, the count with it, and when it came."""
+
+    hash: int
+    count: int
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a fetch is.
+
+    Attributes:
+        received: parameters that have come.
+        total: parameters that the component has, or None before it said so.
+        rate: parameters a second since the first one came.
+        seconds_left: at that rate, or None while it cannot be told.
+    """
+
+    received: int
+    total: int | None
+    rate: float
+    seconds_left: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class FetchResult:
+    """What `fetch_all` brought.
+
+    Attributes:
+        system, component: whose parameters.
+        params: all that are known, by name, as they were at the end of the fetch.
+        source: "cache" when the vehicle's hash confirmed the cached table, "stream" when it was downloaded.
+        count: parameters that the component says it has.
+        received: how many of them are known.
+        missing: indices that did not come, rising. Empty when the fetch is complete.
+        hash: the PX4 hash under which the vehicle confirmed the table; None for a vehicle without one, and
+            when the table moved during the download.
+        elapsed: seconds from the call to the end.
+        notes: what else is worth knowing, in sentences.
+    """
+
+    system: int
+    component: int
+    params: Mapping[str, Param]
+    source: str
+    count: int
+    received: int
+    missing: tuple[int, ...]
+    hash: int | None
+    elapsed: float
+    notes: tuple[str, ...] = ()
+
+    @property
+    def complete(self) -> bool:
+        return not self.missing
+
+    def __repr__(self) -> str:
+        missing = f", {len(self.missing)} missing" if self.missing else ""
+        return (
+            f"<FetchResult {self.system}/{self.component} {self.received} params{missing} "
+            f"from {self.source} in {self.elapsed:.2f} s>"
+        )
+
+
+class Fetch(Operation[FetchResult]):
+    """One fetch: hash first where a cached table has one, else or on a difference the list.
+
+    The table that a download brought is confirmed when the hash that is computed from it is one that the
+    vehicle announced in the course of it, or when the vehicle announced the same before and after: then
+    nothing moved between. For the latter it is asked for once more after the download.
+
+    Attributes:
+        holders: how many wait for it; with none left it is cancelled.
+        download: the download by list, once it is needed.
+    """
+
+    def __init__(
+        self,
+        target: tuple[int, int],
+        round_trip: RoundTrip,
+        send: Callable[[Message], None],
+        reads: Reads,
+        table: Table,
+        now: float,
+        *,
+        announced: Announcement | None,
+        expects_hash: Callable[[], bool],
+        refresh: bool,
+        listed: bool,
+        changed: Callable[[list[Change]], None],
+    ) -> None:
+        super().__init__(now)
+        self._target = target
+        self._round_trip = round_trip
+        self._send = send
+        self._reads = reads
+        self._table = table
+        self._changed = changed
+        self._expects_hash = expects_hash
+        self._hash_read: Read | None = None
+        self._before: int | None = None  # the hash announced before any value counted
+        self._meanwhile: int | None = None  # the hash announced in the course of the download
+        self._was_asked_meanwhile = False
+        self._is_hash_unknown = False  # the vehicle answers, but not to that
+        self._first_value_at = math.inf
+        self._listed = listed
+        self.holders = 0
+        self.download: Download | None = None
+        if refresh or listed or table.hash is None or not table.complete:
+            self._begin_download(now)
+        elif announced is not None and now - announced.at <= FRESH_HASH:
+            self._compare(announced, now)
+        else:
+            self._ask_hash(self._hash_came_first, now)
+
+    def announced(self, announcement: Announcement) -> None:
+        """A `_HASH_CHECK` passed by: PX4 sends one at the head of its list."""
+        if self.download is not None and self._before is None and not self.download.names:
+            self._before = announcement.hash
+
+    def heard(self, message: ParamValue, now: float) -> None:
+        """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
+        if self.download is not None and not self.download.done:
+            self._first_value_at = min(self._first_value_at, now)
+            self.download.heard(message, now)
+            is_unknown = self._before is None and not self._was_asked_meanwhile
+            if is_unknown and self._expects_hash() and not self.done:
+                # the one at the head of the list was lost; asked for now, it need not be waited for later
+                self._was_asked_meanwhile = True
+                self._ask_hash(self._hash_came_meanwhile, now)
+
+    def tick(self, now: float) -> None:
+        if self.download is not None:
+            self.download.tick(now)
+
+    def next_deadline(self) -> float:
+        return math.inf if self.download is None else self.download.next_deadline()
+
+    def resume(self, now: float) -> None:
+        """The link is back."""
+        if self.download is not None:
+            self.download.resume(now)
+
+    def restart(self, now: float) -> None:
+        """The table turned out to be another vehicle's: fetch it anew."""
+        self._drop()
+        self._before = self._meanwhile = None
+        self._was_asked_meanwhile = False
+        self._listed = False
+        self._begin_download(now)
+
+    def cancel(self) -> None:
+        """Nobody waits any more. What is on its way still goes into the table."""
+        self._drop()
+
+    def partial(self, now: float, note: str) -> FetchResult:
+        """What has come so far, for someone whose time is up while it goes on.
+
+        Raises:
+            NoReply: nothing has come.
+        """
+        download = self.download
+        if download is None or download.count is None:
+            system, component = self._target
+            attempts = 1 if download is None else download.lists
+            waited = now - self.begun_at
+            raise NoReply(f"the parameters of {system}/{component}", attempts=attempts, waited=waited)
+        return self._result("stream", download.count, download.missing, None, now, (note,))
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether nothing has come although it was asked for more than once."""
+        if self.download is not None:
+            return self.download.count is None and self.download.lists > 1
+        read = self._hash_read
+        return read is not None and read.attempts > 1 and not read.controls
+
+    def progress(self, now: float) -> Progress:
+        """How far it is."""
+        received, total = (0, self._table.count) if self.download is None else self.download.progress
+        running = now - self._first_value_at
+        rate = received / running if received and running > 0 else 0.0
+        left = (total - received) / rate if rate and total is not None else None
+        return Progress(received, total, rate, left)
+
+    def _ask_hash(self, then: Callable[[Read], None], now: float) -> None:
+        read = self._hash_read = self._reads.ask(HASH_CHECK, now)
+
+        def ended() -> None:
+            if self._hash_read is read:
+                self._hash_read = None
+                then(read)
+
+        read.on_done.append(ended)
+
+    def _hash_came_meanwhile(self, read: Read) -> None:
+        if read.result is not None:
+            self._meanwhile = int.from_bytes(read.result.raw, "little")
+        self._is_hash_unknown = isinstance(read.error, UnknownParameter)
+        if self.download is not None and self.download.done:
+            self._download_ended(self.download)
+
+    def _hash_came_first(self, read: Read) -> None:
+        if read.result is None:
+            self._begin_download(read.ended_at)
+        else:
+            message = read.result
+            announced = int.from_bytes(message.raw, "little")
+            self._compare(Announcement(announced, message.param_count, read.ended_at), read.ended_at)
+
+    def _compare(self, announcement: Announcement, now: float) -> None:
+        table = self._table
+        listed = table.listed()
+        if announcement.hash != table.hash or announcement.count != len(listed):
+            self._before = announcement.hash
+            self._begin_download(now)
+            return
+        table.count = announcement.count
+        table.verify(param.name for param in listed if param.name not in table.volatile)
+        notes = () if table.volatile_known else (_UNPROVEN,)
+        self.finish(self._result("cache", announcement.count, (), announcement.hash, now, notes), now)
+
+    def _begin_download(self, now: float) -> None:
+        download = self.download = Download(
+            self._target, self._round_trip, self._send, self._reads, now, listed=self._listed
+        )
+
+        def ended() -> None:
+            if self.download is download and not self.done:
+                self._download_ended(download)
+
+        download.on_done.append(ended)
+
+    def _download_ended(self, download: Download) -> None:
+        if download.error is not None:
+            self.fail(download.error, download.ended_at)
+        elif self._hash_read is not None:
+            return  # it is on its way
+        elif self._is_proven(download):
+            self._finish_download(download.ended_at, ())
+        elif self._expects_hash() and not self._is_hash_unknown:
+            self._ask_hash(self._hash_came_last, download.ended_at)
+        else:
+            self._settle(download, None, download.ended_at)
+
+    def _is_proven(self, download: Download) -> bool:
+        """Whether the hash computed from what came is the one that was announced meanwhile.
+
+        Then the table is what the vehicle had at that moment, and the hash need not be waited for again.
+        """
+        announced = self._before if self._meanwhile is None else self._meanwhile
+        if announced is None or download.missing or not download.is_settled:
+            return False
+        self._remove_what_is_gone(download)
+        table = self._table
+        volatile, is_proven = find_volatile(table.listed(), announced, believed=table.volatile)
+        if is_proven:
+            table.confirm(announced, volatile, proven=True)
+        return is_proven
+
+    def _remove_what_is_gone(self, download: Download) -> None:
+        present = frozenset(download.names.values())
+        gone = self._table.remove(lambda param: param.index is not None and param.name not in present)
+        self._changed(gone)
+
+    def _hash_came_last(self, read: Read) -> None:
+        if self.download is not None:
+            after = None if read.result is None else int.from_bytes(read.result.raw, "little")
+            self._settle(self.download, after, read.ended_at)
+
+    def _settle(self, download: Download, after: int | None, now: float) -> None:
+        """The download is over and the hash is known, if there is one."""
+        table = self._table
+        notes: tuple[str, ...] = ()
+        if not download.missing:
+            self._remove_what_is_gone(download)
+            if not download.is_settled:
+                notes = (_UNSETTLED,)
+            table.unconfirm()
+        if after is not None and not download.missing:
+            volatile, proven = find_volatile(table.listed(), after, believed=table.volatile)
+            if proven or after == self._before:
+                table.confirm(after, volatile, proven=proven)
+                notes += () if proven else (_UNPROVEN,)
+            else:
+                notes += (_UNBRACKETED,) if self._before is None else (_MOVED,)
+        self._finish_download(now, notes)
+
+    def _finish_download(self, now: float, notes: tuple[str, ...]) -> None:
+        download = self.download
+        if download is None:
+            return
+        count = download.count or 0
+        missing = download.missing
+        table = self._table
+        if not missing:
+            table.complete = download.is_settled
+        elif count != table.count:
+            table.complete = False
+        table.count = count
+        self.finish(
+            self._result("stream", count, missing, table.hash if not missing else None, now, notes), now
+        )
+
+    def _result(
+        self,
+        source: str,
+        count: int,
+        missing: tuple[int, ...],
+        confirmed: int | None,
+        now: float,
+        notes: tuple[str, ...],
+    ) -> FetchResult:
+        params = dict(self._table.params)
+        received = count - len(missing)
+        elapsed = now - self.begun_at
+        return FetchResult(*self._target, params, source, count, received, missing, confirmed, elapsed, notes)
+
+    def _drop(self) -> None:
+        read, self._hash_read = self._hash_read, None
+        if read is not None:
+            self._reads.release(read)
+        if self.download is not None:
+            self.download.cancel()
+
+
+_UNPROVEN = (
+    "Which parameters this firmware leaves out of its hash could not be proven; "
+    "those that usually are were taken to be."
+)
+_MOVED = "The table moved during the download, so no hash stands for it; the next session downloads it again."
+_UNBRACKETED = (
+    "No hash was heard before the download, and what this firmware leaves out of it could not be proven, "
+    "so none stands for the table; the next session downloads it again."
+)
+_UNSETTLED = "The number of parameters kept changing during the download."

@@ -1,0 +1,186 @@
+"""Who a component is and how it writes values: by its heartbeat and its AUTOPILOT_VERSION."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+from paramclient.identity import Identity
+from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.wire import (
+    AUTOPILOT_VERSION_ID,
+    CAPABILITY_PARAM_ENCODE_BYTEWISE,
+    CAPABILITY_PARAM_ENCODE_C_CAST,
+    MAV_AUTOPILOT_ARDUPILOTMEGA,
+    MAV_AUTOPILOT_INVALID,
+    MAV_AUTOPILOT_PX4,
+    MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
+    MAV_CMD_REQUEST_MESSAGE,
+    MAV_RESULT_ACCEPTED,
+    MAV_TYPE_GCS,
+    AutopilotVersion,
+    CommandAck,
+    CommandLong,
+    Heartbeat,
+    Message,
+)
+from paramclient.values import Encoding
+
+__all__ = ["Identification", "judge_encoding"]
+
+TRIES: Final = 4
+"""AUTOPILOT_VERSION is asked for so often; many components (cameras, radios) never give one."""
+SILENCE: Final = 5.0
+"""Seconds without a heartbeat after which another vehicle may stand behind the same system id."""
+
+
+def judge_encoding(
+    chosen: Encoding | None, capabilities: int | None, autopilot: int | None
+) -> tuple[Encoding, str]:
+    """The encoding of a component and the reason, by the first evidence there is.
+
+    What the user said; the capability bits of AUTOPILOT_VERSION; the autopilot in its own heartbeat; the
+    standard. ArduPilot sets neither capability bit, PX4 before 1.12 neither, and MAV_PROTOCOL_CAPABILITY_
+    PARAM_FLOAT is set by both, so it proves nothing (measured).
+
+    Args:
+        chosen: what the user said, or None.
+        capabilities: the bits of AUTOPILOT_VERSION, or None while unknown.
+        autopilot: MAV_AUTOPILOT, or None before a heartbeat.
+    """
+    if chosen is not None:
+        return chosen, "chosen by the user"
+    bits = capabilities or 0
+    if bits & CAPABILITY_PARAM_ENCODE_BYTEWISE:
+        return Encoding.BYTEWISE, "the vehicle's capability PARAM_ENCODE_BYTEWISE"
+    if bits & CAPABILITY_PARAM_ENCODE_C_CAST:
+        return Encoding.C_CAST, "the vehicle's capability PARAM_ENCODE_C_CAST"
+    if autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+        return Encoding.C_CAST, "its heartbeat says ArduPilot, which casts values to float"
+    if autopilot == MAV_AUTOPILOT_PX4:
+        return Encoding.BYTEWISE, "its heartbeat says PX4, which sends values byte by byte"
+    return Encoding.BYTEWISE, "the standard's encoding, as nothing says otherwise"
+
+
+class Identification:
+    """Follows a component's heartbeat, asks for its AUTOPILOT_VERSION, and draws the conclusions.
+
+    Attributes:
+        identity: who the vehicle is; without a hardware id until AUTOPILOT_VERSION came.
+        settled: whether `identity` is as good as it gets: the version came, or it never will.
+        autopilot, vehicle_type: of the heartbeat; None before one came.
+        encoding, encoding_reason: how it writes values, and why that is believed.
+    """
+
+    def __init__(
+        self,
+        target: tuple[int, int],
+        link: str,
+        round_trip: RoundTrip,
+        send: Callable[[Message], None],
+        chosen: Encoding | None,
+    ) -> None:
+        self._target = target
+        self._round_trip = round_trip
+        self._send = send
+        self._chosen = chosen
+        self.identity = Identity(target[0], link)
+        self.settled = False
+        self.autopilot: int | None = None
+        self.vehicle_type: int | None = None
+        self.capabilities: int | None = None
+        self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
+        self._attempts = 0
+        self._asked_at = -math.inf
+        self._ask_at = math.inf
+
+    @property
+    def has_parameters(self) -> bool:
+        """Whether parameters can be expected of it: it is no ground station."""
+        return self.vehicle_type != MAV_TYPE_GCS
+
+    @property
+    def encoding_is_certain(self) -> bool:
+        """Whether nothing that is still to come can tell otherwise."""
+        has_said = self.autopilot in (MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4)
+        return self._chosen is not None or has_said or self.settled or not self.has_parameters
+
+    @property
+    def is_autopilot(self) -> bool:
+        """Whether its heartbeat names an autopilot."""
+        return self.autopilot not in (None, MAV_AUTOPILOT_INVALID) and self.has_parameters
+
+    def heartbeat(self, message: Heartbeat) -> None:
+        """Take a heartbeat."""
+        if (message.autopilot, message.type) != (self.autopilot, self.vehicle_type):
+            self.autopilot = message.autopilot
+            self.vehicle_type = message.type
+            self.identity = replace(self.identity, autopilot=message.autopilot, vehicle_type=message.type)
+            self._judge()
+
+    def heard(self, silence: float, now: float) -> None:
+        """Something came, `silence` seconds after what came before: ask who it is, if that is not known."""
+        if self.has_parameters and (not self._attempts or silence > SILENCE):
+            self._attempts = 0
+            self._ask(now)
+
+    def version(self, message: AutopilotVersion, now: float) -> bool:
+        """Take an AUTOPILOT_VERSION; true when it shows another vehicle than the one known so far."""
+        if self._ask_at < math.inf:
+            self._round_trip.answered(self._asked_at, now, self._attempts)
+        self._ask_at = math.inf
+        system, _ = self._target
+        before = self.identity
+        self.identity = Identity.from_version(
+            system=system,
+            link=before.link,
+            autopilot=self.autopilot or 0,
+            vehicle_type=self.vehicle_type or 0,
+            uid=message.uid,
+            uid2=message.uid2,
+            firmware=message.flight_sw_version,
+            git_hash=message.git_hash,
+            board=message.board_version,
+            vendor_id=message.vendor_id,
+            product_id=message.product_id,
+            capabilities=message.capabilities,
+        )
+        self.capabilities = message.capabilities
+        self._judge()
+        is_another = self.settled and before.uid is not None and before.key != self.identity.key
+        self.settled = True
+        return is_another
+
+    def acknowledged(self, message: CommandAck, now: float) -> None:
+        """Take a COMMAND_ACK: a refusal of one way to ask leads to the other at once."""
+        asked = (MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
+        if message.command in asked and message.result != MAV_RESULT_ACCEPTED and self._ask_at < math.inf:
+            self._ask_at = now
+
+    def tick(self, now: float) -> None:
+        """Ask again, or let it be."""
+        if self._ask_at <= now:
+            self._ask(now)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do, or infinity."""
+        return self._ask_at
+
+    def _ask(self, now: float) -> None:
+        if self._attempts >= TRIES:
+            self._ask_at = math.inf
+            self.settled = True
+            return
+        self._attempts += 1
+        self._asked_at = now
+        self._ask_at = now + self._round_trip.timeout
+        if self._attempts % 2:
+            command, first = MAV_CMD_REQUEST_MESSAGE, float(AUTOPILOT_VERSION_ID)
+        else:
+            command, first = MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0
+        self._send(CommandLong(*self._target, command, (first, *[0.0] * 6)))
+
+    def _judge(self) -> None:
+        self.encoding, self.encoding_reason = judge_encoding(self._chosen, self.capabilities, self.autopilot)

@@ -1,0 +1,48 @@
+"""What was begun and will end once: every read, write and download is one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Generic, TypeVar
+
+__all__ = ["Operation"]
+
+Result = TypeVar("Result")
+
+
+class Operation(Generic[Result]):
+    """Something that was begun and will end: with a result or with an error, once.
+
+    Attributes:
+        result, error: one of them is set when `done`.
+        begun_at, ended_at: in the time that was passed in.
+        on_done: called once, in order, when it ends. Whoever waits puts a callback here.
+    """
+
+    def __init__(self, begun_at: float) -> None:
+        self.begun_at = begun_at
+        self.ended_at = math.inf
+        self.done = False
+        self.result: Result | None = None
+        self.error: Exception | None = None
+        self.on_done: list[Callable[[], None]] = []
+
+    def finish(self, result: Result, now: float) -> None:
+        """End with a result; later ends are ignored."""
+        if not self.done:
+            self.result = result
+            self._end(now)
+
+    def fail(self, error: Exception, now: float) -> None:
+        """End with an error; later ends are ignored."""
+        if not self.done:
+            self.error = error
+            self._end(now)
+
+    def _end(self, now: float) -> None:
+        self.done = True
+        self.ended_at = now
+        callbacks, self.on_done = self.on_done, []
+        for callback in callbacks:
+            callback()

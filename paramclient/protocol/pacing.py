@@ -1,0 +1,157 @@
+"""How fast a component may be asked: what it and its link serve, found out by trying."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from paramclient.protocol.timing import RoundTrip
+
+__all__ = ["Pace"]
+
+FIRST_RATE: Final = 50.0
+"""Requests a second before anything is known: what ArduPilot serves, the slowest autopilot there is."""
+LARGEST_RATE: Final = 2000.0
+SMALLEST_RATE: Final = 4.0
+SMALLEST_BURST: Final = 10.0
+"""Requests that may go out at once: half of what ArduPilot queues."""
+BURST_TIME: Final = 0.1
+"""Seconds' worth of requests that may go out at once on a faster component."""
+EPOCH: Final = 0.15
+EPOCH_ANSWERS: Final = 8
+"""Seconds and answers that one look at the component's speed takes, at the least."""
+QUEUEING: Final = 0.12
+"""Seconds by which answers may come later than the quickest one before that counts as a queue: ArduPilot
+answers once in 100 ms."""
+ENOUGH_SERVED: Final = 0.5
+"""The share of the requests that must be answered for a rate to count as served."""
+ROUNDING: Final = 1e-9
+"""Of a token: without it, what `next_at` promises could be missed by the last bit of a float, again and again."""
+UPSTREAM_SHARE: Final = 1 / 3
+REQUEST_SIZE: Final = 16
+VALUE_SIZE: Final = 37
+"""Bytes of a PARAM_REQUEST_READ by index and of a PARAM_VALUE, in MAVLink 2."""
+
+
+class Pace:
+    """A token bucket whose rate follows what the component serves.
+
+    As long as requests wait for their turn and answers come no later than before, the rate doubles with the
+    first look and grows fourfold with each further one. When answers begin to queue up, or fewer come than
+    should, it falls to what was answered, and from there on only creeps.
+    It never takes more than a third of the rate at which the list's stream was seen to come.
+    """
+
+    __slots__ = (
+        "_answers",
+        "_cap",
+        "_epoch_at",
+        "_is_found",
+        "_late",
+        "_quickest",
+        "_rate",
+        "_round_trip",
+        "_timed",
+        "_tokens",
+        "_tokens_at",
+        "_was_short",
+    )
+
+    def __init__(self, round_trip: RoundTrip) -> None:
+        self._round_trip = round_trip
+        self._rate = FIRST_RATE
+        self._cap = LARGEST_RATE
+        self._tokens = SMALLEST_BURST
+        self._tokens_at = -math.inf
+        self._epoch_at = math.inf
+        self._answers = 0
+        self._timed = 0
+        self._late = 0.0
+        self._quickest = math.inf
+        self._was_short = False
+        self._is_found = False
+
+    @property
+    def rate(self) -> float:
+        """Requests a second."""
+        return max(min(self._rate, self._cap), SMALLEST_RATE)
+
+    @property
+    def prospect(self) -> float:
+        """Requests a second that the next look may allow: what is served is not found yet."""
+        return self.rate if self._is_found else min(self.rate * self._growth, self._cap)
+
+    @property
+    def _growth(self) -> float:
+        if self._is_found:
+            return 1.1
+        # at the first rate ArduPilot still keeps up; what serves twice that is of another kind
+        return 2.0 if self._rate <= FIRST_RATE else 4.0
+
+    @property
+    def _burst(self) -> float:
+        return max(self.rate * BURST_TIME, min(SMALLEST_BURST, self._cap * BURST_TIME * 2), 1.0)
+
+    def may_send(self, now: float, reserve: float = 0.0) -> bool:
+        """Whether a request may go out now; with a reserve, whether that many more still could."""
+        self._fill(now)
+        if self._tokens >= 1.0 + reserve - ROUNDING:
+            return True
+        self._was_short = self._was_short or reserve == 0.0
+        return False
+
+    def next_at(self, reserve: float = 0.0) -> float:
+        """When `may_send` will be true."""
+        short = 1.0 + reserve - self._tokens
+        return self._tokens_at + short / self.rate if short > 0 else self._tokens_at
+
+    def sent(self, now: float) -> None:
+        """A request went out."""
+        self._fill(now)
+        self._tokens -= 1.0
+        if self._epoch_at == math.inf:
+            self._epoch_at = now + (self._round_trip.smoothed or 0.0)
+
+    def answered(self, delay: float | None, now: float) -> None:
+        """A request was answered, after `delay` seconds if it was sent only once."""
+        if delay is not None:
+            self._quickest = min(self._quickest, delay)
+        if now < self._epoch_at:
+            return
+        self._answers += 1
+        if delay is not None:
+            self._late += delay
+            self._timed += 1
+        if self._answers >= EPOCH_ANSWERS and now - self._epoch_at >= EPOCH:
+            self._look(now)
+
+    def stream_seen(self, gap: float) -> None:
+        """The list's stream brings a value every `gap` seconds."""
+        if gap > 0:
+            self._cap = VALUE_SIZE / gap * UPSTREAM_SHARE / REQUEST_SIZE
+
+    def idle(self) -> None:
+        """Nothing is asked for any more: what is measured next begins anew."""
+        self._epoch_at = math.inf
+        self._answers = 0
+        self._timed = 0
+        self._late = 0.0
+        self._was_short = False
+
+    def _look(self, now: float) -> None:
+        elapsed = now - self._epoch_at
+        served = self._answers / elapsed / (1.0 - min(self._round_trip.loss, 0.9))
+        is_queueing = self._timed > 0 and self._late / self._timed > 1.25 * self._quickest + QUEUEING
+        if is_queueing or (self._was_short and served < ENOUGH_SERVED * self._rate):
+            self._rate = max(min(served, self._rate), FIRST_RATE)
+            self._is_found = True
+        elif self._was_short:
+            self._rate = min(self._rate * self._growth, LARGEST_RATE)
+        self.idle()
+        # what comes within the next round trip answers to the rate before
+        self._epoch_at = now + self._quickest
+
+    def _fill(self, now: float) -> None:
+        if now > self._tokens_at:
+            self._tokens = min(self._tokens + (now - self._tokens_at) * self.rate, self._burst)
+            self._tokens_at = now

@@ -1,0 +1,321 @@
+"""One read: PARAM_REQUEST_READ until the answer or the end of patience. All reads share one pace."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Final, TypeAlias
+
+from paramclient.errors import NoReply, ParamErrorCode, Refused, TypeMismatch, UnknownParameter, VehicleError
+from paramclient.protocol.operation import Operation
+from paramclient.protocol.pacing import Pace
+from paramclient.protocol.timing import LONGEST_SILENCE, MOST_TRIES, RoundTrip
+from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
+
+__all__ = ["Key", "Read", "Reads"]
+
+Key: TypeAlias = str | int
+"""What a read asks for: a name, or an index."""
+
+CONTROL: Final = 0
+"""The index that is asked for to learn whether the component answers at all."""
+COPY_RESERVE: Final = 2.0
+"""Requests that must remain possible when one is sent again early."""
+COPY_RISK: Final = 0.01
+"""The chance of no answer to go below by asking again early."""
+MOST_COPIES: Final = 6
+ENOUGH_CONTROLS: Final = 4
+"""Answered controls, at the least, after which a silence is the component's and not the link's."""
+
+
+class Read(Operation[ParamValue]):
+    """One PARAM_REQUEST_READ and its answer, shared by everyone who wants the same.
+
+    Attributes:
+        key: name or index.
+        holders: how many want the answer; nobody any more: it is dropped.
+        attempts: requests sent.
+        copies: requests sent on top of the last one, before it had timed out.
+        controls: reads of something that exists which were answered while this one stayed silent.
+    """
+
+    def __init__(self, key: Key, begun_at: float) -> None:
+        super().__init__(begun_at)
+        self.key = key
+        self.sent_at = math.inf
+        self.attempts = 0
+        self.copies = 0
+        self.holders = 0
+        self.controls = 0
+
+
+class Reads:
+    """Every read of one component: as fast as it serves them, single ones before a download's.
+
+    Silence is not an answer: PX4 up to 1.17 and ArduPilot say nothing to what they do not have. What stays
+    silent is therefore asked for together with index 0, which every component with parameters has. When that
+    keeps being answered, and a name that nobody has heard of or an index that is not below the count does
+    not, the link is not the reason: the parameter is unknown.
+
+    Attributes:
+        pace: how fast requests may go out.
+        answered_at: when a read, or the index asked for with it, was answered last.
+        list_runs_again: set while a list comes for another time: then it may answer reads by index, and that
+            tells nothing of the round trip.
+        is_idle: false while a list comes: then nothing is asked for twice to save time.
+    """
+
+    def __init__(
+        self,
+        target: tuple[int, int],
+        round_trip: RoundTrip,
+        send: Callable[[Message], None],
+        is_known: Callable[[Key], bool],
+    ) -> None:
+        self._target = target
+        self._round_trip = round_trip
+        self._send = send
+        self._is_known = is_known
+        self.pace = Pace(round_trip)
+        self._open: dict[Key, Read] = {}
+        self._flying: dict[Key, Read] = {}
+        self._again: deque[Read] = deque()
+        self._urgent: deque[Read] = deque()
+        self._patient: deque[Read] = deque()
+        self.answered_at = -math.inf
+        self.list_runs_again = False
+        self.is_idle = True
+        self._silences = 0  # time-outs since anything was answered
+        self._silent_since = math.inf  # the first request since then
+        self._control_at = math.inf
+        self._control_attempts = 0
+
+    def __len__(self) -> int:
+        return len(self._open)
+
+    def __contains__(self, key: Key) -> bool:
+        return key in self._open
+
+    def ask(self, key: Key, now: float, *, urgent: bool = True) -> Read:
+        """Want an answer; joins an open read of the same. Give it back with `release`."""
+        read = self._open.get(key)
+        if read is None:
+            read = Read(key, now)
+            self._open[key] = read
+            (self._urgent if urgent else self._patient).append(read)
+        elif urgent and read in self._patient:
+            self._patient.remove(read)
+            self._urgent.append(read)
+        read.holders += 1
+        self._send_waiting(now)
+        return read
+
+    def release(self, read: Read) -> None:
+        """Want it no longer. The last holder drops it."""
+        read.holders -= 1
+        if read.holders <= 0 and self._open.get(read.key) is read:
+            self._drop(read)
+
+    def heard(self, message: ParamValue, now: float) -> None:
+        """Every PARAM_VALUE of the component passes here after it went into the table."""
+        for read in [self._open.get(message.param_id), self._open.get(message.param_index)]:
+            if read is None or self._open.get(read.key) is not read:
+                continue
+            if read.attempts:
+                self._count_answer(read, now)
+            self._drop(read)
+            read.finish(message, now)
+            self._send_waiting(now)
+        if message.param_index == CONTROL and self._control_at < math.inf:
+            self._round_trip.answered(self._control_at, now, self._control_attempts)
+            self._control_at = math.inf
+            self._not_silent(now)
+            for read in self._flying.values():
+                read.controls += read.attempts > 1
+
+    def refused(self, message: ParamError, now: float) -> None:
+        """A PARAM_ERROR that may be about a read."""
+        key: Key = message.param_id if message.param_index < 0 else message.param_index
+        read = self._flying.get(key)
+        if read is not None:
+            self._count_answer(read, now)
+            self._drop(read)
+            read.fail(self.error_of(message, read.key), now)
+            self._send_waiting(now)
+
+    def error_of(self, message: ParamError, key: Key) -> VehicleError:
+        """A PARAM_ERROR as an exception."""
+        system, component = self._target
+        name, index = (key, None) if isinstance(key, str) else (None, key)
+        words = ParamErrorCode.name_of(message.error)
+        what = name if name is not None else f"parameter {index}"
+        if message.error == ParamErrorCode.DOES_NOT_EXIST:
+            return UnknownParameter(
+                f"{system}/{component} has no {what}",
+                system=system,
+                component=component,
+                name=name,
+                index=index,
+            )
+        if message.error == ParamErrorCode.TYPE_MISMATCH:
+            return TypeMismatch(
+                f"{system}/{component} refuses {what}: {words}",
+                system=system,
+                component=component,
+                name=name,
+                index=index,
+            )
+        return Refused(
+            f"{system}/{component} refuses {what}: {words}",
+            system=system,
+            component=component,
+            name=name,
+            index=index,
+            code=message.error,
+        )
+
+    def tick(self, now: float) -> None:
+        """Ask again what stayed unanswered, give up what stayed so too often."""
+        timeout = self._round_trip.timeout
+        for read in [read for read in self._flying.values() if read.sent_at + timeout <= now]:
+            if self._flying.get(read.key) is not read:
+                continue  # what the end of another one brought about
+            self._silences += 1
+            if not (self.list_runs_again and isinstance(read.key, int)):
+                self._round_trip.timed_out(read.attempts)
+            if self._is_hopeless(read, now):
+                self._drop(read)
+                read.fail(self._silence(read, now), now)
+            else:
+                read.sent_at = math.inf
+                self._again.append(read)
+        self._send_waiting(now)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do, or infinity."""
+        earliest = math.inf
+        if self._flying:
+            earliest = min(read.sent_at for read in self._flying.values()) + self._round_trip.timeout
+        if self._again or self._urgent or self._patient:
+            return min(earliest, self.pace.next_at())
+        if self._copy_wanted() is not None:
+            return min(earliest, self.pace.next_at(COPY_RESERVE))
+        return earliest
+
+    def resume(self, now: float) -> None:
+        """The link is back: ask again, in its turn, for everything that was in flight."""
+        self._control_at = self._silent_since = math.inf
+        self._again.clear()
+        for read in self._flying.values():
+            read.attempts -= 1
+            read.sent_at = math.inf
+            self._again.append(read)
+        self._send_waiting(now)
+
+    def fail_all(self, error: Exception, now: float) -> None:
+        """Nothing can be answered any more. What is asked for from now on stands."""
+        for read in list(self._open.values()):
+            if self._open.get(read.key) is read:
+                self._drop(read)
+                read.fail(error, now)
+
+    def _is_hopeless(self, read: Read, now: float) -> bool:
+        if self._silences >= MOST_TRIES and now - self._silent_since >= LONGEST_SILENCE:
+            return True  # not one of all these was answered
+        # half as often will do where nothing speaks for it and the link is good enough for others
+        weight = 2 if self._seems_unknown(read) else 1
+        return self._round_trip.is_hopeless(weight * read.attempts, now)
+
+    def _seems_unknown(self, read: Read) -> bool:
+        return read.controls >= ENOUGH_CONTROLS and not self._is_known(read.key)
+
+    def _count_answer(self, read: Read, now: float) -> None:
+        self._not_silent(now)
+        if self.list_runs_again and isinstance(read.key, int):
+            return
+        is_sure = read.attempts + read.copies == 1 and read.sent_at < math.inf
+        self._round_trip.answered(read.sent_at, now, 1 if is_sure else read.attempts + 1)
+        self.pace.answered(now - read.sent_at if is_sure else None, now)
+
+    def _not_silent(self, now: float) -> None:
+        self.answered_at = now
+        self._silences = 0
+        self._silent_since = math.inf
+
+    def _silence(self, read: Read, now: float) -> Exception:
+        system, component = self._target
+        name, index = (read.key, None) if isinstance(read.key, str) else (None, read.key)
+        what = name if name is not None else f"parameter {index}"
+        if self._seems_unknown(read):
+            return UnknownParameter(
+                f"{system}/{component} has no {what}: it keeps silent on it and answers other reads",
+                system=system,
+                component=component,
+                name=name,
+                index=index,
+            )
+        return NoReply(f"{what} of {system}/{component}", attempts=read.attempts, waited=now - read.begun_at)
+
+    def _transmit(self, read: Read, now: float) -> None:
+        read.attempts += 1
+        read.copies = 0
+        read.sent_at = now
+        self._silent_since = min(self._silent_since, now)
+        self.pace.sent(now)
+        self._request(read)
+        if read.key != CONTROL and read.attempts > (2 if self._is_known(read.key) else 1):
+            self._send_control(now)
+
+    def _request(self, read: Read) -> None:
+        if isinstance(read.key, int):
+            self._send(ParamRequestRead(*self._target, "", read.key))
+        else:
+            self._send(ParamRequestRead(*self._target, read.key, -1))
+
+    def _send_control(self, now: float) -> None:
+        """Ask for what is known to exist, unless that is under way for another read."""
+        if self._control_at < math.inf:
+            if now - self._control_at < self._round_trip.timeout:
+                return
+            self._round_trip.timed_out(self._control_attempts)
+            self._control_attempts += 1
+        else:
+            self._control_attempts = 1
+        self._control_at = now
+        self.pace.sent(now)
+        self._send(ParamRequestRead(*self._target, "", CONTROL))
+
+    def _send_waiting(self, now: float) -> None:
+        """Send what waits, as far as the pace allows; on an idle link ask twice rather than wait."""
+        while self._again or self._urgent or self._patient:
+            queue = self._urgent or self._again or self._patient
+            if self._open.get(queue[0].key) is not queue[0]:
+                queue.popleft()
+            elif self.pace.may_send(now):
+                read = queue.popleft()
+                self._flying[read.key] = read
+                self._transmit(read, now)
+            else:
+                return
+        while (read_again := self._copy_wanted()) is not None and self.pace.may_send(now, COPY_RESERVE):
+            read_again.copies += 1
+            self.pace.sent(now)
+            self._request(read_again)
+
+    def _copy_wanted(self) -> Read | None:
+        """A read that is worth asking for once more while its answer may be on the way."""
+        if not self.is_idle or not self._flying:
+            return None
+        loss = self._round_trip.seen_loss
+        if loss < COPY_RISK:
+            return None
+        most = min(math.ceil(math.log(COPY_RISK) / math.log(loss)) - 1, MOST_COPIES)
+        fewest = min(self._flying.values(), key=lambda read: read.copies)
+        return fewest if fewest.copies < most and fewest.sent_at < math.inf else None
+
+    def _drop(self, read: Read) -> None:
+        del self._open[read.key]
+        self._flying.pop(read.key, None)
+        if not self._open:
+            self.pace.idle()

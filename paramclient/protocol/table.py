@@ -1,0 +1,183 @@
+"""The parameters of one component as they are known now, by name, each with how far it can be trusted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+from paramclient.protocol.wire import NO_INDEX, ParamValue
+from paramclient.values import Encoding, Param, Trust, decode, known_type, px4_hash
+
+__all__ = ["Change", "Table"]
+
+MOST_NAMES: Final = 65_535
+"""Names that one table may hold. No more can have an index; a component that invents further ones is ill."""
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One parameter that appeared, changed its value or went away.
+
+    Attributes:
+        name: param_id.
+        old: what was known before, or None when the parameter is new.
+        new: what is known now, or None when the vehicle no longer has it.
+        by: "us" (our own `set`), "vehicle", or "station S/C" when another station was heard setting it.
+    """
+
+    name: str
+    old: Param | None
+    new: Param | None
+    by: str = "vehicle"
+
+
+class Table:
+    """All that is known of a component's parameters.
+
+    Attributes:
+        params: by name, in the order in which they were first heard. Shared with readers; never replaced.
+        count: the param_count heard last, or None.
+        volatile: names that the vehicle leaves out of its hash, as far as known.
+        volatile_known: whether a recomputed hash has proven that set.
+        complete: whether every index below `count` has its parameter here.
+        hash: the PX4 hash under which the vehicle would confirm exactly this table, or None while unknown.
+        dirty: names whose value, type or index changed since `take_dirty` was called last.
+    """
+
+    def __init__(self, encoding: Encoding = Encoding.BYTEWISE) -> None:
+        self.params: dict[str, Param] = {}
+        self.count: int | None = None
+        self.volatile: frozenset[str] = frozenset()
+        self.volatile_known = False
+        self.complete = False
+        self.dirty: dict[str, str] = {}
+        self._hash: int | None = None
+        self._hash_is_stale = False
+        self._encoding = encoding
+        self._wire: dict[str, tuple[bytes, int]] = {}
+
+    @property
+    def encoding(self) -> Encoding:
+        return self._encoding
+
+    @property
+    def hash(self) -> int | None:
+        if self._hash_is_stale:
+            self._hash_is_stale = False
+            self._hash = px4_hash(self.listed(), leave_out=self.volatile)
+        return self._hash
+
+    def confirm(self, announced: int, volatile: frozenset[str], *, proven: bool) -> None:
+        """The vehicle announced this hash for exactly this table.
+
+        With `proven`, the hash computed here without the volatile names was the same. Then it can be computed
+        again whenever a value moves, and the vehicle can confirm the table in the next session as well.
+        """
+        self._hash = announced
+        self._hash_is_stale = False
+        self.volatile = volatile
+        self.volatile_known = proven
+
+    def unconfirm(self) -> None:
+        """No hash is known to belong to this table any more."""
+        self._hash = None
+        self._hash_is_stale = False
+
+    def rehash(self) -> None:
+        """Values may have moved under the confirmed hash: compute it again when it is asked for."""
+        self._hash_is_stale = self._hash is not None
+
+    def hear(self, message: ParamValue, by: str) -> Change | None:
+        """Take one PARAM_VALUE; give the change if it brought one (a first value is one).
+
+        The value counts whatever the index says. An index of 65535 leaves the known one as it is, one that
+        is not below the count is no index.
+        """
+        name = message.param_id
+        number = message.param_type
+        index: int | None = message.param_index
+        count = message.param_count
+        old = self.params.get(name)
+        if index == NO_INDEX:
+            index = None if old is None else old.index
+        elif count == NO_INDEX or message.param_index >= count:
+            index = None
+        if old is not None and self._wire.get(name) == (message.raw, number) and old.trust is Trust.LIVE:
+            if old.index != index:
+                self.params[name] = Param(name, old.value, old.type, index, old.bits, Trust.LIVE)
+                self.dirty.setdefault(name, by)
+            return None
+        if old is None and len(self.params) >= MOST_NAMES:
+            return None
+        value, bits = decode(message.raw, number, self._encoding)
+        new = Param(name, value, known_type(number), index, bits, Trust.LIVE)
+        self.params[name] = new
+        self._wire[name] = (message.raw, number)
+        if old is not None and old.same_value(new):
+            if old.index != index:
+                self.dirty.setdefault(name, by)
+            return None
+        self.dirty[name] = by
+        self._moved(name)
+        return Change(name, old, new, by)
+
+    def use_encoding(self, encoding: Encoding) -> list[Change]:
+        """Read everything that was heard in another encoding; give what looks different now."""
+        if encoding is self._encoding:
+            return []
+        self._encoding = encoding
+        changes = []
+        for name, (raw, number) in self._wire.items():
+            old = self.params[name]
+            value, bits = decode(raw, number, encoding)
+            new = Param(name, value, old.type, old.index, bits, old.trust)
+            self.params[name] = new
+            if not old.same_value(new):
+                self.dirty.setdefault(name, "vehicle")
+                changes.append(Change(name, old, new))
+        return changes
+
+    def fill(self, params: Mapping[str, Param]) -> list[Change]:
+        """Put in what the cache knows, as *cached*; what was heard on this link stays."""
+        changes = []
+        for name, param in params.items():
+            if name not in self.params:
+                new = param.with_trust(Trust.CACHED)
+                self.params[name] = new
+                changes.append(Change(name, None, new))
+        return changes
+
+    def verify(self, names: Iterable[str]) -> None:
+        """The vehicle's hash has confirmed these: cached ones become *verified*."""
+        for name in names:
+            param = self.params[name]
+            if param.trust is Trust.CACHED:
+                self.params[name] = param.with_trust(Trust.VERIFIED)
+
+    def remove(self, condition: Callable[[Param], bool]) -> list[Change]:
+        """Take out the parameters that meet a condition."""
+        gone = [param for param in self.params.values() if condition(param)]
+        for param in gone:
+            del self.params[param.name]
+            self._wire.pop(param.name, None)
+            self.dirty[param.name] = "vehicle"
+            self._moved(param.name)
+        return [Change(param.name, param, None) for param in gone]
+
+    def listed(self) -> list[Param]:
+        """The parameters that have an index: those that the count and the hash are about."""
+        return [param for param in self.params.values() if param.index is not None]
+
+    def take_dirty(self) -> dict[str, str]:
+        """Names that changed since the last call, each with who did it; gone names too."""
+        dirty, self.dirty = self.dirty, {}
+        return dirty
+
+    def _moved(self, name: str) -> None:
+        if self._hash is None or name in self.volatile:
+            return
+        if self.volatile_known:
+            self._hash_is_stale = True
+        else:
+            self._hash = None

@@ -1,0 +1,135 @@
+"""What a component's answers tell of its link: the round trip, and how many tries an answer is worth."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+__all__ = ["RoundTrip"]
+
+INITIAL_TIMEOUT: Final = 1.0
+"""Seconds before anything was measured (RFC 6298, 2.1)."""
+SHORTEST_TIMEOUT: Final = 0.1
+"""ArduPilot answers reads in batches every 100 ms, PX4 once in its loop: asking sooner gains nothing."""
+LONGEST_TIMEOUT: Final = 4.0
+"""To which backing off leads; a link that is measured to be slower than that gets what it needs."""
+SILENCES_TO_BACK_OFF: Final = 6
+"""Time-outs in a row that loss alone hardly explains."""
+FEW_SAMPLES: Final = 8
+"""Samples below which the variation is a guess: the time-out is then at most two round trips."""
+GRANULARITY: Final = 0.02
+"""Seconds that an answer may come later than usual for no reason: PX4 looks at its messages every 20 ms."""
+LIKELY: Final = 0.8
+"""The share of the usual round trip after which an answer may belong to the request that was sent last."""
+FEWEST_TRIES: Final = 5
+MOST_TRIES: Final = 60
+"""Enough for a link that loses two exchanges of three."""
+LONGEST_SILENCE: Final = 20.0
+"""Seconds without a word, not even one of the heartbeats that come every second, after which a component that
+was asked `FEWEST_TRIES` times counts as gone."""
+_CHANCE_OF_BAD_LUCK = 1e-6
+_MEMORY = 0.98  # weight that older answers keep with each new one: about the last 50 count
+
+
+class RoundTrip:
+    """The round-trip estimate of RFC 6298 with Karn's rule, and the share of requests that stay unanswered.
+
+    One stands for one component, and every exchange with it feeds the same one. Samples come only from
+    requests that were sent once. When many in a row time out and no sample comes, as happens when the round
+    trip has become longer than the time-out, that backs off; a link that merely loses much keeps it.
+
+    Attributes:
+        smoothed: the smoothed round trip in seconds, or None before the first sample.
+        variation: how much it varies, in seconds.
+        heard_at: when anything at all came from the component last; its receiver keeps that up to date.
+    """
+
+    __slots__ = (
+        "_answered",
+        "_backoff",
+        "_samples",
+        "_silences",
+        "_unanswered",
+        "heard_at",
+        "smoothed",
+        "variation",
+    )
+
+    def __init__(self) -> None:
+        self.heard_at = math.inf
+        self.smoothed: float | None = None
+        self.variation = 0.0
+        self._backoff = 1.0
+        self._samples = 0
+        self._silences = 0  # time-outs since the last sample
+        self._answered = 0.0
+        self._unanswered = 0.0
+
+    @property
+    def timeout(self) -> float:
+        """Seconds to wait for an answer before asking again."""
+        base = (
+            INITIAL_TIMEOUT if self.smoothed is None else self.smoothed + max(4 * self.variation, GRANULARITY)
+        )
+        if self._samples < FEW_SAMPLES and self.smoothed is not None:
+            base = min(base, 2 * self.smoothed)
+        base = max(base, SHORTEST_TIMEOUT)
+        return min(base * self._backoff, max(LONGEST_TIMEOUT, base))
+
+    @property
+    def loss(self) -> float:
+        """The share of requests that stay unanswered, lost on the way there or back; a tenth at first."""
+        return (self._unanswered + 0.2) / (self._unanswered + self._answered + 2.0)
+
+    @property
+    def seen_loss(self) -> float:
+        """The same as far as it was seen: 0 as long as everything was answered."""
+        return self._unanswered / (self._unanswered + self._answered + 1.0)
+
+    @property
+    def tries(self) -> int:
+        """How often to ask before silence can no longer be bad luck on this link (one in a million)."""
+        seen = self._unanswered + self._answered + 2.0
+        chance = self.loss
+        if seen > 10:
+            # the share is measured on few: reckon with a link that is worse than it looks
+            chance = min(chance + 2 * math.sqrt(chance * (1 - chance) / seen), 0.99)
+        return min(max(math.ceil(math.log(_CHANCE_OF_BAD_LUCK) / math.log(chance)), FEWEST_TRIES), MOST_TRIES)
+
+    def is_hopeless(self, attempts: int, now: float) -> bool:
+        """Whether something was asked for often enough: `tries` times, or the component is gone."""
+        is_gone = now - self.heard_at >= LONGEST_SILENCE
+        return attempts >= self.tries or (is_gone and attempts >= FEWEST_TRIES)
+
+    def answered(self, sent_at: float, now: float, attempts: int) -> None:
+        """A request got its answer; it had been sent `attempts` times, the last time at `sent_at`."""
+        if attempts <= 2:
+            self._answered = self._answered * _MEMORY + 1
+            self._unanswered *= _MEMORY
+        sample = now - sent_at
+        if attempts != 1:
+            if sample >= LIKELY * (self.smoothed or math.inf):
+                self._silences = 0  # it may well be the answer to the last of them
+            return
+        if self.smoothed is None:
+            self.smoothed = sample
+            self.variation = sample / 2
+        else:
+            self.variation += (abs(self.smoothed - sample) - self.variation) / 4
+            self.smoothed += (sample - self.smoothed) / 8
+        self._backoff = 1.0
+        self._silences = 0
+        self._samples += 1
+
+    def timed_out(self, attempts: int) -> None:
+        """A request stayed unanswered for `timeout`, after so many attempts.
+
+        From the third on neither this nor an answer counts into the loss: what stays silent that long may
+        have no answer at all.
+        """
+        if attempts <= 2:
+            self._unanswered = self._unanswered * _MEMORY + 1
+            self._answered *= _MEMORY
+        self._silences += 1
+        if self._silences % SILENCES_TO_BACK_OFF == 0:
+            self._backoff = min(self._backoff * 2, LONGEST_TIMEOUT / SHORTEST_TIMEOUT)

@@ -1,0 +1,358 @@
+"""One write: PARAM_SET until its value is proven. Writes to one name queue up in order."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from paramclient.errors import NoReply, ParamErrorCode, TypeMismatch, UsageError, ValueNotApplied
+from paramclient.protocol.operation import Operation
+from paramclient.protocol.reads import Read, Reads
+from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.wire import Message, ParamError, ParamSet, ParamValue
+from paramclient.values import (
+    Encoding,
+    Param,
+    ParamType,
+    Trust,
+    Value,
+    decode,
+    encode,
+    format_value,
+    type_name,
+)
+
+__all__ = ["SetResult", "Write", "Writes"]
+
+
+@dataclass(frozen=True, slots=True)
+class SetResult:
+    """What became of a `set`.
+
+    Attributes:
+        name: param_id.
+        status: "accepted" (the vehicle holds what was asked for, as far as its type can), or "adjusted" (it
+            took the value and made another of it, as ArduPilot makes 1234 of 1234.7 for an integer).
+        requested: the value that was asked for.
+        actual: the value that the vehicle reports.
+        param: the parameter as it is now.
+        attempts: how many PARAM_SETs were sent.
+    """
+
+    name: str
+    status: str
+    requested: Value
+    actual: Value
+    param: Param
+    attempts: int
+
+    @property
+    def adjusted(self) -> bool:
+        return self.status == "adjusted"
+
+    def __str__(self) -> str:
+        actual = format_value(self.actual, self.param.type)
+        if self.adjusted:
+            return f"{self.name} = {actual} (adjusted from {format_value(self.requested, self.param.type)})"
+        return f"{self.name} = {actual}"
+
+
+class Write(Operation[SetResult]):
+    """One PARAM_SET until its value is proven; see `Writes`."""
+
+    def __init__(self, name: str, value: Value, begun_at: float) -> None:
+        super().__init__(begun_at)
+        self.name = name
+        self.value = value
+        self.attempts = 0
+        self.sent_at = math.inf
+        self.number = 0  # the type that was sent
+        self.wanted: Param | None = None
+        self.before: Param | None = None
+        self.is_answered = False  # a value that is not the wanted one came after the last PARAM_SET
+        self.made: Param | None = None  # what the vehicle held after an earlier one: not the old value either
+        self.verify_at = math.inf
+        self.read: Read | None = None
+        self.was_denied = False  # a read after a PARAM_SET did not show the wanted value
+        self.was_retyped = False
+
+
+class Writes:
+    """Every write to one component: those to one name in order, those to different names side by side.
+
+    How a write goes: learn the type (unless it was heard or verified on this link), send exactly that type,
+    wait for a PARAM_VALUE of the name. Only the wanted value proves success. Another value may be an old
+    read's answer or the stream passing by: wait a little, read by name, then decide. A value that is neither
+    the old nor the wanted one may be the vehicle's adjustment, or another station's that came between: the
+    PARAM_SET is sent again, and if the same comes of it, it is the adjustment. The old one means that nothing
+    was applied, and the PARAM_SET is sent again, as it may have been lost, until that is no longer likely.
+
+    Nothing is sent before it is certain how the component writes values: an integer in the wrong encoding
+    would be taken as another number.
+    """
+
+    def __init__(
+        self,
+        target: tuple[int, int],
+        round_trip: RoundTrip,
+        send: Callable[[Message], None],
+        reads: Reads,
+        params: dict[str, Param],
+        encoding: Callable[[], Encoding],
+        is_certain: Callable[[], bool],
+    ) -> None:
+        self._target = target
+        self._round_trip = round_trip
+        self._send = send
+        self._reads = reads
+        self._params = params
+        self._encoding = encoding
+        self._is_certain = is_certain
+        self._queues: dict[str, deque[Write]] = {}
+
+    def __len__(self) -> int:
+        return len(self._queues)
+
+    def __contains__(self, name: str) -> bool:
+        """Whether a PARAM_SET to this name is under way."""
+        return self._active(name) is not None
+
+    def set(self, name: str, value: Value, now: float) -> Write:
+        """Begin a write, behind those to the same name that are open."""
+        write = Write(name, value, now)
+        queue = self._queues.setdefault(name, deque())
+        queue.append(write)
+        if len(queue) == 1:
+            self._start(write, now)
+        return write
+
+    def cancel(self, write: Write, now: float) -> None:
+        """Forget a write. What was sent cannot be taken back: the vehicle may have applied it."""
+        queue = self._queues.get(write.name)
+        if queue is None or write not in queue:
+            return
+        if queue[0] is write:
+            self._leave(write, now)
+        else:
+            queue.remove(write)
+
+    def proceed(self, now: float) -> None:
+        """It is certain now how the component writes values: begin what had to wait for that."""
+        for queue in list(self._queues.values()):
+            if queue and not queue[0].attempts and queue[0].read is None:
+                self._start(queue[0], now)
+
+    def heard(self, message: ParamValue, now: float) -> None:
+        """Every PARAM_VALUE of the component passes here after it went into the table."""
+        queue = self._queues.get(message.param_id)
+        if queue is None or not queue[0].attempts:
+            return
+        write = queue[0]
+        value, bits = decode(message.raw, message.param_type, self._encoding())
+        heard = Param(write.name, value, message.param_type, None, bits)
+        if message.param_type != write.number:
+            if write.was_retyped:
+                words = f"it is written as {type_name(write.number)} and reported as {type_name(heard.type)}"
+                self._fail(write, self._type_mismatch(write, words), now)
+            else:
+                write.was_retyped = True
+                self._begin(write, heard, now)
+        elif write.wanted is not None and write.wanted.same_value(heard):
+            self._round_trip.answered(write.sent_at, now, write.attempts)
+            self._succeed(write, now)
+        else:
+            if write.read is None:
+                write.is_answered = True
+                write.verify_at = min(write.verify_at, now + self._grace)
+
+    def refused(self, message: ParamError, now: float) -> bool:
+        """A PARAM_ERROR: true when it ended a write."""
+        write = self._active(message.param_id) if message.param_index < 0 or message.param_id else None
+        if write is None:
+            return False
+        self._fail(write, self._reads.error_of(message, write.name), now)
+        return True
+
+    def denied(self, name: str, now: float) -> None:
+        """ArduPilot's text says that a write to this name was denied."""
+        write = self._active(name)
+        if write is not None:
+            message = ParamError(0, 0, name, -1, ParamErrorCode.READ_ONLY)
+            self._fail(write, self._reads.error_of(message, name), now)
+
+    def tick(self, now: float) -> None:
+        """Verify, send again, give up."""
+        timeout = self._round_trip.timeout
+        for queue in list(self._queues.values()):
+            if not queue:
+                continue
+            write = queue[0]
+            if write.verify_at <= now:
+                write.verify_at = math.inf
+                self._read(write, now)
+            elif (
+                write.attempts
+                and write.read is None
+                and not write.is_answered
+                and write.sent_at + timeout <= now
+            ):
+                self._round_trip.timed_out(write.attempts)
+                if not self._round_trip.is_hopeless(write.attempts, now):
+                    self._transmit(write, now)
+                    if write.attempts > 2 and not write.done:
+                        # the vehicle may be silent on just this write: what does it hold?
+                        self._read(write, now)
+                elif write.was_denied:
+                    self._fail(write, self._not_applied(write, self._params[write.name]), now)
+                else:
+                    what = f"PARAM_SET {write.name} to {self._target[0]}/{self._target[1]}"
+                    waited = now - write.begun_at
+                    self._fail(write, NoReply(what, attempts=write.attempts, waited=waited), now)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do, or infinity."""
+        timeout = self._round_trip.timeout
+        earliest = math.inf
+        for queue in self._queues.values():
+            write = queue[0]
+            earliest = min(earliest, write.verify_at)
+            if write.attempts and write.read is None and not write.is_answered:
+                earliest = min(earliest, write.sent_at + timeout)
+        return earliest
+
+    def resume(self, now: float) -> None:
+        """The link is back: what was under way goes on at once."""
+        for queue in list(self._queues.values()):
+            if queue and queue[0].attempts and queue[0].read is None:
+                queue[0].attempts -= 1
+                self._transmit(queue[0], now)
+
+    def fail_all(self, error: Exception, now: float) -> None:
+        """Nothing can be acknowledged any more."""
+        queues, self._queues = self._queues, {}
+        for queue in queues.values():
+            for write in queue:
+                if write.read is not None:
+                    self._reads.release(write.read)
+                write.fail(error, now)
+
+    @property
+    def _grace(self) -> float:
+        # an old answer can be at most about one round trip ahead of the one that counts
+        return max(self._round_trip.timeout / 2, 0.05)
+
+    def _active(self, name: str) -> Write | None:
+        queue = self._queues.get(name)
+        return queue[0] if queue and queue[0].attempts else None
+
+    def _start(self, write: Write, now: float) -> None:
+        known = self._params.get(write.name)
+        if not self._is_certain():
+            return
+        if known is not None and known.trust is not Trust.CACHED:
+            self._begin(write, known, now)
+        else:
+            self._read(write, now)
+
+    def _begin(self, write: Write, known: Param, now: float) -> None:
+        write.before = known
+        write.number = known.type
+        self._transmit(write, now)
+
+    def _transmit(self, write: Write, now: float) -> None:
+        encoding = self._encoding()
+        try:
+            raw = encode(write.value, write.number, encoding)
+        except UsageError as error:
+            # once something was sent, it is the vehicle that has turned out to be different
+            self._fail(write, self._type_mismatch(write, str(error)) if write.was_retyped else error, now)
+            return
+        value, bits = decode(raw, write.number, encoding)
+        write.wanted = Param(write.name, value, write.number, None, bits)
+        write.attempts += 1
+        write.sent_at = now
+        write.is_answered = False
+        write.verify_at = math.inf
+        self._send(ParamSet(*self._target, write.name, raw, write.number))
+
+    def _read(self, write: Write, now: float) -> None:
+        """Ask what the vehicle holds: before the first PARAM_SET to learn the type, later to decide."""
+        if write.read is not None:
+            return
+        read = write.read = self._reads.ask(write.name, now)
+
+        def answered() -> None:
+            if write.read is not read:
+                return  # it has ended meanwhile, or nobody wants it any more
+            write.read = None
+            if read.error is not None:
+                self._fail(write, read.error, read.ended_at)
+            elif write.attempts:
+                self._decide(write, self._params[write.name], read.ended_at)
+            else:
+                self._begin(write, self._params[write.name], read.ended_at)
+
+        read.on_done.append(answered)
+
+    def _decide(self, write: Write, actual: Param, now: float) -> None:
+        """A read after the PARAM_SET showed a value that is not the wanted one."""
+        is_made_again = write.made is not None and write.made.same_value(actual)
+        if write.is_answered and is_made_again:
+            self._succeed(write, now)
+        elif self._round_trip.is_hopeless(write.attempts, now):
+            self._fail(write, self._not_applied(write, actual), now)
+        else:
+            is_old = write.before is not None and write.before.same_value(actual)
+            write.made = None if is_old else actual
+            write.was_denied = True
+            self._transmit(write, now)
+
+    def _succeed(self, write: Write, now: float) -> None:
+        actual = self._params[write.name]
+        wanted = write.wanted
+        exact = wanted is not None and wanted.same_value(actual)
+        if exact and actual.type != ParamType.REAL32 and not isinstance(write.value, bytes):
+            exact = actual.value == write.value
+        status = "accepted" if exact else "adjusted"
+        result = SetResult(write.name, status, write.value, actual.value, actual, write.attempts)
+        self._leave(write, now)
+        write.finish(result, now)
+
+    def _fail(self, write: Write, error: Exception, now: float) -> None:
+        self._leave(write, now)
+        write.fail(error, now)
+
+    def _leave(self, write: Write, now: float) -> None:
+        if write.read is not None:
+            self._reads.release(write.read)
+            write.read = None
+        queue = self._queues[write.name]
+        queue.remove(write)
+        if queue:
+            self._start(queue[0], now)
+        else:
+            del self._queues[write.name]
+
+    def _not_applied(self, write: Write, actual: Param) -> Exception:
+        system, component = self._target
+        number = actual.type
+        return ValueNotApplied(
+            f"{system}/{component} keeps {write.name} at {format_value(actual.value, number)}; "
+            f"{format_value(write.value, number)} was sent {write.attempts} times",
+            system=system,
+            component=component,
+            name=write.name,
+            requested=write.value,
+            actual=actual.value,
+        )
+
+    def _type_mismatch(self, write: Write, words: str) -> Exception:
+        system, component = self._target
+        return TypeMismatch(
+            f"{write.name} of {system}/{component} is not what it was: {words}",
+            system=system,
+            component=component,
+            name=write.name,
+        )

@@ -1,0 +1,177 @@
+"""Whole sessions in simulated time: a `Station` on one side of an `Air`, simulated vehicles on the other."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import TypeVar
+
+from paramclient.errors import ParamClientError
+from paramclient.protocol import wire
+from paramclient.protocol.component import ComponentMachine, Event
+from paramclient.protocol.fetch import Fetch, FetchResult
+from paramclient.protocol.operation import Operation
+from paramclient.protocol.station import Station
+from paramclient.protocol.wire import NO_INDEX, Framer, Message, ParamValue
+from paramclient.protocol.writes import SetResult
+from paramclient.sim import Air, Endpoint
+from paramclient.values import Encoding, Param, ParamType, Trust, Value, encode
+
+__all__ = ["Simulation", "known", "param_value"]
+
+MOST_STEPS = 2000
+"""Steps without any time passing that look like an endless loop."""
+PEER = "the only peer"
+
+Message_ = TypeVar("Message_")
+Result = TypeVar("Result")
+
+
+def param_value(
+    name: str,
+    value: Value = 0.0,
+    *,
+    index: int = NO_INDEX,
+    count: int = 10,
+    kind: int = ParamType.REAL32,
+    encoding: Encoding = Encoding.BYTEWISE,
+) -> ParamValue:
+    """A PARAM_VALUE as a component would send it."""
+    return ParamValue(name, encode(value, kind, encoding), kind, count, index)
+
+
+def known(
+    name: str, value: int | float = 0.0, *, index: int | None = 0, kind: ParamType | None = None
+) -> Param:
+    """A parameter as the cache may have kept it: INT32 or REAL32 by its value, unless it is said."""
+    if kind is None:
+        kind = ParamType.INT32 if isinstance(value, int) else ParamType.REAL32
+    raw = encode(value, kind, Encoding.BYTEWISE)[: kind.size]
+    return Param(name, value, kind, index, int.from_bytes(raw, "little"), Trust.CACHED)
+
+
+class Simulation:
+    """A station and vehicles, joined by an air, in a time that begins at 0 and passes as fast as it can.
+
+    Args:
+        vehicles: what is on the far side.
+        air: the way there; None for a perfect one.
+        station: our side; None for a usual one.
+
+    Attributes:
+        now: seconds.
+        sent: everything that the station has sent, with the time.
+        events: everything that it told of.
+    """
+
+    def __init__(self, *vehicles: Endpoint, air: Air | None = None, station: Station | None = None) -> None:
+        self.air = Air(vehicles) if air is None else air
+        self.station = Station(link="sim:test", is_stream=False) if station is None else station
+        self.now = 0.0
+        self.sent: list[tuple[float, Message]] = []
+        self.events: list[Event] = []
+        self._own = Framer(wire.UNDERSTOOD, stream=False)
+        self._others = 0
+        self.air.tick(self.now)
+        self.exchange()
+
+    def exchange(self) -> None:
+        """Do what is due at this moment, and hand over what either side has to send."""
+        for _ in range(MOST_STEPS):
+            for data in self.air.data_to_send():
+                self.station.receive(data, PEER, self.now)
+            self.station.tick(self.now)
+            outgoing = self.station.data_to_send()
+            for data, _peer in outgoing:
+                for frame in self._own.receive(data):
+                    message = wire.decode(frame)
+                    assert message is not None
+                    self.sent.append((self.now, message))
+                self.air.receive(data, self.now)
+            self.air.tick(self.now)
+            self.events += self.station.events()
+            if not outgoing and self.station.next_deadline() > self.now and self._air_deadline() > self.now:
+                return
+        raise AssertionError(f"{MOST_STEPS} steps at {self.now}, and something is still due")
+
+    def run(self, seconds: float) -> None:
+        """Let time pass."""
+        end = self.now + seconds
+        self.exchange()
+        while (step := min(self.station.next_deadline(), self._air_deadline())) <= end:
+            self.now = step
+            self.air.tick(self.now)
+            self.exchange()
+        self.now = end
+        self.air.tick(self.now)
+        self.exchange()
+
+    def until(self, condition: Callable[[], bool], limit: float = 120.0) -> None:
+        """Let time pass until something is so; it is a failure if that takes longer than the limit."""
+        end = self.now + limit
+        self.exchange()
+        while not condition():
+            self.now = min(self.station.next_deadline(), self._air_deadline())
+            assert self.now <= end, f"nothing came of it in {limit} s"
+            self.air.tick(self.now)
+            self.exchange()
+
+    @property
+    def machine(self) -> ComponentMachine:
+        """The component 1/1."""
+        return self.station.components[1, 1]
+
+    def meet(self) -> ComponentMachine:
+        """Wait until it is settled who 1/1 is."""
+        self.until(lambda: (1, 1) in self.station.components and self.machine.who.settled)
+        return self.machine
+
+    def outcome(self, operation: Operation[Result], limit: float = 120.0) -> Result:
+        """Wait for the end of an operation; its result, or its error raised."""
+        self.until(lambda: operation.done, limit)
+        if operation.error is not None:
+            raise operation.error
+        assert operation.result is not None
+        return operation.result
+
+    def fetch(self, *, refresh: bool = False, limit: float = 120.0) -> FetchResult:
+        """Fetch everything of 1/1."""
+        machine = self.meet()
+        fetch: Fetch = machine.begin_fetch(self.now, refresh=refresh)
+        try:
+            return self.outcome(fetch, limit)
+        finally:
+            machine.end_fetch(fetch)
+
+    def get(self, key: str | int, limit: float = 120.0) -> Param:
+        """Read one parameter of 1/1."""
+        machine = self.meet()
+        message = self.outcome(machine.read(key, self.now), limit)
+        return machine.table.params[message.param_id]
+
+    def set(self, name: str, value: Value, limit: float = 120.0) -> SetResult:
+        """Write one parameter of 1/1."""
+        return self.outcome(self.meet().write(name, value, self.now), limit)
+
+    def error_of(self, call: Callable[[], object]) -> ParamClientError:
+        """The error with which a call ends."""
+        try:
+            call()
+        except ParamClientError as error:
+            return error
+        raise AssertionError("it did not fail")
+
+    def other_station(self, message: Message, *, system: int = 254, component: int = 190) -> None:
+        """Another ground station sends something to the vehicles; we do not hear it."""
+        self._others = (self._others + 1) % 256
+        data = wire.encode(message, system=system, component=component, sequence=self._others)
+        self.air.receive(data, self.now)
+        self.exchange()
+
+    def sent_of(self, kind: type[Message_]) -> list[Message_]:
+        """All messages of one kind that the station has sent, in order."""
+        return [message for _, message in self.sent if isinstance(message, kind)]
+
+    def _air_deadline(self) -> float:
+        deadline = self.air.next_deadline()
+        return math.inf if deadline is None else deadline
