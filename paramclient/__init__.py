@@ -2,6 +2,61 @@
 
 from __future__ import annotations
 
+from paramclient.cache import CachedComponent, CachedVehicle, HistoryEntry, ParamCache
+from paramclient.client import FetchedAll, ParamClient
+from paramclient.component import Changes, Component
+from paramclient.errors import (
+    CacheError,
+    ClientClosed,
+    LinkError,
+    NoReply,
+    ParamClientError,
+    ParamErrorCode,
+    Refused,
+    TypeMismatch,
+    UnknownParameter,
+    UsageError,
+    ValueNotApplied,
+    VehicleError,
+)
+from paramclient.identity import Identity
+from paramclient.params import ParamMap
+from paramclient.protocol.fetch import FetchResult, Progress
+from paramclient.protocol.table import Change
+from paramclient.protocol.writes import SetResult
+from paramclient.values import Encoding, Param, ParamType, Trust
 from paramclient.version import __version__
 
-__all__ = ["__version__"]
+__all__ = [
+    "CacheError",
+    "CachedComponent",
+    "CachedVehicle",
+    "Change",
+    "Changes",
+    "ClientClosed",
+    "Component",
+    "Encoding",
+    "FetchResult",
+    "FetchedAll",
+    "HistoryEntry",
+    "Identity",
+    "LinkError",
+    "NoReply",
+    "Param",
+    "ParamCache",
+    "ParamClient",
+    "ParamClientError",
+    "ParamErrorCode",
+    "ParamMap",
+    "ParamType",
+    "Progress",
+    "Refused",
+    "SetResult",
+    "Trust",
+    "TypeMismatch",
+    "UnknownParameter",
+    "UsageError",
+    "ValueNotApplied",
+    "VehicleError",
+    "__version__",
+]

@@ -1,0 +1,528 @@
+"""The shell around the protocol: a link, a clock, and calls that can be awaited."""
+
+from __future__ import annotations
+
+import logging
+import math
+import os
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from types import MappingProxyType, TracebackType
+from typing import TYPE_CHECKING, Final
+
+import anyio
+import anyio.abc
+
+from paramclient.cache import ParamCache
+from paramclient.component import PROGRESS_INTERVAL, Component
+from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
+from paramclient.identity import Identity
+from paramclient.links import Link, create_link
+from paramclient.protocol.component import ComponentHeard, ComponentIdentified, ComponentMachine, ParamChanged
+from paramclient.protocol.fetch import Fetch, FetchResult, Progress
+from paramclient.protocol.station import Address, Station
+from paramclient.values import Encoding
+from paramclient.writethrough import FLUSH_INTERVAL, RETRY_INTERVAL, WriteThrough
+
+if TYPE_CHECKING:
+    from paramclient.sim import Endpoint
+
+__all__ = ["FetchedAll", "ParamClient"]
+
+HEARING_PATIENCE: Final = 10.0
+"""Seconds to wait for a first component, unless the caller says otherwise."""
+LISTENING_TIME: Final = 1.2
+"""Seconds from opening in which every component has been heard: each sends a heartbeat once a second."""
+LINK_PATIENCE: Final = 10.0
+"""Seconds that calls wait for a link to come back before they fail with its error."""
+FIRST_BACKOFF: Final = 0.25
+LONGEST_BACKOFF: Final = 5.0
+"""Seconds between two attempts to open a link again: doubled from the first to the longest."""
+SILENT_PATIENCE: Final = 2.5
+"""Seconds for which a component that does not answer at all is asked, once another one is done."""
+CLOSING_PATIENCE: Final = 0.5
+"""Seconds that closing waits for the hash after a write, where the next session could not do without it."""
+
+logger = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class FetchedAll:
+    """What a fetch of several components brought.
+
+    Attributes:
+        results: by (system, component), for those that answered.
+        silent: those that have not, each with its error.
+    """
+
+    results: Mapping[Address, FetchResult]
+    silent: Mapping[Address, NoReply]
+
+    @property
+    def complete(self) -> bool:
+        """Whether everyone who answered gave every parameter."""
+        return all(result.complete for result in self.results.values())
+
+
+class ParamClient:
+    """The ground station's side of the parameter protocol on one link, as an async context manager.
+
+    Inside the `async with`, it sends its heartbeat once a second, follows every component that it hears, and
+    keeps their tables in the cache. At its end every call that still waits, in other tasks, raises
+    ClientClosed, what is new is written, and neither task nor socket nor thread remains. What the body
+    raises comes out as it is.
+
+    A TCP connection that drops is opened again with back-off for as long as the client lives. Calls that wait
+    meanwhile go on when it is back: what had not been answered is asked for again. After `LINK_PATIENCE`
+    seconds without a link they raise LinkError, and new ones do so at once. A link that cannot come back
+    (a UDP socket that fails) ends every call with its LinkError.
+
+    Args:
+        link: a link's name, such as `udpin:0.0.0.0:14550` (`paramclient.links.FORMS` says which there are), a
+            link object, or a simulated vehicle.
+        cache: where tables are kept: None for the user's cache, a path, a `ParamCache` (which stays open), or
+            False for none.
+        system, component: who we are on the link.
+        encoding: how all components lay out values, for those who know better than the evidence.
+
+    Attributes:
+        cache: where tables are kept, or None.
+
+    Raises:
+        UsageError: no such link, or ids outside 1 to 255; on entering: for the second time.
+        LinkError: on entering: the link cannot be opened.
+    """
+
+    def __init__(
+        self,
+        link: str | Link | Endpoint,
+        *,
+        cache: ParamCache | str | os.PathLike[str] | bool | None = None,
+        system: int = 255,
+        component: int = 190,
+        encoding: Encoding | None = None,
+    ) -> None:
+        for number in (system, component):
+            if not 1 <= number <= 255:
+                raise UsageError(f"our own system and component ids are 1 to 255, not {number}")
+        self._link = create_link(link)
+        if isinstance(cache, ParamCache):
+            self.cache: ParamCache | None = cache
+        elif cache is False:
+            self.cache = None
+        else:
+            self.cache = ParamCache(None if cache is None or cache is True else cache)
+        self._writer = WriteThrough(self.cache, owned=self.cache is not cache)
+        self._station = Station(
+            link=self._link.name,
+            is_stream=self._link.is_stream,
+            system=system,
+            component=component,
+            encoding=encoding,
+        )
+        self._components: dict[Address, Component] = {}
+        self._tasks: anyio.abc.TaskGroup | None = None
+        self._something_to_send = anyio.Event()
+        self._something_to_write = anyio.Event()
+        self._news = anyio.Event()  # set, and replaced, when anything was received or the calls fail
+        self._is_entered = False
+        self._opened_at = -math.inf
+        self._is_away = False
+        self._broken: LinkError | None = None  # what calls raise now
+        self._ended: LinkError | None = None  # the same, for good
+
+    @property
+    def components(self) -> Mapping[Address, Component]:
+        """Every component heard so far, by (system, component)."""
+        return MappingProxyType(self._components)
+
+    @property
+    def link(self) -> Link:
+        """The link."""
+        return self._link
+
+    @property
+    def bytes_received(self) -> int:
+        """Bytes that have come over the link."""
+        return self._station.bytes_received
+
+    @property
+    def bytes_sent(self) -> int:
+        """Bytes of the frames that were sent, our heartbeats among them."""
+        return self._station.bytes_sent
+
+    def __repr__(self) -> str:
+        state = "closed" if self._tasks is None or self._ended is not None else "open"
+        if state == "open" and self._is_away:
+            state = "away"
+        heard = len(self._components)
+        return f"<ParamClient {self._link.name} {state}, {heard} component{'' if heard == 1 else 's'}>"
+
+    async def __aenter__(self) -> ParamClient:
+        if self._is_entered:
+            raise UsageError("a ParamClient is opened once; make a new one")
+        self._is_entered = True
+        try:
+            await self._link.open()
+            await self._writer.open()
+        except BaseException:
+            await self._release()
+            raise
+        tasks = anyio.create_task_group()
+        await tasks.__aenter__()
+        self._tasks = tasks
+        self._opened_at = anyio.current_time()
+        tasks.start_soon(self._read, name="paramclient reader")
+        tasks.start_soon(self._send, name="paramclient sender")
+        tasks.start_soon(self._write, name="paramclient cache writer")
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        tasks = self._tasks
+        assert tasks is not None
+        try:
+            if kind is None and self._broken is None:
+                await self._let_hashes_settle()
+        finally:
+            self._end(ClientClosed("the client was closed", link=self._link.name))
+            tasks.cancel_scope.cancel()
+            try:
+                # not told of the caller's exception: it would come out wrapped in a group
+                await tasks.__aexit__(None, None, None)
+            finally:
+                await self._release()
+
+    async def _release(self) -> None:
+        """Give back the link and the cache, also when cancelled."""
+        with anyio.CancelScope(shield=True):
+            try:
+                await self._link.close()
+            finally:
+                await self._writer.close()
+
+    async def component(
+        self,
+        system: int | None = None,
+        component: int | None = None,
+        *,
+        timeout: float | None = HEARING_PATIENCE,  # noqa: ASYNC109 - public API
+    ) -> Component:
+        """The component with this address, as soon as it has been heard.
+
+        Without arguments the first autopilot; with a system alone, that system's autopilot; with a component
+        alone, the first of that id. If the cache may have its table, it is in `params` on return, unless the
+        vehicle does not say who it is.
+
+        Args:
+            system: system id.
+            component: component id.
+            timeout: seconds; None waits for ever.
+
+        Raises:
+            NoReply: it was not heard in time.
+            LinkError: the link failed, or the client was closed.
+        """
+        self._check_open()
+        began = anyio.current_time()
+        with anyio.move_on_after(timeout):
+            while (found := self._find(system, component)) is None:
+                await self._news.wait()
+                self._check_open()
+            await found._wait_for_cache()
+        if found is None:
+            waited = anyio.current_time() - began
+            raise NoReply(_wanted(system, component), attempts=0, waited=waited)
+        return found
+
+    async def fetch_all(
+        self,
+        system: int | None = None,
+        *,
+        refresh: bool = False,
+        timeout: float | None = None,  # noqa: ASYNC109 - public API
+        progress: Callable[[Mapping[Address, Progress]], None] | None = None,
+    ) -> FetchedAll:
+        """Bring the tables of all components of one system, or of every system heard, up to date.
+
+        They are fetched side by side; those that begin to speak meanwhile join in, and so does everyone who
+        is heard within `LISTENING_TIME` of opening. A component that stays silent is given up soon after
+        another one is done.
+
+        Args:
+            system: this system's components only, asked for with one list request to all of them.
+            refresh: as in `Component.fetch_all`.
+            timeout: seconds, after which what has come is given.
+            progress: called about ten times a second with the progress of each, from this task.
+
+        Raises:
+            NoReply: nobody was heard, or nobody answered.
+            LinkError: the link failed, or the client was closed.
+        """
+        began = anyio.current_time()
+        deadline = math.inf if timeout is None else began + timeout
+        give_up_hearing = began + HEARING_PATIENCE if timeout is None else deadline
+        fetches: dict[Address, Fetch] = {}
+        try:
+            while True:
+                self._check_open()
+                is_waiting = self._join_fetches(fetches, system, refresh=refresh)
+                now = anyio.current_time()
+                if now >= deadline or not (
+                    is_waiting or self._is_worth_waiting(fetches, give_up_hearing, now)
+                ):
+                    break
+                await self._sleep_until_news(min(PROGRESS_INTERVAL, deadline - now), fetches)
+                if progress is not None:
+                    now = anyio.current_time()
+                    progress({address: fetch.progress(now) for address, fetch in fetches.items()})
+            results, silent = _outcomes(fetches, now)
+        finally:
+            for address, fetch in fetches.items():
+                self._station.components[address].end_fetch(fetch)
+        if not results:
+            whose = "any component" if system is None else f"any component of system {system}"
+            attempts = max((error.attempts for error in silent.values()), default=0)
+            raise NoReply(f"the parameters of {whose}", attempts=attempts, waited=now - began)
+        return FetchedAll(results, silent)
+
+    # the tasks
+
+    async def _read(self) -> None:
+        while True:
+            try:
+                chunks = await self._link.receive()
+            except LinkError as error:
+                if not self._link.reconnects:
+                    self._end(error)
+                    return
+                await self._reopen(error)
+                continue
+            now = anyio.current_time()
+            for peer, data in chunks:
+                self._station.receive(data, peer, now)
+            self._dispatch()
+            self._tell()
+            self._wake()
+
+    async def _reopen(self, error: LinkError) -> None:
+        """Open the link again, for as long as it takes."""
+        logger.warning("%s; trying to open it again", error)
+        self._is_away = True
+        self._station.pause()
+        patience_ends = anyio.current_time() + LINK_PATIENCE
+        backoff = FIRST_BACKOFF
+        while True:
+            patience = patience_ends - anyio.current_time()
+            await anyio.sleep(min(backoff, patience) if patience > 0 else backoff)
+            backoff = min(backoff * 2, LONGEST_BACKOFF)
+            try:
+                await self._link.open()
+            except LinkError as again:
+                if anyio.current_time() >= patience_ends:
+                    self._fail_calls(again)
+            else:
+                logger.info("%s: open again", self._link.name)
+                self._is_away = False
+                self._broken = None
+                self._station.resume(anyio.current_time())
+                self._wake()
+                return
+
+    async def _send(self) -> None:
+        station = self._station
+        while self._ended is None:
+            self._something_to_send = anyio.Event()
+            station.tick(anyio.current_time())
+            self._dispatch()
+            for data, peer in station.data_to_send():
+                # a link that drops is the reader's business; what is not sent now is sent again in time
+                with suppress(LinkError):
+                    await self._link.send(data, peer)
+            wait = station.next_deadline() - anyio.current_time()
+            with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):
+                await self._something_to_send.wait()
+
+    async def _write(self) -> None:
+        while True:
+            await self._something_to_write.wait()
+            self._something_to_write = anyio.Event()
+            await anyio.sleep(FLUSH_INTERVAL)
+            if not await self._writer.flush():
+                await anyio.sleep(RETRY_INTERVAL)
+                self._something_to_write.set()
+
+    async def _load(self, component: Component, identity: Identity) -> None:
+        machine = component._machine
+        cached = await self._writer.load(machine, identity)
+        current = self._station.identity_of(machine)
+        if current is None or current.key != identity.key or self._writer.follow(machine, current):
+            return  # overtaken: by another vehicle, or by the same call for another reason
+        self._writer.keep(machine, current, cached)
+        component._cache_is_read.set()
+        self._something_to_write.set()
+        self._dispatch()
+
+    def _dispatch(self) -> None:
+        """Hand out what has happened."""
+        for event in self._station.events():
+            machine = event.machine
+            if isinstance(event, ParamChanged):
+                self._components[machine.system, machine.component]._publish(event.change)
+                self._something_to_write.set()
+            elif isinstance(event, ComponentHeard):
+                self._meet(machine)
+            elif isinstance(event, ComponentIdentified):
+                for component in self._components.values():
+                    if component.system == machine.system:
+                        self._read_cache(component)
+            elif event.result.complete:
+                self._writer.synced(machine, is_whole=event.result.source != "cache")
+                self._something_to_write.set()
+
+    def _meet(self, machine: ComponentMachine) -> None:
+        address = (machine.system, machine.component)
+        now = anyio.current_time()
+        component = self._components[address] = Component(self, machine, now)
+        self._read_cache(component)
+        if self._writer.may_hit(*address):
+            machine.ask_hash(now)
+
+    def _read_cache(self, component: Component) -> None:
+        """Look for its cached table, once it is known whose it is."""
+        machine = component._machine
+        identity = self._station.identity_of(machine)
+        if identity is None or self._writer.follow(machine, identity):
+            return
+        if self._tasks is not None:
+            self._tasks.start_soon(self._load, component, identity)
+
+    def _tell(self) -> None:
+        news, self._news = self._news, anyio.Event()
+        news.set()
+
+    def _wake(self) -> None:
+        self._something_to_send.set()
+
+    # ends
+
+    def _end(self, error: LinkError) -> None:
+        """No call can be answered any more."""
+        self._dispatch()
+        self._ended = error
+        self._fail_calls(error)
+        for component in self._components.values():
+            component._end(error)
+
+    def _fail_calls(self, error: LinkError) -> None:
+        """Whoever waits gets this error, and so does every new call until the link is back."""
+        self._broken = error
+        self._station.fail_all(error, anyio.current_time())
+        self._tell()
+
+    def _check_open(self) -> None:
+        if self._broken is not None:
+            raise self._broken.with_traceback(None)
+        if self._tasks is None:
+            raise ClientClosed("the client is not open; use it as `async with`", link=self._link.name)
+
+    async def _let_hashes_settle(self) -> None:
+        """Wait for the hash after our writes, where it cannot be computed here."""
+        with anyio.move_on_after(CLOSING_PATIENCE):
+            while any(
+                machine.is_settling and machine.table.complete and not machine.table.volatile_known
+                for machine in self._station.components.values()
+            ):
+                await self._news.wait()
+
+    # helpers
+
+    def _may_be_cached(self, component: Component) -> bool:
+        return self._writer.may_have(component.system, component.component)
+
+    def _identity_of(self, machine: ComponentMachine) -> Identity | None:
+        return self._station.identity_of(machine)
+
+    def _find(self, system: int | None, component: int | None) -> Component | None:
+        if component is None:
+            for machine in self._station.components.values():
+                if system in (None, machine.system) and machine.who.is_autopilot:
+                    autopilot = self._station.autopilot_of(machine.system) or machine
+                    return self._components[autopilot.system, autopilot.component]
+            return None
+        for address, found in self._components.items():
+            if address[1] == component and system in (None, address[0]):
+                return found
+        return None
+
+    def _join_fetches(self, fetches: dict[Address, Fetch], system: int | None, *, refresh: bool) -> bool:
+        """Begin the fetches of components that have none yet; true while one is waited for to do so."""
+        now = anyio.current_time()
+        is_waiting = False
+        ready: dict[int, list[ComponentMachine]] = {}
+        for address, component in self._components.items():
+            machine = component._machine
+            if address in fetches or system not in (None, address[0]) or not machine.who.has_parameters:
+                continue
+            if refresh or component._cache_is_due(now):
+                ready.setdefault(address[0], []).append(machine)
+            else:
+                is_waiting = True
+        for machines in ready.values():
+            begun = self._station.begin_fetches(machines, now, refresh=refresh)
+            for machine, fetch in zip(machines, begun, strict=True):
+                fetches[machine.system, machine.component] = fetch
+        if ready:
+            self._wake()
+        return is_waiting
+
+    def _is_worth_waiting(self, fetches: Mapping[Address, Fetch], give_up_hearing: float, now: float) -> bool:
+        """Whether more may come: from somebody not heard yet, or from a fetch that is not over."""
+        if now < self._opened_at + LISTENING_TIME:
+            return True
+        if not fetches:
+            return now < give_up_hearing
+        is_anyone_done = any(fetch.result is not None for fetch in fetches.values())
+        patience = SILENT_PATIENCE if is_anyone_done else math.inf
+        return any(
+            not fetch.done and (not fetch.is_silent or now - fetch.begun_at < patience)
+            for fetch in fetches.values()
+        )
+
+    async def _sleep_until_news(self, seconds: float, fetches: Mapping[Address, Fetch]) -> None:
+        news = anyio.Event()
+        open_ = [fetch for fetch in fetches.values() if not fetch.done]
+        for fetch in open_:
+            fetch.on_done.append(news.set)
+        try:
+            with anyio.move_on_after(seconds):
+                await news.wait()
+        finally:
+            for fetch in open_:
+                with suppress(ValueError):
+                    fetch.on_done.remove(news.set)
+
+
+def _outcomes(
+    fetches: Mapping[Address, Fetch], now: float
+) -> tuple[dict[Address, FetchResult], dict[Address, NoReply]]:
+    """What came of each fetch, also of one that is not over; an error other than silence is raised."""
+    results: dict[Address, FetchResult] = {}
+    silent: dict[Address, NoReply] = {}
+    for address, fetch in fetches.items():
+        try:
+            if fetch.error is not None:
+                raise fetch.error
+            results[address] = fetch.result or fetch.partial(now, "The time given for the fetch was over.")
+        except NoReply as error:
+            silent[address] = error
+    return results, silent
+
+
+def _wanted(system: int | None, component: int | None) -> str:
+    """What was looked for, in words."""
+    if component is None:
+        return "an autopilot" if system is None else f"an autopilot with system id {system}"
+    return f"component {'*' if system is None else system}/{component}"

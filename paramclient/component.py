@@ -1,0 +1,376 @@
+"""A component as users see it: its parameters, and the calls that can be awaited."""
+
+from __future__ import annotations
+
+import weakref
+from collections.abc import AsyncIterator, Callable
+from contextlib import suppress
+from dataclasses import replace
+from typing import TYPE_CHECKING, SupportsFloat, SupportsIndex, TypeVar
+
+import anyio
+
+from paramclient.errors import NoReply, ParamClientError, UsageError
+from paramclient.identity import Identity, autopilot_name
+from paramclient.params import ParamMap
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.fetch import Fetch, FetchResult, Progress
+from paramclient.protocol.operation import Operation
+from paramclient.protocol.table import Change
+from paramclient.protocol.wire import HASH_CHECK, NO_INDEX, ParamValue
+from paramclient.protocol.writes import SetResult
+from paramclient.values import Encoding, Param, check_name, check_value, decode, known_type
+
+if TYPE_CHECKING:
+    from paramclient.client import ParamClient
+
+__all__ = ["Changes", "Component"]
+
+Result = TypeVar("Result")
+
+PROGRESS_INTERVAL = 0.1
+"""Seconds between two calls of a progress callback."""
+IDENTITY_PATIENCE = 1.5
+"""Seconds to wait for a component to say who it is before its cached table is done without."""
+
+
+class Component:
+    """One component of a vehicle, as `ParamClient.component` gives it.
+
+    All of its calls may be cancelled at any point, and the next call works. All of them wait on while a link
+    that comes back by itself is away, up to `LINK_PATIENCE` of `paramclient.client`; then, and when the
+    client is closed, they raise LinkError.
+
+    Attributes:
+        system, component: its address.
+        params: all that is known of its parameters now, by name: live, verified or cached, see `Trust`. The
+            mapping is read-only and follows what is heard.
+    """
+
+    def __init__(self, client: ParamClient, machine: ComponentMachine, heard_at: float) -> None:
+        self._client = client
+        self._machine = machine
+        self._heard_at = heard_at
+        self._subscriptions: weakref.WeakSet[Changes] = weakref.WeakSet()
+        self.system = machine.system
+        self.component = machine.component
+        self.params = ParamMap(machine.table.params)
+        self._cache_is_read = anyio.Event()
+
+    @property
+    def autopilot(self) -> str:
+        """What its heartbeat says it runs: px4, ardupilot, generic, …; "unknown" before a heartbeat came."""
+        number = self._machine.who.autopilot
+        return "unknown" if number is None else autopilot_name(number)
+
+    @property
+    def identity(self) -> Identity:
+        """Who the vehicle is: hardware id, firmware, capabilities, as far as known."""
+        return self._client._identity_of(self._machine) or self._machine.identity
+
+    @property
+    def encoding(self) -> Encoding:
+        """How it lays values into messages."""
+        return self._machine.table.encoding
+
+    @property
+    def encoding_reason(self) -> str:
+        """Why that is believed, in words."""
+        return self._machine.who.encoding_reason
+
+    @property
+    def count(self) -> int | None:
+        """The number of parameters that it says it has, or None before it said so."""
+        return self._machine.table.count
+
+    @property
+    def hash(self) -> int | None:
+        """The PX4 hash under which the vehicle would confirm the table as it stands here, or None."""
+        return self._machine.table.hash if self._machine.table.complete else None
+
+    @property
+    def state(self) -> str:
+        """The table's state in a word: new, cached, fetching, synced, partial."""
+        return self._machine.state
+
+    @property
+    def round_trip(self) -> float | None:
+        """The measured round trip in seconds, smoothed, or None before anything was answered."""
+        return self._machine.round_trip.smoothed
+
+    def __repr__(self) -> str:
+        last = self._machine.last_fetch
+        origin = f" from {last.source} in {last.elapsed:.2f} s" if last is not None else ""
+        known = len(self.params)
+        of = f" of {self.count}" if self.count is not None and self.state in ("partial", "fetching") else ""
+        return (
+            f"<Component {self.system}/{self.component} {self.autopilot} {self.state} {known}{of} "
+            f"params{origin}>"
+        )
+
+    async def get(self, name: str | int, *, timeout: float | None = None) -> Param:  # noqa: ASYNC109 - public API
+        """Ask the vehicle for one parameter.
+
+        Equal calls at the same time share one request. Different ones run side by side.
+
+        Args:
+            name: param_id, or an index from 0.
+            timeout: seconds until giving up; None leaves it to the number of tries, which follows the
+                measured round trip and loss.
+
+        Raises:
+            UsageError: no such name or index can exist.
+            UnknownParameter: the vehicle does not have it.
+            Refused: it gave a reason not to tell.
+            NoReply: it did not answer.
+            LinkError: the link failed, or the client was closed.
+        """
+        if isinstance(name, str):
+            check_name(name)
+        elif not 0 <= name < NO_INDEX:
+            raise UsageError(f"parameter index {name}: indices are 0 to {NO_INDEX - 1}")
+        machine = self._machine
+        self._client._check_open()
+        read = machine.read(name, anyio.current_time())
+        try:
+            message = await self._wait(read, timeout, lambda: (_read_of(machine, name), read.attempts))
+        finally:
+            machine.reads.release(read)
+        known = machine.table.params.get(message.param_id)
+        return known if known is not None else _param_of(message, machine.table.encoding)
+
+    async def set(
+        self,
+        name: str,
+        value: SupportsIndex | SupportsFloat | bytes,
+        *,
+        timeout: float | None = None,  # noqa: ASYNC109 - public API
+    ) -> SetResult:
+        """Write one parameter and prove by its value that the vehicle has taken it.
+
+        The type is learnt first when it is not known. Writes to one name are done in the order of the calls,
+        those to different names side by side.
+
+        Args:
+            name: param_id.
+            value: a number; or the 4 bytes of the message for what cannot be said as a number.
+            timeout: as in `get`.
+
+        Returns:
+            Accepted, or adjusted: the vehicle made another value of it.
+
+        Raises:
+            UsageError: the name or the value cannot be right. Nothing was written.
+            UnknownParameter: the vehicle does not have it.
+            Refused: it gave a reason.
+            TypeMismatch: it holds the parameter in another type.
+            ValueNotApplied: it keeps the value it had and gives no reason.
+            NoReply: it did not answer. Whether it has taken the value is not known, as after cancellation.
+            LinkError: the link failed, or the client was closed.
+        """
+        if check_name(name) == HASH_CHECK:
+            raise UsageError(f"{HASH_CHECK} is no parameter: it can be read, and not written")
+        machine = self._machine
+        self._client._check_open()
+        write = machine.write(name, check_value(value), anyio.current_time())
+        try:
+            what = f"PARAM_SET {name} to {self.system}/{self.component}"
+            return await self._wait(write, timeout, lambda: (what, write.attempts))
+        finally:
+            machine.writes.cancel(write, anyio.current_time())
+
+    async def fetch_all(
+        self,
+        *,
+        refresh: bool = False,
+        timeout: float | None = None,  # noqa: ASYNC109 - public API
+        progress: Callable[[Progress], None] | None = None,
+    ) -> FetchResult:
+        """Bring the whole table up to date.
+
+        Where the cache has a table and the vehicle a hash, the hash is asked for first; when it confirms the
+        table, nothing is downloaded. Then the values that the hash does not cover are read afresh in the
+        background: they stay *cached* until they have come, and `refreshed` waits for them.
+
+        It ends by itself in every case: indices that never answer are given up and named in `missing`.
+        Calls at the same time share one fetch. Cancelling it leaves what has come in the table.
+
+        Args:
+            refresh: download even when the hash would confirm the cached table.
+            timeout: seconds, after which what has come is given with `missing`.
+            progress: called about ten times a second, from this task.
+
+        Raises:
+            NoReply: nothing came at all.
+            LinkError: the link failed, or the client was closed.
+        """
+        self._client._check_open()
+        began = anyio.current_time()
+        if not refresh:
+            with anyio.move_on_after(timeout):
+                await self._wait_for_cache()
+        machine = self._machine
+        fetch = machine.begin_fetch(anyio.current_time(), refresh=refresh)
+        try:
+            result = await self._wait_for_fetch(fetch, None if timeout is None else began + timeout, progress)
+        finally:
+            machine.end_fetch(fetch)
+        return replace(result, elapsed=anyio.current_time() - began)
+
+    async def refreshed(self, *, timeout: float | None = None) -> None:  # noqa: ASYNC109 - public API
+        """Wait until the values that a hash does not cover have been read afresh after `fetch_all`.
+
+        Returns at once where there are none. A value that cannot be read stays *cached*.
+
+        Raises:
+            NoReply: that took longer than `timeout`.
+            LinkError: the link failed, or the client was closed.
+        """
+        self._client._check_open()
+        refresh = self._machine.refresh
+        if refresh is not None:
+            await self._wait(refresh, timeout, lambda: ("the values that no hash covers", 0))
+
+    def changes(self) -> Changes:
+        """What changes from now on: `async for change in component.changes()`.
+
+        Each change names the parameter, what was known before and what is known now. A value that is heard
+        for the first time is one too. Whoever is slow to ask gets several changes of one parameter as one,
+        so what waits is never more than one change for each parameter. It goes on over an absence of the link,
+        and ends when nobody holds it any more.
+
+        Raises:
+            LinkError: while waiting, when the link failed for good or the client was closed. What had come
+                before is given first.
+        """
+        changes = Changes()
+        self._subscriptions.add(changes)
+        if self._client._ended is not None:
+            changes._end(self._client._ended)
+        return changes
+
+    def _cache_is_due(self, now: float) -> bool:
+        """Whether the cached table is in `params`, or is not worth waiting for."""
+        return (
+            self._cache_is_read.is_set()
+            or not self._client._may_be_cached(self)
+            or now >= self._heard_at + IDENTITY_PATIENCE
+        )
+
+    async def _wait_for_cache(self) -> None:
+        """Wait until the cached table, if the cache may have one, is in `params`; but not for long."""
+        now = anyio.current_time()
+        if not self._cache_is_due(now):
+            with anyio.move_on_after(self._heard_at + IDENTITY_PATIENCE - now):
+                await self._cache_is_read.wait()
+            self._client._check_open()
+
+    def _publish(self, change: Change) -> None:
+        """Hand a change to everyone who listens."""
+        for changes in list(self._subscriptions):
+            changes._push(change)
+
+    def _end(self, error: ParamClientError) -> None:
+        """Nothing will come any more."""
+        self._cache_is_read.set()
+        for changes in list(self._subscriptions):
+            changes._end(error)
+
+    async def _wait(
+        self, operation: Operation[Result], patience: float | None, describe: Callable[[], tuple[str, int]]
+    ) -> Result:
+        """Wait until an operation ends; `describe` tells for NoReply what was awaited and asked how often."""
+        began = anyio.current_time()
+        ended = anyio.Event()
+        operation.on_done.append(ended.set)
+        self._client._wake()
+        try:
+            if not operation.done:
+                with anyio.move_on_after(patience):
+                    await ended.wait()
+        finally:
+            with suppress(ValueError):
+                operation.on_done.remove(ended.set)
+        if not operation.done:
+            awaited, attempts = describe()
+            raise NoReply(awaited, attempts=attempts, waited=anyio.current_time() - began)
+        return _outcome(operation)
+
+    async def _wait_for_fetch(
+        self, fetch: Fetch, deadline: float | None, progress: Callable[[Progress], None] | None
+    ) -> FetchResult:
+        ended = anyio.Event()
+        fetch.on_done.append(ended.set)
+        self._client._wake()
+        try:
+            while not fetch.done:
+                now = anyio.current_time()
+                if deadline is not None and now >= deadline:
+                    return fetch.partial(now, "The time given for the fetch was over.")
+                until = now + PROGRESS_INTERVAL if progress is not None else None
+                if deadline is not None:
+                    until = deadline if until is None else min(until, deadline)
+                with anyio.move_on_after(None if until is None else until - now):
+                    await ended.wait()
+                if progress is not None:
+                    progress(fetch.progress(anyio.current_time()))
+        finally:
+            with suppress(ValueError):
+                fetch.on_done.remove(ended.set)
+        return _outcome(fetch)
+
+
+class Changes(AsyncIterator[Change]):
+    """The changes of one component's parameters since this object was made; see `Component.changes`."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[str, Change] = {}
+        self._error: ParamClientError | None = None
+        self._arrived = anyio.Event()
+
+    def _push(self, change: Change) -> None:
+        """Add a change, or join it with one of the same parameter that waits."""
+        earlier = self._waiting.pop(change.name, None)
+        if earlier is not None:
+            change = replace(change, old=earlier.old)
+            old, new = change.old, change.new
+            if old is new or (old is not None and new is not None and old.same_value(new)):
+                return
+        self._waiting[change.name] = change
+        self._arrived.set()
+
+    def _end(self, error: ParamClientError) -> None:
+        """What waits is still given, then the error is raised."""
+        self._error = error
+        self._arrived.set()
+
+    def __aiter__(self) -> Changes:
+        return self
+
+    async def __anext__(self) -> Change:
+        while not self._waiting:
+            if self._error is not None:
+                raise self._error.with_traceback(None)
+            if self._arrived.is_set():
+                self._arrived = anyio.Event()
+            await self._arrived.wait()
+        return self._waiting.pop(next(iter(self._waiting)))
+
+
+def _outcome(operation: Operation[Result]) -> Result:
+    if operation.error is not None:
+        raise operation.error
+    assert operation.done
+    return operation.result  # type: ignore[return-value]  # an Operation[None] ends with None
+
+
+def _param_of(message: ParamValue, encoding: Encoding) -> Param:
+    """What a message says: of a hash, or of a parameter that has left the table since."""
+    value, bits = decode(message.raw, message.param_type, encoding)
+    index = None if message.param_index == NO_INDEX else message.param_index
+    return Param(message.param_id, value, known_type(message.param_type), index, bits)
+
+
+def _read_of(machine: ComponentMachine, name: str | int) -> str:
+    what = name if isinstance(name, str) else f"parameter {name}"
+    return f"{what} of {machine.system}/{machine.component}"

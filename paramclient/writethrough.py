@@ -1,0 +1,277 @@
+"""What the tables learn goes to the cache: in batches, in a thread of its own, never in anybody's way."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future
+from contextlib import suppress
+from dataclasses import dataclass
+from functools import partial
+from queue import SimpleQueue
+from typing import Final, TypeVar
+
+import anyio
+import anyio.from_thread
+import anyio.lowlevel
+
+from paramclient.cache import CachedComponent, ParamCache, StoredParam, TableState, TableUpdate
+from paramclient.errors import CacheError, UsageError
+from paramclient.identity import Identity
+from paramclient.protocol.component import ComponentMachine
+
+__all__ = ["WriteThrough"]
+
+FLUSH_INTERVAL: Final = 0.25
+"""Seconds that changes are gathered for before they are written. A download fills several batches."""
+RETRY_INTERVAL: Final = 5.0
+"""Seconds until a cache that could not be written is tried again."""
+
+logger = logging.getLogger(__name__)
+Result = TypeVar("Result")
+
+
+class WriteThrough:
+    """The way from the tables of one client to its cache, and back at the beginning.
+
+    A cache that fails costs a warning in the log, once until it can be written again, and nothing else: what
+    could not be written is written when it can be.
+
+    Args:
+        cache: where to, or None for nowhere.
+        owned: whether `close` closes it.
+    """
+
+    def __init__(self, cache: ParamCache | None, *, owned: bool) -> None:
+        self._cache = cache
+        self._owned = owned
+        self._worker = _Worker()
+        self._kept: dict[ComponentMachine, _Kept] = {}
+        self._has_failed = False
+        self._tables: dict[tuple[int, int], bool] = {}
+
+    async def open(self) -> None:
+        """Find out which components the cache knows."""
+        if self._cache is not None:
+            for each in await self._run(self._cache.components) or ():
+                address = (each.system, each.component)
+                self._tables[address] = self._tables.get(address, False) or each.hash is not None
+
+    async def close(self) -> None:
+        """Write what is left, and end the thread."""
+        try:
+            await self.flush()
+        finally:
+            cache = self._cache if self._owned else None
+            await self._worker.close(None if cache is None else cache.close)
+
+    def may_have(self, system: int, component: int) -> bool:
+        """Whether the cache had a table for such an address when the client was opened."""
+        return (system, component) in self._tables
+
+    def may_hit(self, system: int, component: int) -> bool:
+        """Whether it had one that the vehicle's hash may confirm."""
+        return self._tables.get((system, component), False)
+
+    def follow(self, machine: ComponentMachine, identity: Identity) -> bool:
+        """Go on under an identity; false where `load` and `keep` must come first, as for another vehicle.
+
+        What becomes of the table when another vehicle takes the address is no news of the one before.
+        """
+        kept = self._kept.get(machine)
+        if kept is not None and kept.identity.key == identity.key:
+            kept.identity = identity
+            return True
+        if kept is not None:
+            del self._kept[machine]
+            machine.table.take_dirty()
+        return False
+
+    async def load(self, machine: ComponentMachine, identity: Identity) -> CachedComponent | None:
+        """A component's cached table, or None."""
+        if self._cache is None:
+            return None
+        return await self._run(partial(self._cache.load, identity.key, machine.component))
+
+    def keep(self, machine: ComponentMachine, identity: Identity, cached: CachedComponent | None) -> None:
+        """Give a component its cached table; from now on what it learns is kept under this identity."""
+        table = machine.table
+        kept = self._kept[machine] = _Kept(machine, identity, is_whole=table.complete)
+        for name in table.params:
+            table.dirty.setdefault(name, "vehicle")
+        if cached is not None:
+            machine.use_cached(
+                cached.params,
+                anyio.current_time(),
+                count=cached.count,
+                confirmed=cached.hash,
+                complete=cached.complete,
+                volatile=cached.volatile,
+                volatile_known=cached.volatile_known,
+            )
+            kept.synced_at = cached.synced_at
+            kept.state = self._state(machine, kept)
+        if machine.synced:
+            kept.synced_at = time.time()
+
+    def synced(self, machine: ComponentMachine, *, is_whole: bool) -> None:
+        """The table was proven to be the vehicle's just now; `is_whole` by a download of all of it."""
+        kept = self._kept.get(machine)
+        if kept is not None:
+            kept.synced_at = time.time()
+            kept.is_whole |= is_whole
+
+    async def flush(self) -> bool:
+        """Write what is new; false when the cache could not take it. Cancelled, it loses nothing."""
+        cache = self._cache
+        news = [] if cache is None else [new for kept in self._kept.values() for new in self._news_of(kept)]
+        if cache is None or not news:
+            return True
+        is_written = False
+        try:
+            is_written = await self._run(partial(_save, cache, [new.update for new in news])) is not None
+        finally:
+            for new in news:
+                if not is_written and self._kept.get(new.kept.machine) is new.kept:
+                    new.take_back()
+        if is_written:
+            self._has_failed = False
+        return is_written
+
+    def _news_of(self, kept: _Kept) -> list[_News]:
+        """What the cache does not know of a table yet; it counts as written from now on."""
+        machine, table = kept.machine, kept.machine.table
+        state = self._state(machine, kept)
+        if not (table.dirty or kept.is_whole or state != kept.state):
+            return []
+        dirty = table.take_dirty()
+        is_whole, kept.is_whole = kept.is_whole, False
+        kept.state = state
+        now = time.time()
+        knows_volatile = bool(table.volatile) or table.volatile_known
+        update = TableUpdate(
+            identity=kept.identity,
+            component=machine.component,
+            autopilot=machine.who.autopilot or 0,
+            at=now,
+            table=state,
+            params=[
+                StoredParam(
+                    table.params[name],
+                    now,
+                    name in table.volatile if knows_volatile else None,
+                    dirty.get(name, "vehicle"),
+                )
+                for name in (table.params if is_whole else dirty)
+                if name in table.params
+            ],
+            removed=[name for name in dirty if name not in table.params],
+            replace=is_whole,
+        )
+        return [_News(kept, dirty, update)]
+
+    def _state(self, machine: ComponentMachine, kept: _Kept) -> TableState:
+        table = machine.table
+        return TableState(
+            hash=table.hash if table.complete else None,
+            count=table.count,
+            complete=table.complete,
+            volatile_known=table.volatile_known,
+            synced_at=kept.synced_at,
+        )
+
+    async def _run(self, work: Callable[[], Result]) -> Result | None:
+        """Run a call of the cache in the thread; None when it failed, which is worth a warning once."""
+        try:
+            return await self._worker.run(work)
+        except (CacheError, UsageError) as error:  # a UsageError comes of a clock that is far off
+            if not self._has_failed:
+                logger.warning("going on without the cache: %s", error)
+            self._has_failed = True
+            return None
+
+
+@dataclass(slots=True)
+class _Kept:
+    """What is known of a component's place in the cache."""
+
+    machine: ComponentMachine
+    identity: Identity
+    state: TableState | None = None
+    synced_at: float | None = None
+    is_whole: bool = False
+
+
+@dataclass(slots=True)
+class _News:
+    """What is on its way to the cache for one component."""
+
+    kept: _Kept
+    dirty: dict[str, str]
+    update: TableUpdate
+
+    def take_back(self) -> None:
+        """It has not arrived: it is news again."""
+        self.kept.machine.table.dirty = self.dirty | self.kept.machine.table.dirty
+        self.kept.is_whole |= self.update.replace
+        self.kept.state = None
+
+
+class _Worker:
+    """One thread for calls that block. They are done in order; `close` ends it.
+
+    Not a thread of anyio's pool: that would be left behind, idle, until the event loop ends.
+    """
+
+    def __init__(self) -> None:
+        self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
+        self._thread: threading.Thread | None = None
+
+    async def run(self, work: Callable[[], Result]) -> Result:
+        """Do it in the thread, and wait for its end also when cancelled."""
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._main, name="paramclient cache", daemon=True)
+            self._thread.start()
+        future: Future[Result] = Future()
+        ended = anyio.Event()
+        token = anyio.lowlevel.current_token()
+
+        def call() -> None:
+            try:
+                future.set_result(work())
+            except BaseException as error:
+                future.set_exception(error)
+            with suppress(anyio.RunFinishedError):
+                anyio.from_thread.run_sync(ended.set, token=token)
+
+        self._calls.put(call)
+        with anyio.CancelScope(shield=True):
+            await ended.wait()
+        return future.result()
+
+    async def close(self, work: Callable[[], None] | None) -> None:
+        """Do a last piece of work, and end the thread."""
+        thread = self._thread
+        if thread is None and work is None:
+            return
+        try:
+            await self.run(_nothing if work is None else work)
+        finally:
+            self._calls.put(None)
+        if self._thread is not None:
+            self._thread.join()  # at once: it has nothing more to do
+
+    def _main(self) -> None:
+        while (call := self._calls.get()) is not None:
+            call()
+
+
+def _save(cache: ParamCache, updates: list[TableUpdate]) -> bool:
+    cache.save(updates)
+    return True
+
+
+def _nothing() -> None:
+    return

@@ -1,0 +1,246 @@
+"""Makings of the client's tests: an event loop that never sleeps, small vehicles, links that drop."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import selectors
+from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
+from typing import Any, ParamSpec, TypeVar
+from unittest import mock
+
+import anyio
+
+from paramclient import Component, Param, ParamClient, ParamType, writethrough
+from paramclient.errors import LinkError
+from paramclient.links import Peer, SimLink
+from paramclient.protocol import wire
+from paramclient.sim import Endpoint, GenericVehicle, PX4Vehicle, SimParam
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+PATIENCE = 20.0
+"""Seconds after which a test on real sockets gives up; nothing waits that long when all is well."""
+
+VALUES: dict[str, int | float] = {
+    f"PARAM_{number:02}": number if number % 3 else number / 4 for number in range(24)
+}
+"""A small table: whole numbers, and every third with a fraction."""
+
+
+class SwiftLoop(asyncio.SelectorEventLoop):
+    """An event loop whose clock leaps to the next thing to do.
+
+    A session with simulated vehicles takes no real time on it, and goes the same way on every machine. While
+    a thread is at work the clock stands still. Where nothing would ever happen again, it says so.
+
+    Attributes:
+        now: its clock.
+        threads: calls in threads that are under way.
+        has_struck: whether the last `strike` met its task still at work.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(_LeapingSelector(self))
+        self.now = 1000.0
+        self.threads = 0
+        self.has_struck = False
+        self._rounds_left = 0
+        self._victim: asyncio.Task[Any] | None = None
+        self._blow: Callable[[], object] = _nothing
+
+    def time(self) -> float:
+        return self.now
+
+    def strike(self, task: asyncio.Task[Any], blow: Callable[[], object], *, after: int) -> None:
+        """Do this between two rounds of the loop, so many from now, if the task is not done by then."""
+        self.has_struck = False
+        self._rounds_left = after
+        self._victim = task
+        self._blow = blow
+
+    def begin_round(self) -> None:
+        self.now += 1e-6  # nothing is done in no time at all
+        self._rounds_left -= 1
+        if self._rounds_left == 0 and self._victim is not None and not self._victim.done():
+            self.has_struck = True
+            self._blow()
+
+
+class _LeapingSelector(selectors.DefaultSelector):
+    def __init__(self, loop: SwiftLoop) -> None:
+        super().__init__()
+        self._loop = loop
+
+    def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
+        loop = self._loop
+        loop.begin_round()
+        ready = super().select(0)
+        if ready or timeout == 0 or loop._ready:
+            return ready
+        if loop.threads:
+            return super().select(PATIENCE)
+        if timeout is None:
+            raise RuntimeError("everybody waits, and for nothing")
+        loop.now += timeout
+        return []
+
+
+def swift_loop() -> SwiftLoop:
+    """The loop that the caller runs on."""
+    loop = asyncio.get_running_loop()
+    assert isinstance(loop, SwiftLoop)
+    return loop
+
+
+def swiftly(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
+    """Run an asynchronous test on a `SwiftLoop`."""
+
+    @functools.wraps(test)
+    def run(*args: P.args, **kwargs: P.kwargs) -> T:
+        in_thread = writethrough._Worker.run
+
+        async def counted(worker: Any, work: Callable[[], Any]) -> Any:
+            swift_loop().threads += 1
+            try:
+                return await in_thread(worker, work)
+            finally:
+                swift_loop().threads -= 1
+
+        with (
+            mock.patch.object(writethrough._Worker, "run", counted),
+            asyncio.Runner(loop_factory=SwiftLoop) as runner,
+        ):
+            return runner.run(test(*args, **kwargs))
+
+    return run
+
+
+def small_px4(*, volatile: Collection[str] = ("CAL_ACC0_XOFF", "PARAM_03"), **options: Any) -> PX4Vehicle:
+    """A PX4 vehicle with VALUES and CAL_ACC0_XOFF, of which some are not in its hash."""
+    rows = [
+        SimParam(name, ParamType.REAL32 if isinstance(value, float) else ParamType.INT32, value, name in volatile)
+        for name, value in {**VALUES, "CAL_ACC0_XOFF": 0.5}.items()
+    ]
+    return PX4Vehicle(**{"table": rows} | options)
+
+
+def generic(**options: Any) -> GenericVehicle:
+    """A vehicle that keeps to the standard, with VALUES."""
+    return GenericVehicle(**{"table": VALUES} | options)
+
+
+class Tap:
+    """An endpoint through which another one speaks: it listens, and can hold either direction up.
+
+    Attributes:
+        heard: what the station has sent: when, the frame, the message.
+        is_deaf: the endpoint hears nothing.
+        is_mute: nothing that it says comes through.
+    """
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self.heard: list[tuple[float, wire.Frame, wire.Message]] = []
+        self.is_deaf = False
+        self.is_mute = False
+        self._endpoint = endpoint
+        self._framer = wire.Framer(wire.UNDERSTOOD, stream=False)
+
+    def messages(self, kind: type[T]) -> list[T]:
+        """What the station has sent, of one kind."""
+        return [message for _, _, message in self.heard if isinstance(message, kind)]
+
+    def receive(self, data: bytes, now: float) -> None:
+        for frame in self._framer.receive(data):
+            message = wire.decode(frame)
+            assert message is not None
+            self.heard.append((now, frame, message))
+        if not self.is_deaf:
+            self._endpoint.receive(data, now)
+
+    def tick(self, now: float) -> None:
+        self._endpoint.tick(now)
+
+    def next_deadline(self) -> float | None:
+        return self._endpoint.next_deadline()
+
+    def data_to_send(self) -> list[bytes]:
+        data = self._endpoint.data_to_send()
+        return [] if self.is_mute else data
+
+
+class FlakyLink(SimLink):
+    """A link to an endpoint that can drop, and be opened again.
+
+    Attributes:
+        is_away: whether it cannot be opened now.
+        openings: how often somebody tried.
+    """
+
+    reconnects = True
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        super().__init__(endpoint, "tcp:flaky:5760")
+        self.is_away = False
+        self.openings = 0
+
+    async def open(self) -> None:
+        self.openings += 1
+        if self.is_away:
+            raise LinkError(f"{self.name}: connection refused", link=self.name)
+        await super().open()
+
+    async def drop(self, *, stays_away: bool = False) -> None:
+        self.is_away = stays_away
+        await self.close()
+
+    async def receive(self) -> list[tuple[Peer, bytes]]:
+        # who has spoken is another one after each opening, as with a TCP connection
+        return [((peer, self.openings), data) for peer, data in await super().receive()]
+
+    async def send(self, data: bytes, peer: Peer | None) -> None:
+        if peer in (None, ("sim", self.openings)):
+            await super().send(data, None)
+
+
+def bits(params: Mapping[str, Param]) -> dict[str, int]:
+    """The values to the last bit, whatever the order."""
+    return {name: param.bits for name, param in params.items()}
+
+
+def residue(component: Component) -> list[object]:
+    """What is still registered with a component: reads, writes, a fetch, waiters."""
+    machine = component._machine
+    left: list[object] = [f"{len(machine.reads)} reads"] if len(machine.reads) else []
+    left += [f"{len(machine.writes)} writes"] if len(machine.writes) else []
+    left += [machine.fetch] if machine.fetch is not None else []
+    left += [machine.refresh] if machine.refresh is not None else []
+    return left
+
+
+async def outcome(call: Awaitable[T]) -> T | Exception:
+    """What a call returns or raises."""
+    try:
+        return await call
+    except Exception as error:
+        return error
+
+
+def tasks_beside() -> set[str]:
+    """The tasks that run besides the caller's."""
+    return {task.get_name() for task in asyncio.all_tasks() - {asyncio.current_task()}}
+
+
+async def settled() -> None:
+    """Let everything happen that happens now."""
+    await anyio.wait_all_tasks_blocked()
+
+
+def a_client(link: Any, **options: Any) -> ParamClient:
+    """A client without a cache, unless one is given."""
+    return ParamClient(link, **{"cache": False} | options)
+
+
+def _nothing() -> None:
+    return

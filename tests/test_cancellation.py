@@ -1,0 +1,249 @@
+"""Every public call, cancelled at every point: nothing of it is left, and the next call works.
+
+Two ways lead to every point. One cancels a call at each of its own suspensions, before or after what it waits
+for has come. The other lets it wait and cancels it after each round of the event loop, which meets the protocol
+below in each of its states.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import AsyncIterator, Callable, Coroutine, Generator
+from contextlib import asynccontextmanager
+from itertools import count
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import anyio
+import pytest
+
+from paramclient import Component, ParamCache, ParamClient
+from paramclient.protocol import wire
+from paramclient.sim import Air, PX4Vehicle
+from tests.shell import (
+    VALUES,
+    FlakyLink,
+    a_client,
+    bits,
+    generic,
+    residue,
+    settled,
+    small_px4,
+    swift_loop,
+    swiftly,
+    tasks_beside,
+)
+
+Call = Callable[[ParamClient, Component], Coroutine[Any, Any, object]]
+
+FEW = {name: VALUES[name] for name in list(VALUES)[:8]}
+fresh = count(1000)
+
+MOST_POINTS = 1000
+"""None of these calls has as many: whoever gets here cancels nothing."""
+
+
+async def first_change(client: ParamClient, component: Component) -> object:
+    """A change that another call brings about."""
+    changes = component.changes()
+    writing = asyncio.create_task(component.set("PARAM_02", next(fresh)))
+    try:
+        return await anext(changes)
+    finally:
+        writing.cancel()
+        await asyncio.wait([writing])
+
+
+CALLS: dict[str, Call] = {
+    "get": lambda client, component: component.get("PARAM_01"),
+    "get by index": lambda client, component: component.get(5, timeout=9),
+    "set": lambda client, component: component.set("PARAM_01", 77),
+    "fetch_all": lambda client, component: component.fetch_all(),
+    "fetch_all anew": lambda client, component: component.fetch_all(refresh=True, timeout=9, progress=seen),
+    "changes": first_change,
+    "component": lambda client, component: client.component(system=2),
+    "fetch_all of everyone": lambda client, component: client.fetch_all(),
+    "fetch_all of a system": lambda client, component: client.fetch_all(1, progress=seen),
+}
+EVERY_CALL = pytest.mark.parametrize("call", CALLS.values(), ids=CALLS)
+
+
+def seen(progress: object) -> None:
+    return
+
+
+class Struck(Coroutine[Any, Any, Any]):
+    """A coroutine whose task is cancelled at its suspension of this number, from 1.
+
+    Args:
+        inner: the coroutine.
+        number: which suspension.
+        late: strike only when what it waits for has come, and it would go on.
+
+    Attributes:
+        is_struck: whether it had so many.
+    """
+
+    def __init__(self, inner: Coroutine[Any, Any, Any], number: int, *, late: bool) -> None:
+        self.is_struck = False
+        self._inner = inner
+        self._left = number
+        self._late = late
+
+    def __await__(self) -> Generator[Any, Any, Any]:
+        raise NotImplementedError
+
+    def send(self, value: Any) -> Any:
+        return self._strike(self._inner.send(value))
+
+    def throw(self, kind: Any, error: Any = None, trace: TracebackType | None = None) -> Any:
+        return self._strike(self._inner.throw(kind, error, trace) if error else self._inner.throw(kind))
+
+    def close(self) -> None:
+        self._inner.close()
+
+    def _strike(self, awaited: Any) -> Any:
+        self._left -= 1
+        if not self._left:
+            self.is_struck = True
+            task = asyncio.current_task()
+            assert task is not None
+            if self._late and asyncio.isfuture(awaited):
+                awaited.add_done_callback(lambda _: task.cancel())
+            else:
+                task.cancel()
+        return awaited
+
+
+@asynccontextmanager
+async def a_session() -> AsyncIterator[tuple[ParamClient, Component]]:
+    """A client that has just heard a vehicle with a camera, while another one comes a little later."""
+    late = generic(system=2, table=FEW)
+    late.reboot(swift_loop().time(), down=0.03)
+    camera = generic(component=100, table=FEW, autopilot=wire.MAV_AUTOPILOT_INVALID)
+    vehicle = PX4Vehicle(table={**FEW, "CAL_ACC0_XOFF": 0.5}, burst=3)
+    air = Air.symmetric([vehicle, camera, late], delay=0.004)
+    async with a_client(air) as client:
+        yield client, await client.component()
+
+
+def registered(client: ParamClient) -> list[object]:
+    """What is registered in any component, but for the reads of the hash that nobody waits for."""
+    found: list[object] = []
+    for component in client.components.values():
+        hashes = ["1 reads"] if wire.HASH_CHECK in component._machine.reads else []
+        found += [each for each in residue(component) if each not in hashes]
+    return found
+
+
+async def check_after(call: Call, client: ParamClient, component: Component) -> None:
+    """A call was cancelled: nothing is left, and it can be made again."""
+    assert not registered(client)
+    await call(client, component)
+    await settled()
+    assert not registered(client)
+    await asyncio.sleep(0.5)
+    assert not any(residue(each) for each in client.components.values())
+
+
+@EVERY_CALL
+@pytest.mark.parametrize("late", [False, True], ids=["before", "after"])
+@swiftly
+async def test_cancelled_at_each_suspension(call: Call, late: bool) -> None:
+    for number in range(1, MOST_POINTS):
+        async with a_session() as (client, component):
+            before = tasks_beside()
+            struck = Struck(call(client, component), number, late=late)
+            task = asyncio.create_task(struck)
+            await asyncio.wait([task])
+            assert task.cancelled() == struck.is_struck
+            await settled()
+            assert tasks_beside() == before
+            await check_after(call, client, component)
+        assert not tasks_beside()
+        if not struck.is_struck:
+            break
+    assert 1 < number < MOST_POINTS - 1
+
+
+@EVERY_CALL
+@pytest.mark.parametrize("by", ["task", "scope"])
+@swiftly
+async def test_cancelled_after_each_round(call: Call, by: str) -> None:
+    loop = swift_loop()
+    for number in range(1, MOST_POINTS):
+        async with a_session() as (client, component):
+            scope = anyio.CancelScope()
+
+            async def scoped() -> None:
+                with scope:  # noqa: B023 - it has ended before the next one is made
+                    await call(client, component)  # noqa: B023
+
+            task = asyncio.create_task(scoped())
+            loop.strike(task, task.cancel if by == "task" else scope.cancel, after=number)
+            await asyncio.wait([task])
+            # a task that goes on already leaves its scope without another look at it
+            was_cancelled = task.cancelled() or scope.cancelled_caught
+            assert was_cancelled == loop.has_struck or (by == "scope" and not was_cancelled)
+            await settled()
+            await check_after(call, client, component)
+        assert not tasks_beside()
+        if not loop.has_struck:
+            break
+    assert 1 < number < MOST_POINTS - 1
+
+
+@EVERY_CALL
+@swiftly
+async def test_cancelled_while_the_link_is_away(call: Call) -> None:
+    link = FlakyLink(Air([small_px4(), generic(system=2)]))
+    async with a_client(link) as client:
+        component = await client.component()
+        await link.drop(stays_away=True)
+        task = asyncio.create_task(call(client, component))
+        await asyncio.sleep(1.0)
+        task.cancel()
+        await asyncio.wait([task])
+        assert not registered(client)
+        link.is_away = False
+        await asyncio.sleep(1.0)
+        await check_after(call, client, component)
+
+
+@pytest.mark.parametrize("point", ["before", "after", "round"])
+@swiftly
+async def test_a_whole_session_cancelled_at_each_point(tmp_path: Path, point: str) -> None:
+    path = tmp_path / "cache"
+    vehicle = small_px4()
+    loop = swift_loop()
+
+    async def session() -> None:
+        async with ParamClient(vehicle, cache=path) as client:
+            component = await client.component()
+            await component.fetch_all()
+            await component.refreshed()
+            await component.set("PARAM_01", number)
+            await asyncio.sleep(0.3)
+
+    for number in range(1, MOST_POINTS):
+        struck = Struck(session(), 0 if point == "round" else number, late=point == "after")
+        task = asyncio.create_task(struck)
+        if point == "round":
+            loop.strike(task, task.cancel, after=number)
+        await asyncio.wait([task])
+        is_struck = struck.is_struck or loop.has_struck
+        assert task.cancelled() == is_struck
+        await settled()
+        assert not tasks_beside()
+        while any(thread.name == "paramclient cache" for thread in threading.enumerate()):
+            await asyncio.sleep(0)
+        if not is_struck:
+            break
+    assert 5 < number < MOST_POINTS - 1
+    with ParamCache(path) as cache:
+        cached = cache.component()
+        assert bits(cached.params) == bits(vehicle.params)
+        assert cached.hash == vehicle.announced_hash()
+    assert not list(tmp_path.glob("*.damaged*"))
