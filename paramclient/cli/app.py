@@ -1,0 +1,172 @@
+"""Arguments to a command, and how it ends: exit code, one line for an error, signals."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import logging
+import signal
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
+from typing import Final
+
+import anyio
+from cyclopts import App, CycloptsError, Parameter
+
+from paramclient.cli.offline import cache_history, cache_list, cache_path, cache_remove, show
+from paramclient.cli.outcome import ExitCode, code_of
+from paramclient.cli.output import report
+from paramclient.cli.simulate import sim
+from paramclient.cli.vehicle import fetch, get, set_, watch
+from paramclient.errors import ParamClientError
+from paramclient.version import __version__
+
+__all__ = ["run"]
+
+
+def run(arguments: Sequence[str]) -> int:
+    """Run the command with these arguments; give its exit code.
+
+    Raises:
+        KeyboardInterrupt: Ctrl-C outside of an awaiting command, or a second time inside of one.
+        BrokenPipeError: nobody reads what is printed.
+    """
+    with _warnings_shown():
+        try:
+            command, bound, _ = _app.parse_args(arguments, exit_on_error=False, print_error=False)
+            call = partial(command, *bound.args, **bound.kwargs)
+            code = anyio.run(_until_signal, call) if inspect.iscoroutinefunction(command) else call()
+        except CycloptsError as error:
+            report(str(error))
+            return ExitCode.USAGE
+        except ParamClientError as error:
+            report(str(error))
+            return code_of(error)
+        except BrokenPipeError:
+            raise
+        except OSError as error:  # of stdout: the library has turned all others into its own
+            report(f"cannot write the output: {error.strerror}")
+            return ExitCode.INCOMPLETE
+    return code or ExitCode.DONE
+
+
+_SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+
+
+async def _until_signal(work: Callable[[], Awaitable[int | None]]) -> int | None:
+    """Do the work, or on a signal end it in good order and give 128 and its number.
+
+    Whoever cannot wait for the good order sends a second signal, which ends the process at once.
+    """
+    loop = asyncio.get_running_loop()
+    before = {number: signal.getsignal(number) for number in _SIGNALS}
+    received: list[int] = []
+
+    with anyio.CancelScope() as scope:
+
+        def end(number: int) -> None:
+            received.append(number)
+            scope.cancel()
+            for each in _SIGNALS:
+                loop.remove_signal_handler(each)
+                signal.signal(each, signal.SIG_DFL)
+
+        for number in _SIGNALS:
+            loop.add_signal_handler(number, end, number)
+        try:
+            return await work()
+        finally:
+            for number, handler in before.items():
+                loop.remove_signal_handler(number)
+                signal.signal(number, handler)
+    return 128 + received[0]
+
+
+class _Lines(logging.Handler):
+    """Shows what the library warns of."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        report(f"{record.levelname.lower()}: {record.getMessage()}")
+
+
+@contextmanager
+def _warnings_shown() -> Iterator[None]:
+    logger = logging.getLogger("paramclient")
+    handler = _Lines(logging.WARNING)
+    logger.addHandler(handler)
+    try:
+        yield
+    finally:
+        logger.removeHandler(handler)
+
+
+def _examples(*lines: str) -> str:
+    return "\n".join(["Examples:", *(f"  paramclient {line}" for line in lines)])
+
+
+_EXIT_CODES: Final = """
+
+Exit codes: 0 done; 1 refused or incomplete; 2 usage; 3 no vehicle or no answer; 4 link; 5 cache."""
+
+_app: Final = App(
+    name="paramclient",
+    help="Fetch, get and set the parameters of MAVLink vehicles, and look at them again with no link.",
+    help_epilogue=_examples(
+        "fetch sim:px4",
+        "get udpin:0.0.0.0:14550 MC_ROLL_P",
+        "set udpin:0.0.0.0:14550 MC_ROLL_P 6.5",
+        "show",
+    )
+    + _EXIT_CODES,
+    version=f"paramclient {__version__}",
+    default_parameter=Parameter(negative=()),
+    help_format="plaintext",
+    version_format="plaintext",
+)
+_cache: Final = App(
+    name="cache",
+    help="Look into the cache, with no link.",
+    help_epilogue=_examples("cache list", "cache history 1 MC_ROLL_P", "cache path", "cache remove 1"),
+)
+
+_app.command(
+    fetch,
+    help_epilogue=_examples(
+        "fetch udpin:0.0.0.0:14550", "fetch sim:px4 --json", "fetch tcp:127.0.0.1:5760 --system 3"
+    ),
+)
+_app.command(
+    get,
+    usage="Usage: paramclient get [OPTIONS] URL NAME [NAME...]",
+    help_epilogue=_examples("get udpin:0.0.0.0:14550 MC_ROLL_P MC_PITCH_P", "get sim:ardupilot RTL_ALT"),
+)
+_app.command(
+    set_,
+    name="set",
+    usage="Usage: paramclient set [OPTIONS] URL NAME VALUE [NAME VALUE...]",
+    help_epilogue=_examples("set udpin:0.0.0.0:14550 MC_ROLL_P 6.5 MC_PITCH_P 6.5"),
+)
+_app.command(
+    watch,
+    usage="Usage: paramclient watch [OPTIONS] URL [NAME...]",
+    help_epilogue=_examples("watch udpin:0.0.0.0:14550", "watch udpin:0.0.0.0:14550 MC_ROLL_P --json"),
+)
+_app.command(
+    show,
+    usage="Usage: paramclient show [OPTIONS] [VEHICLE]",
+    help_epilogue=_examples("show", "show 1", "show 00020000 --json"),
+)
+_app.command(_cache)
+_app.command(
+    sim,
+    help_epilogue=_examples(
+        "sim px4 --link udpout:127.0.0.1:14550 --loss 0.05 --seed 1", "sim ardupilot --link udpin:127.0.0.1:0"
+    ),
+)
+_cache.command(cache_list, name="list")
+_cache.command(
+    cache_history, name="history", usage="Usage: paramclient cache history [OPTIONS] VEHICLE [NAME]"
+)
+_cache.command(cache_path, name="path")
+_cache.command(cache_remove, name="remove")

@@ -1,0 +1,74 @@
+"""What several commands can be told. The texts below the fields are their help."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, TypeAlias
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from paramclient.errors import UsageError
+from paramclient.values import Encoding
+
+__all__ = ["CacheOptions", "Id", "LinkOptions"]
+
+Id: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))]
+"""A system or component id."""
+
+
+def _check_seconds(_: object, seconds: float | None) -> None:
+    if seconds is not None and not 0 < seconds < math.inf:
+        raise ValueError("It is a number of seconds above 0.")
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True, slots=True)
+class CacheOptions:
+    """Of commands that work with no link."""
+
+    json: bool = False
+    """Print JSON, for programs."""
+
+    cache: Path | None = None
+    """The cache file, instead of the user's own."""
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LinkOptions:
+    """Of commands that speak to a vehicle."""
+
+    json: bool = False
+    """Print JSON, for programs."""
+
+    system: Id = None
+    """The system to speak to, 1 to 255. Without it, the first one that is heard."""
+
+    component: Id = None
+    """The component to speak to, 1 to 255. Without it, the autopilot."""
+
+    timeout: Annotated[float | None, Parameter(validator=_check_seconds)] = None
+    """Seconds for everything together. Without it, 10 to hear the vehicle, then as many as it takes."""
+
+    encoding: Encoding | None = None
+    """How the component lays values into messages, where what it says of itself is wrong."""
+
+    cache: Path | None = None
+    """The cache file, instead of the user's own."""
+
+    no_cache: bool = False
+    """Neither read nor write a cache."""
+
+    @property
+    def place(self) -> Path | bool:
+        """Where tables are kept, as `ParamClient` takes it.
+
+        Raises:
+            UsageError: a cache was named and none was wanted.
+        """
+        if self.no_cache and self.cache is not None:
+            raise UsageError("--cache and --no-cache exclude each other")
+        return not self.no_cache if self.cache is None else self.cache

@@ -1,0 +1,63 @@
+"""How a command ends: exit codes, and the words for what became of a set."""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Final
+
+from paramclient.errors import (
+    CacheError,
+    LinkError,
+    NoReply,
+    ParamClientError,
+    Refused,
+    TypeMismatch,
+    UnknownParameter,
+    UsageError,
+    ValueNotApplied,
+    VehicleError,
+)
+
+__all__ = ["ExitCode", "code_of", "status_of"]
+
+
+class ExitCode(IntEnum):
+    """Of several that apply, the highest counts."""
+
+    DONE = 0
+    INCOMPLETE = 1
+    """The vehicle refused something, or did not give everything."""
+    USAGE = 2
+    """Something was asked for that cannot be right."""
+    NO_ANSWER = 3
+    """No vehicle was heard, or it did not answer."""
+    LINK = 4
+    CACHE = 5
+
+
+def code_of(error: ParamClientError) -> ExitCode:
+    """The exit code for an error."""
+    return next(code for kind, code in _CODES.items() if isinstance(error, kind))
+
+
+def status_of(error: ParamClientError) -> str:
+    """What became of a set that ended with this error, in a word."""
+    return next(status for kind, status in _STATUSES.items() if isinstance(error, kind))
+
+
+_CODES: Final = {
+    VehicleError: ExitCode.INCOMPLETE,
+    UsageError: ExitCode.USAGE,
+    NoReply: ExitCode.NO_ANSWER,
+    LinkError: ExitCode.LINK,
+    CacheError: ExitCode.CACHE,
+}
+_STATUSES: Final = {
+    Refused: "refused",
+    UnknownParameter: "unknown",
+    TypeMismatch: "mismatch",
+    ValueNotApplied: "not-applied",
+    NoReply: "no-reply",
+    UsageError: "invalid",
+    LinkError: "link",
+}

@@ -1,0 +1,211 @@
+"""What is printed: JSON for programs, tables and lines for people.
+
+Results go to stdout; progress, summaries, warnings and errors to stderr. Text from the wire reaches neither
+as it came: in JSON everything outside ASCII is escaped, and people see `printable` text only.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from datetime import UTC, datetime
+from typing import Any, Final
+
+from paramclient.protocol.fetch import Progress
+from paramclient.values import Param, ParamType, Value, format_value, shortest_float, type_name
+
+__all__ = [
+    "as_json",
+    "bits_text",
+    "by_index",
+    "hash_text",
+    "param_json",
+    "print_json",
+    "print_line",
+    "print_table",
+    "printable",
+    "progress_bar",
+    "report",
+    "say",
+    "time_text",
+    "value_json",
+]
+
+UNLIMITED: Final = 10_000
+"""Columns of an output that is no terminal: nothing is wrapped or cut there."""
+
+
+def printable(text: str) -> str:
+    """Text that is safe on any terminal: whatever is not printable ASCII becomes `\\x1b`, `\\u202e`, …"""
+    if text.isascii() and text.isprintable():
+        return text
+    return "".join(
+        character if character.isascii() and character.isprintable() else _escaped(character)
+        for character in text
+    )
+
+
+def time_text(at: float) -> str:
+    """A unix time in ISO 8601, UTC, with milliseconds."""
+    return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
+
+
+def hash_text(crc: int | None) -> str | None:
+    """A PX4 hash as 8 hexadecimal digits."""
+    return None if crc is None else f"{crc:08x}"
+
+
+def bits_text(param: Param) -> str:
+    """`Param.bits` as hexadecimal digits: 16 for the types of 8 bytes, else 8."""
+    is_wide = isinstance(param.type, ParamType) and param.type.size == 8
+    return f"{param.bits:0{16 if is_wide else 8}x}"
+
+
+def by_index(params: Iterable[Param]) -> list[Param]:
+    """In the vehicle's own order; those without an index last, by name."""
+    return sorted(params, key=lambda param: (param.index is None, param.index or 0, param.name))
+
+
+# for programs
+
+
+def value_json(value: Value, number: ParamType | int) -> int | float | str:
+    """A value as strict JSON knows it: NaN and infinities as text, raw bytes as hexadecimal text.
+
+    A REAL32 is given by the shortest number that rounds to the same float32.
+    """
+    if isinstance(value, bytes):
+        return format_value(value, number)
+    if isinstance(value, int):
+        return value
+    if math.isfinite(value):
+        return shortest_float(value) if number == ParamType.REAL32 else value
+    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+
+
+def param_json(param: Param) -> dict[str, Any]:
+    """One parameter; its name is the key under which it stands."""
+    return {
+        "value": value_json(param.value, param.type),
+        "type": type_name(param.type),
+        "index": param.index,
+        "bits": bits_text(param),
+    }
+
+
+def as_json(params: Iterable[Param]) -> dict[str, dict[str, Any]]:
+    """Parameters by name."""
+    return {param.name: param_json(param) for param in params}
+
+
+def print_json(result: object) -> None:
+    """Print one object on one line, at once."""
+    print(json.dumps(result, allow_nan=False), flush=True)  # noqa: T201  # this is the command's output
+
+
+# for people
+
+
+def print_line(text: str) -> None:
+    """Print one line of the result, at once."""
+    print(printable(text), flush=True)  # noqa: T201  # this is the command's output
+
+
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, right: str = "") -> None:
+    """Print a table: as wide as the terminal allows, and as wide as it needs where there is none.
+
+    Args:
+        columns: their headings.
+        rows: their cells; None is an empty one.
+        right: the headings of the columns that are aligned to the right.
+    """
+    from rich.console import Console  # only here: not needed to get started
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in columns:
+        table.add_column(column, justify="right" if column in right.split() else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text("" if cell is None else printable(str(cell))) for cell in row))
+    console = Console(width=None if sys.stdout.isatty() else UNLIMITED)
+    # rich would end the process by itself when the output is closed
+    with console.capture() as captured:
+        console.print(table)
+    lines = [line.rstrip() for line in captured.get().splitlines()]
+    print(*lines, sep="\n", flush=True)  # noqa: T201  # this is the command's output
+
+
+def report(text: str) -> None:
+    """Tell on stderr what went wrong. Further lines, as the forms of a link name, stay lines."""
+    say("\n".join(printable(line) for line in f"paramclient: {text}".splitlines()))
+
+
+def say(text: str) -> None:
+    """Print to stderr what accompanies a result."""
+    print(text, file=sys.stderr, flush=True)  # noqa: T201  # this is the command's output
+
+
+@contextmanager
+def progress_bar(title: str) -> Iterator[Callable[[Progress], None] | None]:
+    """What draws the progress of a fetch, for the time of the block; None where stderr is no terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    with ExitStack() as stack:
+        yield _bar(printable(title), stack)
+
+
+def _bar(title: str, stack: ExitStack) -> Callable[[Progress], None]:
+    update: Callable[[Progress], None] | None = None
+
+    def draw(state: Progress) -> None:
+        nonlocal update
+        if update is None and state.received:  # nothing is drawn for a fetch that needs no download
+            update = _start_bar(title, stack)
+        if update is not None:
+            update(state)
+
+    return draw
+
+
+def _start_bar(title: str, stack: ExitStack) -> Callable[[Progress], None]:
+    from rich.console import Console  # only here: not needed to get started
+    from rich.progress import BarColumn, TextColumn
+    from rich.progress import Progress as Bar
+
+    columns = ("{task.description}", "{task.completed}/{task.fields[of]}", "{task.fields[pace]}")
+    title_column, count_column, pace_column = (TextColumn(text, markup=False) for text in columns)
+    bar = stack.enter_context(
+        Bar(
+            title_column,
+            BarColumn(),
+            count_column,
+            pace_column,
+            console=Console(stderr=True),
+            auto_refresh=False,
+            transient=True,
+        )
+    )
+    task = bar.add_task(title, total=None, of="?", pace="")
+
+    def update(state: Progress) -> None:
+        left = "" if state.seconds_left is None else f", {state.seconds_left:.0f} s left"
+        bar.update(
+            task,
+            total=state.total,
+            completed=state.received,
+            of="?" if state.total is None else state.total,
+            pace=f"{state.rate:.0f}/s{left}",
+            refresh=True,
+        )
+
+    return update
+
+
+def _escaped(character: str) -> str:
+    code = ord(character)
+    return f"\\x{code:02x}" if code < 0x100 else f"\\u{code:04x}" if code < 0x10000 else f"\\U{code:08x}"

@@ -1,0 +1,68 @@
+"""A link, a vehicle on it, and the time that there is for both."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from typing import Final
+
+import anyio
+
+from paramclient.cli.options import LinkOptions
+from paramclient.client import ParamClient
+from paramclient.component import Component
+
+__all__ = ["Deadline", "Session", "connect"]
+
+HEARING_PATIENCE: Final = 10.0
+"""Seconds for a vehicle to be heard, where the user sets no limit."""
+
+
+class Deadline:
+    """The moment at which everything is to be over.
+
+    Args:
+        seconds: from now; None for never.
+    """
+
+    def __init__(self, seconds: float | None) -> None:
+        self._at = None if seconds is None else anyio.current_time() + seconds
+
+    def left(self, at_most: float | None = None) -> float | None:
+        """Seconds that are left, 0 when it is over; None without a limit, or `at_most` where given."""
+        if self._at is None:
+            return at_most
+        left = max(self._at - anyio.current_time(), 0.0)
+        return left if at_most is None else min(left, at_most)
+
+
+@dataclass(frozen=True, slots=True)
+class Session:
+    """An open client and the component that the command is about."""
+
+    client: ParamClient
+    component: Component
+    deadline: Deadline
+
+    @property
+    def who(self) -> str:
+        """The component in words: `1/1 px4`."""
+        component = self.component
+        return f"{component.system}/{component.component} {component.autopilot}"
+
+
+@asynccontextmanager
+async def connect(url: str, options: LinkOptions) -> AsyncIterator[Session]:
+    """Open a link and wait for the component that the options name.
+
+    Raises:
+        UsageError: no such link, or options that exclude each other.
+        NoReply: the component was not heard.
+        LinkError: the link cannot be opened, or failed.
+    """
+    deadline = Deadline(options.timeout)
+    async with ParamClient(url, cache=options.place, encoding=options.encoding) as client:
+        patience = HEARING_PATIENCE if options.timeout is None else deadline.left()
+        component = await client.component(options.system, options.component, timeout=patience)
+        yield Session(client, component, deadline)

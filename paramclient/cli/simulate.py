@@ -1,0 +1,101 @@
+"""The command that plays a vehicle for other programs: sim."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from typing import Annotated, Final, Literal
+
+from anyio.abc import TaskStatus
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from paramclient.cli.output import print_line
+from paramclient.errors import UsageError
+from paramclient.links import Link, LinkKind, LinkSpec, create_link, parse_link, serve_endpoint
+from paramclient.links.tcp import TcpIn
+from paramclient.links.udp import UdpIn
+
+__all__ = ["Faults", "sim"]
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Faults:
+    """What `Air.symmetric` takes. The texts below the fields are their help."""
+
+    loss: float = 0.0
+    """The share of datagrams that never arrive, 0 to 1; this and the others count for each direction."""
+
+    delay: float = 0.0
+    """Seconds on the way."""
+
+    jitter: float = 0.0
+    """Further seconds on the way, at random between 0 and this."""
+
+    duplicate: float = 0.0
+    """The share that arrives twice."""
+
+    reorder: float = 0.0
+    """The share that is overtaken."""
+
+    bit_errors: float = 0.0
+    """The chance of each single bit to arrive turned over."""
+
+    rate: float | None = None
+    """Bytes per second. Without it, no limit."""
+
+    queue: int | None = None
+    """Bytes that may wait for their turn at --rate. Without it, no limit."""
+
+    seed: int = 0
+    """Of the random numbers: the same faults for the same seed."""
+
+
+_NO_FAULTS: Final = Faults()
+_Id = Annotated[int, Parameter(validator=Number(gte=1, lte=255))]
+
+
+async def sim(
+    autopilot: Literal["px4", "ardupilot"],
+    /,
+    *,
+    link: str = "udpout:127.0.0.1:14550",
+    system: _Id = 1,
+    component: _Id = 1,
+    param_error: bool = False,
+    faults: Faults = _NO_FAULTS,
+) -> None:
+    """Run a simulated vehicle for other programs, until Ctrl-C.
+
+    Args:
+        autopilot: Which one.
+        link: Whom it speaks to, or where it listens; with port 0 the system chooses one, which is printed.
+        system: Its system id.
+        component: Its component id.
+        param_error: Answer what cannot be done with PARAM_ERROR, as newer firmware does.
+    """
+    from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle  # only here: no other command needs them
+
+    spec = parse_link(link)
+    if spec.kind is LinkKind.SIM:
+        raise UsageError(f"{spec.name} is a vehicle itself; a simulated one needs a link to other programs")
+    real = create_link(spec)
+    make = PX4Vehicle if autopilot == "px4" else ArduPilotVehicle
+    vehicle = make(system=system, component=component, param_error=param_error, stream=real.is_stream)
+    air = Air.symmetric([vehicle], **asdict(faults))
+    announcement = _Announcement(f"{autopilot} {system}/{component}", spec)
+    await serve_endpoint(air, real, task_status=announcement)
+
+
+class _Announcement(TaskStatus[Link]):
+    """Prints where the vehicle is, as soon as the link is open."""
+
+    def __init__(self, who: str, spec: LinkSpec) -> None:
+        self._who = who
+        self._spec = spec
+
+    def started(self, value: Link | None = None) -> None:
+        where = f"speaks to {self._spec}"
+        if isinstance(value, UdpIn | TcpIn) and value.address is not None:
+            where = f"listens on {replace(self._spec, port=value.address[1])}"
+        print_line(f"{self._who} {where}; Ctrl-C ends it")

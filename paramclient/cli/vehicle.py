@@ -1,0 +1,381 @@
+"""The commands that speak to a vehicle: fetch, get, set, watch."""
+
+from __future__ import annotations
+
+import math
+import re
+import time
+from collections.abc import Iterable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Annotated, Any, Final
+
+import anyio
+from cyclopts import Parameter
+
+from paramclient.cli.options import LinkOptions
+from paramclient.cli.outcome import ExitCode, code_of, status_of
+from paramclient.cli.output import (
+    as_json,
+    by_index,
+    hash_text,
+    print_json,
+    print_line,
+    print_table,
+    printable,
+    progress_bar,
+    report,
+    say,
+    time_text,
+    value_json,
+)
+from paramclient.cli.session import Session, connect
+from paramclient.component import Changes
+from paramclient.errors import NoReply, ParamClientError, UsageError, ValueNotApplied
+from paramclient.protocol.fetch import FetchResult
+from paramclient.protocol.table import Change
+from paramclient.values import Param, ParamType, Trust, Value, check_name, format_value, type_name
+
+__all__ = ["fetch", "get", "set_", "watch"]
+
+REFRESH_PATIENCE: Final = 10.0
+"""Seconds for the values that no hash covers, where the user sets no limit."""
+MOST_INDICES: Final = 20
+"""Missing indices that are named to people."""
+
+_DEFAULTS: Final = LinkOptions()
+
+
+async def fetch(url: str, /, *, refresh: bool = False, options: LinkOptions = _DEFAULTS) -> int:
+    """Bring every parameter: from the cache where the vehicle's hash confirms it, else by download.
+
+    Exit code 1 says that some are missing.
+
+    Args:
+        url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
+        refresh: Download even what the cache has.
+    """
+    async with connect(url, options) as session:
+        result = await _fetch_all(session, refresh=refresh)
+        with suppress(NoReply):
+            await session.component.refreshed(timeout=session.deadline.left(REFRESH_PATIENCE))
+        fetched = _Fetched.of(session, result)
+    for note in result.notes:
+        report(note)
+    if options.json:
+        print_json(fetched.as_json())
+    else:
+        rows = ((*_cells(param), param.trust) for param in fetched.params)
+        print_table([*_COLUMNS, "trust"], rows, right="value index")
+        say(printable(fetched.summary))
+    if fetched.missing:
+        report(f"incomplete: {_named(fetched.missing)} did not come")
+        return ExitCode.INCOMPLETE
+    return ExitCode.DONE
+
+
+async def get(url: str, name: str, /, *names: str, options: LinkOptions = _DEFAULTS) -> int:
+    """Ask the vehicle for single parameters.
+
+    Args:
+        url: The link.
+        name: The parameter.
+        names: More of them.
+    """
+    wanted = [check_name(each) for each in dict.fromkeys((name, *names))]
+    async with connect(url, options) as session:
+        params, errors = await _get_all(session, wanted)
+    if options.json:
+        texts = {each: str(error) for each, error in errors.items()}
+        print_json({"params": as_json(params), **({"errors": texts} if texts else {})})
+    elif params:
+        print_table(_COLUMNS, map(_cells, params), right="value index")
+    return _report_all(errors.values())
+
+
+async def set_(
+    url: str,
+    /,
+    *pairs: Annotated[str, Parameter(name="NAME VALUE", allow_leading_hyphen=True)],
+    options: LinkOptions = _DEFAULTS,
+) -> int:
+    """Write parameters, in the order given, and prove by its value that the vehicle has taken each.
+
+    A value is a decimal number, a hexadecimal one (0x1F), nan or inf. All are tried even if one is refused.
+
+    Args:
+        url: The link.
+        pairs: A parameter and its value, as often as wanted.
+    """
+    writes = _parse_pairs(pairs)
+    async with connect(url, options) as session:
+        began = anyio.current_time()
+        outcomes = [await _write(session, name, value) for name, value in writes]
+        client = session.client
+        summary = (
+            f"{sum(not outcome.reason for outcome in outcomes)} of {len(outcomes)} set on {session.who} in "
+            f"{anyio.current_time() - began:.2f} s, "
+            f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent"
+        )
+    if options.json:
+        print_json({"results": [outcome.as_json() for outcome in outcomes]})
+    else:
+        print_table(
+            ["name", "requested", "actual", "status"],
+            (outcome.cells() for outcome in outcomes),
+            right="requested actual",
+        )
+        say(summary)
+    for outcome in outcomes:
+        if outcome.reason:
+            report(f"{outcome.name}: {outcome.reason}")
+    return max(outcome.code for outcome in outcomes)
+
+
+async def watch(url: str, /, *names: str, options: LinkOptions = _DEFAULTS) -> int:
+    """Print every change of a value as it happens, whoever caused it, until Ctrl-C.
+
+    What is known is brought up to date first; what has changed since the cache was written is printed too.
+    With --timeout it ends by itself.
+
+    Args:
+        url: The link.
+        names: The parameters to watch; without any, all of them.
+    """
+    wanted = [check_name(each) for each in dict.fromkeys(names)]
+    async with connect(url, options) as session:
+        changes = session.component.changes()
+        if wanted:
+            _, errors = await _get_all(session, wanted)
+            if errors:
+                return _report_all(errors.values())
+        else:
+            await _fetch_all(session, refresh=False)
+        known = set(session.component.params)
+        what = ", ".join(wanted) if wanted else f"{len(known)} parameters"
+        say(printable(f"watching {what} of {session.who}"))
+        with anyio.move_on_after(session.deadline.left()):
+            await _print_changes(changes, known, frozenset(wanted), as_lines_of_json=options.json)
+    return ExitCode.DONE
+
+
+# fetch
+
+
+@dataclass(frozen=True, slots=True)
+class _Fetched:
+    """What the vehicle has given or confirmed in this session.
+
+    A value that only the cache knows is left out, and its index is missing like one that did not come.
+    """
+
+    session: Session
+    result: FetchResult
+    params: list[Param]
+    missing: list[int]
+    bytes_received: int
+    bytes_sent: int
+
+    @classmethod
+    def of(cls, session: Session, result: FetchResult) -> _Fetched:
+        known = by_index(session.component.params.values())
+        stale = {param.index for param in known if param.trust is Trust.CACHED and param.index is not None}
+        return cls(
+            session,
+            result,
+            params=[param for param in known if param.trust is not Trust.CACHED],
+            missing=sorted(stale if result.source == "cache" else result.missing),
+            bytes_received=session.client.bytes_received,
+            bytes_sent=session.client.bytes_sent,
+        )
+
+    @property
+    def received(self) -> int:
+        return self.result.count - len(self.missing)
+
+    @property
+    def summary(self) -> str:
+        result = self.result
+        of = f" of {result.count}" if self.missing else ""
+        crc = "" if result.hash is None else f"; hash {hash_text(result.hash)}"
+        return (
+            f"{self.received}{of} parameters of {self.session.who} from {result.source} in "
+            f"{result.elapsed:.2f} s, {self.bytes_received:,} bytes received, {self.bytes_sent:,} sent{crc}"
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        component = self.session.component
+        return {
+            "system": component.system,
+            "component": component.component,
+            "autopilot": component.autopilot,
+            "uid": component.identity.uid,
+            "count": self.result.count,
+            "received": self.received,
+            "source": self.result.source,
+            "hash": hash_text(self.result.hash),
+            "missing": self.missing,
+            "elapsed_s": round(self.result.elapsed, 4),
+            "bytes_received": self.bytes_received,
+            "bytes_sent": self.bytes_sent,
+            "params": as_json(self.params),
+        }
+
+
+async def _fetch_all(session: Session, *, refresh: bool) -> FetchResult:
+    with progress_bar(f"fetching {session.who}") as progress:
+        return await session.component.fetch_all(
+            refresh=refresh, timeout=session.deadline.left(), progress=progress
+        )
+
+
+def _named(indices: Sequence[int]) -> str:
+    shown = ", ".join(map(str, indices[:MOST_INDICES]))
+    more = len(indices) - MOST_INDICES
+    return f"ind{'ex' if len(indices) == 1 else 'ices'} {shown}{f' and {more} more' if more > 0 else ''}"
+
+
+# get
+
+_COLUMNS: Final = ("name", "value", "type", "index")
+
+
+def _cells(param: Param) -> tuple[object, ...]:
+    return param.name, format_value(param.value, param.type), type_name(param.type), param.index
+
+
+async def _get_all(session: Session, names: Sequence[str]) -> tuple[list[Param], dict[str, ParamClientError]]:
+    """Read several side by side; what came and what did not, both in the order of the names."""
+    found: dict[str, Param] = {}
+    errors: dict[str, ParamClientError] = {}
+
+    async def read(name: str) -> None:
+        try:
+            found[name] = await session.component.get(name, timeout=session.deadline.left())
+        except ParamClientError as error:
+            errors[name] = error
+
+    async with anyio.create_task_group() as tasks:
+        for name in names:
+            tasks.start_soon(read, name)
+    return (
+        [found[name] for name in names if name in found],
+        {name: errors[name] for name in names if name in errors},
+    )
+
+
+def _report_all(errors: Iterable[ParamClientError]) -> int:
+    """Tell every error; the exit code for all of them."""
+    worst = ExitCode.DONE
+    for error in errors:
+        report(str(error))
+        worst = max(worst, code_of(error))
+    return worst
+
+
+# set
+
+
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """What became of one set; `reason` is empty where it was done."""
+
+    name: str
+    type: ParamType | int
+    requested: Value
+    actual: Value | None
+    status: str
+    reason: str = ""
+    code: ExitCode = ExitCode.DONE
+
+    def as_json(self) -> dict[str, Any]:
+        actual = None if self.actual is None else value_json(self.actual, self.type)
+        return {
+            "name": self.name,
+            "requested": value_json(self.requested, ParamType.REAL64),
+            "actual": actual,
+            "status": self.status,
+            **({"reason": self.reason} if self.reason else {}),
+        }
+
+    def cells(self) -> tuple[object, ...]:
+        actual = None if self.actual is None else format_value(self.actual, self.type)
+        return self.name, format_value(self.requested, ParamType.REAL64), actual, self.status
+
+
+async def _write(session: Session, name: str, value: int | float) -> _Written:
+    try:
+        done = await session.component.set(name, value, timeout=session.deadline.left())
+    except ParamClientError as error:
+        known = session.component.params.get(name)
+        return _Written(
+            name,
+            ParamType.REAL32 if known is None else known.type,
+            requested=value,
+            actual=error.actual if isinstance(error, ValueNotApplied) else None,
+            status=status_of(error),
+            reason=str(error),
+            code=code_of(error),
+        )
+    return _Written(name, done.param.type, requested=value, actual=done.actual, status=done.status)
+
+
+def _parse_pairs(words: Sequence[str]) -> list[tuple[str, int | float]]:
+    if not words or len(words) % 2:
+        raise UsageError(f"set takes pairs of NAME and VALUE, not {len(words)} words")
+    return [
+        (check_name(name), _parse_number(name, text))
+        for name, text in zip(words[::2], words[1::2], strict=True)
+    ]
+
+
+def _parse_number(name: str, text: str) -> int | float:
+    """Read a value exactly: an integer as an int, everything else as a float.
+
+    Raises:
+        UsageError: it is no number, or one beyond a float.
+    """
+    if _INTEGER.fullmatch(text):
+        return int(text, 16 if "x" in text.lower() else 10)
+    if _REAL.fullmatch(text):
+        value = float(text)
+        if math.isinf(value) and "i" not in text.lower():
+            raise UsageError(f"{name}: {text} is beyond the range of a float")
+        return value
+    raise UsageError(f"{name}: {text!r} is no number; 12, 0x1F, -1.5, 1e-3, nan and inf are")
+
+
+_INTEGER: Final = re.compile(r"[+-]?(0[xX][0-9a-fA-F]{1,32}|[0-9]{1,40})")
+_REAL: Final = re.compile(
+    r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(inf|infinity|nan)", re.IGNORECASE
+)
+
+
+# watch
+
+
+async def _print_changes(
+    changes: Changes, known: set[str], wanted: frozenset[str], *, as_lines_of_json: bool
+) -> None:
+    """Print changes until cancelled; a parameter that has just been heard for the first time is none."""
+    async for change in changes:
+        if change.old is None and change.name in known:
+            known.discard(change.name)
+        elif not wanted or change.name in wanted:
+            at = time.time()
+            if as_lines_of_json:
+                print_json(_change_json(change, at))
+            else:
+                old, new = (_change_text(param) for param in (change.old, change.new))
+                print_line(f"{time_text(at)}  {change.name}  {old} -> {new}  ({change.by})")
+
+
+def _change_json(change: Change, at: float) -> dict[str, Any]:
+    old, new = (
+        None if param is None else value_json(param.value, param.type) for param in (change.old, change.new)
+    )
+    return {"time": time_text(at), "name": change.name, "old": old, "new": new, "by": change.by}
+
+
+def _change_text(param: Param | None) -> str:
+    return "none" if param is None else format_value(param.value, param.type)
