@@ -1,0 +1,77 @@
+# Everything happens in .venv, which is made at the first call; nothing is installed outside this folder.
+#
+#   make demo       the main job on a simulated vehicle
+#   make test       the tests                      make coverage   the tests, and what they reach
+#   make lint       style and types                make docs       the pages, into docs/_build/html
+#   make bench      speed of parser and start      make dist       wheel and sdist, into dist
+#   make clean      remove all that was made
+
+PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
+	"$$python" -c $(IS_NEW_ENOUGH) 2>/dev/null && echo "$$python" && break; done)
+IS_NEW_ENOUGH = 'import sys; sys.exit(sys.version_info < (3, 11))'
+
+VENV ?= .venv
+BIN = $(VENV)/bin
+PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
+TESTS ?=
+
+MEASURED = 'protocol/*' 'sim/*' 'cache/*' values.py errors.py identity.py params.py
+# what they start are programs of their own, which are not measured
+UNMEASURED = $(addprefix --ignore=tests/test_,docs.py examples.py packaging.py)
+
+.PHONY: demo test coverage lint docs bench dist clean
+.NOTPARALLEL:
+
+demo: $(VENV)/with-cli
+	@$(BIN)/python examples/demo.py
+
+test: $(VENV)/with-test
+	$(BIN)/python -m pytest --numprocesses auto $(TESTS)
+
+coverage: $(VENV)/with-test
+	$(BIN)/python -m pytest --numprocesses auto --cov --cov-report= $(TESTS) $(UNMEASURED)
+	@failed=; for room in $(MEASURED); do \
+		echo "== paramclient/$$room"; \
+		$(BIN)/coverage report --include="paramclient/$$room" --fail-under=95 || failed=1; \
+	done; test -z "$$failed"
+
+lint: $(VENV)/with-test $(VENV)/with-lint
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+docs: $(VENV)/with-docs
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --fresh-env -d docs/_build/doctrees docs docs/_build/html
+
+bench: $(VENV)/with-cli
+	$(BIN)/python bench/parse.py
+	$(BIN)/python bench/startup.py
+
+dist: $(VENV)/with-test
+	rm -rf dist
+	$(BIN)/hatchling build
+
+clean:
+	rm -rf $(VENV) dist docs/_build htmlcov .coverage .coverage.* .hypothesis .mypy_cache .pytest_cache .ruff_cache
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+# The environment, and what is installed into it: once, and again when pyproject.toml changes.
+
+$(VENV)/made:
+	@test -n "$(PYTHON)" && "$(PYTHON)" -c $(IS_NEW_ENOUGH) || { \
+		echo "paramclient needs Python 3.11 or newer; name one: make PYTHON=/path/to/python3.12"; exit 1; }
+	@echo "Making $(VENV) with $(PYTHON)"
+	@"$(PYTHON)" -m venv --clear $(VENV)
+	@touch $@
+
+$(VENV)/with-cli: pyproject.toml $(VENV)/made
+	@echo "Installing paramclient into $(VENV)"
+	@$(PIP) --editable '.[cli]'
+	@touch $@
+
+# dependency groups need pip 25.1, and the pip of the environment is as old as its Python
+$(VENV)/with-test $(VENV)/with-lint $(VENV)/with-docs: $(VENV)/with-%: pyproject.toml $(VENV)/with-cli
+	@echo "Installing what $* needs into $(VENV)"
+	@$(PIP) 'pip>=25.1'
+	@$(PIP) --group $*
+	@touch $@

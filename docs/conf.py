@@ -1,0 +1,52 @@
+"""How the pages are built; the command is `make docs`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from paramclient import __version__
+
+project = "paramclient"
+author = "The paramclient authors"
+project_copyright = author
+version = release = __version__
+
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon"]
+exclude_patterns = ["_build"]
+default_role = "py:obj"
+myst_heading_anchors = 3
+
+autodoc_member_order = "bysource"
+autodoc_preserve_defaults = True
+autodoc_class_signature = "mixed"
+autodoc_default_options = {"members": True}
+napoleon_numpy_docstring = False
+# one field may stand for several names, as in "system, component: who we are", which only this form takes
+napoleon_use_param = False
+napoleon_custom_sections = [("Attributes", "params_style"), ("Args of every vehicle", "params_style")]
+
+html_theme = "furo"
+html_title = f"paramclient {version}"
+html_copy_source = False
+html_show_sphinx = False
+
+
+STAND_IN = "\ue000"
+"""For a colon, which napoleon takes for the end of a type in an attribute's first line."""
+
+
+def setup(app: Any) -> None:
+    """Called by Sphinx; napoleon's own work has the priority 500."""
+    app.connect("autodoc-process-docstring", hide_colons, priority=400)
+    app.connect("autodoc-process-docstring", show_colons, priority=600)
+
+
+def hide_colons(app: Any, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
+    """Let a docstring such as "Who it is: px4, ardupilot, …" stay a sentence."""
+    if what in ("attribute", "data", "property") and lines:
+        lines[0] = lines[0].replace(": ", f"{STAND_IN} ")
+
+
+def show_colons(app: Any, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
+    """Undo `hide_colons`."""
+    lines[:] = [line.replace(STAND_IN, ":") for line in lines]

@@ -1,0 +1,174 @@
+"""The README and the pages: their programs run, their links lead somewhere, and what they name exists."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from functools import cache
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import paramclient
+import paramclient.links
+import paramclient.sim
+
+ROOT = Path(__file__).parent.parent
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(DOCS.glob("*.md"))]
+EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+
+FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
+DIRECTIVE = re.compile(r"^\.\. (\w+):: ([\w.]+)(?:\(\))?$", re.MULTILINE)
+LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]*)?\)")
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return [code for kind, code in FENCE.findall(page.read_text(encoding="utf-8")) if kind == language]
+
+
+def programs() -> Iterator[object]:
+    """Every whole Python program; what begins with `async with` is a piece of one."""
+    for page in PAGES:
+        for number, code in enumerate(blocks(page, "python"), start=1):
+            if not code.startswith("async with"):
+                yield pytest.param(code, id=f"{page.stem}-{number}")
+
+
+def commands() -> list[list[str]]:
+    """Every call of the command in the pages, without the comment and what the shell does."""
+    lines = [line for page in PAGES for code in blocks(page, "sh") for line in code.splitlines()]
+    words = [shlex.split(line, comments=True) for line in lines]
+    return [
+        [word for word in each[1:] if not word.startswith(">")]
+        for each in words
+        if each[:1] == ["paramclient"]
+    ]
+
+
+def run(*arguments: str, **environment: str) -> str:
+    """Run a Python program; what it printed. It must end well, and complain of nothing."""
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        encoding="utf-8",
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+@pytest.mark.parametrize("program", [*programs()])
+def test_a_program_runs(program: str, tmp_path: Path) -> None:
+    run("-W", "error", "-c", program, XDG_CACHE_HOME=str(tmp_path))
+
+
+def test_the_first_example_runs(tmp_path: Path) -> None:
+    """The five lines of the README, with a vehicle that needs no radio."""
+    (example,) = blocks(ROOT / "README.md", "python")
+    assert len(example.splitlines()) == 5
+    assert '"udpin:0.0.0.0:14550"' in example
+    lines = [
+        "import asyncio",
+        "from paramclient import ParamClient",
+        "async def main():",
+        *(f"    {line}" for line in example.replace("udpin:0.0.0.0:14550", "sim:px4").splitlines()),
+        "    print(len(result.params), roll, done, sep=', ')",
+        "asyncio.run(main())",
+    ]
+    printed = run("-W", "error", "-c", "\n".join(lines), XDG_CACHE_HOME=str(tmp_path))
+    assert printed == "903, MC_ROLL_P = 4.0, MC_ROLL_P = 6.0\n"
+
+
+@EVERY_PAGE
+def test_links_lead_somewhere(page: Path) -> None:
+    for target, _ in LINK.findall(page.read_text(encoding="utf-8")):
+        if not target.startswith("https://"):
+            assert (page.parent / target).exists(), f"{page.name}: {target}"
+
+
+def test_every_page_is_in_the_table_of_contents() -> None:
+    index = (DOCS / "index.md").read_text(encoding="utf-8")
+    for page in [*DOCS.glob("*.md"), *DOCS.glob("api/*.rst")]:
+        name = page.relative_to(DOCS).with_suffix("").as_posix()
+        assert name == "index" or re.search(rf"^{name}$", index, re.MULTILINE), name
+
+
+@pytest.mark.parametrize(
+    "module",
+    [paramclient, paramclient.links, paramclient.sim],
+    ids=lambda m: m.__name__,
+)
+def test_every_public_name_is_in_the_pages(module: ModuleType) -> None:
+    documented = set()
+    for page in DOCS.glob("api/*.rst"):
+        current = ""
+        for directive, name in DIRECTIVE.findall(page.read_text(encoding="utf-8")):
+            if directive in ("currentmodule", "automodule"):
+                current = name
+            else:
+                documented.add(f"{current}.{name}")
+    public = {f"{module.__name__}.{name}" for name in module.__all__ if name != "__version__"}
+    assert public == {name for name in documented if name.rpartition(".")[0] == module.__name__}
+
+
+def test_the_page_of_the_design_names_every_room() -> None:
+    text = (DOCS / "design.md").read_text(encoding="utf-8")
+    package = ROOT / "paramclient"
+    modules = {path.name for folder in (package, package / "protocol") for path in folder.glob("*.py")}
+    folders = {f"{path.parent.name}/" for path in package.glob("*/__init__.py")}
+    rooms = (modules | folders) - {"__init__.py", "__main__.py", "version.py"}
+    assert set(re.findall(r"^ {2,4}(\w+(?:\.py|/)) ", text, re.MULTILINE)) == rooms
+
+
+def test_make_knows_what_the_pages_say() -> None:
+    targets = set(re.findall(r"^([a-z]+):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE))
+    named = set()
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        for code in [*re.findall(r"`(make [^`]+)`", text), *blocks(page, "sh")]:
+            named |= set(re.findall(r"\bmake ([a-z]+)", code))
+    assert {"demo", "test", "docs"} <= named <= targets
+
+
+@cache
+def help_of(*words: str) -> str:
+    return run("-m", "paramclient", *words, "--help", COLUMNS="200")
+
+
+def subcommand(words: list[str]) -> list[str]:
+    return words[:2] if words[0] == "cache" else words[:1]
+
+
+def test_every_command_is_shown_and_exists() -> None:
+    used = {tuple(subcommand(words)) for words in commands()}
+    cache = {("cache", verb) for verb in ("list", "history", "path", "remove")}
+    assert used == {("fetch",), ("get",), ("set",), ("watch",), ("show",), ("sim",)} | cache
+    for words in used:
+        assert words[-1] in help_of(*words)
+
+
+def test_options_in_examples_exist() -> None:
+    for words in commands():
+        options = help_of(*subcommand(words))
+        for option in (word for word in words if word.startswith("--")):
+            assert re.search(rf"{option}\b", options), f"paramclient {shlex.join(words)}: no {option}"
+
+
+def test_the_page_of_the_command_names_every_option() -> None:
+    page = (DOCS / "command.md").read_text(encoding="utf-8")
+    offered = set()
+    for command in ("fetch", "get", "set", "watch", "show", "sim"):
+        offered |= set(re.findall(r"--[a-z][a-z-]+", help_of(command)))
+    for verb in ("list", "history", "path", "remove"):
+        offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("cache", verb)))
+    named = set(re.findall(r"`(--[a-z][a-z-]+)", page))
+    assert named - {"--help"} == offered - {"--help", "--version"}

@@ -1,0 +1,102 @@
+"""Every example runs by itself, as a program of its own, and prints what it should."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+EXAMPLES = ROOT / "examples"
+
+PRINTED = {
+    "demo": [
+        r"903 parameters, 0 missing, hash cf579589",
+        r"903 parameters from the cache",
+        r"equal to the vehicle's own table: yes",
+        r"accepted: MC_ROLL_P = 7\.25; on board: 7\.25",
+        r"cold fetch +\d+\.\d+ +[\d,]+ +[\d,]+",
+        r"second run, from the cache +\d+\.\d+ +[\d,]+ +[\d,]+",
+        r"one set, confirmed +\d+\.\d+ +[\d,]+ +[\d,]+",
+    ],
+    "offline": [
+        r"visit: <FetchResult 1/1 903 params from stream in ",
+        r"known: .+ \(system 1, px4, components 1\)",
+        r"table: <CachedComponent 1/1 px4 903 params synced ",
+        r"MC_ROLL_P = 4\.0 -> MC_ROLL_P = 7\.0, by us",
+    ],
+    "read_one": [r"MC_ROLL_P = 4\.0 +\(index 547, bits 40800000\)"],
+    "set_and_prove": [
+        r"done: +MC_ROLL_P = 7\.0",
+        r"done: +COM_DISARM_LAND = 3\.0",
+        r"wrong: +1\.5 is not a whole number",
+        r"refused: .*NO_SUCH",
+    ],
+    "test_your_program": [
+        r"passed: test_works_on_a_bad_radio",
+        r"passed: test_refuses_other_autopilots",
+    ],
+    "two_vehicles": [
+        r"<FetchResult 1/1 903 params from stream in ",
+        r"<FetchResult 2/1 903 params from stream in ",
+        r"MC_ROLL_P = 4\.0 on 1, MC_ROLL_P = 8\.0 on 2",
+    ],
+    "watch": [
+        r"<Component 1/1 px4 synced 903 params",
+        r"MC_PITCH_P = 4\.0 -> MC_PITCH_P = 7\.5, by vehicle",
+        r"MC_ROLL_P = 4\.0 -> MC_ROLL_P = 7\.0, by vehicle",
+    ],
+}
+
+
+def run(*command: str | Path, cache: Path) -> str:
+    """Run a Python program with a cache of its own; what it printed. A warning would be an error."""
+    done = subprocess.run(
+        [sys.executable, "-W", "error", *command],
+        env=os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(cache), "COLUMNS": "80"},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        encoding="utf-8",
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, "")
+    return done.stdout
+
+
+def test_all_are_here() -> None:
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == set(PRINTED)
+
+
+@pytest.mark.parametrize("name", PRINTED)
+def test_runs(name: str, tmp_path: Path) -> None:
+    printed = run(EXAMPLES / f"{name}.py", cache=tmp_path)
+    for line in PRINTED[name]:
+        assert re.search(line, printed), f"{line!r} is not in\n{printed}"
+    assert "\x1b" not in printed
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "line"),
+    [
+        ("read_one", ["sim:ardupilot", "RTL_ALT"], "RTL_ALT = 1500 "),
+        (
+            "set_and_prove",
+            ["sim:ardupilot", "RTL_ALT", "1234.7"],
+            "RTL_ALT = 1234 (adjusted from 1234.7)",
+        ),
+        ("offline", ["sim:ardupilot"], "1/1 ardupilot 1382 params"),
+        ("test_your_program", ["sim:px4?system=7"], "changed: ['MPC_XY_VEL_MAX', "),
+    ],
+)
+def test_takes_a_link(name: str, arguments: list[str], line: str, tmp_path: Path) -> None:
+    assert line in run(EXAMPLES / f"{name}.py", *arguments, cache=tmp_path)
+
+
+def test_pytest_finds_the_tests_of_your_program(tmp_path: Path) -> None:
+    example = EXAMPLES / "test_your_program.py"
+    assert "4 passed" in run("-m", "pytest", "-p", "no:cacheprovider", example, cache=tmp_path)

@@ -1,0 +1,105 @@
+"""What is shipped: the wheel and the sdist as hatchling builds them, and what they say of themselves."""
+
+from __future__ import annotations
+
+import re
+import tarfile
+import tomllib
+import zipfile
+from email.message import Message
+from email.parser import Parser
+from pathlib import Path
+
+import pytest
+from hatchling.builders.sdist import SdistBuilder
+from hatchling.builders.wheel import WheelBuilder
+
+import paramclient
+
+ROOT = Path(__file__).parent.parent
+SOURCES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient").rglob("*.py")}
+TABLES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/sim/tables").glob("*.csv")}
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The files in the wheel."""
+    folder = tmp_path_factory.mktemp("wheel")
+    (path,) = WheelBuilder(str(ROOT)).build(directory=str(folder), versions=["standard"])
+    with zipfile.ZipFile(path) as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+@pytest.fixture(scope="module")
+def sdist(tmp_path_factory: pytest.TempPathFactory) -> set[str]:
+    """The names of the files in the sdist, without its top folder."""
+    (path,) = SdistBuilder(str(ROOT)).build(directory=str(tmp_path_factory.mktemp("sdist")))
+    with tarfile.open(path) as archive:
+        return {member.name.split("/", 1)[1] for member in archive if member.isfile()}
+
+
+@pytest.fixture(scope="module")
+def metadata(wheel: dict[str, bytes]) -> Message:
+    (name,) = (name for name in wheel if name.endswith(".dist-info/METADATA"))
+    return Parser().parsestr(wheel[name].decode())
+
+
+def test_the_wheel_has_the_package_and_nothing_else(wheel: dict[str, bytes]) -> None:
+    shipped = {name for name in wheel if ".dist-info/" not in name}
+    assert shipped == SOURCES | TABLES | {"paramclient/py.typed"}
+    assert len(TABLES) >= 3
+
+
+def test_the_wheel_has_the_licence(wheel: dict[str, bytes], metadata: Message) -> None:
+    (name,) = (name for name in wheel if name.endswith(".dist-info/licenses/LICENSE"))
+    assert wheel[name].startswith(b"MIT License")
+    assert metadata["License-Expression"] == "MIT"
+
+
+def test_the_command_is_an_entry_point(wheel: dict[str, bytes]) -> None:
+    (name,) = (name for name in wheel if name.endswith(".dist-info/entry_points.txt"))
+    assert "paramclient = paramclient.__main__:main" in wheel[name].decode()
+
+
+def test_the_sdist_can_be_built_and_tested(sdist: set[str]) -> None:
+    assert sdist >= SOURCES | TABLES
+    assert sdist >= {
+        "pyproject.toml",
+        "README.md",
+        "CHANGELOG.md",
+        "LICENSE",
+        "Makefile",
+        "docs/conf.py",
+    }
+    assert sdist >= {path.relative_to(ROOT).as_posix() for path in (ROOT / "tests/data").iterdir()}
+    assert not {name for name in sdist if "__pycache__" in name or name.startswith((".venv", "docs/_build"))}
+
+
+def test_the_version_stands_in_one_place(metadata: Message) -> None:
+    assert metadata["Version"] == paramclient.__version__
+    written = [
+        name for name in SOURCES if paramclient.__version__ in (ROOT / name).read_text(encoding="utf-8")
+    ]
+    assert written == ["paramclient/version.py"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["dynamic"] == ["version"]
+
+
+def test_the_changelog_knows_the_version() -> None:
+    text = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    versions = re.findall(r"^## \[([^]]+)\](?: - \d{4}-\d\d-\d\d)?$", text, re.MULTILINE)
+    assert versions[:2] == ["Unreleased", paramclient.__version__]
+
+
+def test_what_an_installation_brings(metadata: Message) -> None:
+    """The library alone brings nothing of the command's."""
+    requirements = metadata.get_all("Requires-Dist", [])
+    always = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra ==" not in each}
+    command = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra == 'cli'" in each}
+    assert always == {"anyio", "fastcrc", "platformdirs", "pydantic", "pymavlink"}
+    assert command == {"cyclopts", "rich"}
+    assert metadata["Requires-Python"] == ">=3.11"
+
+
+def test_the_readme_is_the_description(metadata: Message) -> None:
+    assert metadata.get_payload() == (ROOT / "README.md").read_text(encoding="utf-8")
