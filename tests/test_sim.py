@@ -1037,6 +1037,21 @@ class TestFaultyLink:
         assert link.next_deadline() == 1.25
         assert link.deliver(1.25) == [b"x"]
 
+    def test_loss_in_bursts(self) -> None:
+        link = FaultyLink(loss=0.2, loss_burst=8.0, seed=6)
+        arrived = {number for _, number in pass_through(link)}
+        assert 0.15 <= link.lost / link.sent <= 0.25
+        runs = [
+            len(list(run))
+            for is_lost, run in itertools.groupby(range(5000), lambda n: n not in arrived)
+            if is_lost
+        ]
+        assert 6.0 <= sum(runs) / len(runs) <= 10.0
+        assert link.lost == sum(runs)
+
+    def test_everything_lost_in_bursts(self) -> None:
+        assert pass_through(FaultyLink(loss=1.0, loss_burst=3.0)) == []
+
     def test_jitter_keeps_the_order(self) -> None:
         arrived = pass_through(FaultyLink(delay=0.01, jitter=0.05, seed=3))
         assert [number for _, number in arrived] == list(range(5000))
@@ -1112,6 +1127,8 @@ class TestFaultyLink:
         [
             {"loss": -0.1},
             {"loss": 1.1},
+            {"loss_burst": 0.5},
+            {"loss_burst": math.inf},
             {"duplicate": math.nan},
             {"reorder": 2.0},
             {"bit_errors": -1.0},

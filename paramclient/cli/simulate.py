@@ -26,6 +26,9 @@ class Faults:
     loss: float = 0.0
     """The share of datagrams that never arrive, 0 to 1; this and the others count for each direction."""
 
+    loss_burst: float = 1.0
+    """How many in a row are lost, on average: more than 1 for a link that fades."""
+
     delay: float = 0.0
     """Seconds on the way."""
 

@@ -227,6 +227,7 @@ def _whole(smallest: int, largest: int) -> Callable[[str, str], int]:
 
 _SIM_OPTIONS: dict[str, Callable[[str, str], int | float]] = {
     "loss": _real(0, 1),
+    "loss_burst": _real(1, 1e6),
     "delay": _real(0, 3600),
     "jitter": _real(0, 3600),
     "duplicate": _real(0, 1),
@@ -238,4 +239,4 @@ _SIM_OPTIONS: dict[str, Callable[[str, str], int | float]] = {
     "system": _whole(1, 255),
     "param_error": _whole(0, 1),
 }
-"""Options of `sim:` links: probabilities, seconds one way, bytes per second, bytes in the queue, numbers."""
+"""Options of `sim:` links: probabilities, datagrams lost in a row, seconds one way, bytes per second, bytes in the queue, numbers."""

@@ -46,6 +46,9 @@ class FaultyLink:
 
     Args:
         loss: the share of datagrams that never arrive, 0 to 1.
+        loss_burst: how many in a row are lost, on average: 1 for losses that know nothing of each other,
+            more for a link that fades (Gilbert's model: a good state that loses nothing, a bad one that
+            loses all).
         delay: seconds on the way.
         jitter: further seconds on the way, uniform between 0 and this.
         duplicate: the share that arrives twice, 0 to 1.
@@ -70,6 +73,7 @@ class FaultyLink:
         self,
         *,
         loss: float = 0.0,
+        loss_burst: float = 1.0,
         delay: float = 0.0,
         jitter: float = 0.0,
         duplicate: float = 0.0,
@@ -83,6 +87,8 @@ class FaultyLink:
         for name, share in shares.items():
             if not 0.0 <= share <= 1.0:
                 raise UsageError(f"{name} is a share between 0 and 1, not {share}")
+        if not (math.isfinite(loss_burst) and loss_burst >= 1.0):
+            raise UsageError(f"loss_burst is a number of datagrams from 1 up, not {loss_burst}")
         for name, seconds in {"delay": delay, "jitter": jitter}.items():
             if not (math.isfinite(seconds) and seconds >= 0.0):
                 raise UsageError(f"{name} is a number of seconds from 0 up, not {seconds}")
@@ -91,6 +97,8 @@ class FaultyLink:
         if queue is not None and (rate is None or queue < 0):
             raise UsageError("queue is a number of bytes from 0 up, and needs a rate")
         self._loss = loss
+        self._loss_burst = loss_burst
+        self._is_fading = False
         self._delay = delay
         self._jitter = jitter
         self._duplicate = duplicate
@@ -120,7 +128,7 @@ class FaultyLink:
                 return
             leaves_at = self._free_at = starts_at + len(data) / self._rate
         chance = self._random.random
-        if self._loss and chance() < self._loss:
+        if self._loss and self._loses():
             self.lost += 1
             return
         arrives_at = leaves_at + self._delay
@@ -150,6 +158,17 @@ class FaultyLink:
     def next_deadline(self) -> float | None:
         """When the next datagram arrives; None while none is on the way."""
         return self._flying[0][0] if self._flying else None
+
+    def _loses(self) -> bool:
+        """Whether the next datagram is lost; in bursts, whether the link is in its bad state."""
+        if self._loss_burst == 1.0 or self._loss == 1.0:
+            return self._random.random() < self._loss
+        if self._is_fading:
+            change = 1.0 / self._loss_burst
+        else:
+            change = self._loss / max(1.0 - self._loss, 1e-9) / self._loss_burst
+        self._is_fading ^= self._random.random() < change
+        return self._is_fading
 
     def _damaged(self, data: bytes) -> bytes:
         if not self._bit_errors:
@@ -202,6 +221,7 @@ class Air:
         vehicles: Sequence[Endpoint],
         *,
         loss: float = 0.0,
+        loss_burst: float = 1.0,
         delay: float = 0.0,
         jitter: float = 0.0,
         duplicate: float = 0.0,
@@ -220,6 +240,7 @@ class Air:
         def link(own_seed: int) -> FaultyLink:
             return FaultyLink(
                 loss=loss,
+                loss_burst=loss_burst,
                 delay=delay,
                 jitter=jitter,
                 duplicate=duplicate,

@@ -1,0 +1,179 @@
+"""How long a download takes on good and bad links, against an oracle, in simulated time.
+
+Run `python bench/links.py` for the table, `--seeds N` for more seeds, `--only TEXT` for the rows whose name
+holds a text, `--check` to fail when a row is beyond its bound. The protocol core runs against the simulated
+vehicles through the faulty link with no socket and no clock: the same seeds give the same figures anywhere.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import statistics
+import sys
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from typing import Any
+
+from oracle import TellingLink, oracle_time
+
+from paramclient.protocol.station import Station
+from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
+
+LIMIT = 600.0
+"""Simulated seconds after which a run counts as endless."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One kind of vehicle on one kind of link.
+
+    Attributes:
+        name: what the row is called.
+        make: makes the vehicle.
+        reads_per_second: what the oracle may count on: the vehicle's own pace, or the link's.
+        faults: keywords of `FaultyLink`, for each direction.
+        bound: the largest ratio to the oracle that is good enough.
+    """
+
+    name: str
+    make: Callable[[], Vehicle]
+    reads_per_second: float
+    faults: dict[str, Any] = field(default_factory=dict)
+    bound: float = 1.25
+
+
+@dataclass(frozen=True)
+class Run:
+    """One download: when it ended, whether it was whole and right, and what it cost."""
+
+    seconds: float
+    is_right: bool
+    bytes_up: int
+    bytes_down: int
+    requests: int
+    oracle: float
+
+    @property
+    def ratio(self) -> float:
+        return self.seconds / self.oracle
+
+
+def rows() -> Iterator[Row]:
+    """Every row, in the order in which they are printed."""
+    kinds: tuple[tuple[str, Callable[..., Vehicle], float], ...] = (
+        ("PX4", PX4Vehicle, 5000.0),
+        ("ArduPilot", ArduPilotVehicle, 50.0),
+    )
+    for beside, telemetry in (("", 0.0), (" + telemetry", 50.0)):
+        for kind, make, served in kinds:
+            plain = partial(make, telemetry=telemetry)
+            for loss in (0.0, 0.01, 0.05, 0.20, 0.40):
+                for trip in (0.02, 0.1, 0.6, 2.5):
+                    name = f"{kind} UDP {trip * 1000:g} ms {loss:.0%}{beside}"
+                    faults = {"loss": loss, "delay": trip / 2}
+                    yield Row(name, plain, served, faults, 1.5 if loss > 0.2 else 1.25)
+            for loss in (0.05, 0.20):
+                name = f"{kind} UDP 100 ms {loss:.0%} in bursts of 8{beside}"
+                yield Row(name, plain, served, {"loss": loss, "delay": 0.05, "loss_burst": 8.0})
+            # on a serial port both pace themselves by the room in its buffer, and send less telemetry
+            burst = 3 if make is PX4Vehicle else 1
+            radio = partial(make, burst=burst, period=0.025, telemetry=telemetry / 5)
+            for loss in (0.0, 0.05, 0.15):
+                faults = {"loss": loss, "delay": 0.075, "rate": 5760.0, "queue": 1024.0}
+                yield Row(f"{kind} radio 57600 {loss:.0%}{beside}", radio, min(served, 5760 / 37), faults)
+            slow = partial(make, burst=1, period=1 / 30, telemetry=telemetry / 50)
+            faults = {"delay": 0.075, "rate": 1200.0, "queue": 1024.0}
+            yield Row(f"{kind} 1200 bytes/s{beside}", slow, min(served, 1200 / 37), faults)
+
+
+def download(row: Row, seed: int) -> Run:
+    """One download by this library, and the oracle's beside it."""
+    vehicle = row.make()
+    uplink = FaultyLink(**row.faults, seed=2 * seed)
+    downlink = FaultyLink(**row.faults, seed=2 * seed + 1)
+    air = Air([vehicle], uplink=uplink, downlink=downlink)
+    station = Station(link="bench", is_stream=False)
+    now = began = 0.0
+    fetch = None
+    air.tick(now)
+    while now < LIMIT and (fetch is None or not fetch.done):
+        station.tick(now)
+        machine = station.components.get((1, 1))
+        if fetch is None and machine is not None and machine.who.settled:
+            began = now
+            up, down, sent = station.bytes_sent, station.bytes_received, vehicle.requests.total()
+            fetch = machine.begin_fetch(now)
+        for data, _ in station.data_to_send():
+            air.receive(data, now)
+        deadline = air.next_deadline()
+        now = max(min(station.next_deadline(), math.inf if deadline is None else deadline), now + 1e-7)
+        air.tick(now)
+        for data in air.data_to_send():
+            station.receive(data, None, now)
+    result = None if fetch is None else fetch.result
+    if machine is None or result is None or fetch is None:
+        return Run(math.inf, False, 0, 0, 0, oracle(row, seed))
+    is_right = result.complete and all(
+        result.params[name].same_value(param)
+        for name, param in vehicle.params.items()
+        if name not in ("STAT_RUNTIME", "BARO1_GND_PRESS")  # they move by themselves
+    )
+    return Run(
+        fetch.ended_at - began,
+        is_right,
+        station.bytes_sent - up,
+        station.bytes_received - down,
+        vehicle.requests.total() - sent,
+        oracle(row, seed),
+    )
+
+
+def oracle(row: Row, seed: int) -> float:
+    """The oracle's time: the quickest of single reads and of two or three passes."""
+    times = []
+    for passes in (1, 2, 3):
+        vehicle = row.make()
+        air = Air(
+            [vehicle],
+            uplink=TellingLink(**row.faults, seed=2 * seed),
+            downlink=TellingLink(**row.faults, seed=2 * seed + 1),
+        )
+        count = len(vehicle.params)
+        served = row.reads_per_second
+        times.append(oracle_time(vehicle, air, count, passes=passes, reads_per_second=served))
+    return min(times)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--only", default="")
+    parser.add_argument("--check", action="store_true")
+    arguments = parser.parse_args()
+    head = f"{'seconds':>8} {'worst':>7} {'oracle':>7} {'ratio':>6} {'up B':>7} {'down B':>7} {'req':>5}"
+    print(f"{'':46} {head}  right")
+    failures = 0
+    for row in rows():
+        if arguments.only not in row.name:
+            continue
+        runs = [download(row, seed) for seed in range(arguments.seeds)]
+        right = sum(run.is_right for run in runs)
+        ratio = statistics.median(run.ratio for run in runs)
+        failed = ratio > row.bound or right < len(runs)
+        failures += failed
+        print(
+            f"{row.name:46} {statistics.median(run.seconds for run in runs):8.2f}"
+            f" {max(run.seconds for run in runs):7.2f} {statistics.median(run.oracle for run in runs):7.2f}"
+            f" {ratio:6.2f} {statistics.median(run.bytes_up for run in runs):7.0f}"
+            f" {statistics.median(run.bytes_down for run in runs):7.0f}"
+            f" {statistics.median(run.requests for run in runs):5.0f}  {right}/{len(runs)}"
+            f"{'  beyond its bound' if failed else ''}",
+            flush=True,
+        )
+    return 1 if arguments.check and failures else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
