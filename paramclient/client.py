@@ -7,7 +7,6 @@ import math
 import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Final
 
@@ -20,8 +19,9 @@ from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
 from paramclient.identity import Identity
 from paramclient.links import Link, create_link
 from paramclient.protocol.component import ComponentHeard, ComponentIdentified, ComponentMachine, ParamChanged
-from paramclient.protocol.fetch import Fetch, FetchResult, Progress
+from paramclient.protocol.fetch import Progress
 from paramclient.protocol.station import Address, Station
+from paramclient.together import FetchedAll, FetchTogether
 from paramclient.values import Encoding
 from paramclient.writethrough import FLUSH_INTERVAL, RETRY_INTERVAL, WriteThrough
 
@@ -39,30 +39,10 @@ LINK_PATIENCE: Final = 10.0
 FIRST_BACKOFF: Final = 0.25
 LONGEST_BACKOFF: Final = 5.0
 """Seconds between two attempts to open a link again: doubled from the first to the longest."""
-SILENT_PATIENCE: Final = 2.5
-"""Seconds for which a component that does not answer at all is asked, once another one is done."""
 CLOSING_PATIENCE: Final = 0.5
 """Seconds that closing waits for the hash after a write, where the next session could not do without it."""
 
 logger = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True, slots=True)
-class FetchedAll:
-    """What a fetch of several components brought.
-
-    Attributes:
-        results: by (system, component), for those that answered.
-        silent: those that have not, each with its error.
-    """
-
-    results: Mapping[Address, FetchResult]
-    silent: Mapping[Address, NoReply]
-
-    @property
-    def complete(self) -> bool:
-        """Whether everyone who answered gave every parameter."""
-        return all(result.complete for result in self.results.values())
 
 
 class ParamClient:
@@ -263,30 +243,30 @@ class ParamClient:
         """
         began = anyio.current_time()
         deadline = math.inf if timeout is None else began + timeout
-        give_up_hearing = began + HEARING_PATIENCE if timeout is None else deadline
-        fetches: dict[Address, Fetch] = {}
+        hear_until = began + HEARING_PATIENCE if timeout is None else deadline
+        together = FetchTogether(self._station, self._components, system, refresh=refresh)
         try:
             while True:
                 self._check_open()
-                is_waiting = self._join_fetches(fetches, system, refresh=refresh)
                 now = anyio.current_time()
-                if now >= deadline or not (
-                    is_waiting or self._is_worth_waiting(fetches, give_up_hearing, now)
+                together.join(now)
+                self._wake()
+                listen_until = self._opened_at + LISTENING_TIME
+                if now >= deadline or not together.is_worth_waiting(
+                    now, listen_until=listen_until, hear_until=hear_until
                 ):
                     break
-                await self._sleep_until_news(min(PROGRESS_INTERVAL, deadline - now), fetches)
+                await together.news(min(PROGRESS_INTERVAL, deadline - now))
                 if progress is not None:
-                    now = anyio.current_time()
-                    progress({address: fetch.progress(now) for address, fetch in fetches.items()})
-            results, silent = _outcomes(fetches, now)
+                    progress(together.progress(anyio.current_time()))
+            fetched = together.outcome(now)
         finally:
-            for address, fetch in fetches.items():
-                self._station.components[address].end_fetch(fetch)
-        if not results:
+            together.end()
+        if not fetched.results:
             whose = "any component" if system is None else f"any component of system {system}"
-            attempts = max((error.attempts for error in silent.values()), default=0)
+            attempts = max((error.attempts for error in fetched.silent.values()), default=0)
             raise NoReply(f"the parameters of {whose}", attempts=attempts, waited=now - began)
-        return FetchedAll(results, silent)
+        return fetched
 
     # the tasks
 
@@ -456,69 +436,6 @@ class ParamClient:
             if address[1] == component and system in (None, address[0]):
                 return found
         return None
-
-    def _join_fetches(self, fetches: dict[Address, Fetch], system: int | None, *, refresh: bool) -> bool:
-        """Begin the fetches of components that have none yet; true while one is waited for to do so."""
-        now = anyio.current_time()
-        is_waiting = False
-        ready: dict[int, list[ComponentMachine]] = {}
-        for address, component in self._components.items():
-            machine = component._machine
-            if address in fetches or system not in (None, address[0]) or not machine.who.has_parameters:
-                continue
-            if refresh or component._cache_is_due(now):
-                ready.setdefault(address[0], []).append(machine)
-            else:
-                is_waiting = True
-        for machines in ready.values():
-            begun = self._station.begin_fetches(machines, now, refresh=refresh)
-            for machine, fetch in zip(machines, begun, strict=True):
-                fetches[machine.system, machine.component] = fetch
-        if ready:
-            self._wake()
-        return is_waiting
-
-    def _is_worth_waiting(self, fetches: Mapping[Address, Fetch], give_up_hearing: float, now: float) -> bool:
-        """Whether more may come: from somebody not heard yet, or from a fetch that is not over."""
-        if now < self._opened_at + LISTENING_TIME:
-            return True
-        if not fetches:
-            return now < give_up_hearing
-        is_anyone_done = any(fetch.result is not None for fetch in fetches.values())
-        patience = SILENT_PATIENCE if is_anyone_done else math.inf
-        return any(
-            not fetch.done and (not fetch.is_silent or now - fetch.begun_at < patience)
-            for fetch in fetches.values()
-        )
-
-    async def _sleep_until_news(self, seconds: float, fetches: Mapping[Address, Fetch]) -> None:
-        news = anyio.Event()
-        open_ = [fetch for fetch in fetches.values() if not fetch.done]
-        for fetch in open_:
-            fetch.on_done.append(news.set)
-        try:
-            with anyio.move_on_after(seconds):
-                await news.wait()
-        finally:
-            for fetch in open_:
-                with suppress(ValueError):
-                    fetch.on_done.remove(news.set)
-
-
-def _outcomes(
-    fetches: Mapping[Address, Fetch], now: float
-) -> tuple[dict[Address, FetchResult], dict[Address, NoReply]]:
-    """What came of each fetch, also of one that is not over; an error other than silence is raised."""
-    results: dict[Address, FetchResult] = {}
-    silent: dict[Address, NoReply] = {}
-    for address, fetch in fetches.items():
-        try:
-            if fetch.error is not None:
-                raise fetch.error
-            results[address] = fetch.result or fetch.partial(now, "The time given for the fetch was over.")
-        except NoReply as error:
-            silent[address] = error
-    return results, silent
 
 
 def _wanted(system: int | None, component: int | None) -> str:

@@ -32,6 +32,8 @@ PROGRESS_INTERVAL = 0.1
 """Seconds between two calls of a progress callback."""
 IDENTITY_PATIENCE = 1.5
 """Seconds to wait for a component to say who it is before its cached table is done without."""
+TIME_IS_OVER = "The time given for the fetch was over."
+"""Why a result is partial that a time limit ended."""
 
 
 class Component:
@@ -236,8 +238,8 @@ class Component:
 
         Each change names the parameter, what was known before and what is known now. A value that is heard
         for the first time is one too. Whoever is slow to ask gets several changes of one parameter as one,
-        so what waits is never more than one change for each parameter. It goes on over an absence of the link,
-        and ends when nobody holds it any more.
+        so what waits is never more than one change for each parameter. An absence of the link does not end
+        it; it ends when nobody holds it any more.
 
         Raises:
             LinkError: while waiting, when the link failed for good or the client was closed. What had come
@@ -306,7 +308,7 @@ class Component:
             while not fetch.done:
                 now = anyio.current_time()
                 if deadline is not None and now >= deadline:
-                    return fetch.partial(now, "The time given for the fetch was over.")
+                    return fetch.partial(now, TIME_IS_OVER)
                 until = now + PROGRESS_INTERVAL if progress is not None else None
                 if deadline is not None:
                     until = deadline if until is None else min(until, deadline)

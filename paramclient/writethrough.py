@@ -230,7 +230,7 @@ class _Worker:
         self._thread: threading.Thread | None = None
 
     async def run(self, work: Callable[[], Result]) -> Result:
-        """Do it in the thread, and wait for its end also when cancelled."""
+        """Do it in the thread. Cancelled, it is done all the same."""
         if self._thread is None:
             self._thread = threading.Thread(target=self._main, name="paramclient cache", daemon=True)
             self._thread.start()
@@ -247,8 +247,7 @@ class _Worker:
                 anyio.from_thread.run_sync(ended.set, token=token)
 
         self._calls.put(call)
-        with anyio.CancelScope(shield=True):
-            await ended.wait()
+        await ended.wait()
         return future.result()
 
     async def close(self, work: Callable[[], None] | None) -> None:

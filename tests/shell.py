@@ -46,6 +46,7 @@ class SwiftLoop(asyncio.SelectorEventLoop):
         self.now = 1000.0
         self.threads = 0
         self.has_struck = False
+        self._patient: list[asyncio.Future[None]] = []
         self._rounds_left = 0
         self._victim: asyncio.Task[Any] | None = None
         self._blow: Callable[[], object] = _nothing
@@ -60,12 +61,29 @@ class SwiftLoop(asyncio.SelectorEventLoop):
         self._victim = task
         self._blow = blow
 
-    def begin_round(self) -> None:
+    async def settled(self) -> None:
+        """Wait until nothing can happen any more without the clock."""
+        waiter = self.create_future()
+        self._patient.append(waiter)
+        await waiter
+
+    def has_told_the_patient(self) -> bool:
+        """Whether somebody waited for nothing to happen."""
+        patient, self._patient = self._patient, []
+        for waiter in patient:
+            if not waiter.done():
+                waiter.set_result(None)
+        return bool(patient)
+
+    def begin_round(self) -> bool:
+        """Whether there is something to do that was not there before."""
         self.now += 1e-6  # nothing is done in no time at all
         self._rounds_left -= 1
-        if self._rounds_left == 0 and self._victim is not None and not self._victim.done():
-            self.has_struck = True
-            self._blow()
+        if self._rounds_left or self._victim is None or self._victim.done():
+            return False
+        self.has_struck = True
+        self._blow()
+        return True
 
 
 class _LeapingSelector(selectors.DefaultSelector):
@@ -75,12 +93,15 @@ class _LeapingSelector(selectors.DefaultSelector):
 
     def select(self, timeout: float | None = None) -> list[tuple[selectors.SelectorKey, int]]:
         loop = self._loop
-        loop.begin_round()
+        if loop.begin_round():
+            timeout = 0
         ready = super().select(0)
-        if ready or timeout == 0 or loop._ready:
+        if ready or timeout == 0:
             return ready
-        if loop.threads:
+        if loop.threads:  # one of them will wake the loop
             return super().select(PATIENCE)
+        if loop.has_told_the_patient():
+            return []
         if timeout is None:
             raise RuntimeError("everybody waits, and for nothing")
         loop.now += timeout
@@ -120,7 +141,9 @@ def swiftly(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
 def small_px4(*, volatile: Collection[str] = ("CAL_ACC0_XOFF", "PARAM_03"), **options: Any) -> PX4Vehicle:
     """A PX4 vehicle with VALUES and CAL_ACC0_XOFF, of which some are not in its hash."""
     rows = [
-        SimParam(name, ParamType.REAL32 if isinstance(value, float) else ParamType.INT32, value, name in volatile)
+        SimParam(
+            name, ParamType.REAL32 if isinstance(value, float) else ParamType.INT32, value, name in volatile
+        )
         for name, value in {**VALUES, "CAL_ACC0_XOFF": 0.5}.items()
     ]
     return PX4Vehicle(**{"table": rows} | options)
@@ -232,9 +255,16 @@ def tasks_beside() -> set[str]:
     return {task.get_name() for task in asyncio.all_tasks() - {asyncio.current_task()}}
 
 
+async def until(condition: Callable[[], object], pause: float = 0.001) -> None:
+    """Wait until something has come about of which nobody tells."""
+    with anyio.fail_after(PATIENCE):
+        while not condition():  # noqa: ASYNC110 - nobody tells
+            await asyncio.sleep(pause)
+
+
 async def settled() -> None:
     """Let everything happen that happens now."""
-    await anyio.wait_all_tasks_blocked()
+    await swift_loop().settled()
 
 
 def a_client(link: Any, **options: Any) -> ParamClient:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from typing import TypeVar
+from collections.abc import Callable, Mapping
+from typing import TypedDict, TypeVar
 
 from paramclient.errors import ParamClientError
 from paramclient.protocol import wire
@@ -17,7 +17,7 @@ from paramclient.protocol.writes import SetResult
 from paramclient.sim import Air, Endpoint
 from paramclient.values import Encoding, Param, ParamType, Trust, Value, encode
 
-__all__ = ["Simulation", "known", "param_value"]
+__all__ = ["Memory", "Simulation", "is_so", "known", "param_value"]
 
 MOST_STEPS = 2000
 """Steps without any time passing that look like an endless loop."""
@@ -50,6 +50,22 @@ def known(
     return Param(name, value, kind, index, int.from_bytes(raw, "little"), Trust.CACHED)
 
 
+def is_so(claim: bool) -> bool:
+    """The claim as it is; for attributes that change behind the type checker's back."""
+    return claim
+
+
+class Memory(TypedDict):
+    """What a cache keeps of a table, as `ComponentMachine.use_cached` takes it."""
+
+    params: Mapping[str, Param]
+    count: int | None
+    confirmed: int | None
+    complete: bool
+    volatile: frozenset[str]
+    volatile_known: bool
+
+
 class Simulation:
     """A station and vehicles, joined by an air, in a time that begins at 0 and passes as fast as it can.
 
@@ -73,6 +89,25 @@ class Simulation:
         self._own = Framer(wire.UNDERSTOOD, stream=False)
         self._others = 0
         self.air.tick(self.now)
+        self.exchange()
+
+    def memory(self) -> Memory:
+        """What a cache would keep of 1/1."""
+        table = self.machine.table
+        return Memory(
+            params={name: param.with_trust(Trust.CACHED) for name, param in table.params.items()},
+            count=table.count,
+            confirmed=table.hash if table.complete else None,
+            complete=table.complete,
+            volatile=table.volatile,
+            volatile_known=table.volatile_known,
+        )
+
+    def next_session(self) -> None:
+        """Put a new station, which knows nothing, in the place of the one there was; the vehicles go on."""
+        self.station = Station(link="sim:test", is_stream=False)
+        self.sent.clear()
+        self.events.clear()
         self.exchange()
 
     def exchange(self) -> None:

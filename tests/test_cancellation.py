@@ -1,8 +1,8 @@
 """Every public call, cancelled at every point: nothing of it is left, and the next call works.
 
-Two ways lead to every point. One cancels a call at each of its own suspensions, before or after what it waits
-for has come. The other lets it wait and cancels it after each round of the event loop, which meets the protocol
-below in each of its states.
+Two ways lead to every point. One cancels a call at each of its own suspensions, before or after what it
+waits for has come. The other lets it wait and cancels it after each round of the event loop, which meets the
+protocol below in each of its states.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ import pytest
 from paramclient import Component, ParamCache, ParamClient
 from paramclient.protocol import wire
 from paramclient.sim import Air, PX4Vehicle
+from tests.caches import set_aside
 from tests.shell import (
     VALUES,
     FlakyLink,
@@ -34,6 +35,7 @@ from tests.shell import (
     swift_loop,
     swiftly,
     tasks_beside,
+    until,
 )
 
 Call = Callable[[ParamClient, Component], Coroutine[Any, Any, object]]
@@ -179,7 +181,7 @@ async def test_cancelled_after_each_round(call: Call, by: str) -> None:
 
             async def scoped() -> None:
                 with scope:  # noqa: B023 - it has ended before the next one is made
-                    await call(client, component)  # noqa: B023
+                    await call(client, component)
 
             task = asyncio.create_task(scoped())
             loop.strike(task, task.cancel if by == "task" else scope.cancel, after=number)
@@ -237,8 +239,7 @@ async def test_a_whole_session_cancelled_at_each_point(tmp_path: Path, point: st
         assert task.cancelled() == is_struck
         await settled()
         assert not tasks_beside()
-        while any(thread.name == "paramclient cache" for thread in threading.enumerate()):
-            await asyncio.sleep(0)
+        await until(lambda: not any(each.name == "paramclient cache" for each in threading.enumerate()))
         if not is_struck:
             break
     assert 5 < number < MOST_POINTS - 1
@@ -246,4 +247,4 @@ async def test_a_whole_session_cancelled_at_each_point(tmp_path: Path, point: st
         cached = cache.component()
         assert bits(cached.params) == bits(vehicle.params)
         assert cached.hash == vehicle.announced_hash()
-    assert not list(tmp_path.glob("*.damaged*"))
+    assert not set_aside(path)

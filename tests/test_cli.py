@@ -12,6 +12,7 @@ import socket
 import sqlite3
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -34,7 +35,7 @@ from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehic
 from paramclient.sim.vehicle import Entry
 
 ROOT = Path(__file__).parent.parent
-PATIENCE = 30.0  # seconds after which a test gives up; nothing waits that long when all is well
+PATIENCE = 60.0  # seconds after which a test gives up; nothing waits that long when all is well
 ESCAPE = "\x1b"
 
 FETCH_KEYS = [
@@ -131,8 +132,9 @@ def key_of(cache: Path) -> str:
 PLAIN = {
     name: value
     for name, value in os.environ.items()
-    if name not in {"FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "COLUMNS", "PY_COLORS"}
+    if name not in {"FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "COLUMNS", "PYTHONUNBUFFERED"}
 }
+"""The environment without what changes how programs print."""
 
 
 @contextmanager
@@ -141,9 +143,12 @@ def process(*arguments: object, **options: Any) -> Iterator[subprocess.Popen[str
     words = [sys.executable, "-m", "paramclient", *map(str, arguments)]
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": PLAIN, **options}
     with subprocess.Popen(words, cwd=ROOT, text=True, **options) as started:
+        watchdog = threading.Timer(PATIENCE, started.kill)
+        watchdog.start()
         try:
             yield started
         finally:
+            watchdog.cancel()
             if started.poll() is None:
                 started.kill()
 
@@ -663,7 +668,7 @@ def test_a_vehicle_can_be_forgotten(command: Command, warm: Path) -> None:
         (["fetch", "serial:/dev/ttyACM0", "--no-cache"], "serial"),
         (["sim", "px5"], "px4"),
         (["sim", "px4", "--link", "sim:px4"], "vehicle itself"),
-        (["sim", "px4", "--loss", "2"], "loss"),
+        (["sim", "px4", "--loss", "2", "--link", "tcp:127.0.0.1:1"], "loss"),
         (["cache", "history"], "VEHICLE"),
     ],
 )
@@ -749,9 +754,14 @@ def test_every_error_has_a_code_and_every_failed_set_a_word() -> None:
     assert code_of(ClientClosed("", link="")) == ExitCode.LINK
 
 
-def test_signals_are_handled_as_before_afterwards(command: Command) -> None:
+def test_signals_are_handled_as_before_afterwards(command: Command, put: Callable[[Endpoint], str]) -> None:
+    class Interrupting(Mute):
+        def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
     before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
-    command("get", "sim:px4", "MC_ROLL_P", "--no-cache")
+    assert command("get", put(GenericVehicle({"A": 1})), "A", "--no-cache").code == 0
+    assert command("get", put(Interrupting({"A": 1})), "A", "--no-cache").code == 143
     assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
 
 
@@ -793,7 +803,7 @@ def test_sim_ends_cleanly() -> None:
 
 
 def test_a_closed_pipe_ends_it_without_a_word(warm: Path) -> None:
-    for arguments in (["fetch", "sim:px4"], ["fetch", "sim:px4", "--json"], ["show"]):
+    for arguments in (["fetch", "sim:px4"], ["fetch", "sim:px4", "--json"], ["show"], ["cache", "path"]):
         reading, writing = os.pipe()
         os.close(reading)
         try:
@@ -1009,3 +1019,24 @@ def test_sim_speaks_first_on_udpout(command: Command) -> None:
             assert line_of(started.stdout) == f"px4 1/1 speaks to {link}; Ctrl-C ends it\n"
             [heartbeat] = wire.Framer(stream=False).receive(free.recv(300))
     assert (heartbeat.message_id, heartbeat.system) == (0, 1)
+
+
+def test_sim_on_a_byte_stream_joins_what_was_cut() -> None:
+    request = wire.encode(wire.ParamRequestRead(1, 1, "MC_ROLL_P"), system=255, component=190, sequence=0)
+    framer = wire.Framer()
+    messages: list[wire.Message | None] = []
+    with process("sim", "px4", "--link", "tcpin:127.0.0.1:0") as started:
+        found = re.search(r":([0-9]+);", line_of(started.stdout))
+        assert found is not None
+        with socket.create_connection(("127.0.0.1", int(found[1])), PATIENCE) as connection:
+
+            def receive(heartbeats: int) -> None:
+                while sum(isinstance(each, wire.Heartbeat) for each in messages) < heartbeats:
+                    messages.extend(map(wire.decode, framer.receive(connection.recv(4096))))
+
+            connection.sendall(request[:9])
+            receive(2)  # by then the first half has been read
+            connection.sendall(request[9:])
+            receive(4)
+    values = [each.param_id for each in messages if isinstance(each, wire.ParamValue)]
+    assert values == ["MC_ROLL_P"]

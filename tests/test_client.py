@@ -24,7 +24,6 @@ from paramclient import (
     Encoding,
     LinkError,
     NoReply,
-    Param,
     ParamClient,
     ParamErrorCode,
     ParamType,
@@ -53,6 +52,7 @@ from tests.shell import (
     small_px4,
     swiftly,
     tasks_beside,
+    until,
 )
 
 Call = Callable[[ParamClient, Component], Coroutine[Any, Any, object]]
@@ -89,19 +89,25 @@ async def test_what_the_body_raises_comes_out_as_it_is() -> None:
         ExceptionGroup("", [OSError()]),
     ]
     for error in errors:
-        with pytest.raises(type(error)) as caught:
+        try:
             async with a_client(generic()) as client:
                 await client.component()
                 raise error
-        assert caught.value is error
+        except BaseException as caught:
+            assert caught is error  # noqa: PT017 - pytest.raises would want one type for all of them
+        else:
+            pytest.fail("nothing was raised")
         assert not tasks_beside()
 
 
 @swiftly
 async def test_an_error_of_a_call_comes_out_as_it_is() -> None:
-    with pytest.raises(UnknownParameter):
+    async def session() -> None:
         async with a_client(generic(param_error=True)) as client:
             await (await client.component()).get("NOT_THERE")
+
+    with pytest.raises(UnknownParameter):
+        await session()
 
 
 @swiftly
@@ -293,9 +299,7 @@ class Served:
     async def __aenter__(self) -> Served:
         link: Any = create_link(f"{self._kind}:127.0.0.1:{self.port}")
         self._task = asyncio.create_task(serve_endpoint(self._endpoint, link))
-        with anyio.fail_after(PATIENCE):
-            while link.address is None:
-                await asyncio.sleep(0)
+        await until(lambda: link.address is not None)
         self.port = link.address[1]
         return self
 
@@ -1055,22 +1059,17 @@ async def test_calls_go_on_when_the_link_is_back() -> None:
 
 @swiftly
 async def test_what_waited_is_asked_for_at_once_when_the_link_is_back() -> None:
-    link = FlakyLink(generic())
+    link = FlakyLink(Air.symmetric([generic()], delay=0.5))
     async with a_client(link) as client:
         component = await client.component()
         await component.get("PARAM_00")
-        await asyncio.sleep(0.5)
-        await link.drop(stays_away=True)
+        await link.drop()
         await settled()
         read = asyncio.create_task(component.get("PARAM_01"))
-        await asyncio.sleep(2.0)
-        link.is_away = False
-        openings = link.openings
-        while link.openings == openings:
-            await asyncio.sleep(0.01)
+        await until(lambda: link.openings == 2)
         came_back = anyio.current_time()
         await read
-        assert anyio.current_time() - came_back < 0.02, "not only after a time-out"
+        assert anyio.current_time() - came_back < 1.1, "one round trip, and no time-out before it"
 
 
 @swiftly
@@ -1216,10 +1215,8 @@ async def test_a_tcp_server_that_stays_away(monkeypatch: pytest.MonkeyPatch) -> 
             await component.get("PARAM_01")
         assert isinstance(caught.value.__cause__, ConnectionRefusedError)
         await served.__aenter__()
-        while isinstance(param := await outcome(component.get("PARAM_01")), LinkError):
-            await asyncio.sleep(0.01)
-        assert isinstance(param, Param)
-        assert param.value == 1
+        await until(lambda: " open, " in repr(client))
+        assert (await component.get("PARAM_01")).value == 1
 
 
 # How they look

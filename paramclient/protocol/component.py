@@ -508,8 +508,7 @@ class ComponentMachine:
         return True
 
     def _fetch_ended(self, fetch: Fetch) -> None:
-        if self.fetch is fetch:
-            self.fetch = None
+        self.fetch = None
         result = fetch.result
         if result is None:
             return

@@ -103,7 +103,8 @@ class Download(Operation[None]):
         self._began = (0, now)  # where and when the stream began
         self._gap = 0.0  # the mean time between two values of it
         self._longest = 0.0  # the longest of late
-        self._is_awaited = True  # the list was asked for, and nothing of it has come
+        self._is_awaited = True  # the list was asked for, and no value of it has come
+        self._is_answered = False  # the first answer to it tells the round trip
         self._list_wait = 0.0
         self._list_at = now
         self._patient_since = now
@@ -138,8 +139,7 @@ class Download(Operation[None]):
         if index == NO_INDEX or count == NO_INDEX or index >= count or self.done:
             return
         if self.count is None:
-            if not self.names:
-                self._round_trip.answered(self._list_at, now, self.lists)
+            self._note_answer(now)
             self.count = count
         elif count != self.count and self._moves < MOST_MOVES:
             if index in self._asked or not self._is_streaming:
@@ -154,6 +154,13 @@ class Download(Operation[None]):
             self._follow(index, message.param_id, now)
         self._ask_for_gaps(now)
         self._finish_if_complete(now)
+
+    def heed(self, now: float) -> None:
+        """The head of the list has come: it was heard, and is not asked for again yet."""
+        if self.count is None:
+            self._note_answer(now)
+            self._list_at = now
+            self._list_wait = max(self._list_wait, SHORTEST_QUIET)
 
     def tick(self, now: float) -> None:
         """Ask for the list again, or see that the stream is over."""
@@ -197,6 +204,11 @@ class Download(Operation[None]):
         if self._advances < ENOUGH_ADVANCES or self._is_awaited:
             return self._heard_at + max(SHORTEST_QUIET, self._round_trip.timeout)
         return self._heard_at + max(QUIET_GAPS * self._longest, SHORTEST_QUIET_AT_PACE)
+
+    def _note_answer(self, now: float) -> None:
+        if not self._is_answered:
+            self._is_answered = True
+            self._round_trip.answered(self._list_at, now, self.lists)
 
     def _ask_for_list(self, now: float) -> None:
         self.lists += 1
@@ -326,8 +338,8 @@ class Download(Operation[None]):
                 self._ask_for_another_pass(now)
             else:
                 self._ask_for_gaps(now)
-        elif len(self.names) + len(self.given_up) >= self.count:
-            self.finish(None, now)
+        else:
+            self.finish(None, now)  # whatever has not come was asked for and given up
 
     def _give_up_the_rest(self) -> None:
         """Nothing at all was answered while one read used up its tries: more of them lead nowhere."""

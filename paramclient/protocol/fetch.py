@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Final
 
 from paramclient.errors import NoReply, UnknownParameter
@@ -143,8 +144,10 @@ class Fetch(Operation[FetchResult]):
 
     def announced(self, announcement: Announcement) -> None:
         """A `_HASH_CHECK` passed by: PX4 sends one at the head of its list."""
-        if self.download is not None and self._before is None and not self.download.names:
-            self._before = announcement.hash
+        if self.download is not None and not self.download.names:
+            self.download.heed(announcement.at)
+            if self._before is None:
+                self._before = announcement.hash
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
@@ -253,11 +256,7 @@ class Fetch(Operation[FetchResult]):
             self._target, self._round_trip, self._send, self._reads, now, listed=self._listed
         )
 
-        def ended() -> None:
-            if self.download is download and not self.done:
-                self._download_ended(download)
-
-        download.on_done.append(ended)
+        download.on_done.append(partial(self._download_ended, download))
 
     def _download_ended(self, download: Download) -> None:
         if download.error is not None:
@@ -265,9 +264,9 @@ class Fetch(Operation[FetchResult]):
         elif self._hash_read is not None:
             return  # it is on its way
         elif self._is_proven(download):
-            self._finish_download(download.ended_at, ())
+            self._finish_download(download, download.ended_at, ())
         elif self._expects_hash() and not self._is_hash_unknown:
-            self._ask_hash(self._hash_came_last, download.ended_at)
+            self._ask_hash(partial(self._hash_came_last, download), download.ended_at)
         else:
             self._settle(download, None, download.ended_at)
 
@@ -291,10 +290,9 @@ class Fetch(Operation[FetchResult]):
         gone = self._table.remove(lambda param: param.index is not None and param.name not in present)
         self._changed(gone)
 
-    def _hash_came_last(self, read: Read) -> None:
-        if self.download is not None:
-            after = None if read.result is None else int.from_bytes(read.result.raw, "little")
-            self._settle(self.download, after, read.ended_at)
+    def _hash_came_last(self, download: Download, read: Read) -> None:
+        after = None if read.result is None else int.from_bytes(read.result.raw, "little")
+        self._settle(download, after, read.ended_at)
 
     def _settle(self, download: Download, after: int | None, now: float) -> None:
         """The download is over and the hash is known, if there is one."""
@@ -312,19 +310,14 @@ class Fetch(Operation[FetchResult]):
                 notes += () if proven else (_UNPROVEN,)
             else:
                 notes += (_UNBRACKETED,) if self._before is None else (_MOVED,)
-        self._finish_download(now, notes)
+        self._finish_download(download, now, notes)
 
-    def _finish_download(self, now: float, notes: tuple[str, ...]) -> None:
-        download = self.download
-        if download is None:
-            return
+    def _finish_download(self, download: Download, now: float, notes: tuple[str, ...]) -> None:
         count = download.count or 0
         missing = download.missing
         table = self._table
         if not missing:
             table.complete = download.is_settled
-        elif count != table.count:
-            table.complete = False
         table.count = count
         self.finish(
             self._result("stream", count, missing, table.hash if not missing else None, now, notes), now

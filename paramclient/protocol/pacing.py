@@ -26,7 +26,7 @@ answers once in 100 ms."""
 ENOUGH_SERVED: Final = 0.5
 """The share of the requests that must be answered for a rate to count as served."""
 ROUNDING: Final = 1e-9
-"""Of a token: without it, what `next_at` promises could be missed by the last bit of a float, again and again."""
+"""Of a token: without it, what `next_at` promises could be missed by the last bit of a float, for ever."""
 UPSTREAM_SHARE: Final = 1 / 3
 REQUEST_SIZE: Final = 16
 VALUE_SIZE: Final = 37

@@ -25,6 +25,8 @@ COPY_RESERVE: Final = 2.0
 COPY_RISK: Final = 0.01
 """The chance of no answer to go below by asking again early."""
 MOST_COPIES: Final = 6
+SILENCES_TO_SPARE: Final = 24
+"""Time-outs in a row, with no answer at all between them, after which asking twice cannot be of help."""
 ENOUGH_CONTROLS: Final = 4
 """Answered controls, at the least, after which a silence is the component's and not the link's."""
 
@@ -305,7 +307,7 @@ class Reads:
 
     def _copy_wanted(self) -> Read | None:
         """A read that is worth asking for once more while its answer may be on the way."""
-        if not self.is_idle or not self._flying:
+        if not self.is_idle or not self._flying or self._silences >= SILENCES_TO_SPARE:
             return None
         loss = self._round_trip.seen_loss
         if loss < COPY_RISK:

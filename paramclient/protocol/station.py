@@ -99,10 +99,7 @@ class Station:
             self._framers.pop(key, None)
         for frame in frames:
             sender = (frame.system, frame.component)
-            if sender == self.own or frame.system == 0:
-                continue
-            message = decode(frame)
-            if message is None:
+            if sender == self.own or frame.system == 0 or (message := decode(frame)) is None:
                 continue
             self._peers[frame.system] = peer
             if isinstance(message, ParamSet):

@@ -75,7 +75,6 @@ class Write(Operation[SetResult]):
         self.made: Param | None = None  # what the vehicle held after an earlier one: not the old value either
         self.verify_at = math.inf
         self.read: Read | None = None
-        self.was_denied = False  # a read after a PARAM_SET did not show the wanted value
         self.was_retyped = False
 
 
@@ -199,17 +198,14 @@ class Writes:
                 and write.sent_at + timeout <= now
             ):
                 self._round_trip.timed_out(write.attempts)
-                if not self._round_trip.is_hopeless(write.attempts, now):
-                    self._transmit(write, now)
-                    if write.attempts > 2 and not write.done:
-                        # the vehicle may be silent on just this write: what does it hold?
-                        self._read(write, now)
-                elif write.was_denied:
+                if self._round_trip.is_hopeless(write.attempts, now):
+                    # reads in between have shown that nothing came of it
                     self._fail(write, self._not_applied(write, self._params[write.name]), now)
-                else:
-                    what = f"PARAM_SET {write.name} to {self._target[0]}/{self._target[1]}"
-                    waited = now - write.begun_at
-                    self._fail(write, NoReply(what, attempts=write.attempts, waited=waited), now)
+                    continue
+                self._transmit(write, now)
+                if write.attempts > 2 and not write.done:
+                    # the vehicle may be silent on just this write: what does it hold?
+                    self._read(write, now)
 
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity."""
@@ -279,15 +275,15 @@ class Writes:
 
     def _read(self, write: Write, now: float) -> None:
         """Ask what the vehicle holds: before the first PARAM_SET to learn the type, later to decide."""
-        if write.read is not None:
-            return
         read = write.read = self._reads.ask(write.name, now)
 
         def answered() -> None:
             if write.read is not read:
                 return  # it has ended meanwhile, or nobody wants it any more
             write.read = None
-            if read.error is not None:
+            if isinstance(read.error, NoReply) and write.attempts:
+                self._fail(write, self._no_reply(write, read.ended_at), read.ended_at)
+            elif read.error is not None:
                 self._fail(write, read.error, read.ended_at)
             elif write.attempts:
                 self._decide(write, self._params[write.name], read.ended_at)
@@ -306,7 +302,6 @@ class Writes:
         else:
             is_old = write.before is not None and write.before.same_value(actual)
             write.made = None if is_old else actual
-            write.was_denied = True
             self._transmit(write, now)
 
     def _succeed(self, write: Write, now: float) -> None:
@@ -334,6 +329,10 @@ class Writes:
             self._start(queue[0], now)
         else:
             del self._queues[write.name]
+
+    def _no_reply(self, write: Write, now: float) -> Exception:
+        what = f"PARAM_SET {write.name} to {self._target[0]}/{self._target[1]}"
+        return NoReply(what, attempts=write.attempts, waited=now - write.begun_at)
 
     def _not_applied(self, write: Write, actual: Param) -> Exception:
         system, component = self._target

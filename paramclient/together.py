@@ -1,0 +1,139 @@
+"""Fetch several components side by side: who takes part, how long to wait, what came of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Final
+
+import anyio
+
+from paramclient.component import TIME_IS_OVER, Component
+from paramclient.errors import NoReply
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.fetch import Fetch, FetchResult, Progress
+from paramclient.protocol.station import Address, Station
+
+__all__ = ["FetchTogether", "FetchedAll"]
+
+SILENT_PATIENCE: Final = 2.5
+"""Seconds for which a component that does not answer at all is asked, once another one is done."""
+
+
+@dataclass(frozen=True, slots=True)
+class FetchedAll:
+    """What a fetch of several components brought.
+
+    Attributes:
+        results: by (system, component), for those that answered.
+        silent: those that have not, each with its error.
+    """
+
+    results: Mapping[Address, FetchResult]
+    silent: Mapping[Address, NoReply]
+
+    @property
+    def complete(self) -> bool:
+        """Whether everyone who answered gave every parameter."""
+        return all(result.complete for result in self.results.values())
+
+
+class FetchTogether:
+    """The fetches of all components of one system, or of every system. `end` it, whatever happens.
+
+    Args:
+        station: the protocol.
+        components: everyone heard; it may grow meanwhile.
+        system: of this system only.
+        refresh: as in `Component.fetch_all`.
+    """
+
+    def __init__(
+        self, station: Station, components: Mapping[Address, Component], system: int | None, *, refresh: bool
+    ) -> None:
+        self._station = station
+        self._components = components
+        self._system = system
+        self._refresh = refresh
+        self._fetches: dict[Address, Fetch] = {}
+        self._is_cache_awaited = False
+
+    def join(self, now: float) -> None:
+        """Begin the fetches of components that have none yet, as soon as their cached table is there."""
+        self._is_cache_awaited = False
+        ready: dict[int, list[ComponentMachine]] = {}
+        for address, component in self._components.items():
+            machine = component._machine
+            if address in self._fetches or not machine.who.has_parameters:
+                continue
+            if self._system not in (None, machine.system):
+                continue
+            if self._refresh or component._cache_is_due(now):
+                ready.setdefault(machine.system, []).append(machine)
+            else:
+                self._is_cache_awaited = True
+        for machines in ready.values():
+            begun = self._station.begin_fetches(machines, now, refresh=self._refresh)
+            for machine, fetch in zip(machines, begun, strict=True):
+                self._fetches[machine.system, machine.component] = fetch
+
+    def is_worth_waiting(self, now: float, *, listen_until: float, hear_until: float) -> bool:
+        """Whether more may come.
+
+        Args:
+            now: the time.
+            listen_until: until then somebody else may be heard.
+            hear_until: until then it is waited for anybody at all.
+        """
+        if now < listen_until or self._is_cache_awaited:
+            return True
+        if not self._fetches:
+            return now < hear_until
+        is_anyone_done = any(fetch.result is not None for fetch in self._fetches.values())
+        patience = SILENT_PATIENCE if is_anyone_done else math.inf
+        return any(
+            not fetch.done and (not fetch.is_silent or now - fetch.begun_at < patience)
+            for fetch in self._fetches.values()
+        )
+
+    async def news(self, seconds: float) -> None:
+        """Wait until a fetch ends, but not longer than this."""
+        ended = anyio.Event()
+        under_way = [fetch for fetch in self._fetches.values() if not fetch.done]
+        for fetch in under_way:
+            fetch.on_done.append(ended.set)
+        try:
+            with anyio.move_on_after(seconds):
+                await ended.wait()
+        finally:
+            for fetch in under_way:
+                with suppress(ValueError):
+                    fetch.on_done.remove(ended.set)
+
+    def progress(self, now: float) -> dict[Address, Progress]:
+        """How far each is."""
+        return {address: fetch.progress(now) for address, fetch in self._fetches.items()}
+
+    def outcome(self, now: float) -> FetchedAll:
+        """What came, also of those that are not over.
+
+        Raises:
+            LinkError: the link failed, or the client was closed.
+        """
+        results: dict[Address, FetchResult] = {}
+        silent: dict[Address, NoReply] = {}
+        for address, fetch in self._fetches.items():
+            try:
+                if fetch.error is not None:
+                    raise fetch.error
+                results[address] = fetch.result or fetch.partial(now, TIME_IS_OVER)
+            except NoReply as error:
+                silent[address] = error
+        return FetchedAll(results, silent)
+
+    def end(self) -> None:
+        """Nobody waits for them any longer."""
+        for address, fetch in self._fetches.items():
+            self._station.components[address].end_fetch(fetch)

@@ -1,0 +1,225 @@
+"""The table: what is known of a component's parameters, and how far."""
+
+from __future__ import annotations
+
+import pytest
+
+from paramclient.protocol import table as room
+from paramclient.protocol.table import Change, Table
+from paramclient.protocol.wire import ParamValue
+from paramclient.values import Encoding, ParamType, Trust, px4_hash
+from tests.simulation import known, param_value
+
+
+def test_a_first_value() -> None:
+    table = Table()
+    change = table.hear(param_value("A", 1.5, index=3), "vehicle")
+    param = table.params["A"]
+    assert change == Change("A", None, param, "vehicle")
+    assert (param.value, param.type, param.index, param.trust) == (1.5, ParamType.REAL32, 3, Trust.LIVE)
+    assert table.take_dirty() == {"A": "vehicle"}
+    assert table.take_dirty() == {}
+
+
+def test_the_same_once_more_is_no_change() -> None:
+    table = Table()
+    table.hear(param_value("A", 1.5, index=3), "vehicle")
+    table.take_dirty()
+    assert table.hear(param_value("A", 1.5, index=3), "us") is None
+    assert table.take_dirty() == {}
+
+
+def test_a_change_and_who_did_it() -> None:
+    table = Table()
+    table.hear(param_value("A", 1.5, index=3), "vehicle")
+    old = table.params["A"]
+    change = table.hear(param_value("A", 2.5, index=3), "us")
+    assert change is not None
+    assert (change.old, change.new, change.by) == (old, table.params["A"], "us")
+    assert table.take_dirty() == {"A": "us"}
+
+
+def test_minus_zero_is_no_change_of_zero() -> None:
+    table = Table()
+    table.hear(param_value("A", 0.0, index=0), "vehicle")
+    assert table.hear(param_value("A", -0.0, index=0), "vehicle") is None
+
+
+def test_a_change_of_type_is_a_change() -> None:
+    table = Table()
+    table.hear(param_value("A", 0.0, index=0), "vehicle")
+    change = table.hear(param_value("A", 0, index=0, kind=ParamType.INT32), "vehicle")
+    assert change is not None
+    assert table.params["A"].type is ParamType.INT32
+    assert table.params["A"].value == 0
+
+
+def test_index_65535_keeps_the_one_that_is_known() -> None:
+    table = Table()
+    table.hear(param_value("A", 1.0, index=3), "vehicle")
+    table.hear(param_value("A", 2.0), "vehicle")
+    assert table.params["A"].index == 3
+    table.hear(param_value("B", 2.0), "vehicle")
+    assert table.params["B"].index is None
+    assert [param.name for param in table.listed()] == ["A"]
+
+
+@pytest.mark.parametrize(("index", "count"), [(10, 10), (900, 10), (3, 65535), (0, 0)])
+def test_an_index_that_cannot_be_is_none_but_the_value_counts(index: int, count: int) -> None:
+    table = Table()
+    table.hear(param_value("A", 2.0, index=index, count=count), "vehicle")
+    assert table.params["A"].index is None
+    assert table.params["A"].value == 2.0
+
+
+@pytest.mark.parametrize("value", [1.0, 2.0])
+def test_an_index_may_move(value: float) -> None:
+    table = Table()
+    table.hear(param_value("A", 1.0, index=3), "vehicle")
+    table.take_dirty()
+    table.hear(param_value("A", value, index=4), "vehicle")
+    assert table.params["A"].index == 4
+    assert table.params["A"].value == value
+    assert table.take_dirty() == {"A": "vehicle"}
+
+
+def test_a_table_has_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(room, "MOST_NAMES", 3)
+    table = Table()
+    for number in range(10):
+        table.hear(param_value(f"N{number}", 1.0), "vehicle")
+    assert list(table.params) == ["N0", "N1", "N2"]
+    assert set(table.take_dirty()) == {"N0", "N1", "N2"}
+    table.hear(param_value("N1", 5.0), "vehicle")
+    assert table.params["N1"].value == 5.0
+
+
+def test_other_evidence_of_the_encoding_gives_other_values() -> None:
+    table = Table()
+    for name, value in (("I", 1234.0), ("F", 2.5)):
+        kind = ParamType.INT32 if name == "I" else ParamType.REAL32
+        table.hear(param_value(name, value, index=0, kind=kind, encoding=Encoding.C_CAST), "vehicle")
+    assert table.params["I"].value == 0x449A4000
+    table.take_dirty()
+    changes = table.use_encoding(Encoding.C_CAST)
+    assert table.encoding is Encoding.C_CAST
+    assert [change.name for change in changes] == ["I"]
+    assert table.params["I"].value == 1234
+    assert table.params["F"].value == 2.5
+    assert table.take_dirty() == {"I": "vehicle"}
+    assert table.use_encoding(Encoding.C_CAST) == []
+    assert table.hear(param_value("I", 1234.0, index=0, kind=6, encoding=Encoding.C_CAST), "x") is None
+
+
+def test_a_type_that_mavlink_does_not_define_is_kept() -> None:
+    table = Table()
+    table.hear(ParamValue("X", b"\x01\x02\x03\x04", 77, 5, 1), "vehicle")
+    assert table.params["X"].type == 77
+    assert table.params["X"].value == b"\x01\x02\x03\x04"
+
+
+# what the cache knows
+
+
+def test_the_cache_fills_in_what_was_not_heard() -> None:
+    table = Table()
+    table.hear(param_value("A", 9.0, index=0), "vehicle")
+    changes = table.fill({"A": known("A", 1.0), "B": known("B", 2.0, index=1)})
+    assert [change.name for change in changes] == ["B"]
+    assert table.params["A"].value == 9.0
+    assert table.params["B"].trust is Trust.CACHED
+    assert "B" not in table.take_dirty()
+
+
+def test_a_cached_value_that_is_heard_becomes_live() -> None:
+    table = Table()
+    table.fill({"A": known("A", 1.0, index=4)})
+    assert table.hear(param_value("A", 1.0, index=4), "vehicle") is None
+    assert table.params["A"].trust is Trust.LIVE
+    assert table.take_dirty() == {}
+    table.fill({"B": known("B", 1.0, index=4)})
+    assert table.hear(param_value("B", 1.0, index=5), "vehicle") is None
+    assert table.take_dirty() == {"B": "vehicle"}
+
+
+def test_the_vehicles_hash_makes_cached_values_verified_and_leaves_live_ones() -> None:
+    table = Table()
+    table.hear(param_value("A", 9.0, index=0), "vehicle")
+    table.fill({"B": known("B", 2.0, index=1), "C": known("C", 3.0, index=2)})
+    table.verify(["A", "B"])
+    assert [param.trust for param in table.params.values()] == [Trust.LIVE, Trust.VERIFIED, Trust.CACHED]
+
+
+def test_what_the_vehicle_no_longer_has_is_taken_out() -> None:
+    table = Table()
+    table.hear(param_value("A", 9.0, index=0), "vehicle")
+    table.hear(param_value("B", 9.0, index=1), "vehicle")
+    gone = table.params["B"]
+    table.take_dirty()
+    assert table.remove(lambda param: param.name == "B") == [Change("B", gone, None)]
+    assert list(table.params) == ["A"]
+    assert table.take_dirty() == {"B": "vehicle"}
+    change = table.hear(param_value("B", 9.0, index=1), "vehicle")
+    assert change is not None
+    assert change.old is None
+
+
+# the hash
+
+
+def hashed(*, proven: bool) -> Table:
+    table = Table()
+    for index, name in enumerate("ABV"):
+        table.hear(param_value(name, 1.0, index=index), "vehicle")
+    table.confirm(px4_hash(table.listed(), leave_out="V"), frozenset("V"), proven=proven)
+    return table
+
+
+def test_a_hash_moves_with_the_values_once_it_is_known_what_it_covers() -> None:
+    table = hashed(proven=True)
+    before = table.hash
+    table.hear(param_value("A", 2.0, index=0), "us")
+    assert table.hash == px4_hash(table.listed(), leave_out="V") != before
+    table.hear(param_value("A", 1.0, index=0), "us")
+    assert table.hash == before
+
+
+def test_a_hash_that_cannot_be_computed_ends_with_the_first_change() -> None:
+    table = hashed(proven=False)
+    before = px4_hash(table.listed(), leave_out="V")
+    table.hear(param_value("V", 2.0, index=2), "vehicle")
+    assert table.hash == before
+    table.hear(param_value("A", 2.0, index=0), "us")
+    table.rehash()
+    assert table.hash is None
+
+
+def test_what_is_not_covered_does_not_move_it() -> None:
+    table = hashed(proven=True)
+    before = table.hash
+    table.hear(param_value("V", 2.0, index=2), "vehicle")
+    assert table.hash == before
+
+
+def test_a_parameter_that_goes_away_moves_it() -> None:
+    table = hashed(proven=True)
+    table.remove(lambda param: param.name == "A")
+    assert table.hash == px4_hash(table.listed(), leave_out="V")
+
+
+def test_without_confirmation_there_is_no_hash() -> None:
+    table = hashed(proven=True)
+    table.hear(param_value("A", 2.0, index=0), "us")
+    table.unconfirm()
+    assert table.hash is None
+    table.hear(param_value("A", 3.0, index=0), "us")
+    assert table.hash is None
+
+
+def test_it_is_computed_again_on_request() -> None:
+    table = hashed(proven=True)
+    right = table.hash
+    table.confirm(0x12345678, frozenset("V"), proven=True)
+    assert table.hash == 0x12345678
+    table.rehash()
+    assert table.hash == right
