@@ -180,6 +180,8 @@ class ParamClient:
         with anyio.CancelScope(shield=True):
             try:
                 await self._link.close()
+                for component in self._components.values():
+                    await self._keep(component)
             finally:
                 await self._writer.close()
 
@@ -334,6 +336,20 @@ class ParamClient:
                 await anyio.sleep(RETRY_INTERVAL)
                 self._something_to_write.set()
 
+    async def _keep(self, component: Component) -> None:
+        """Let the cache have a table that there was no time to load it for.
+
+        A component that has not said who it is by now may be one that never does: what is whole is kept.
+        """
+        machine = component._machine
+        table = machine.table
+        is_known = self._station.identity_of(machine) is not None
+        if not (table.complete or (is_known and table.params)):
+            return
+        identity = self._station.identity_of(machine) or machine.identity
+        if not self._writer.follow(machine, identity):
+            self._writer.keep(machine, identity, await self._writer.load(machine, identity))
+
     async def _load(self, component: Component, identity: Identity) -> None:
         machine = component._machine
         cached = await self._writer.load(machine, identity)
@@ -376,8 +392,8 @@ class ParamClient:
         identity = self._station.identity_of(machine)
         if identity is None or self._writer.follow(machine, identity):
             return
-        if self._tasks is not None:
-            self._tasks.start_soon(self._load, component, identity)
+        assert self._tasks is not None, "nothing is heard before"
+        self._tasks.start_soon(self._load, component, identity)
 
     def _tell(self) -> None:
         news, self._news = self._news, anyio.Event()

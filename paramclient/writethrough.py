@@ -65,7 +65,7 @@ class WriteThrough:
             await self.flush()
         finally:
             cache = self._cache if self._owned else None
-            await self._worker.close(None if cache is None else cache.close)
+            await self._worker.close(_nothing if cache is None else cache.close)
 
     def may_have(self, system: int, component: int) -> bool:
         """Whether the cache had a table for such an address when the client was opened."""
@@ -250,17 +250,16 @@ class _Worker:
         await ended.wait()
         return future.result()
 
-    async def close(self, work: Callable[[], None] | None) -> None:
+    async def close(self, work: Callable[[], None]) -> None:
         """Do a last piece of work, and end the thread."""
-        thread = self._thread
-        if thread is None and work is None:
+        if self._thread is None:
+            work()
             return
         try:
-            await self.run(_nothing if work is None else work)
+            await self.run(work)
         finally:
             self._calls.put(None)
-        if self._thread is not None:
-            self._thread.join()  # at once: it has nothing more to do
+        self._thread.join()  # at once: it has nothing more to do
 
     def _main(self) -> None:
         while (call := self._calls.get()) is not None:

@@ -176,6 +176,16 @@ async def test_a_client_is_opened_once() -> None:
         await twice.component()
 
 
+def test_a_client_can_be_made_before_the_event_loop() -> None:
+    client = a_client(generic())
+
+    async def use() -> None:
+        async with client:
+            assert (await (await client.component()).get("PARAM_01")).value == 1
+
+    asyncio.run(use())
+
+
 @swiftly
 async def test_calls_on_a_client_that_is_not_open() -> None:
     client = a_client(small_px4())

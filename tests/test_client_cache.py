@@ -31,7 +31,7 @@ from paramclient import (
 from paramclient import component as component_module
 from paramclient.cache import CachedComponent
 from paramclient.protocol import wire
-from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
 from tests.caches import full_disk, read_only, set_aside, start
 from tests.shell import (
     VALUES,
@@ -585,6 +585,26 @@ async def test_a_table_is_never_called_whole_that_is_not(path: Path) -> None:
         assert cached.count == 24
     result = await session(vehicle, path)
     assert (result.source, result.complete) == ("stream", True)
+
+
+@swiftly
+async def test_an_index_that_never_comes(path: Path) -> None:
+    class Holey(GenericVehicle):
+        def _send_value(self, entry: Any, **how: Any) -> None:
+            if entry.name != "PARAM_05":
+                super()._send_value(entry, **how)
+
+    for known in (0, 23):
+        async with ParamClient(Holey(VALUES), cache=path) as client:
+            component = await client.component()
+            assert len(component.params) == known
+            result = await component.fetch_all()
+            assert (result.count, result.received, result.missing) == (24, 23, (5,))
+            assert not result.complete
+            assert component.state == "partial"
+    with ParamCache(path) as cache:
+        assert not cache.component().complete
+        assert "PARAM_05" not in cache.component().params
 
 
 @swiftly

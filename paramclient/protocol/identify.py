@@ -31,7 +31,8 @@ from paramclient.values import Encoding
 __all__ = ["Identification", "judge_encoding"]
 
 TRIES: Final = 4
-"""AUTOPILOT_VERSION is asked for so often; many components (cameras, radios) never give one."""
+"""AUTOPILOT_VERSION is asked for so often where nothing is known of the link, or where it was refused; many
+components (cameras, radios) never give one."""
 SILENCE: Final = 5.0
 """Seconds without a heartbeat after which another vehicle may stand behind the same system id."""
 
@@ -94,7 +95,8 @@ class Identification:
         self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
         self._attempts = 0
         self._asked_at = -math.inf
-        self._ask_at = math.inf
+        self._is_asking = False
+        self._denied_at = math.inf  # when the last way of asking was refused
 
     @property
     def has_parameters(self) -> bool:
@@ -128,9 +130,9 @@ class Identification:
 
     def version(self, message: AutopilotVersion, now: float) -> bool:
         """Take an AUTOPILOT_VERSION; true when it shows another vehicle than the one known so far."""
-        if self._ask_at < math.inf:
+        if self._is_asking:
             self._round_trip.answered(self._asked_at, now, self._attempts)
-        self._ask_at = math.inf
+        self._is_asking = False
         system, _ = self._target
         before = self.identity
         self.identity = Identity.from_version(
@@ -156,26 +158,31 @@ class Identification:
     def acknowledged(self, message: CommandAck, now: float) -> None:
         """Take a COMMAND_ACK: a refusal of one way to ask leads to the other at once."""
         asked = (MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
-        if message.command in asked and message.result != MAV_RESULT_ACCEPTED and self._ask_at < math.inf:
-            self._ask_at = now
+        if self._is_asking and message.command in asked and message.result != MAV_RESULT_ACCEPTED:
+            self._denied_at = now
 
     def tick(self, now: float) -> None:
         """Ask again, or let it be."""
-        if self._ask_at <= now:
+        if self.next_deadline() <= now:
             self._ask(now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
-        return self._ask_at
+        """When `tick` has something to do, or infinity. What other answers tell of the link counts at once."""
+        if not self._is_asking:
+            return math.inf
+        return min(self._denied_at, self._asked_at + self._round_trip.timeout)
 
     def _ask(self, now: float) -> None:
-        if self._attempts >= TRIES:
-            self._ask_at = math.inf
+        is_blind = self._round_trip.smoothed is None or self._denied_at < math.inf
+        tries = TRIES if is_blind else self._round_trip.tries
+        if self._attempts >= tries:
+            self._is_asking = False
             self.settled = True
             return
         self._attempts += 1
         self._asked_at = now
-        self._ask_at = now + self._round_trip.timeout
+        self._is_asking = True
+        self._denied_at = math.inf
         if self._attempts % 2:
             command, first = MAV_CMD_REQUEST_MESSAGE, float(AUTOPILOT_VERSION_ID)
         else:
