@@ -21,7 +21,7 @@ def main() -> NoReturn:
     die of these signals; the other codes stand in `paramclient.cli.outcome`.
     """
     if missing := [name for name in LIBRARIES if find_spec(name) is None]:
-        print(  # noqa: T201  # there is nothing else to say it with
+        print(
             f"paramclient: the command needs {' and '.join(missing)}: pip install 'paramclient[cli]'",
             file=sys.stderr,
         )

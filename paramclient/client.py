@@ -190,7 +190,7 @@ class ParamClient:
         system: int | None = None,
         component: int | None = None,
         *,
-        timeout: float | None = HEARING_PATIENCE,  # noqa: ASYNC109 - public API
+        timeout: float | None = HEARING_PATIENCE,
     ) -> Component:
         """The component with this address, as soon as it has been heard.
 
@@ -224,7 +224,7 @@ class ParamClient:
         system: int | None = None,
         *,
         refresh: bool = False,
-        timeout: float | None = None,  # noqa: ASYNC109 - public API
+        timeout: float | None = None,
         progress: Callable[[Mapping[Address, Progress]], None] | None = None,
     ) -> FetchedAll:
         """Bring the tables of all components of one system, or of every system heard, up to date.

@@ -110,7 +110,7 @@ class Component:
             f"params{origin}>"
         )
 
-    async def get(self, name: str | int, *, timeout: float | None = None) -> Param:  # noqa: ASYNC109 - public API
+    async def get(self, name: str | int, *, timeout: float | None = None) -> Param:
         """Ask the vehicle for one parameter.
 
         Equal calls at the same time share one request. Different ones run side by side.
@@ -146,7 +146,7 @@ class Component:
         name: str,
         value: SupportsIndex | SupportsFloat | bytes,
         *,
-        timeout: float | None = None,  # noqa: ASYNC109 - public API
+        timeout: float | None = None,
     ) -> SetResult:
         """Write one parameter and prove by its value that the vehicle has taken it.
 
@@ -185,7 +185,7 @@ class Component:
         self,
         *,
         refresh: bool = False,
-        timeout: float | None = None,  # noqa: ASYNC109 - public API
+        timeout: float | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> FetchResult:
         """Bring the whole table up to date.
@@ -219,7 +219,7 @@ class Component:
             machine.end_fetch(fetch)
         return replace(result, elapsed=anyio.current_time() - began)
 
-    async def refreshed(self, *, timeout: float | None = None) -> None:  # noqa: ASYNC109 - public API
+    async def refreshed(self, *, timeout: float | None = None) -> None:
         """Wait until the values that a hash does not cover have been read afresh after `fetch_all`.
 
         Returns at once where there are none. A value that cannot be read stays *cached*.

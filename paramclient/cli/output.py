@@ -103,7 +103,7 @@ def as_json(params: Iterable[Param]) -> dict[str, dict[str, Any]]:
 
 def print_json(result: object) -> None:
     """Print one object on one line, at once."""
-    print(json.dumps(result, allow_nan=False), flush=True)  # noqa: T201  # this is the command's output
+    print(json.dumps(result, allow_nan=False), flush=True)
 
 
 # for people
@@ -111,7 +111,7 @@ def print_json(result: object) -> None:
 
 def print_line(text: str) -> None:
     """Print one line of the result, at once."""
-    print(printable(text), flush=True)  # noqa: T201  # this is the command's output
+    print(printable(text), flush=True)
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, right: str = "") -> None:
@@ -136,7 +136,7 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
     with console.capture() as captured:
         console.print(table)
     lines = [line.rstrip() for line in captured.get().splitlines()]
-    print(*lines, sep="\n", flush=True)  # noqa: T201  # this is the command's output
+    print(*lines, sep="\n", flush=True)
 
 
 def report(text: str) -> None:
@@ -146,7 +146,7 @@ def report(text: str) -> None:
 
 def say(text: str) -> None:
     """Print to stderr what accompanies a result."""
-    print(text, file=sys.stderr, flush=True)  # noqa: T201  # this is the command's output
+    print(text, file=sys.stderr, flush=True)
 
 
 @contextmanager

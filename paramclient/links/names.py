@@ -239,5 +239,5 @@ _SIM_OPTIONS: dict[str, Callable[[str, str], int | float]] = {
     "system": _whole(1, 255),
     "param_error": _whole(0, 1),
 }
-"""Options of `sim:` links: probabilities, datagrams lost in a row, seconds one way, bytes per second, bytes in
-the queue, numbers."""
+"""Options of `sim:` links: probabilities, datagrams lost in a row, seconds one way, bytes per second, bytes
+in the queue, numbers."""

@@ -167,7 +167,7 @@ class Identification:
             self._ask(now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity. What other answers tell of the link counts at once."""
+        """When `tick` has something to do, or infinity; it follows what other answers tell of the link."""
         if not self._is_asking:
             return math.inf
         return min(self._denied_at, self._asked_at + self._round_trip.timeout)

@@ -130,7 +130,9 @@ class Reads:
             read.finish(message, now)
             self._send_waiting(now)
         if message.param_index == CONTROL and self._control_at < math.inf:
-            self._round_trip.answered(self._control_at, now, self._control_attempts)
+            # one that was lost may have nobody left to ask again; then this is not its answer
+            is_late = now - self._control_at > 2 * self._round_trip.timeout
+            self._round_trip.answered(self._control_at, now, self._control_attempts + is_late)
             self._control_at = math.inf
             self._not_silent(now)
             for read in self._flying.values():

@@ -159,7 +159,8 @@ class Writes:
                 write.was_retyped = True
                 self._begin(write, heard, now)
         elif write.wanted is not None and write.wanted.same_value(heard):
-            self._round_trip.answered(write.sent_at, now, write.attempts)
+            is_sure = write.read is None and not write.is_answered
+            self._round_trip.answered(write.sent_at, now, write.attempts if is_sure else write.attempts + 1)
             self._succeed(write, now)
         else:
             if write.read is None:
