@@ -4,6 +4,7 @@
 #   make test       the tests                      make coverage   the tests, and what they reach
 #   make lint       style and types                make docs       the pages, into docs/_build/html
 #   make bench      speed of parser and start      make dist       wheel and sdist, into dist
+#   make cost       CPU and memory                 make peers      downloads beside other programs
 #   make clean      remove all that was made
 
 PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
@@ -17,9 +18,9 @@ TESTS ?=
 
 MEASURED = 'protocol/*' 'sim/*' 'cache/*' values.py errors.py identity.py params.py
 # what they start are programs of their own, which are not measured
-UNMEASURED = $(addprefix --ignore=tests/test_,docs.py examples.py packaging.py)
+UNMEASURED = $(addprefix --ignore=tests/test_,bench.py docs.py examples.py packaging.py)
 
-.PHONY: demo test coverage lint docs bench dist clean
+.PHONY: demo test coverage lint docs bench cost peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -47,6 +48,12 @@ bench: $(VENV)/with-cli
 	$(BIN)/python bench/parse.py
 	$(BIN)/python bench/startup.py
 
+cost: $(VENV)/with-cli
+	$(BIN)/python bench/cost.py
+
+peers: $(VENV)/with-peers
+	$(BIN)/python bench/peers.py
+
 dist: $(VENV)/with-test
 	rm -rf dist
 	$(BIN)/hatchling build
@@ -70,7 +77,7 @@ $(VENV)/with-cli: pyproject.toml $(VENV)/made
 	@touch $@
 
 # dependency groups need pip 25.1, and the pip of the environment is as old as its Python
-$(VENV)/with-test $(VENV)/with-lint $(VENV)/with-docs: $(VENV)/with-%: pyproject.toml $(VENV)/with-cli
+$(VENV)/with-test $(VENV)/with-lint $(VENV)/with-docs $(VENV)/with-peers: $(VENV)/with-%: pyproject.toml $(VENV)/with-cli
 	@echo "Installing what $* needs into $(VENV)"
 	@$(PIP) 'pip>=25.1'
 	@$(PIP) --group $*

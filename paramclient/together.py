@@ -18,7 +18,7 @@ from paramclient.protocol.station import Address, Station
 
 __all__ = ["FetchTogether", "FetchedAll"]
 
-SILENT_PATIENCE: Final = 2.5
+SILENT_PATIENCE: Final = 1.0
 """Seconds for which a component that does not answer at all is asked, once another one is done."""
 
 

@@ -293,6 +293,7 @@ def test_an_index_that_is_answered_with_nonsense_is_given_up(count: int) -> None
     desk.hear(7, count=count)
     assert desk.download.done
     assert desk.download.missing == (7,)
+    assert desk.download.given_up == {7}
 
 
 def test_no_more_is_asked_for_at_a_time_than_is_bounded() -> None:
@@ -341,9 +342,9 @@ def test_a_long_gap_is_believed_when_the_stream_goes_on_behind_it() -> None:
     assert desk.take()[:3] == [10, 11, 12]
 
 
-def test_two_pushes_far_apart_are_not_the_stream() -> None:
+def test_pushes_far_apart_are_not_the_stream() -> None:
     desk = Desk()
-    desk.stream([*range(10), 300, 300 + LONGEST_JUMP + 1, 10, 11, 12, 13], count=1000)
+    desk.stream([*range(10), *range(300, 900, LONGEST_JUMP + 1), 10, 11, 12, 13], count=1000)
     assert desk.take() == ["list"]
 
 
@@ -367,12 +368,13 @@ def test_another_stations_list_starts_it_again() -> None:
 
 def test_a_list_that_starts_again_for_ever_does_not_hold_it_up() -> None:
     desk = Desk()
-    for _ in range(1000):
+    for _ in range(100):
         desk.stream(range(40))
-        desk.pass_time(0.0)
-        if desk.take() not in ([], ["list"]):
-            break
-    desk.answer()
+        for each in desk.take():
+            if isinstance(each, int):
+                desk.hear(each)
+        desk.pass_time(0.01)
+    assert desk.download.done
     assert desk.download.missing == ()
 
 

@@ -11,6 +11,7 @@ from paramclient.errors import LinkError, NoReply
 from paramclient.protocol import wire
 from paramclient.protocol.component import Fetched, ParamChanged
 from paramclient.protocol.fetch import FRESH_HASH, FetchResult
+from paramclient.protocol.reads import Read
 from paramclient.protocol.table import Change
 from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
@@ -118,6 +119,8 @@ def test_the_hash_that_is_lost_at_the_head_is_asked_for_meanwhile() -> None:
     assert result.hash == vehicle.announced_hash()
     assert names_read(world) == [HASH_CHECK]
     assert result.notes == ()
+    asked = {type(message): at for at, message in world.sent if not isinstance(message, wire.Heartbeat)}
+    assert asked[ParamRequestRead] - asked[ParamRequestList] < 0.02 < result.elapsed
 
 
 def test_a_vehicle_whose_hash_is_switched_off() -> None:
@@ -134,12 +137,22 @@ def test_a_vehicle_whose_hash_is_switched_off() -> None:
     assert result.complete
 
 
-def test_a_vehicle_whose_hash_is_switched_off_and_that_says_so() -> None:
-    vehicle = PX4Vehicle(table=SMALL, hash_check=False, param_error=True)
+def test_a_hash_that_the_vehicle_keeps_silent_on_is_asked_for_once() -> None:
+    vehicle = PX4Vehicle(table=SMALL, hash_check=False)
     world = Simulation(vehicle)
+    reads = world.meet().reads
+    asked: list[object] = []
+    ask = reads.ask
+
+    def spy(key: str | int, now: float, *, urgent: bool = True) -> Read:
+        asked.append(key)
+        return ask(key, now, urgent=urgent)
+
+    reads.ask = spy  # type: ignore[method-assign]  # only looks on
     result = world.fetch()
     assert result.hash is None
     assert result.complete
+    assert asked == [HASH_CHECK]
 
 
 # the next time
@@ -403,6 +416,64 @@ def test_an_unproven_hash_is_confirmed_by_being_the_same_before_and_after() -> N
     result = world.fetch()
     assert result.source == "cache"
     assert "could not be proven" in result.notes[0]
+
+
+def test_after_a_hit_with_an_unproven_hash_everything_is_read_afresh() -> None:
+    vehicle = PX4Vehicle(table=STRANGE)
+    world = Simulation(vehicle)
+    world.fetch()
+    go_on(world)
+    vehicle._entry("P03").store(77)  # no hash tells of it
+    result = world.fetch()
+    assert {param.trust for param in result.params.values()} == {Trust.CACHED}
+    refresh = world.machine.refresh
+    assert refresh is not None
+    world.until(lambda: refresh.done)
+    params = world.machine.table.params
+    assert {param.trust for param in params.values()} == {Trust.LIVE}
+    assert params["P03"].value == 77
+    world.run(0.1)
+    assert world.machine.table.hash == vehicle.announced_hash()
+    assert "P03" in world.machine.table.volatile
+    go_on(world)
+    assert world.fetch().source == "cache"
+
+
+ODD = [SimParam(row.name, row.type, row.value, row.volatile or row.name in ("P03", "P04")) for row in SMALL]
+"""A firmware that leaves out a little more than usual."""
+
+
+def test_what_changes_under_an_unchanged_hash_is_found_to_be_volatile() -> None:
+    vehicle = PX4Vehicle(table=ODD)
+    world = Simulation(vehicle)
+    world.fetch()
+    assert is_so(not world.machine.table.volatile_known)
+    go_on(world)
+    for name in ("P03", "P04"):
+        vehicle._entry(name).store(77)
+    assert world.fetch().source == "cache"
+    world.run(1.0)
+    table = world.machine.table
+    assert table.volatile_known
+    assert table.volatile == {*VOLATILE, "P03", "P04"}
+    world.set("P20", 500)
+    assert table.hash == vehicle.announced_hash()
+    go_on(world)
+    assert world.fetch().notes == ()
+
+
+def test_what_changes_with_the_hash_is_not_found_to_be_volatile() -> None:
+    vehicle = PX4Vehicle(table=ODD)
+    world = Simulation(air=Air.symmetric([vehicle], delay=0.05))
+    world.fetch()
+    go_on(world)
+    assert world.fetch().source == "cache"
+    vehicle._entry("P20").store(77)  # behind everybody's back, while all is read afresh
+    vehicle._hash = None
+    world.run(2.0)
+    assert not world.machine.table.volatile_known
+    assert "P20" not in world.machine.table.volatile
+    assert world.machine.table.params["P20"].value == 77
 
 
 def test_an_unproven_hash_without_one_before_stands_for_nothing() -> None:
@@ -684,6 +755,35 @@ def test_the_link_goes_for_good_at_any_moment(seconds: float) -> None:
     assert world.machine.fetch is None
     assert len(world.machine.reads) == len(world.machine.writes) == 0
     assert world.fetch().complete  # a later one is not spoilt by it
+
+
+def test_the_link_goes_for_good_while_everything_is_read_afresh() -> None:
+    world = Simulation(air=Air.symmetric([PX4Vehicle(table=STRANGE)], delay=0.05))
+    world.fetch()
+    go_on(world)
+    world.fetch()
+    refresh = world.machine.refresh
+    assert refresh is not None
+    error = LinkError("gone", link="x")
+    world.station.fail_all(error, world.now)
+    assert refresh.error is error
+    assert world.machine.refresh is None
+    assert len(world.machine.reads) == 0
+
+
+def test_a_write_while_everything_is_read_afresh_leaves_the_question_open() -> None:
+    vehicle = PX4Vehicle(table=ODD)
+    world = Simulation(air=Air.symmetric([vehicle], delay=0.05))
+    world.fetch()
+    go_on(world)
+    vehicle._entry("P03").store(77)
+    world.fetch()
+    refresh = world.machine.refresh
+    assert refresh is not None
+    world.until(lambda: refresh.done)
+    world.machine.write("P20", 5, world.now)
+    world.run(0.09)  # the hash comes before the write is done
+    assert not world.machine.table.volatile_known
 
 
 def test_changes_are_told_in_order() -> None:

@@ -151,6 +151,7 @@ def test_it_is_asked_for_its_version_once() -> None:
     assert len(desk.sent) == 1
     assert is_so(not desk.who.settled)
     desk.who.acknowledged(CommandAck(MAV_CMD_REQUEST_MESSAGE, MAV_RESULT_ACCEPTED), 1.2)
+    assert desk.who.next_deadline() > 1.2
     assert desk.who.version(AutopilotVersion(CAPABILITY_PARAM_ENCODE_BYTEWISE, uid=7), 1.2) is False
     assert desk.who.settled
     assert desk.who.next_deadline() == math.inf

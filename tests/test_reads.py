@@ -344,6 +344,7 @@ def test_a_vehicle_that_answers_all_else_does_not_have_it(key: Key) -> None:
     assert isinstance(read.error, UnknownParameter)
     assert (read.error.name, read.error.index) == ((key, None) if isinstance(key, str) else (None, key))
     assert read.controls >= ENOUGH_CONTROLS
+    assert read.attempts < desk.round_trip.tries
     assert desk.now < 3.0
     assert desk.take().count(CONTROL) >= ENOUGH_CONTROLS
 
@@ -363,6 +364,19 @@ def test_without_answered_controls_nothing_is_called_unknown() -> None:
     desk.pass_time()
     assert isinstance(read.error, NoReply)
     assert desk.sent.count(CONTROL) > 1  # asked for again as well
+
+
+def test_a_control_that_was_lost_is_not_answered_by_what_passes_by_much_later() -> None:
+    desk = Desk()
+    desk.reads.is_idle = False
+    read = desk.ask("A")
+    desk.pass_time(INITIAL_TIMEOUT + 0.1)
+    assert desk.take() == ["A", "A", CONTROL]
+    desk.hear("A")
+    assert read.done
+    desk.now = 300.0
+    desk.hear("ZERO", index=CONTROL)
+    assert desk.round_trip.timeout == INITIAL_TIMEOUT
 
 
 def test_index_0_needs_no_other_control() -> None:

@@ -145,9 +145,21 @@ def test_a_cached_value_that_is_heard_becomes_live() -> None:
 def test_the_vehicles_hash_makes_cached_values_verified_and_leaves_live_ones() -> None:
     table = Table()
     table.hear(param_value("A", 9.0, index=0), "vehicle")
-    table.fill({"B": known("B", 2.0, index=1), "C": known("C", 3.0, index=2)})
-    table.verify(["A", "B"])
-    assert [param.trust for param in table.params.values()] == [Trust.LIVE, Trust.VERIFIED, Trust.CACHED]
+    table.fill({name: known(name, 2.0, index=index) for name, index in (("B", 1), ("C", 2), ("D", None))})
+    table.confirm(5, frozenset("C"), proven=True)
+    table.verify()
+    trusts = {name: param.trust for name, param in table.params.items()}
+    assert trusts == {"A": Trust.LIVE, "B": Trust.VERIFIED, "C": Trust.CACHED, "D": Trust.CACHED}
+    assert table.unhashed() == {"C"}
+
+
+def test_a_hash_that_may_leave_out_anything_verifies_nothing() -> None:
+    table = Table()
+    table.fill({name: known(name, 2.0, index=index) for name, index in (("A", 0), ("B", 1), ("C", None))})
+    table.confirm(5, frozenset("B"), proven=False)
+    table.verify()
+    assert {param.trust for param in table.params.values()} == {Trust.CACHED}
+    assert table.unhashed() == {"A", "B"}
 
 
 def test_what_the_vehicle_no_longer_has_is_taken_out() -> None:

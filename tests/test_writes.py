@@ -131,7 +131,8 @@ def test_the_type_is_learnt_first() -> None:
 def test_a_cached_type_is_not_enough_but_a_verified_one_is() -> None:
     desk = Desk()
     desk.table.fill({"A": known("A", 1), "B": known("B", 1)})
-    desk.table.verify(["B"])
+    desk.table.confirm(5, frozenset("A"), proven=True)
+    desk.table.verify()
     desk.set("A", 5)
     desk.set("B", 5)
     assert desk.take() == ["read A", "set B 5 INT32"]
@@ -279,6 +280,18 @@ def test_the_read_that_decides_may_bring_the_wanted_value() -> None:
     assert write.result is not None
     assert write.result.status == "accepted"
     assert len(desk.reads) == 0
+
+
+def test_the_answer_to_that_read_does_not_tell_how_long_the_write_took() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", 2.0)
+    desk.hear("A", 1.0, at=0.1)
+    desk.pass_time(4.0)
+    assert desk.take().count("read A") == 4
+    desk.hear("A", 2.0)
+    assert write.done
+    assert desk.round_trip.smoothed is None
 
 
 def test_a_value_that_the_vehicle_makes_of_it_twice_is_its_adjustment() -> None:
@@ -626,6 +639,20 @@ def test_a_write_that_no_longer_fits_when_it_is_repeated_fails() -> None:
     desk.knows("A", 0, INT32)
     write = desk.set("A", 1.5)
     desk.pass_time(1.5 * INITIAL_TIMEOUT)
+    desk.table.use_encoding(Encoding.BYTEWISE)
+    desk.pass_time()
+    assert isinstance(write.error, UsageError)
+    assert len(desk.reads) == 0
+
+
+def test_a_write_that_no_longer_fits_leaves_no_read_behind() -> None:
+    desk = Desk(Encoding.C_CAST)
+    desk.knows("A", 0, INT32)
+    write = desk.set("A", 1.5)
+    while write.attempts < 4:
+        desk.pass_time(0.01)
+        if "read A" in desk.take():
+            desk.hear("A", 0, INT32)
     desk.table.use_encoding(Encoding.BYTEWISE)
     desk.pass_time()
     assert isinstance(write.error, UsageError)

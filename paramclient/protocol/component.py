@@ -13,8 +13,8 @@ from paramclient.errors import LinkError, NoReply, UnknownParameter
 from paramclient.identity import Identity, autopilot_name
 from paramclient.protocol.fetch import FRESH_HASH, Announcement, Fetch, FetchResult
 from paramclient.protocol.identify import Identification
-from paramclient.protocol.operation import Operation
 from paramclient.protocol.reads import Key, Read, Reads
+from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.wire import (
@@ -38,6 +38,8 @@ __all__ = ["ComponentHeard", "ComponentIdentified", "ComponentMachine", "Event",
 SETTLING_TIME: Final = 0.06
 """Seconds from the last of our writes until the hash is asked for: what PX4 changed with it, it pushes 10 to
 24 ms later."""
+FRESH_IDENTITY: Final = 1.0
+"""Seconds for which an AUTOPILOT_VERSION needs no other."""
 FOREIGN_SET_MEMORY: Final = 2.0
 """Seconds for which a PARAM_SET of another station explains a change."""
 MOST_FOREIGN_SETS: Final = 256
@@ -135,7 +137,7 @@ class ComponentMachine:
         self.synced = False
         self.fetch: Fetch | None = None
         self.last_fetch: FetchResult | None = None
-        self.refresh: Operation[None] | None = None
+        self.refresh: Refresh | None = None
         self._own = own
         self._send = send
         self._emit = emit
@@ -271,6 +273,7 @@ class ComponentMachine:
                 refresh=refresh,
                 listed=listed,
                 changed=self._report,
+                doubt=self._doubt_identity,
             )
             if fetch.done:
                 self._fetch_ended(fetch)
@@ -451,6 +454,11 @@ class ComponentMachine:
             self._may_write = True
             self.writes.proceed(now)
 
+    def _doubt_identity(self, now: float) -> None:
+        """The table is not what it was: it may be another vehicle that answers by now."""
+        if self.who.settled and now - self.who.known_at > FRESH_IDENTITY:
+            self.who.ask_again(now)
+
     def _become_another(self, now: float) -> None:
         """Another vehicle has taken this system id: nothing that is known is about it."""
         self._report(self.table.remove(lambda param: True))
@@ -503,7 +511,7 @@ class ComponentMachine:
         listed = table.listed()
         if not table.complete or announced.count != len(listed):
             return False
-        table.verify(param.name for param in listed if param.name not in table.volatile)
+        table.verify()
         self._moved_by_us_alone = True
         return True
 
@@ -516,28 +524,20 @@ class ComponentMachine:
         self.synced = result.complete and self.table.complete
         self._moved_by_us_alone = result.hash is not None
         self._emit(Fetched(self, result))
-        if result.source == "cache":
-            self._refresh_volatile(fetch.ended_at)
+        if result.source == "cache" and result.hash is not None:
+            self._refresh_unhashed(result.hash, fetch.ended_at)
 
-    def _refresh_volatile(self, now: float) -> None:
+    def _refresh_unhashed(self, confirmed: int, now: float) -> None:
         """Read what the hash says nothing about."""
-        params = self.table.params
-        volatile = self.table.volatile
-        names = {name for name in volatile if name in params and params[name].trust is not Trust.LIVE}
-        if not names:
+        refresh = Refresh(self.reads, self.table, confirmed, lambda: len(self.writes) > 0, now)
+        if refresh.done:
             return
-        refresh = self.refresh = Operation[None](now)
+        self.refresh = refresh
+        refresh.on_done.append(partial(self._refresh_ended, refresh))
 
-        def ended(name: str, read: Read) -> None:
-            names.discard(name)
-            if not names:
-                if self.refresh is refresh:
-                    self.refresh = None
-                refresh.finish(None, read.ended_at)
-
-        for name in sorted(names):
-            read = self.reads.ask(name, now, urgent=False)
-            read.on_done.append(partial(ended, name, read))
+    def _refresh_ended(self, refresh: Refresh) -> None:
+        if self.refresh is refresh:
+            self.refresh = None
 
 
 _WRITE_DENIED = re.compile(r"Param write denied \((\w{1,16})\)")

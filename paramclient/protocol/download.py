@@ -224,6 +224,7 @@ class Download(Operation[None]):
         self._vain_passes += 1
         self._list_wait = 0.0
         self._front = self._jump = -1
+        self._vain = 0
         self._holes.clear()
         self._is_streaming = self._reads.list_runs_again = True
         self._heard_at = now
@@ -231,7 +232,10 @@ class Download(Operation[None]):
 
     def _follow(self, index: int, name: str, now: float) -> None:
         """The stream has brought an index, or the vehicle has pushed a change into it."""
-        self._vain = self._vain + 1 if index in self.names else 0
+        if index in self.names:
+            self._vain += 1
+        else:
+            self._vain = self._vain_passes = 0
         self._take(index, name)
         if self._is_streaming and index > self._front:
             if index - self._front > LONGEST_JUMP and not 0 < index - self._jump <= LONGEST_JUMP:
@@ -253,15 +257,16 @@ class Download(Operation[None]):
             self._front = index
         self._heard_at = now
         count = self.count or 0
-        # a list that others begin anew for ever must not hold this one up
-        if self._front == count - 1 or len(self.names) >= count or self._vain > count:
+        if self._front == count - 1 or len(self.names) >= count:
+            self._stream_ends()
+        elif self._vain > count:
+            # others begin the list anew again and again: leave it to them, and read what is missing
+            self._passes = MOST_PASSES
             self._stream_ends()
 
     def _take(self, index: int, name: str) -> None:
         if index in self.names:
             self.repeated += 1
-        else:
-            self._vain_passes = 0
         self.names[index] = name
         self._holes.pop(index, None)
         self.given_up.discard(index)

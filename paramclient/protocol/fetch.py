@@ -117,6 +117,7 @@ class Fetch(Operation[FetchResult]):
         refresh: bool,
         listed: bool,
         changed: Callable[[list[Change]], None],
+        doubt: Callable[[float], None],
     ) -> None:
         super().__init__(now)
         self._target = target
@@ -125,6 +126,7 @@ class Fetch(Operation[FetchResult]):
         self._reads = reads
         self._table = table
         self._changed = changed
+        self._doubt = doubt
         self._expects_hash = expects_hash
         self._hash_read: Read | None = None
         self._before: int | None = None  # the hash announced before any value counted
@@ -247,11 +249,12 @@ class Fetch(Operation[FetchResult]):
             self._begin_download(now)
             return
         table.count = announcement.count
-        table.verify(param.name for param in listed if param.name not in table.volatile)
+        table.verify()
         notes = () if table.volatile_known else (_UNPROVEN,)
         self.finish(self._result("cache", announcement.count, (), announcement.hash, now, notes), now)
 
     def _begin_download(self, now: float) -> None:
+        self._doubt(now)
         download = self.download = Download(
             self._target, self._round_trip, self._send, self._reads, now, listed=self._listed
         )
@@ -346,8 +349,8 @@ class Fetch(Operation[FetchResult]):
 
 
 _UNPROVEN = (
-    "Which parameters this firmware leaves out of its hash could not be proven; "
-    "those that usually are were taken to be."
+    "Which parameters this firmware leaves out of its hash could not be proven, "
+    "so after a start from the cache every value is read afresh."
 )
 _MOVED = "The table moved during the download, so no hash stands for it; the next session downloads it again."
 _UNBRACKETED = (

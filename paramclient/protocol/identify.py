@@ -70,6 +70,7 @@ class Identification:
 
     Attributes:
         identity: who the vehicle is; without a hardware id until AUTOPILOT_VERSION came.
+        known_at: when the version came; minus infinity before that.
         settled: whether `identity` is as good as it gets: the version came, or it never will.
         autopilot, vehicle_type: of the heartbeat; None before one came.
         encoding, encoding_reason: how it writes values, and why that is believed.
@@ -89,6 +90,7 @@ class Identification:
         self._chosen = chosen
         self.identity = Identity(target[0], link)
         self.settled = False
+        self.known_at = -math.inf
         self.autopilot: int | None = None
         self.vehicle_type: int | None = None
         self.capabilities: int | None = None
@@ -153,7 +155,14 @@ class Identification:
         self._judge()
         is_another = self.settled and before.uid is not None and before.key != self.identity.key
         self.settled = True
+        self.known_at = now
         return is_another
+
+    def ask_again(self, now: float) -> None:
+        """Another vehicle may have taken the address: ask, if it has ever been said who it is."""
+        if self.identity.uid is not None and not self._is_asking:
+            self._attempts = 0
+            self._ask(now)
 
     def acknowledged(self, message: CommandAck, now: float) -> None:
         """Take a COMMAND_ACK: a refusal of one way to ask leads to the other at once."""

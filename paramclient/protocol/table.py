@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Final
 
@@ -103,7 +103,7 @@ class Table:
             index = None if old is None else old.index
         elif count == NO_INDEX or message.param_index >= count:
             index = None
-        if old is not None and self._wire.get(name) == (message.raw, number) and old.trust is Trust.LIVE:
+        if old is not None and self._wire.get(name) == (message.raw, number):
             if old.index != index:
                 self.params[name] = Param(name, old.value, old.type, index, old.bits, Trust.LIVE)
                 self.dirty.setdefault(name, by)
@@ -148,12 +148,12 @@ class Table:
                 changes.append(Change(name, None, new))
         return changes
 
-    def verify(self, names: Iterable[str]) -> None:
-        """The vehicle's hash has confirmed these: cached ones become *verified*."""
-        for name in names:
-            param = self.params[name]
-            if param.trust is Trust.CACHED:
-                self.params[name] = param.with_trust(Trust.VERIFIED)
+    def verify(self) -> None:
+        """The vehicle's hash has confirmed it: what is cached and counts into it becomes *verified*."""
+        unhashed = self.unhashed()
+        for param in self.listed():
+            if param.trust is Trust.CACHED and param.name not in unhashed:
+                self.params[param.name] = param.with_trust(Trust.VERIFIED)
 
     def remove(self, condition: Callable[[Param], bool]) -> list[Change]:
         """Take out the parameters that meet a condition."""
@@ -168,6 +168,10 @@ class Table:
     def listed(self) -> list[Param]:
         """The parameters that have an index: those that the count and the hash are about."""
         return [param for param in self.params.values() if param.index is not None]
+
+    def unhashed(self) -> set[str]:
+        """The names that the hash says nothing about: the volatile ones, or any while those are not known."""
+        return set(self.volatile) if self.volatile_known else {param.name for param in self.listed()}
 
     def take_dirty(self) -> dict[str, str]:
         """Names that changed since the last call, each with who did it; gone names too."""

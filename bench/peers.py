@@ -1,0 +1,444 @@
+"""Download every parameter with this library and with the programs that people use today, side by side.
+
+    python bench/peers.py [--repeat N] [--limit SECONDS] [--only TEXT ...]
+
+Simulated PX4 and ArduPilot vehicles speak over real UDP on loopback, each in a process of its own, behind a
+link that loses datagrams in both directions. Every client starts with nothing known and hears the vehicle
+first; then its time runs from asking until it has every value. What it got is compared with what the vehicle
+holds. Prints a Markdown table of the median seconds, each with its ratio to this library. A whole run takes
+about 20 minutes.
+
+MAVSDK and MAVProxy are in the dependency group `peers`; one that is not installed is named as such.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import multiprocessing
+import os
+import platform
+import re
+import socket
+import statistics
+import struct
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from multiprocessing.connection import Connection
+from pathlib import Path
+from typing import Any
+
+import anyio
+
+from paramclient import ParamClient
+from paramclient.links import create_link, serve_endpoint
+from paramclient.protocol import wire
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
+from paramclient.version import __version__
+
+REPEAT = 3
+LIMIT = 120.0
+"""Seconds that one download may take."""
+START_PATIENCE = 30.0
+"""Further seconds for a client to start and to hear the vehicle."""
+ROUND_TRIP = 0.1
+LOSSES = (0.0, 0.05, 0.20)
+"""The share of datagrams lost in each direction. Where some are, the round trip is `ROUND_TRIP` seconds."""
+SILENCE = 1.0
+MISSING_AT_ONCE = 10
+"""How the usual loop over pymavlink goes on: so many missing indices after so long a silence."""
+TOLERANCE = 1e-6
+"""Within which values count as equal: the file that MAVProxy writes has six decimals."""
+
+Values = Mapping[str, float]
+spawn = multiprocessing.get_context("spawn")
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How one download went.
+
+    Attributes:
+        seconds: it took; infinite when it did not bring everything.
+        problem: what went wrong, or nothing.
+        wrong: values that are not the vehicle's.
+    """
+
+    seconds: float
+    problem: str = ""
+    wrong: int = 0
+
+
+@dataclass(frozen=True)
+class Case:
+    """One vehicle behind one link."""
+
+    kind: str
+    loss: float
+
+    @property
+    def name(self) -> str:
+        return f"{self.kind} {f'{self.loss:.0%}' if self.loss else 'clean'}"
+
+    def vehicle(self) -> Vehicle:
+        return PX4Vehicle() if self.kind == "PX4" else ArduPilotVehicle(live_period=0.0)
+
+    def air(self, seed: int) -> Air:
+        return Air.symmetric(
+            [self.vehicle()], loss=self.loss, delay=ROUND_TRIP / 2 if self.loss else 0.0, seed=seed
+        )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--repeat", type=int, default=REPEAT, help="downloads of which the median counts")
+    parser.add_argument("--limit", type=float, default=LIMIT, help="seconds that one may take")
+    parser.add_argument(
+        "--only",
+        nargs="+",
+        default=[""],
+        metavar="TEXT",
+        help="clients and cases whose names hold one of these",
+    )
+    arguments = parser.parse_args()
+    cases = [Case(kind, loss) for kind in ("PX4", "ArduPilot") for loss in LOSSES]
+    clients = choose(list(CLIENTS), arguments.only)
+    chosen = [case for case in cases if case.name in choose([case.name for case in cases], arguments.only)]
+    results: dict[tuple[str, Case], list[Outcome]] = {}
+    began = time.monotonic()
+    loads = [os.getloadavg()[0]]
+    for seed in range(arguments.repeat):
+        for case in chosen:
+            for client in clients:
+                outcome = CLIENTS[client].run(case, seed, arguments.limit)
+                results.setdefault((client, case), []).append(outcome)
+                loads.append(os.getloadavg()[0])
+                said = outcome.problem or f"{outcome.seconds:.2f} s"
+                print(f"{case.name}, {client}: {said}", file=sys.stderr, flush=True)
+    print_table(clients, chosen, results)
+    print(
+        f"\nMedian of {arguments.repeat}, in seconds; in brackets the ratio to paramclient. Datagrams are "
+        f"lost in both directions, and where they are, the round trip is {ROUND_TRIP * 1000:.0f} ms. "
+        f"{time.strftime('%Y-%m-%d')}, {machine()}, load {min(loads):.1f} to {max(loads):.1f}, "
+        f"{(time.monotonic() - began) / 60:.0f} minutes. {versions()}."
+    )
+
+
+def choose(names: list[str], texts: list[str]) -> list[str]:
+    """The names that hold one of the texts; all of them when none does."""
+    return [name for name in names if any(text in name for text in texts)] or names
+
+
+# what is printed
+
+
+def print_table(
+    clients: list[str], cases: list[Case], results: Mapping[tuple[str, Case], list[Outcome]]
+) -> None:
+    notes: list[str] = []
+    heads = [f"{case.kind} ({len(case.vehicle().params)}), {case.name.partition(' ')[2]}" for case in cases]
+    print(f"| client | {' | '.join(heads)} |")
+    print(f"|---|{'---|' * len(cases)}")
+    for client in clients:
+        cells = []
+        for case in cases:
+            outcomes = results[client, case]
+            ours = results.get(("paramclient", case))
+            cells.append(cell(outcomes, ours) + "".join(mark(notes, note) for note in remarks(outcomes)))
+        print(f"| {client} | {' | '.join(cells)} |")
+    if notes:
+        print()
+    for number, note in enumerate(notes, 1):
+        print(f"{number}. {note}")
+
+
+def cell(outcomes: list[Outcome], ours: list[Outcome] | None) -> str:
+    seconds = middle(outcomes)
+    if seconds == math.inf:
+        problems = [outcome.problem for outcome in outcomes if outcome.problem]
+        return statistics.mode(problems)
+    ratio = f" ({seconds / middle(ours):.1f})" if ours and middle(ours) < math.inf else ""
+    return f"{seconds:.2f}{ratio}"
+
+
+def middle(outcomes: list[Outcome]) -> float:
+    return statistics.median_high([outcome.seconds for outcome in outcomes])
+
+
+def remarks(outcomes: list[Outcome]) -> Iterator[str]:
+    """What must be known besides the median."""
+    if middle(outcomes) < math.inf:
+        for problem in sorted({outcome.problem for outcome in outcomes if outcome.problem}):
+            times = sum(outcome.problem == problem for outcome in outcomes)
+            yield f"{times} of {len(outcomes)} downloads: {problem}"
+    wrong = max(outcome.wrong for outcome in outcomes)
+    if wrong:
+        yield f"{wrong} values were not the vehicle's"
+
+
+def mark(notes: list[str], note: str) -> str:
+    if note not in notes:
+        notes.append(note)
+    return f" [{notes.index(note) + 1}]"
+
+
+def machine() -> str:
+    return f"{os.cpu_count()} cores, {platform.system()}, Python {platform.python_version()}"
+
+
+def versions() -> str:
+    return ", ".join(
+        f"{package} {installed(package)}" for package in ("paramclient", "pymavlink", "mavsdk", "MAVProxy")
+    )
+
+
+def installed(package: str) -> str:
+    if package == "paramclient":
+        return __version__  # also where it is run without being installed
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
+
+
+# the vehicle's side
+
+
+@contextmanager
+def flying(case: Case, seed: int) -> Iterator[tuple[int, Any]]:
+    """A vehicle in a process of its own.
+
+    Gives the port that it speaks to, and a shared number: when it was first asked for its list.
+    """
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        port: int = probe.getsockname()[1]
+    asked_at = spawn.Value("d", math.inf)
+    process = spawn.Process(target=fly, args=(case, seed, port, asked_at))
+    process.start()
+    try:
+        yield port, asked_at
+    finally:
+        process.kill()
+        process.join()
+
+
+def fly(case: Case, seed: int, port: int, asked_at: Any) -> None:
+    """Speak to a port until the process is ended."""
+    anyio.run(serve_endpoint, Watched(case.air(seed), asked_at), create_link(f"udpout:127.0.0.1:{port}"))
+
+
+class Watched:
+    """An endpoint that notes when the list was first asked for, before anything can be lost."""
+
+    def __init__(self, air: Air, asked_at: Any) -> None:
+        self._air = air
+        self._asked_at = asked_at
+        self._framer = wire.Framer({21}, stream=False)
+        self.tick = air.tick
+        self.next_deadline = air.next_deadline
+        self.data_to_send = air.data_to_send
+
+    def receive(self, data: bytes, now: float) -> None:
+        if self._asked_at.value == math.inf and self._framer.receive(data):
+            self._asked_at.value = time.monotonic()
+        self._air.receive(data, now)
+
+
+# the clients
+
+
+class PythonClient:
+    """A client that is called from Python, each time in a new process.
+
+    Args:
+        package: what must be installed.
+        fetch: takes the port and the seconds that it may take; gives those that it took, and the values.
+    """
+
+    def __init__(self, package: str, fetch: Callable[[int, float], tuple[float, Values]]) -> None:
+        self._package = package
+        self._fetch = fetch
+
+    def run(self, case: Case, seed: int, limit: float) -> Outcome:
+        if installed(self._package) == "not installed":
+            return Outcome(math.inf, "not installed")
+        receiver, sender = spawn.Pipe(duplex=False)
+        with flying(case, seed) as (port, _):
+            process = spawn.Process(target=call, args=(self._fetch, port, limit, sender))
+            process.start()
+            sender.close()
+            try:
+                if not receiver.poll(limit + START_PATIENCE):
+                    return Outcome(math.inf, f"> {limit:.0f}")
+                seconds, values, problem = receiver.recv()
+            except EOFError:
+                return Outcome(math.inf, "ended without a result")
+            finally:
+                process.kill()
+                process.join()
+        return Outcome(math.inf, problem) if problem else judge(case, seconds, values, limit)
+
+
+def call(
+    fetch: Callable[[int, float], tuple[float, Values]], port: int, limit: float, result: Connection
+) -> None:
+    try:
+        seconds, values = fetch(port, limit)
+    except Exception as error:
+        result.send((math.inf, {}, f"failed: {type(error).__name__}: {error}"))
+    else:
+        result.send((seconds, values, ""))
+
+
+def judge(case: Case, seconds: float, values: Values, limit: float) -> Outcome:
+    """Compare what was got with what the vehicle holds."""
+    truth = case.vehicle().values
+    got = truth.keys() & values.keys()
+    if len(got) < len(truth):
+        return Outcome(math.inf, f"incomplete ({len(got)} of {len(truth)})")
+    if seconds > limit:
+        return Outcome(math.inf, f"> {limit:.0f}")
+    wrong = sum(
+        not math.isclose(values[name], float(value), rel_tol=TOLERANCE, abs_tol=TOLERANCE)
+        for name, value in truth.items()
+        if not isinstance(value, bytes)
+    )
+    return Outcome(seconds, wrong=wrong)
+
+
+def fetch_with_paramclient(port: int, limit: float) -> tuple[float, Values]:
+    async def fetch() -> tuple[float, Values]:
+        async with ParamClient(f"udpin:127.0.0.1:{port}", cache=False) as client:
+            component = await client.component(timeout=START_PATIENCE)
+            began = time.monotonic()
+            result = await component.fetch_all(timeout=limit)
+            seconds = time.monotonic() - began
+            return seconds, {name: float(param.value) for name, param in result.params.items()}
+
+    return anyio.run(fetch)
+
+
+def fetch_with_pymavlink(port: int, limit: float) -> tuple[float, Values]:
+    """The loop that is found everywhere: the list, then after each silence some of what is missing."""
+    from pymavlink import mavutil
+
+    master = mavutil.mavlink_connection(f"udpin:127.0.0.1:{port}")
+    master.wait_heartbeat(timeout=START_PATIENCE)
+    is_cast = master.messages["HEARTBEAT"].autopilot == wire.MAV_AUTOPILOT_ARDUPILOTMEGA
+    values: dict[str, float] = {}
+    missing: set[int] | None = None
+    began = heard = time.monotonic()
+    master.param_fetch_all()
+    while missing is None or missing:
+        now = time.monotonic()
+        if now - began > limit:
+            break
+        if now - heard >= SILENCE:
+            heard = now
+            if missing is None:
+                master.param_fetch_all()
+            else:
+                for index in sorted(missing)[:MISSING_AT_ONCE]:
+                    master.param_fetch_one(index)
+        message = master.recv_match(type="PARAM_VALUE", blocking=True, timeout=heard + SILENCE - now)
+        if message is not None and message.param_index < message.param_count:
+            heard = time.monotonic()
+            if missing is None:
+                missing = set(range(message.param_count))
+            missing.discard(message.param_index)
+            values[message.param_id] = number_in(message, is_cast=is_cast)
+    return time.monotonic() - began, values
+
+
+def number_in(message: Any, *, is_cast: bool) -> float:
+    """The number that a float of pymavlink stands for."""
+    layout = {1: "B", 2: "b", 3: "H", 4: "h", 5: "I", 6: "i"}.get(message.param_type)
+    if is_cast or layout is None:
+        return float(message.param_value)
+    return float(struct.unpack_from(f"<{layout}", struct.pack("<f", message.param_value))[0])
+
+
+def fetch_with_mavsdk(port: int, limit: float) -> tuple[float, Values]:
+    from mavsdk import ComponentType, Configuration, Mavsdk, log_subscribe
+    from mavsdk.plugins.param import Param
+
+    log_subscribe(lambda *_: True)  # it would tell on the standard output what it does
+    with Mavsdk(Configuration.create_with_component_type(ComponentType.GROUND_STATION)) as mavsdk:
+        mavsdk.add_any_connection(f"udpin://127.0.0.1:{port}")
+        system = mavsdk.first_autopilot(timeout_s=START_PATIENCE)
+        if system is None:
+            raise RuntimeError("heard no autopilot")
+        param = Param(system)
+        began = time.monotonic()
+        found = param.get_all_params()
+        seconds = time.monotonic() - began
+        return seconds, {each.name: float(each.value) for each in (*found.int_params, *found.float_params)}
+
+
+class MavProxy:
+    """MAVProxy, as a program of its own. It asks for the list by itself once it has heard the vehicle."""
+
+    def run(self, case: Case, seed: int, limit: float) -> Outcome:
+        if installed("MAVProxy") == "not installed":
+            return Outcome(math.inf, "not installed")
+        with tempfile.TemporaryDirectory() as folder, flying(case, seed) as (port, asked_at):
+            # without its module for MAVFTP it downloads by list
+            command = [sys.executable, "-m", "MAVProxy.mavproxy", f"--master=udpin:127.0.0.1:{port}"]
+            command += [
+                "--non-interactive",
+                "--default-modules=param",
+                f"--state-basedir={folder}",
+                "--aircraft=bench",
+            ]
+            environment = os.environ | {"PYTHONUNBUFFERED": "1", "HOME": folder}
+            with subprocess.Popen(
+                command,
+                cwd=folder,
+                env=environment,
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.STDOUT,
+                text=True,
+            ) as process:
+                watchdog = threading.Timer(limit + START_PATIENCE, process.kill)
+                watchdog.start()
+                try:
+                    return self._follow(process, case, asked_at, limit)
+                finally:
+                    watchdog.cancel()
+                    process.kill()
+
+    def _follow(self, process: subprocess.Popen[str], case: Case, asked_at: Any, limit: float) -> Outcome:
+        assert process.stdout is not None
+        seconds = math.inf
+        for line in process.stdout:
+            if re.search(r"Received \d+ parameters", line):
+                seconds = time.monotonic() - asked_at.value
+            saved = re.search(r"Saved \d+ parameters to (.+)", line)
+            if saved:
+                text = Path(saved[1].strip()).read_text(encoding="utf-8")
+                values = {
+                    name: float(value) for name, value in re.findall(r"^(\w+)\s+(\S+)$", text, re.MULTILINE)
+                }
+                return judge(case, seconds, values, limit)
+        return Outcome(math.inf, f"> {limit:.0f}" if asked_at.value < math.inf else "ended without a result")
+
+
+CLIENTS: dict[str, PythonClient | MavProxy] = {
+    "paramclient": PythonClient("paramclient", fetch_with_paramclient),
+    "pymavlink, the usual loop": PythonClient("pymavlink", fetch_with_pymavlink),
+    "MAVSDK": PythonClient("mavsdk", fetch_with_mavsdk),
+    "MAVProxy": MavProxy(),
+}
+
+
+if __name__ == "__main__":
+    main()

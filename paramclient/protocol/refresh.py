@@ -1,0 +1,73 @@
+"""After a hash hit: read what the hash says nothing about, and learn from it what that is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+
+from paramclient.errors import LinkError
+from paramclient.protocol.hashing import find_volatile
+from paramclient.protocol.operation import Operation
+from paramclient.protocol.reads import Read, Reads
+from paramclient.protocol.table import Table
+from paramclient.protocol.wire import HASH_CHECK
+from paramclient.values import Trust
+
+__all__ = ["Refresh"]
+
+
+class Refresh(Operation[None]):
+    """The reading of values that a confirmed hash does not cover. It ends when each has come or was given up.
+
+    While it is not known which parameters are volatile, that is every value that was not heard on this link.
+    Then the hash is asked for once more: if it still holds, what differs from before is volatile, and with
+    that the whole set may be proven.
+
+    Args:
+        reads: the component's.
+        table: what is refreshed.
+        confirmed: the hash that the vehicle has just announced for the table.
+        is_writing: whether a write of ours is under way, which moves the table too.
+        now: the time.
+    """
+
+    def __init__(
+        self, reads: Reads, table: Table, confirmed: int, is_writing: Callable[[], bool], now: float
+    ) -> None:
+        super().__init__(now)
+        self._reads = reads
+        self._table = table
+        self._confirmed = confirmed
+        self._is_writing = is_writing
+        params = table.params
+        names = [name for name in table.unhashed() if name in params]
+        self._before = {name: params[name] for name in names if params[name].trust is not Trust.LIVE}
+        self._left = set(self._before)
+        for name in sorted(self._before):
+            read = reads.ask(name, now, urgent=False)
+            read.on_done.append(partial(self._one_ended, name, read))
+        if not self._before:
+            self.finish(None, now)
+
+    def _one_ended(self, name: str, read: Read) -> None:
+        self._left.discard(name)
+        if self._left:
+            return
+        if not (self._table.volatile_known or isinstance(read.error, LinkError)):
+            again = self._reads.ask(HASH_CHECK, read.ended_at)
+            again.on_done.append(partial(self._learn, again))
+        self.finish(None, read.ended_at)
+
+    def _learn(self, read: Read) -> None:
+        table = self._table
+        answer = read.result
+        if answer is None or int.from_bytes(answer.raw, "little") != self._confirmed or self._is_writing():
+            return
+        listed = table.listed()
+        if answer.param_count != len(listed) or not table.complete:
+            return
+        now = table.params
+        differ = {name for name, old in self._before.items() if name in now and not now[name].same_value(old)}
+        believed = table.volatile | differ
+        volatile, is_proven = find_volatile(listed, self._confirmed, believed=believed)
+        table.confirm(self._confirmed, volatile if is_proven else believed, proven=is_proven)
