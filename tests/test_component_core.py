@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
@@ -44,7 +45,7 @@ from paramclient.protocol.wire import (
     ParamValue,
     StatusText,
 )
-from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.values import Encoding, Param, ParamType, Trust, Value, px4_hash
 from tests.simulation import Simulation, is_so, known, param_value
 
@@ -679,6 +680,24 @@ def test_two_vehicles_one_after_the_other() -> None:
     world.until(lambda: world.machine.identity.uid == f"{2:016x}")
     assert world.machine.table.params == {}
     result = world.fetch()
+    assert {name: param.value for name, param in result.params.items()} == {"A": 3, "C": 4}
+
+
+@pytest.mark.parametrize("make", [PX4Vehicle, GenericVehicle])
+def test_a_vehicle_that_takes_the_place_of_another_at_once_is_told_apart_by_its_table(
+    make: Callable[..., Vehicle],
+) -> None:
+    first, second = make(uid=1, table={"A": 1, "B": 2}), make(uid=2, table={"A": 3, "C": 4})
+    second.reboot(0.0, down=math.inf)
+    world = Simulation(first, second)
+    world.fetch()
+    world.run(2.0)
+    first.reboot(world.now, down=math.inf)
+    second.reboot(world.now, down=0.0)
+    result = world.fetch()
+    world.until(lambda: world.machine.identity.uid == f"{2:016x}")
+    if result.params.keys() != {"A", "C"}:  # the answer came after the end
+        result = world.fetch()
     assert {name: param.value for name, param in result.params.items()} == {"A": 3, "C": 4}
 
 

@@ -402,6 +402,21 @@ def test_another_station_asks_for_the_list_meanwhile() -> None:
     assert result.elapsed < 2.5
 
 
+@pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
+def test_a_list_that_others_begin_again_and_again_is_left_to_them(
+    make: type[PX4Vehicle] | type[ArduPilotVehicle],
+) -> None:
+    vehicle = make()
+    world = Simulation(vehicle)
+    fetch = world.meet().begin_fetch(world.now)
+    for _ in range(10):
+        world.run(0.3)
+        world.other_station(ParamRequestList(1, 1))
+    result = world.outcome(fetch)
+    assert result.complete
+    assert sum(isinstance(message, ParamRequestList) for _, message in world.sent) == 1
+
+
 # hashes that cannot be computed
 
 
