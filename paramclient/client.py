@@ -371,6 +371,7 @@ class ParamClient:
             elif isinstance(event, ComponentHeard):
                 self._meet(machine)
             elif isinstance(event, ComponentIdentified):
+                self._tell()
                 for component in self._components.values():
                     if component.system == machine.system:
                         self._read_cache(component)
@@ -449,7 +450,7 @@ class ParamClient:
                     return self._components[autopilot.system, autopilot.component]
             return None
         for address, found in self._components.items():
-            if address[1] == component and system in (None, address[0]):
+            if address[1] == component and system in (None, address[0]) and found._machine.who.has_spoken:
                 return found
         return None
 

@@ -415,11 +415,43 @@ async def test_a_component_that_is_heard_before_its_heartbeat() -> None:
     vehicle.set_param("PARAM_01", 5)
     async with a_client(vehicle) as client:
         waiting = [asyncio.create_task(client.component()) for _ in range(2)]
+        named = await client.component(1, 1, timeout=0.4)
+        assert named.encoding_reason == "the vehicle's capability PARAM_ENCODE_BYTEWISE"
         await asyncio.sleep(0.5)
         assert repr(client.components[1, 1]) == "<Component 1/1 unknown partial 1 of 25 params>"
         assert not any(task.done() for task in waiting)
         await asyncio.sleep(0.51)
         assert [task.result().autopilot for task in waiting] == ["px4", "px4"]
+
+
+@swiftly
+async def test_a_component_that_never_says_what_it_is_is_given_in_the_end() -> None:
+    async with a_client(Mute()) as client:
+        began = anyio.current_time()
+        component = await client.component(component=7)
+        assert 3.0 < anyio.current_time() - began < 5.0
+        assert component.encoding_reason == "the standard's encoding, as nothing says otherwise"
+
+
+class Mute:
+    """Sends one PARAM_VALUE at the beginning, and nothing else ever."""
+
+    def __init__(self) -> None:
+        value = wire.ParamValue("A", bytes(4), 6, 1, 0)
+        self.out = [wire.encode(value, system=1, component=7, sequence=0)]
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take it and do nothing."""
+
+    def tick(self, now: float) -> None:
+        """Do nothing."""
+
+    def next_deadline(self) -> float | None:
+        return None
+
+    def data_to_send(self) -> list[bytes]:
+        out, self.out = self.out, []
+        return out
 
 
 @swiftly

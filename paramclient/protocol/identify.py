@@ -112,6 +112,11 @@ class Identification:
         return self._chosen is not None or has_said or self.settled or not self.has_parameters
 
     @property
+    def has_spoken(self) -> bool:
+        """Whether it has said what it is, by a heartbeat or its version, or has been asked in vain."""
+        return self.vehicle_type is not None or self.settled
+
+    @property
     def is_autopilot(self) -> bool:
         """Whether its heartbeat names an autopilot."""
         return self.autopilot not in (None, MAV_AUTOPILOT_INVALID) and self.has_parameters
