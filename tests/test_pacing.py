@@ -90,6 +90,18 @@ def test_answers_that_queue_up_slow_it_down() -> None:
     assert pace.rate < fast
 
 
+@pytest.mark.parametrize(("late", "is_believed"), [(1.0, True), (1.5, False)])
+def test_a_little_too_few_answers_count_when_they_are_late_as_well(late: float, is_believed: bool) -> None:
+    pace = Pace(RoundTrip())
+    pace.answered(0.1, 0.0)  # the quickest one
+    now = 0.0
+    for _ in range(8):
+        burst(pace, now)
+        now += 0.028  # 36 a second: 7 of 10 asked for
+        pace.answered(0.1 * late, now)
+    assert (pace.rate > FIRST_RATE) is is_believed
+
+
 def test_without_requests_that_wait_nothing_is_concluded() -> None:
     pace = Pace(RoundTrip())
     for turn in range(100):

@@ -27,6 +27,9 @@ ENOUGH_SERVED: Final = 0.5
 """The share of the requests that must be answered for a rate to count as served."""
 ROUNDING: Final = 1e-9
 """Of a token: without it, what `next_at` promises could be missed by the last bit of a float, for ever."""
+ENOUGH_SERVED_LATE: Final = 0.8
+LATE: Final = 1.3
+"""The same where answers come later than the quickest one by this factor."""
 UPSTREAM_SHARE: Final = 1 / 3
 REQUEST_SIZE: Final = 16
 VALUE_SIZE: Final = 37
@@ -141,8 +144,11 @@ class Pace:
     def _look(self, now: float) -> None:
         elapsed = now - self._epoch_at
         served = self._answers / elapsed / (1.0 - min(self._round_trip.loss, 0.9))
-        is_queueing = self._timed > 0 and self._late / self._timed > 1.25 * self._quickest + QUEUEING
-        if is_queueing or (self._was_short and served < ENOUGH_SERVED * self._rate):
+        late = self._late / self._timed if self._timed else 0.0
+        is_queueing = late > 1.25 * self._quickest + QUEUEING
+        # few answers say little; that those which came were late as well says more
+        enough = ENOUGH_SERVED_LATE if late > LATE * self._quickest else ENOUGH_SERVED
+        if is_queueing or (self._was_short and served < enough * self._rate):
             self._rate = max(min(served, self._rate), FIRST_RATE)
             self._is_found = True
         elif self._was_short:
