@@ -334,7 +334,7 @@ class Changes(AsyncIterator[Change]):
         """Add a change, or join it with one of the same parameter that waits."""
         earlier = self._waiting.pop(change.name, None)
         if earlier is not None:
-            change = replace(change, old=earlier.old)
+            change = change._replace(old=earlier.old)
             old, new = change.old, change.new
             if old is new or (old is not None and new is not None and old.same_value(new)):
                 return

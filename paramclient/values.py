@@ -143,6 +143,14 @@ class Param:
         return f"{self.name} = {format_value(self.value, self.type)}"
 
 
+# What `decode` needs, without the detours of an enumeration: it runs for every value that comes.
+_REAL32 = int(ParamType.REAL32)
+_REAL64 = int(ParamType.REAL64)
+_BYTEWISE = Encoding.BYTEWISE
+_FITTING = {int(kind): layout for kind, layout in _LAYOUT.items() if layout.size <= 4}
+_BOUNDS = {int(kind): kind.bounds for kind in ParamType if kind.is_integer}
+
+
 def known_type(number: int) -> ParamType | int:
     """The `ParamType` of a number, or the number itself where MAVLink defines none."""
     return _TYPES[number] if number < len(_TYPES) else number
@@ -199,24 +207,23 @@ def decode(raw: bytes, number: int, encoding: Encoding) -> tuple[Value, int]:
         number: param_type as it stood in the message.
         encoding: how the component writes values.
     """
-    if number == ParamType.REAL32:
+    if number == _REAL32:
         return _FLOAT32.unpack(raw)[0], int.from_bytes(raw, "little")
-    if not 1 <= number <= ParamType.REAL64:
-        return raw, int.from_bytes(raw, "little")
-    kind = ParamType(number)
-    if encoding is Encoding.BYTEWISE:
-        if kind.size > 4:
+    if encoding is _BYTEWISE:
+        layout = _FITTING.get(number)
+        if layout is None:
             return raw, int.from_bytes(raw, "little")
-        own = raw[: kind.size]
-        return _LAYOUT[kind].unpack(own)[0], int.from_bytes(own, "little")
+        own = raw[: layout.size]
+        return layout.unpack(own)[0], int.from_bytes(own, "little")
     number32: float = _FLOAT32.unpack(raw)[0]
-    if kind is ParamType.REAL64:
-        return number32, int.from_bytes(_LAYOUT[kind].pack(number32), "little")
-    if math.isfinite(number32):
+    if number == _REAL64:
+        return number32, int.from_bytes(_LAYOUT[ParamType.REAL64].pack(number32), "little")
+    bounds = _BOUNDS.get(number)
+    if bounds is not None and math.isfinite(number32):
         whole = int(number32)
-        low, high = kind.bounds
+        low, high = bounds
         if low <= whole <= high:
-            return whole, whole & ((1 << (8 * kind.size)) - 1)
+            return whole, whole & (high - low)  # as many ones as the type has bits
     return raw, int.from_bytes(raw, "little")
 
 

@@ -20,6 +20,7 @@ from paramclient.protocol.download import (
     REORDER_DEPTH,
     Download,
 )
+from paramclient.protocol.pacing import REQUEST_SIZE, UPSTREAM_SHARE, VALUE_SIZE
 from paramclient.protocol.reads import CONTROL, Reads
 from paramclient.protocol.timing import INITIAL_TIMEOUT, RoundTrip
 from paramclient.protocol.wire import (
@@ -208,6 +209,20 @@ def test_a_gap_is_asked_for_while_the_stream_runs() -> None:
     assert desk.download.done
     assert desk.take() == []
     assert desk.download.missing == ()
+
+
+@pytest.mark.parametrize("lost", [{25}, set(range(90, 100))], ids=["while it runs", "when it is over"])
+def test_the_pace_of_the_stream_bounds_that_of_the_reads(lost: set[int]) -> None:
+    desk = Desk()
+    before = desk.reads.pace.rate
+    for index in range(30 if 25 in lost else 100):
+        desk.now += 0.1
+        if index not in lost:
+            desk.hear(index)
+    desk.pass_time(0.5)
+    assert lost & set(desk.take())
+    assert desk.reads.pace.rate == pytest.approx(VALUE_SIZE / 0.1 * UPSTREAM_SHARE / REQUEST_SIZE)
+    assert desk.reads.pace.rate < before
 
 
 def test_what_comes_in_another_order_is_not_asked_for() -> None:

@@ -54,6 +54,17 @@ def test_a_change_of_type_is_a_change() -> None:
     assert table.params["A"].value == 0
 
 
+def test_another_encoding_goes_by_the_type_that_came_last() -> None:
+    table = Table()
+    table.hear(param_value("A", 5.0, index=0), "vehicle")
+    raw = param_value("A", 5.0, index=0).raw
+    table.hear(ParamValue("A", raw, ParamType.INT16, 1, 0), "vehicle")
+    table.hear(ParamValue("X", raw, 77, 1, 0), "vehicle")
+    table.use_encoding(Encoding.C_CAST)
+    assert (table.params["A"].value, table.params["A"].type) == (5, ParamType.INT16)
+    assert (table.params["X"].value, table.params["X"].type) == (raw, 77)
+
+
 def test_index_65535_keeps_the_one_that_is_known() -> None:
     table = Table()
     table.hear(param_value("A", 1.0, index=3), "vehicle")

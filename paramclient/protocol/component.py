@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, TypeAlias
+from typing import Final, NamedTuple, TypeAlias
 
 from paramclient.errors import LinkError, NoReply, UnknownParameter
 from paramclient.identity import Identity, autopilot_name
@@ -63,9 +63,8 @@ class ComponentIdentified:
     machine: ComponentMachine
 
 
-@dataclass(frozen=True, slots=True)
-class ParamChanged:
-    """A parameter appeared, changed or went away."""
+class ParamChanged(NamedTuple):
+    """A parameter appeared, changed or went away. A named tuple: each first value makes one."""
 
     machine: ComponentMachine
     change: Change
@@ -148,7 +147,7 @@ class ComponentMachine:
         self._known_as: str | None = None  # the key of the identity that was reported
         self._may_write = False
         self._foreign_sets: dict[str, tuple[str, float]] = {}
-        self._changed_at: dict[str, float] = {}  # what changed lately, the latest last
+        self._changed_at: dict[str, float] = {}  # what changed lately; each heartbeat clears it
         self._doubts: dict[str, float] = {}  # what changed again: when to ask for it
 
     # what comes in
@@ -157,11 +156,13 @@ class ComponentMachine:
         """Take a message that this component sent."""
         silence = now - self._last_heard
         self._last_heard = self.round_trip.heard_at = now
-        self.version = max(self.version, version)
+        if version > self.version:
+            self.version = version
         if isinstance(message, ParamValue):
             self._receive_value(message, now)
         elif isinstance(message, Heartbeat):
             self.who.heartbeat(message)
+            self._changed_at = {name: at for name, at in self._changed_at.items() if now - at <= DOUBT}
         elif isinstance(message, AutopilotVersion):
             if self.who.version(message, now):
                 self._become_another(now)
@@ -176,7 +177,8 @@ class ComponentMachine:
             if denied:
                 self.writes.denied(denied.group(1), now)
         self.who.heard(silence, now)
-        self._follow_identity(now)
+        if not isinstance(message, ParamValue):  # a value tells nothing of who it is
+            self._follow_identity(now)
 
     def foreign_set(self, name: str, station: str, now: float) -> None:
         """Another station was heard setting a parameter of this component."""
@@ -383,7 +385,7 @@ class ComponentMachine:
     # private
 
     def _receive_value(self, message: ParamValue, now: float) -> None:
-        name = message.param_id
+        name, _, _, count, _ = message
         if not name:
             return
         if name == HASH_CHECK:
@@ -397,21 +399,23 @@ class ComponentMachine:
         if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
             name = name.upper()
             message = message._replace(param_id=name)
-        if message.param_count not in (self.table.count, NO_INDEX):
-            self._count_moved(message.param_count)
-        change = self.table.hear(message, self._who_did(name, now))
+        if count != self.table.count and count != NO_INDEX:
+            self._count_moved(count)
+        is_writing = len(self.writes) > 0
+        by = self._who_did(name, now) if is_writing or self._foreign_sets else "vehicle"
+        change = self.table.hear(message, by)
         if name not in self.table.params:
             return  # more names than there can be
         if change is not None:
             self._notice(name, now)
             if name not in self.table.volatile:
                 self._moved_by_us_alone &= change.by == "us"
-                if self.announced is not None and self.announced.at > -math.inf:
-                    self.announced = replace(self.announced, at=-math.inf)
-            self._emit(ParamChanged(self, change))
+                if self.announced is not None and self.announced.at != _NEVER:
+                    self.announced = replace(self.announced, at=_NEVER)
+            self._emit(_new(ParamChanged, (self, change)))
         if self.fetch is not None:
             self.fetch.heard(message, now)
-        if len(self.writes):
+        if is_writing:
             self.writes.heard(message, now)
         self.reads.heard(message, now)
 
@@ -422,12 +426,10 @@ class ComponentMachine:
 
     def _notice(self, name: str, now: float) -> None:
         """A value changed: the second time in a short while, the one that came last may be the older one."""
-        times = self._changed_at
-        while times and (oldest := next(iter(times))) and now - times[oldest] > DOUBT:
-            del times[oldest]
-        if times.pop(name, None) is not None and name not in self.writes:
+        before = self._changed_at.pop(name, _NEVER)
+        if now - before <= DOUBT and name not in self.writes:
             self._doubts.setdefault(name, now + DOUBT / 2)
-        times[name] = now
+        self._changed_at[name] = now
 
     def _who_did(self, name: str, now: float) -> str:
         if name in self.writes:
@@ -540,4 +542,6 @@ class ComponentMachine:
             self.refresh = None
 
 
+_NEVER = -math.inf
+_new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
 _WRITE_DENIED = re.compile(r"Param write denied \((\w{1,16})\)")

@@ -91,6 +91,7 @@ class Download(Operation[None]):
         self._vain_passes = 0
         self._moves = 0
         self._front = -1  # the highest index that the stream has reached
+        self._front_at = now  # when that was
         self._jump = -1  # an index too far ahead to be believed at once
         self._advances = 0  # how often the stream went forward
         self._holes: dict[int, int] = {}  # what it passed over: index -> advances when that happened
@@ -135,7 +136,7 @@ class Download(Operation[None]):
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
-        index, count = message.param_index, message.param_count
+        name, _, _, count, index = message
         if index == NO_INDEX or count == NO_INDEX or index >= count or self.done:
             return
         if self.count is None:
@@ -149,11 +150,12 @@ class Download(Operation[None]):
         if index >= self.count:
             return
         if index in self._asked:
-            self._take(index, message.param_id)
+            self._take(index, name)
         else:
-            self._follow(index, message.param_id, now)
-        self._ask_for_gaps(now)
-        self._finish_if_complete(now)
+            self._follow(index, name, now)
+        if self._holes or self._asked or not self._is_streaming:
+            self._ask_for_gaps(now)
+            self._finish_if_complete(now)
 
     def heed(self, now: float) -> None:
         """The head of the list has come: it was heard, and is not asked for again yet."""
@@ -232,11 +234,10 @@ class Download(Operation[None]):
 
     def _follow(self, index: int, name: str, now: float) -> None:
         """The stream has brought an index, or the vehicle has pushed a change into it."""
-        if index in self.names:
+        if self._take(index, name):
             self._vain += 1
         else:
             self._vain = self._vain_passes = 0
-        self._take(index, name)
         if self._is_streaming and index > self._front:
             if index - self._front > LONGEST_JUMP and not 0 < index - self._jump <= LONGEST_JUMP:
                 self._jump = index
@@ -245,16 +246,16 @@ class Download(Operation[None]):
                 self._is_awaited = False
                 self._began = (index, now)
             else:
-                first, since = self._began
-                self._gap = (now - since) / (index - first)
-                self._longest = max(now - self._heard_at, self._longest * 0.99)
+                self._longest *= 0.99
+                if now - self._heard_at > self._longest:
+                    self._longest = now - self._heard_at
             self._advances += 1
-            if self._advances >= ENOUGH_ADVANCES:
-                self._reads.pace.stream_seen(self._gap)
-            for hole in range(self._front + 1, index):
-                if hole not in self.names:
-                    self._holes[hole] = self._advances
+            if index - self._front > 1:
+                for hole in range(self._front + 1, index):
+                    if hole not in self.names:
+                        self._holes[hole] = self._advances
             self._front = index
+            self._front_at = now
         self._heard_at = now
         count = self.count or 0
         if self._front == count - 1 or len(self.names) >= count:
@@ -264,19 +265,34 @@ class Download(Operation[None]):
             self._passes = MOST_PASSES
             self._stream_ends()
 
-    def _take(self, index: int, name: str) -> None:
-        if index in self.names:
+    def _take(self, index: int, name: str) -> bool:
+        """Keep a name; tell whether one had come before."""
+        is_repeated = index in self.names
+        if is_repeated:
             self.repeated += 1
         self.names[index] = name
-        self._holes.pop(index, None)
-        self.given_up.discard(index)
+        if self._holes:
+            self._holes.pop(index, None)
+        if self.given_up:
+            self.given_up.discard(index)
+        return is_repeated
+
+    def _learn_pace(self) -> None:
+        """What the stream has told of the link so far: worked out when it is needed, not for each value."""
+        first, since = self._began
+        if self._front > first:
+            self._gap = (self._front_at - since) / (self._front - first)
+        if self._advances >= ENOUGH_ADVANCES:
+            self._reads.pace.stream_seen(self._gap)
 
     def _stream_ends(self) -> None:
+        self._learn_pace()
         self._is_streaming = self._reads.list_runs_again = False
         self._reads.is_idle = True
 
     def _start_over(self, count: int | None) -> None:
         """The count has moved: indices heard before may mean other parameters now."""
+        self._learn_pace()
         self._forget_reads()
         self._moves += 1
         self.count = count
@@ -293,6 +309,7 @@ class Download(Operation[None]):
         if self.done or count is None or self._other_count is not None:
             return
         if self._is_streaming:
+            self._learn_pace()
             for index, seen in list(self._holes.items()):
                 if len(self._asked) >= MOST_ASKED or self._advances - seen < REORDER_DEPTH - 1:
                     break

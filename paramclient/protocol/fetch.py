@@ -153,11 +153,14 @@ class Fetch(Operation[FetchResult]):
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
-        if self.download is not None and not self.download.done:
-            self._first_value_at = min(self._first_value_at, now)
-            self.download.heard(message, now)
-            is_unknown = self._before is None and not self._was_asked_meanwhile
-            if is_unknown and self._expects_hash() and not self.done:
+        download = self.download
+        if download is not None and not download.done:
+            if self._first_value_at > now:
+                self._first_value_at = now
+            download.heard(message, now)
+            if self._before is not None or self._was_asked_meanwhile:
+                return
+            if self._expects_hash() and not self.done:
                 # the one at the head of the list was lost; asked for now, it need not be waited for later
                 self._was_asked_meanwhile = True
                 self._ask_hash(self._hash_came_meanwhile, now)

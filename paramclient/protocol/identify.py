@@ -131,7 +131,7 @@ class Identification:
 
     def heard(self, silence: float, now: float) -> None:
         """Something came, `silence` seconds after what came before: ask who it is, if that is not known."""
-        if self.has_parameters and (not self._attempts or silence > SILENCE):
+        if (not self._attempts or silence > SILENCE) and self.has_parameters:
             self._attempts = 0
             self._ask(now)
 

@@ -121,7 +121,8 @@ class Reads:
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here after it went into the table."""
-        for read in [self._open.get(message.param_id), self._open.get(message.param_index)]:
+        found = [self._open.get(message.param_id), self._open.get(message.param_index)] if self._open else []
+        for read in found:
             if read is None or self._open.get(read.key) is not read:
                 continue
             if read.attempts:

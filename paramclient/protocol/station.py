@@ -98,16 +98,17 @@ class Station:
             frames += framer.flush()
             self._framers.pop(key, None)
         for frame in frames:
-            sender = (frame.system, frame.component)
-            if sender == self.own or frame.system == 0 or (message := decode(frame)) is None:
+            _, system, component, _, _, version = frame
+            sender = (system, component)
+            if sender == self.own or system == 0 or (message := decode(frame)) is None:
                 continue
-            self._peers[frame.system] = peer
+            self._peers[system] = peer
             if isinstance(message, ParamSet):
                 self._receive_foreign_set(message, sender, now)
                 continue
             machine = self.components.get(sender) or self._meet(sender, message)
             if machine is not None:
-                machine.receive(message, now, version=frame.version)
+                machine.receive(message, now, version=version)
         if self._is_stream and not data:
             self._peers = {system: each for system, each in self._peers.items() if each != peer}
 
@@ -136,7 +137,8 @@ class Station:
 
     def events(self) -> list[Event]:
         """What has happened since the last call."""
-        events, self._events = self._events, []
+        events = self._events.copy()  # the components hold on to the list itself
+        self._events.clear()
         return events
 
     def pause(self) -> None:
@@ -207,7 +209,7 @@ class Station:
             own=self.own,
             link=self.link,
             send=send,
-            emit=lambda event: self._events.append(event),
+            emit=self._events.append,
             encoding=self._encoding,
         )
         self.components[sender] = machine

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 from paramclient.protocol.wire import NO_INDEX, ParamValue
 from paramclient.values import Encoding, Param, Trust, decode, known_type, px4_hash
@@ -14,10 +13,11 @@ __all__ = ["Change", "Table"]
 MOST_NAMES: Final = 65_535
 """Names that one table may hold. No more can have an index; a component that invents further ones is ill."""
 
+_new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
 
-@dataclass(frozen=True, slots=True)
-class Change:
-    """One parameter that appeared, changed its value or went away.
+
+class Change(NamedTuple):
+    """One parameter that appeared, changed its value or went away. A named tuple: each first value makes one.
 
     Attributes:
         name: param_id.
@@ -55,7 +55,7 @@ class Table:
         self._hash: int | None = None
         self._hash_is_stale = False
         self._encoding = encoding
-        self._wire: dict[str, tuple[bytes, int]] = {}
+        self._wire: dict[str, bytes] = {}  # the four bytes as they came, for another encoding
 
     @property
     def encoding(self) -> Encoding:
@@ -94,33 +94,32 @@ class Table:
         The value counts whatever the index says. An index of 65535 leaves the known one as it is, one that
         is not below the count is no index.
         """
-        name = message.param_id
-        number = message.param_type
-        index: int | None = message.param_index
-        count = message.param_count
+        name, raw, number, count, given = message
+        index: int | None = given
         old = self.params.get(name)
-        if index == NO_INDEX:
+        if given == NO_INDEX:
             index = None if old is None else old.index
-        elif count == NO_INDEX or message.param_index >= count:
+        elif count == NO_INDEX or given >= count:
             index = None
-        if old is not None and self._wire.get(name) == (message.raw, number):
+        if old is None:
+            if len(self.params) >= MOST_NAMES:
+                return None
+        elif old.type == number and self._wire.get(name) == raw:
             if old.index != index:
                 self.params[name] = Param(name, old.value, old.type, index, old.bits, Trust.LIVE)
                 self.dirty.setdefault(name, by)
             return None
-        if old is None and len(self.params) >= MOST_NAMES:
-            return None
-        value, bits = decode(message.raw, number, self._encoding)
+        value, bits = decode(raw, number, self._encoding)
         new = Param(name, value, known_type(number), index, bits, Trust.LIVE)
         self.params[name] = new
-        self._wire[name] = (message.raw, number)
+        self._wire[name] = raw
         if old is not None and old.same_value(new):
             if old.index != index:
                 self.dirty.setdefault(name, by)
             return None
         self.dirty[name] = by
         self._moved(name)
-        return Change(name, old, new, by)
+        return _new(Change, (name, old, new, by))
 
     def use_encoding(self, encoding: Encoding) -> list[Change]:
         """Read everything that was heard in another encoding; give what looks different now."""
@@ -128,9 +127,9 @@ class Table:
             return []
         self._encoding = encoding
         changes = []
-        for name, (raw, number) in self._wire.items():
+        for name, raw in self._wire.items():
             old = self.params[name]
-            value, bits = decode(raw, number, encoding)
+            value, bits = decode(raw, old.type, encoding)
             new = Param(name, value, old.type, old.index, bits, old.trust)
             self.params[name] = new
             if not old.same_value(new):

@@ -63,9 +63,10 @@ _MAGIC_V2 = 0xFD
 _SIGNED = 0x01
 _SIGNATURE_LENGTH = 13
 _MAGIC = re.compile(b"[\xfd\xfe]").search
-_START = struct.Struct("<BBB4x3s").unpack_from  # magic, payload length, incompatibility flags, message id
+_START = struct.Struct("<BBBxBBB3s").unpack_from  # a header of MAVLink 2; version 1 shares two bytes
 _CRC_AT = struct.Struct("<H").unpack_from
 _PADDING = bytes(10)  # behind the data: a header can be read at its last byte
+_new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
 _NO_KEY = b""  # of no message
 
 
@@ -229,9 +230,11 @@ class Framer:
 
         Of a stream, at most one unfinished frame (less than 280 bytes) is kept between calls.
         """
+        if not self._stream:
+            return self._scan(data, final=True)[0]
         if self._tail:
             data = self._tail + data
-        found, rest = self._scan(data, final=not self._stream)
+        found, rest = self._scan(data, final=False)
         self._tail = data[rest:]
         return found
 
@@ -249,7 +252,7 @@ class Framer:
         for each byte.
         """
         found: list[Frame] = []
-        wanted = self._wanted
+        number_of = self._wanted.get
         extra_of = _EXTRA_BY_ID_BYTES.get
         length = len(data)
         padded = data + _PADDING
@@ -257,7 +260,7 @@ class Framer:
         skipped = 0
         at = 0
         while at < length:
-            magic, size, flags, key = _START(padded, at)
+            magic, size, flags, sequence, system, component, key = _START(padded, at)
             if magic == _MAGIC_V2:
                 crc_at = at + 10 + size
                 end = crc_at + 2
@@ -279,15 +282,15 @@ class Framer:
                     break
             elif extra is not None and _CRC_AT(data, crc_at)[0] == mcrf4xx(data[at + 1 : crc_at] + extra):
                 good += 1
-                if key in wanted:
+                number = number_of(key)
+                if number is not None:
                     if magic == _MAGIC_V2:
-                        sequence, system, component = data[at + 4 : at + 7]
                         payload = data[at + 10 : crc_at]
-                        found.append(Frame(wanted[key], system, component, sequence, payload, 2))
+                        found.append(_new(Frame, (number, system, component, sequence, payload, 2)))
                     else:
                         sequence, system, component = data[at + 2 : at + 5]
                         payload = data[at + 6 : crc_at]
-                        found.append(Frame(wanted[key], system, component, sequence, payload, 1))
+                        found.append(Frame(number, system, component, sequence, payload, 1))
                 at = end
                 continue
             candidate = _MAGIC(data, at + 1)
@@ -410,7 +413,7 @@ def _decode_param_value(payload: bytes) -> ParamValue:
     if len(payload) < 25:
         payload = payload.ljust(25, b"\0")
     raw, count, index, name, number = _PARAM_VALUE.unpack_from(payload)
-    return ParamValue(text_of(name), raw, number, count, index)
+    return _new(ParamValue, (text_of(name), raw, number, count, index))
 
 
 def _decode_param_set(payload: bytes) -> ParamSet:
