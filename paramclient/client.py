@@ -342,11 +342,10 @@ class ParamClient:
         A component that has not said who it is by now may be one that never does: what is whole is kept.
         """
         machine = component._machine
-        table = machine.table
-        is_known = self._station.identity_of(machine) is not None
-        if not (table.complete or (is_known and table.params)):
+        known = self._station.identity_of(machine)
+        if not (machine.table.complete or (known is not None and machine.table.params)):
             return
-        identity = self._station.identity_of(machine) or machine.identity
+        identity = known or machine.identity
         if not self._writer.follow(machine, identity):
             self._writer.keep(machine, identity, await self._writer.load(machine, identity))
 

@@ -193,6 +193,24 @@ class Tap:
         return [] if self.is_mute else data
 
 
+class Radio(Tap):
+    """A channel that another station shares: what it sends is heard by the endpoint and by us.
+
+    Attributes:
+        other: the other station's frames that are still to be sent.
+    """
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        super().__init__(endpoint)
+        self.other: list[bytes] = []
+
+    def data_to_send(self) -> list[bytes]:
+        sent, self.other = self.other, []
+        for data in sent:
+            self._endpoint.receive(data, anyio.current_time())
+        return sent + super().data_to_send()
+
+
 class FlakyLink(SimLink):
     """A link to an endpoint that can drop, and be opened again.
 

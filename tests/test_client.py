@@ -42,6 +42,7 @@ from tests.shell import (
     PATIENCE,
     VALUES,
     FlakyLink,
+    Radio,
     Tap,
     a_client,
     bits,
@@ -1042,27 +1043,13 @@ async def test_nobody_is_told_who_has_gone() -> None:
 @swiftly
 async def test_changes_by_other_stations_are_told_from_the_vehicles_own() -> None:
     vehicle = small_px4()
-
-    class Relay(Tap):
-        """What another station sends is heard by us too, as on a radio channel."""
-
-        def __init__(self) -> None:
-            super().__init__(vehicle)
-            self.other: list[bytes] = []
-
-        def data_to_send(self) -> list[bytes]:
-            other, self.other = self.other, []
-            for data in other:
-                vehicle.receive(data, anyio.current_time())
-            return other + super().data_to_send()
-
-    relay = Relay()
-    async with a_client(relay) as client:
+    radio = Radio(vehicle)
+    async with a_client(radio) as client:
         component = await client.component()
         await component.fetch_all()
         changes = component.changes()
         message = wire.ParamSet(1, 1, "PARAM_01", (55).to_bytes(4, "little"), ParamType.INT32)
-        relay.other.append(wire.encode(message, system=254, component=190, sequence=0))
+        radio.other.append(wire.encode(message, system=254, component=190, sequence=0))
         change = await anext(changes)
         assert (change.name, change.by) == ("PARAM_01", "station 254/190")
         vehicle.set_param("PARAM_02", 66)

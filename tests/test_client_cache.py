@@ -35,6 +35,7 @@ from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4
 from tests.caches import full_disk, read_only, set_aside, start
 from tests.shell import (
     VALUES,
+    Radio,
     Tap,
     bits,
     generic,
@@ -501,21 +502,7 @@ async def test_a_set_that_moves_the_count_leads_to_a_download_and_a_right_table(
 @swiftly
 async def test_what_another_station_changes_is_kept_with_its_name(path: Path) -> None:
     vehicle = small_px4()
-
-    class Radio(Tap):
-        """What the other station sends is heard by us too."""
-
-        def __init__(self) -> None:
-            super().__init__(vehicle)
-            self.other: list[bytes] = []
-
-        def data_to_send(self) -> list[bytes]:
-            sent, self.other = self.other, []
-            for data in sent:
-                vehicle.receive(data, anyio.current_time())
-            return sent + super().data_to_send()
-
-    radio = Radio()
+    radio = Radio(vehicle)
     async with ParamClient(radio, cache=path) as client:
         component = await client.component()
         await component.fetch_all()

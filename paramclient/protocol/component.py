@@ -212,11 +212,6 @@ class ComponentMachine:
         table = self.table
         if table.complete:
             return
-        moved = [
-            name
-            for name, param in table.params.items()
-            if name in params and not params[name].same_value(param) and name not in volatile
-        ]
         self._report(table.fill(params))
         if table.count not in (None, count):
             return
@@ -227,7 +222,9 @@ class ComponentMachine:
         table.confirm(confirmed, volatile, proven=volatile_known)
         if volatile_known:
             table.rehash()  # what is in the table counts, not what stood beside it
-        elif moved:
+        elif any(
+            not table.params[name].same_value(param) for name, param in params.items() if name not in volatile
+        ):
             table.unconfirm()
         self._compare_hash(now)
 
