@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from paramclient.cache import CachedComponent, CachedVehicle, HistoryEntry, ParamCache
 from paramclient.client import FetchedAll, ParamClient
-from paramclient.component import Changes, Component
+from paramclient.component import Component
 from paramclient.errors import (
     CacheError,
     ClientClosed,
@@ -19,9 +19,11 @@ from paramclient.errors import (
     ValueNotApplied,
     VehicleError,
 )
+from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
-from paramclient.protocol.fetch import FetchResult, Progress
+from paramclient.protocol.fetch import FetchResult, Policy, Progress
+from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
 from paramclient.protocol.writes import SetResult
 from paramclient.values import Encoding, Param, ParamType, Trust
@@ -36,11 +38,16 @@ __all__ = [
     "ClientClosed",
     "Component",
     "Encoding",
+    "Event",
+    "Events",
     "FetchResult",
     "FetchedAll",
+    "Found",
+    "Heard",
     "HistoryEntry",
     "Identity",
     "LinkError",
+    "Lost",
     "NoReply",
     "Param",
     "ParamCache",
@@ -49,9 +56,13 @@ __all__ = [
     "ParamErrorCode",
     "ParamMap",
     "ParamType",
+    "Policy",
     "Progress",
+    "Rebooted",
     "Refused",
+    "Resynced",
     "SetResult",
+    "SyncState",
     "Trust",
     "TypeMismatch",
     "UnknownParameter",

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import os
+import weakref
 from collections.abc import Callable, Mapping
 from contextlib import suppress
 from types import MappingProxyType, TracebackType
@@ -16,11 +17,23 @@ import anyio.abc
 from paramclient.cache import ParamCache
 from paramclient.component import PROGRESS_INTERVAL, Component
 from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
+from paramclient.events import Events, told
 from paramclient.identity import Identity
 from paramclient.links import Link, create_link
-from paramclient.protocol.component import ComponentHeard, ComponentIdentified, ComponentMachine, ParamChanged
-from paramclient.protocol.fetch import Progress
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import (
+    ComponentHeard,
+    ComponentIdentified,
+    Fetched,
+    ParamChanged,
+    TableResynced,
+)
+from paramclient.protocol.events import (
+    Event as Event,
+)
+from paramclient.protocol.fetch import Policy, Progress
 from paramclient.protocol.station import Address, Station
+from paramclient.protocol.sync import Upkeep
 from paramclient.together import FetchedAll, FetchTogether
 from paramclient.values import Encoding
 from paramclient.writethrough import FLUSH_INTERVAL, RETRY_INTERVAL, WriteThrough
@@ -39,6 +52,9 @@ LINK_PATIENCE: Final = 10.0
 FIRST_BACKOFF: Final = 0.25
 LONGEST_BACKOFF: Final = 5.0
 """Seconds between two attempts to open a link again: doubled from the first to the longest."""
+WATCH_INTERVAL: Final = 30.0
+"""Seconds after which a vehicle with a hash is asked for it again, unless the caller says otherwise."""
+SHORTEST_WATCH: Final = 1.0
 CLOSING_PATIENCE: Final = 0.5
 """Seconds that closing waits for the hash after a write, where the next session could not do without it."""
 
@@ -65,12 +81,21 @@ class ParamClient:
             False for none.
         system, component: who we are on the link.
         encoding: how all components lay out values, for those who know better than the evidence.
+        watch_interval: seconds after which it is looked again whether a table that was fetched still is the
+            vehicle's, while the link is idle. An update is sent once, and lost with its frame: so it is found
+            within one interval. None: every `WATCH_INTERVAL` seconds where the vehicle has a hash, which
+            costs two small messages, and never elsewhere. A number goes for every vehicle; of one without a
+            hash the whole list is fetched each time. 0 for never. See `Component.sync_state`.
+        policy: what may be asked of vehicles to bring tables up to date, see `Policy`: "auto", "hash-only"
+            or "cache-only". Anything but "auto" also ends the watch. Single reads and writes go out all the
+            same.
 
     Attributes:
         cache: where tables are kept, or None.
 
     Raises:
-        UsageError: no such link, or ids outside 1 to 255; on entering: for the second time.
+        UsageError: no such link, ids outside 1 to 255, or an interval or policy that cannot be; on entering:
+            for the second time.
         LinkError: on entering: the link cannot be opened.
     """
 
@@ -82,6 +107,8 @@ class ParamClient:
         system: int = 255,
         component: int = 190,
         encoding: Encoding | None = None,
+        watch_interval: float | None = None,
+        policy: Policy | str = Policy.AUTO,
     ) -> None:
         for number in (system, component):
             if not 1 <= number <= 255:
@@ -100,7 +127,9 @@ class ParamClient:
             system=system,
             component=component,
             encoding=encoding,
+            upkeep=_upkeep(watch_interval, policy),
         )
+        self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self._components: dict[Address, Component] = {}
         self._tasks: anyio.abc.TaskGroup | None = None
         self._something_to_send = anyio.Event()
@@ -184,6 +213,23 @@ class ParamClient:
                     await self._keep(component)
             finally:
                 await self._writer.close()
+
+    def events(self) -> Events:
+        """What happens to components from now on: `async for event in client.events()`.
+
+        The events are those of `paramclient.events`: Heard, Lost, Found, Rebooted, Resynced. An absence of
+        the link does not end it; it ends when nobody holds it any more. Whoever is very slow to ask misses
+        the oldest ones.
+
+        Raises:
+            LinkError: while waiting, when the link failed for good or the client was closed. What had come
+                before is given first.
+        """
+        events = Events()
+        self._subscriptions.add(events)
+        if self._ended is not None:
+            events.end(self._ended)
+        return events
 
     async def component(
         self,
@@ -332,6 +378,8 @@ class ParamClient:
             await self._something_to_write.wait()
             self._something_to_write = anyio.Event()
             await anyio.sleep(FLUSH_INTERVAL)
+            if self._writer.is_held_back:
+                self._something_to_write.set()
             if not await self._writer.flush():
                 await anyio.sleep(RETRY_INTERVAL)
                 self._something_to_write.set()
@@ -367,16 +415,29 @@ class ParamClient:
             if isinstance(event, ParamChanged):
                 self._components[machine.system, machine.component]._publish(event.change)
                 self._something_to_write.set()
-            elif isinstance(event, ComponentHeard):
+                continue
+            if isinstance(event, ComponentHeard):
                 self._meet(machine)
             elif isinstance(event, ComponentIdentified):
                 self._tell()
                 for component in self._components.values():
                     if component.system == machine.system:
                         self._read_cache(component)
-            elif event.result.complete:
+            elif isinstance(event, Fetched) and event.result.complete:
                 self._writer.synced(machine, is_whole=event.result.source != "cache")
                 self._something_to_write.set()
+            elif isinstance(event, TableResynced):
+                self._writer.synced(machine, is_whole=False)
+                self._something_to_write.set()
+            if self._subscriptions:
+                self._announce(event)
+
+    def _announce(self, event: Event) -> None:
+        """Tell those who listen, if it is for them."""
+        news = told(event, self._components[event.machine.system, event.machine.component])
+        if news is not None:
+            for events in list(self._subscriptions):
+                events.push(news)
 
     def _meet(self, machine: ComponentMachine) -> None:
         address = (machine.system, machine.component)
@@ -384,7 +445,7 @@ class ParamClient:
         component = self._components[address] = Component(self, machine, now)
         self._read_cache(component)
         if self._writer.may_hit(*address):
-            machine.ask_hash(now)
+            machine.sync.ask(now)
 
     def _read_cache(self, component: Component) -> None:
         """Look for its cached table, once it is known whose it is."""
@@ -411,6 +472,8 @@ class ParamClient:
         self._fail_calls(error)
         for component in self._components.values():
             component._end(error)
+        for events in list(self._subscriptions):
+            events.end(error)
 
     def _fail_calls(self, error: LinkError) -> None:
         """Whoever waits gets this error, and so does every new call until the link is back."""
@@ -452,6 +515,19 @@ class ParamClient:
             if address[1] == component and system in (None, address[0]) and found._machine.who.has_spoken:
                 return found
         return None
+
+
+def _upkeep(watch_interval: float | None, policy: Policy | str) -> Upkeep:
+    """What the two options of the client mean."""
+    try:
+        policy = Policy(policy)
+    except ValueError:
+        raise UsageError(f"policy is one of {', '.join(Policy)}, not {policy!r}") from None
+    if watch_interval is None:
+        return Upkeep(WATCH_INTERVAL, policy=policy)
+    if not (watch_interval == 0 or watch_interval >= SHORTEST_WATCH):
+        raise UsageError(f"watch_interval is 0 or seconds from {SHORTEST_WATCH:g} up, not {watch_interval}")
+    return Upkeep(watch_interval or math.inf, without_hash=True, policy=policy)
 
 
 def _wanted(system: int | None, component: int | None) -> str:

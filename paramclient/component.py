@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import weakref
-from collections.abc import AsyncIterator, Callable
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from typing import TYPE_CHECKING, SupportsFloat, SupportsIndex, TypeVar
@@ -11,11 +11,13 @@ from typing import TYPE_CHECKING, SupportsFloat, SupportsIndex, TypeVar
 import anyio
 
 from paramclient.errors import NoReply, ParamClientError, UsageError
+from paramclient.events import Changes
 from paramclient.identity import Identity, autopilot_name
 from paramclient.params import ParamMap
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.fetch import Fetch, FetchResult, Progress
 from paramclient.protocol.operation import Operation
+from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
 from paramclient.protocol.wire import HASH_CHECK, NO_INDEX, ParamValue
 from paramclient.protocol.writes import SetResult
@@ -24,7 +26,7 @@ from paramclient.values import Encoding, Param, check_name, check_value, decode,
 if TYPE_CHECKING:
     from paramclient.client import ParamClient
 
-__all__ = ["Changes", "Component"]
+__all__ = ["Component"]
 
 Result = TypeVar("Result")
 
@@ -41,7 +43,10 @@ class Component:
 
     All of its calls may be cancelled at any point, and the next call works. All of them wait on while a link
     that comes back by itself is away, up to `LINK_PATIENCE` of `paramclient.client`; then, and when the
-    client is closed, they raise LinkError.
+    client is closed, they raise LinkError. A component that is lost (see `Lost`) is not asked: calls that
+    wait for an answer and new ones raise NoReply at once, but for a `fetch_all` under way, which goes on for
+    a while, as the vehicle may only be starting again. The table stays, and what is in it is *cached* until
+    the vehicle is back and has confirmed it.
 
     Attributes:
         system, component: its address.
@@ -92,8 +97,18 @@ class Component:
 
     @property
     def state(self) -> str:
-        """The table's state in a word: new, cached, fetching, synced, partial."""
+        """The table's state in a word: new, cached, fetching, synced, partial, lost."""
         return self._machine.state
+
+    @property
+    def sync_state(self) -> SyncState:
+        """How the table stands to the vehicle's: up to date, or what is done about it."""
+        return self._machine.sync_state
+
+    @property
+    def silence(self) -> float:
+        """Seconds since it was heard last. After five without a word it is lost, see `Lost`."""
+        return max(0.0, anyio.current_time() - self._machine.presence.heard_at)
 
     @property
     def round_trip(self) -> float | None:
@@ -248,7 +263,7 @@ class Component:
         changes = Changes()
         self._subscriptions.add(changes)
         if self._client._ended is not None:
-            changes._end(self._client._ended)
+            changes.end(self._client._ended)
         return changes
 
     def _cache_is_due(self, now: float) -> bool:
@@ -270,13 +285,13 @@ class Component:
     def _publish(self, change: Change) -> None:
         """Hand a change to everyone who listens."""
         for changes in list(self._subscriptions):
-            changes._push(change)
+            changes.push(change)
 
     def _end(self, error: ParamClientError) -> None:
         """Nothing will come any more."""
         self._cache_is_read.set()
         for changes in list(self._subscriptions):
-            changes._end(error)
+            changes.end(error)
 
     async def _wait(
         self, operation: Operation[Result], patience: float | None, describe: Callable[[], tuple[str, int]]
@@ -320,43 +335,6 @@ class Component:
             with suppress(ValueError):
                 fetch.on_done.remove(ended.set)
         return _outcome(fetch)
-
-
-class Changes(AsyncIterator[Change]):
-    """The changes of one component's parameters since this object was made; see `Component.changes`."""
-
-    def __init__(self) -> None:
-        self._waiting: dict[str, Change] = {}
-        self._error: ParamClientError | None = None
-        self._arrived = anyio.Event()
-
-    def _push(self, change: Change) -> None:
-        """Add a change, or join it with one of the same parameter that waits."""
-        earlier = self._waiting.pop(change.name, None)
-        if earlier is not None:
-            change = change._replace(old=earlier.old)
-            old, new = change.old, change.new
-            if old is new or (old is not None and new is not None and old.same_value(new)):
-                return
-        self._waiting[change.name] = change
-        self._arrived.set()
-
-    def _end(self, error: ParamClientError) -> None:
-        """What waits is still given, then the error is raised."""
-        self._error = error
-        self._arrived.set()
-
-    def __aiter__(self) -> Changes:
-        return self
-
-    async def __anext__(self) -> Change:
-        while not self._waiting:
-            if self._error is not None:
-                raise self._error.with_traceback(None)
-            if self._arrived.is_set():
-                self._arrived = anyio.Event()
-            await self._arrived.wait()
-        return self._waiting.pop(next(iter(self._waiting)))
 
 
 def _outcome(operation: Operation[Result]) -> Result:

@@ -68,7 +68,7 @@ class FetchTogether:
             machine = component._machine
             if address in self._fetches or not machine.who.has_parameters:
                 continue
-            if self._system not in (None, machine.system):
+            if self._system not in (None, machine.system) or (machine.presence.is_lost and not machine.fetch):
                 continue
             if self._refresh or component._cache_is_due(now):
                 ready.setdefault(machine.system, []).append(machine)
@@ -131,6 +131,11 @@ class FetchTogether:
                 results[address] = fetch.result or fetch.partial(now, TIME_IS_OVER)
             except NoReply as error:
                 silent[address] = error
+        for address, component in self._components.items():
+            is_wanted = self._system in (None, address[0])
+            if is_wanted and address not in self._fetches and component._machine.presence.is_lost:
+                what = f"the parameters of {address[0]}/{address[1]} (lost)"
+                silent[address] = NoReply(what, attempts=0, waited=component.silence)
         return FetchedAll(results, silent)
 
     def end(self) -> None:

@@ -113,7 +113,7 @@ class WriteThrough:
             )
             kept.synced_at = cached.synced_at
             kept.state = self._state(machine, kept)
-        if machine.synced:
+        if machine.sync.synced:
             kept.synced_at = time.time()
 
     def synced(self, machine: ComponentMachine, *, is_whole: bool) -> None:
@@ -122,6 +122,11 @@ class WriteThrough:
         if kept is not None:
             kept.synced_at = time.time()
             kept.is_whole |= is_whole
+
+    @property
+    def is_held_back(self) -> bool:
+        """Whether there is news of a component of which it is open who it is: it may be another vehicle."""
+        return any(machine.who.is_doubted and machine.table.dirty for machine in self._kept)
 
     async def flush(self) -> bool:
         """Write what is new; false when the cache could not take it. Cancelled, it loses nothing."""
@@ -143,6 +148,8 @@ class WriteThrough:
     def _news_of(self, kept: _Kept) -> list[_News]:
         """What the cache does not know of a table yet; it counts as written from now on."""
         machine, table = kept.machine, kept.machine.table
+        if machine.who.is_doubted:
+            return []
         state = self._state(machine, kept)
         if not (table.dirty or kept.is_whole or state != kept.state):
             return []

@@ -8,7 +8,8 @@ from typing import TypedDict, TypeVar
 
 from paramclient.errors import ParamClientError
 from paramclient.protocol import wire
-from paramclient.protocol.component import ComponentMachine, Event
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import Event
 from paramclient.protocol.fetch import Fetch, FetchResult
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.station import Station

@@ -706,7 +706,7 @@ async def test_every_call_has_a_time_limit_of_its_own() -> None:
     async with a_client(tap) as client:
         component = await client.component()
         await asyncio.sleep(0.1)
-        tap.is_mute = True
+        tap.is_deaf = True
         limited = {
             "PARAM_01 of 1/1": component.get("PARAM_01", timeout=2.5),
             "parameter 5 of 1/1": component.get(5, timeout=2.5),
@@ -730,7 +730,7 @@ async def test_calls_without_a_time_limit_end_by_themselves() -> None:
     tap = Tap(generic())
     async with a_client(tap) as client:
         component = await client.component()
-        tap.is_mute = True
+        tap.is_deaf = True
         for name in ("get", "set", "fetch_all", "client.fetch_all"):
             began = anyio.current_time()
             with pytest.raises(NoReply) as caught:

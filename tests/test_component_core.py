@@ -17,16 +17,9 @@ from paramclient.errors import (
     UsageError,
 )
 from paramclient.protocol import table as table_room
-from paramclient.protocol.component import (
-    DOUBT,
-    FOREIGN_SET_MEMORY,
-    MOST_FOREIGN_SETS,
-    ComponentIdentified,
-    ComponentMachine,
-    Event,
-    Fetched,
-    ParamChanged,
-)
+from paramclient.protocol.authors import DOUBT, FOREIGN_SET_MEMORY, MOST_FOREIGN_SETS
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import ComponentIdentified, Event, Fetched, ParamChanged
 from paramclient.protocol.table import Change
 from paramclient.protocol.wire import (
     CAPABILITY_PARAM_ENCODE_BYTEWISE,
@@ -176,7 +169,7 @@ def test_a_hash_is_no_parameter(index: int) -> None:
     desk = Desk()
     desk.receive(ParamValue(HASH_CHECK, b"\x01\x02\x03\x04", ParamType.UINT32, 3, index), at=2.0)
     assert desk.machine.table.params == {}
-    announced = desk.machine.announced
+    announced = desk.machine.sync.announced
     assert announced is not None
     assert (announced.hash, announced.count, announced.at) == (0x04030201, 3, 2.0)
 
@@ -219,11 +212,11 @@ def test_other_autopilots_mind_the_case() -> None:
 def test_a_count_that_moves_takes_the_table_out_of_step() -> None:
     desk = Desk()
     fetched(desk)
-    assert is_so(desk.machine.synced)
+    assert is_so(desk.machine.sync.synced)
     desk.hear("A", 0.0, index=0, count=NO_INDEX)
-    assert is_so(desk.machine.synced)
+    assert is_so(desk.machine.sync.synced)
     desk.hear("A", 0.0, index=0, count=4)
-    assert not desk.machine.synced
+    assert not desk.machine.sync.synced
     assert not desk.machine.can_hit
     assert desk.machine.table.count == 4
 
@@ -274,7 +267,7 @@ def test_memory_of_changes_is_short() -> None:
         desk.hear(f"N{number}")
         if number % 10 == 0:
             desk.receive(PX4)
-    assert len(desk.machine._changed_at) <= (DOUBT + 1.0) / 0.1 + 2
+    assert len(desk.machine._authors._changed_at) <= (DOUBT + 1.0) / 0.1 + 2
 
 
 # who did it
@@ -304,7 +297,7 @@ def test_the_memory_of_other_stations_is_bounded() -> None:
     desk = Desk()
     for number in range(3 * MOST_FOREIGN_SETS):
         desk.machine.foreign_set(f"N{number}", "station 2/2", desk.now)
-    assert len(desk.machine._foreign_sets) == MOST_FOREIGN_SETS
+    assert len(desk.machine._authors._foreign_sets) == MOST_FOREIGN_SETS
     desk.hear("N0")
     desk.hear(f"N{3 * MOST_FOREIGN_SETS - 1}")
     assert [change.by for change in desk.changes] == ["vehicle", "station 2/2"]
@@ -419,7 +412,7 @@ def test_after_our_write_the_hash_is_asked_for_once_things_have_settled() -> Non
     assert expected is not None
     desk.hash(expected)
     assert not desk.machine.is_settling
-    assert desk.machine.synced
+    assert desk.machine.sync.synced
 
 
 def test_another_hash_than_expected_takes_the_table_out_of_step() -> None:
@@ -429,18 +422,18 @@ def test_another_hash_than_expected_takes_the_table_out_of_step() -> None:
     desk.hear("A", 7.0, index=0)
     desk.pass_time(0.1)
     desk.hash(0x12345678)
-    assert not desk.machine.synced
+    assert not desk.machine.sync.synced
     assert desk.machine.table.hash != 0x12345678
 
 
 def test_the_right_hash_with_another_count_confirms_nothing() -> None:
     desk = Desk()
     fetched(desk)
-    desk.machine.ask_hash(desk.now)
+    desk.machine.sync.ask(desk.now)
     expected = desk.machine.table.hash
     assert expected is not None
     desk.hash(expected, count=4)
-    assert not desk.machine.synced
+    assert not desk.machine.sync.synced
 
 
 def test_the_right_hash_with_another_count_is_no_hit() -> None:
@@ -459,10 +452,10 @@ def test_the_right_hash_with_another_count_is_no_hit() -> None:
 def test_during_further_writes_a_hash_means_nothing() -> None:
     desk = Desk()
     fetched(desk)
-    desk.machine.ask_hash(desk.now)
+    desk.machine.sync.ask(desk.now)
     desk.machine.write("A", 7.0, desk.now)
     desk.hash(0x12345678)
-    assert desk.machine.synced
+    assert desk.machine.sync.synced
 
 
 def test_a_vehicle_without_a_hash_is_not_asked_for_it() -> None:
@@ -478,7 +471,7 @@ def test_a_vehicle_without_a_hash_is_not_asked_for_it() -> None:
 def test_a_hash_that_the_vehicle_does_not_have_is_not_asked_for_again() -> None:
     desk = Desk()
     desk.hear("A", 1.0)
-    desk.machine.ask_hash(desk.now)
+    desk.machine.sync.ask(desk.now)
     desk.receive(ParamError(*OWN, HASH_CHECK, -1, 1))
     desk.machine.write("A", 2.0, desk.now)
     desk.hear("A", 2.0)
@@ -495,22 +488,22 @@ def test_a_hash_that_the_vehicle_does_not_have_is_not_asked_for_again() -> None:
 @pytest.mark.parametrize("how", ["silence", "link"])
 def test_a_hash_that_was_not_heard_may_still_be_there(how: str) -> None:
     desk = Desk()
-    desk.machine.ask_hash(desk.now)
+    desk.machine.sync.ask(desk.now)
     if how == "silence":
         desk.pass_time()
     else:
         desk.machine.fail_all(LinkError("gone", link="x"), desk.now)
-    assert desk.machine._expects_hash()
+    assert desk.machine.sync.expects_hash
 
 
 def test_a_change_makes_an_announced_hash_old() -> None:
     desk = Desk()
     desk.hash(5)
     desk.hear("A", 1.0)
-    assert desk.machine.announced is not None
-    assert desk.machine.announced.at == -math.inf
+    assert desk.machine.sync.announced is not None
+    assert desk.machine.sync.announced.at == -math.inf
     desk.hear("A", 2.0)
-    assert desk.machine.announced.hash == 5
+    assert desk.machine.sync.announced.hash == 5
 
 
 # the cache
@@ -604,7 +597,7 @@ def test_a_table_whose_count_never_rests_is_not_in_step() -> None:
     assert fetch.result is not None
     assert fetch.result.complete
     assert "kept changing" in fetch.result.notes[0]
-    assert not desk.machine.synced
+    assert not desk.machine.sync.synced
     assert not desk.machine.table.complete
 
 
@@ -624,11 +617,12 @@ def test_it_is_told_when_it_is_settled_who_it_is() -> None:
 
 def test_it_is_told_again_when_a_late_answer_gives_another_name() -> None:
     desk = Desk(None)
-    desk.receive(PX4)
-    desk.pass_time(10.0)
-    assert len(desk.events) == 1
+    for _ in range(10):
+        desk.receive(PX4)
+        desk.pass_time(1.0)
+    assert desk.events == [ComponentIdentified(desk.machine)]
     desk.receive(AutopilotVersion(0, uid=7))
-    assert len(desk.events) == 2
+    assert desk.events == 2 * [ComponentIdentified(desk.machine)]
     assert desk.machine.identity.key == "uid:0000000000000007"
 
 
@@ -646,8 +640,8 @@ def test_another_vehicle_in_the_same_place() -> None:
     assert table.params == {}
     assert (table.count, table.complete, table.hash, table.volatile) == (None, False, None, frozenset())
     assert not table.volatile_known
-    assert desk.machine.announced is None
-    assert not desk.machine.synced
+    assert desk.machine.sync.announced is None
+    assert not desk.machine.sync.synced
     assert isinstance(write.error, NoReply)
     assert "another vehicle" in str(write.error)
     assert [change.name for change in desk.changes] == ["A", "B", "C"]
@@ -713,7 +707,7 @@ def test_when_the_link_is_gone_everything_ends_and_nothing_is_left() -> None:
     error = LinkError("gone", link="x")
     read, write = desk.machine.read("Q", desk.now), desk.machine.write("A", 5.0, desk.now)
     fetch = desk.machine.begin_fetch(desk.now, refresh=True)
-    desk.machine.ask_hash(desk.now)
+    desk.machine.sync.ask(desk.now)
     desk.hear("A", 9.0, index=0)
     desk.hear("B", 9.0, index=1)
     desk.hear("B", 8.0, index=1)  # in doubt
@@ -723,7 +717,7 @@ def test_when_the_link_is_gone_everything_ends_and_nothing_is_left() -> None:
     assert fetch.error is error
     assert len(desk.machine.reads) == len(desk.machine.writes) == 0
     assert desk.machine.fetch is None
-    assert desk.machine.next_deadline() == math.inf
+    assert desk.machine.next_deadline() == desk.machine.presence.lost_at(), "that is all there is left to see"
 
 
 def test_a_refresh_of_volatile_values_fails_with_the_link() -> None:
@@ -745,11 +739,11 @@ def test_a_pause_does_not_count_as_the_vehicles_silence() -> None:
     desk = Desk()
     desk.hear("A", 1.0)
     read = desk.machine.read("A", desk.now)
-    desk.pass_time(18.0)
+    desk.pass_time(4.0)
     assert not read.done
     desk.now += 100.0
     desk.machine.resume(desk.now)
-    desk.pass_time(10.0)
+    desk.pass_time(4.0)
     assert not read.done
 
 

@@ -9,7 +9,7 @@ import pytest
 
 from paramclient.errors import LinkError, NoReply
 from paramclient.protocol import wire
-from paramclient.protocol.component import Fetched, ParamChanged
+from paramclient.protocol.events import Fetched, ParamChanged
 from paramclient.protocol.fetch import FRESH_HASH, FetchResult
 from paramclient.protocol.reads import Read
 from paramclient.protocol.table import Change
@@ -79,7 +79,7 @@ def test_a_first_fetch_from_px4() -> None:
     assert values_of(result) == vehicle.values
     assert repr(result).startswith("<FetchResult 1/1 903 params from stream in 0.9")
     machine = world.machine
-    assert machine.synced
+    assert machine.sync.synced
     assert machine.state == "synced"
     assert machine.table.complete
     assert machine.table.volatile_known
@@ -193,7 +193,7 @@ def test_volatile_values_are_read_afresh_after_a_hit() -> None:
     world.run(1.0)
     param = world.machine.table.params["CAL_MAG0_XOFF"]
     assert (param.value, param.trust) == (99, Trust.LIVE)
-    assert world.machine.synced
+    assert world.machine.sync.synced
 
 
 def test_a_second_hit_while_the_first_one_is_refreshed() -> None:
@@ -222,7 +222,7 @@ def test_a_hash_that_was_asked_for_ahead_costs_nothing_more() -> None:
     world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
     world.fetch()
     go_on(world)
-    world.machine.ask_hash(world.now)
+    world.machine.sync.ask(world.now)
     world.run(0.3)
     before = len(world.sent_of(ParamRequestRead))
     fetch = world.machine.begin_fetch(world.now)
@@ -506,7 +506,7 @@ def test_after_our_own_write_the_next_session_hits() -> None:
     world.set("P05", 500)
     assert world.machine.table.hash == vehicle.announced_hash()
     world.run(0.5)
-    assert world.machine.synced
+    assert world.machine.sync.synced
     go_on(world)
     result = world.fetch()
     assert result.source == "cache"
@@ -544,7 +544,7 @@ def test_a_write_that_brings_parameters_into_use() -> None:
     assert world.fetch().count == 43
     world.set("A_SWITCH", 1)
     world.run(1.0)
-    assert not world.machine.synced
+    assert not world.machine.sync.synced
     assert world.machine.state == "partial"
     result = world.fetch()
     assert result.count == 44
@@ -566,7 +566,7 @@ def test_what_never_comes_is_named_and_the_table_is_not_complete() -> None:
     assert (result.count, result.received, result.hash) == (42, 40, None)
     assert "2 missing" in repr(result)
     assert not world.machine.table.complete
-    assert not world.machine.synced
+    assert not world.machine.sync.synced
     assert world.machine.state == "partial"
 
 

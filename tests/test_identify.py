@@ -6,7 +6,7 @@ import math
 
 import pytest
 
-from paramclient.protocol.identify import SILENCE, TRIES, Identification, judge_encoding
+from paramclient.protocol.identify import TRIES, Identification, judge_encoding
 from paramclient.protocol.timing import INITIAL_TIMEOUT, RoundTrip
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
@@ -46,9 +46,9 @@ class Desk:
         self.trip = RoundTrip()
         self.who = Identification((1, 1), "udpin:x", self.trip, self.sent.append, chosen)
 
-    def beat(self, heartbeat: Heartbeat, now: float = 0.0, *, silence: float = 1.0) -> None:
+    def beat(self, heartbeat: Heartbeat, now: float = 0.0) -> None:
         self.who.heartbeat(heartbeat)
-        self.who.heard(silence, now)
+        self.who.heard(now)
 
     def commands(self) -> list[int]:
         sent, self.sent[:] = list(self.sent), []
@@ -223,14 +223,17 @@ def settled(uid: int) -> Desk:
     return desk
 
 
-def test_after_a_silence_it_is_asked_again_who_it_is() -> None:
+def test_where_it_is_doubted_it_is_asked_again_who_it_is() -> None:
     desk = settled(7)
-    desk.beat(PX4, 20.0, silence=SILENCE)
+    desk.beat(PX4, 20.0)
     assert desk.commands() == []
-    desk.beat(PX4, 30.0, silence=SILENCE + 0.1)
+    assert is_so(desk.who.may_be_written)
+    desk.who.doubt(30.0)
+    assert not desk.who.may_be_written
     assert desk.commands() == [MAV_CMD_REQUEST_MESSAGE]
     assert desk.who.settled
     assert desk.who.version(AutopilotVersion(0, uid=7), 30.1) is False
+    assert is_so(desk.who.may_be_written)
     assert desk.who.version(AutopilotVersion(0, uid=8), 30.2) is True
     assert desk.who.identity.uid == "0000000000000008"
 
@@ -251,7 +254,8 @@ def test_ids_that_name_no_single_vehicle_do_not_tell_them_apart() -> None:
 
 def test_an_answer_that_never_comes_again_leaves_what_is_known() -> None:
     desk = settled(7)
-    desk.beat(PX4, 30.0, silence=60.0)
+    desk.who.doubt(30.0)
     desk.let_it_be()
+    assert not desk.who.is_doubted
     assert desk.who.identity.uid == "0000000000000007"
     assert desk.who.settled

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from hypothesis import HealthCheck, settings
@@ -144,24 +145,20 @@ class Sessions(RuleBasedStateMachine):
     @precondition(lambda self: self.is_known)
     @rule(refresh=st.booleans())
     def fetch(self, refresh: bool) -> None:
-        fetch = self.world.machine.begin_fetch(self.world.now, refresh=refresh)
-        self.begun(fetch)
-        self.world.exchange()
+        self.begin(lambda: self.world.machine.begin_fetch(self.world.now, refresh=refresh))
 
     @precondition(lambda self: self.is_known)
     @rule(data=st.data(), name=st.sampled_from([*VOLATILE, SWITCH, INTEGERS[0], FLOATS[0], "NOT_THERE"]))
     def get(self, data: st.DataObject, name: str) -> None:
         key: str | int = data.draw(st.one_of(st.just(name), st.integers(0, len(self.names) + 2)))
-        self.begun(self.world.machine.read(key, self.world.now))
-        self.world.exchange()
+        self.begin(lambda: self.world.machine.read(key, self.world.now))
 
     @precondition(lambda self: self.is_known)
     @rule(data=st.data(), number=st.integers(0, 50))
     def set(self, data: st.DataObject, number: int) -> None:
         name = data.draw(st.sampled_from([*self.names, "NOT_THERE"]))
         self.moved()
-        self.begun(self.world.machine.write(name, number, self.world.now))
-        self.world.exchange()
+        self.begin(lambda: self.world.machine.write(name, number, self.world.now))
 
     @precondition(lambda self: self.open)
     @rule(data=st.data())
@@ -263,7 +260,17 @@ class Sessions(RuleBasedStateMachine):
     def is_known(self) -> bool:
         return hasattr(self, "world") and (1, 1) in self.world.station.components
 
-    def begun(self, operation: Operation[object] | Read | Write | Fetch) -> None:
+    def begin(self, call: Callable[[], Read | Write | Fetch]) -> None:
+        """Begin something; of a component that is lost, nothing can be asked."""
+        try:
+            operation = call()
+        except NoReply:
+            assert self.world.machine.presence.is_lost
+            return
+        self.begun(operation)
+        self.world.exchange()
+
+    def begun(self, operation: Read | Write | Fetch) -> None:
         is_moving = self.world.now - self.changed_at < SETTLING or len(self.world.machine.writes)
         changes = None if is_moving else self.changes
         self.open.append(Begun(operation, changes))  # type: ignore[arg-type]  # only its end counts here

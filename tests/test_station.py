@@ -9,7 +9,8 @@ import pytest
 from paramclient.errors import LinkError
 from paramclient.protocol import station as room
 from paramclient.protocol import wire
-from paramclient.protocol.component import ComponentHeard, ComponentIdentified, ComponentMachine
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import ComponentHeard, ComponentIdentified
 from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
@@ -274,7 +275,7 @@ def test_what_another_station_sets() -> None:
     for address, machine in station.components.items():
         for name in ("P11", "P10", "P00", "P22"):
             hear(station, param_value(name), *address)
-        told[address] = [machine._who_did(name, 0.0) for name in ("P11", "P10", "P00", "P22")]
+        told[address] = [machine._authors.of(name, 0.0) for name in ("P11", "P10", "P00", "P22")]
     other = "station 254/190"
     assert told[1, 1] == [other, other, other, "vehicle"]
     assert told[1, 2] == ["vehicle", other, other, "vehicle"]
@@ -286,7 +287,7 @@ def test_our_own_sets_that_come_back_are_not_another_stations() -> None:
     station = a_station()
     hear(station, PX4)
     hear(station, ParamSet(1, 1, "A", bytes(4), 9), 255, 190)
-    assert station.components[1, 1]._who_did("A", 0.0) == "vehicle"
+    assert station.components[1, 1]._authors.of("A", 0.0) == "vehicle"
 
 
 # pause and resume

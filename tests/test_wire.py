@@ -27,6 +27,7 @@ from paramclient.protocol.wire import (
     Frame,
     Framer,
     Heartbeat,
+    HighLatency2,
     Message,
     ParamError,
     ParamRequestList,
@@ -34,6 +35,7 @@ from paramclient.protocol.wire import (
     ParamSet,
     ParamValue,
     StatusText,
+    SystemTime,
     build_frame,
     decode,
     encode,
@@ -164,6 +166,8 @@ MESSAGES: list[tuple[Message, Any]] = [
     (StatusText(6, "x" * 50), dialect.MAVLink_statustext_message(6, b"x" * 50)),
     (ParamError(255, 190, "A", -1, 5), dialect.MAVLink_param_error_message(255, 190, b"A", -1, 5)),
     (ParamError(0, 0, "", 7, 1), dialect.MAVLink_param_error_message(0, 0, b"", 7, 1)),
+    (SystemTime(2**40 + 1, 2**31 + 2), dialect.MAVLink_system_time_message(2**40 + 1, 2**31 + 2)),
+    (HighLatency2(2, 12), dialect.MAVLink_high_latency2_message(0, 2, 12, *[0] * 24)),
 ]  # fmt: skip
 BEFORE_EXTENSIONS = {"AUTOPILOT_VERSION": 60, "COMMAND_ACK": 3, "STATUSTEXT": 51}
 """Length of a payload without its extension fields, which MAVLink 1 does not carry. pymavlink sends them."""

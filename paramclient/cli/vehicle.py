@@ -30,8 +30,8 @@ from paramclient.cli.output import (
     value_json,
 )
 from paramclient.cli.session import Session, connect
-from paramclient.component import Changes
 from paramclient.errors import NoReply, ParamClientError, UsageError, ValueNotApplied
+from paramclient.events import Changes
 from paramclient.protocol.fetch import FetchResult
 from paramclient.protocol.table import Change
 from paramclient.values import Param, ParamType, Trust, Value, check_name, format_value, type_name

@@ -5,16 +5,28 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
 from functools import partial
-from typing import Final, NamedTuple, TypeAlias
+from typing import Final
 
-from paramclient.errors import LinkError, NoReply, UnknownParameter
+from paramclient.errors import LinkError, NoReply
 from paramclient.identity import Identity, autopilot_name
-from paramclient.protocol.fetch import FRESH_HASH, Announcement, Fetch, FetchResult
+from paramclient.protocol.authors import Authors
+from paramclient.protocol.events import (
+    ComponentFound,
+    ComponentIdentified,
+    ComponentLost,
+    ComponentRebooted,
+    Event,
+    Fetched,
+    ParamChanged,
+    TableResynced,
+)
+from paramclient.protocol.fetch import Fetch, FetchResult, Policy
 from paramclient.protocol.identify import Identification
+from paramclient.protocol.presence import Presence
 from paramclient.protocol.reads import Key, Read, Reads
 from paramclient.protocol.refresh import Refresh
+from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.wire import (
@@ -25,60 +37,20 @@ from paramclient.protocol.wire import (
     AutopilotVersion,
     CommandAck,
     Heartbeat,
+    HighLatency2,
     Message,
     ParamError,
     ParamValue,
     StatusText,
+    SystemTime,
 )
 from paramclient.protocol.writes import Write, Writes
 from paramclient.values import Encoding, Param, Trust, Value, encode
 
-__all__ = ["ComponentHeard", "ComponentIdentified", "ComponentMachine", "Event", "Fetched", "ParamChanged"]
+__all__ = ["ComponentMachine"]
 
-SETTLING_TIME: Final = 0.06
-"""Seconds from the last of our writes until the hash is asked for: what PX4 changed with it, it pushes 10 to
-24 ms later."""
 FRESH_IDENTITY: Final = 1.0
 """Seconds for which an AUTOPILOT_VERSION needs no other."""
-FOREIGN_SET_MEMORY: Final = 2.0
-"""Seconds for which a PARAM_SET of another station explains a change."""
-MOST_FOREIGN_SETS: Final = 256
-"""Names remembered for that; the oldest goes first."""
-DOUBT: Final = 2.0
-"""Seconds within which a second change of one value may be an old answer that came late: ArduPilot takes the
-values for a batch of answers up to 100 ms before it sends them, and what was set meanwhile overtakes them."""
-
-
-@dataclass(frozen=True, slots=True)
-class ComponentHeard:
-    """A component was heard for the first time."""
-
-    machine: ComponentMachine
-
-
-@dataclass(frozen=True, slots=True)
-class ComponentIdentified:
-    """It is settled who the component is, as far as it ever will be; its cached table can be looked for."""
-
-    machine: ComponentMachine
-
-
-class ParamChanged(NamedTuple):
-    """A parameter appeared, changed or went away. A named tuple: each first value makes one."""
-
-    machine: ComponentMachine
-    change: Change
-
-
-@dataclass(frozen=True, slots=True)
-class Fetched:
-    """A fetch has ended with a result."""
-
-    machine: ComponentMachine
-    result: FetchResult
-
-
-Event: TypeAlias = ComponentHeard | ComponentIdentified | ParamChanged | Fetched
 
 
 class ComponentMachine:
@@ -91,14 +63,17 @@ class ComponentMachine:
         send: takes each message for it, in order.
         emit: takes each event.
         encoding: what the user said about its encoding, or None.
+        upkeep: what is done for its table without being asked.
+        is_link_busy: whether anything is being asked for on the link.
+        another: is told that another vehicle has taken the system id; by default `become_another`.
 
     Attributes:
         version: the MAVLink version that it speaks, as far as heard.
         who: its identity, and how it writes values.
         table: its parameters.
         round_trip: what its answers tell of the link.
-        announced: the last hash that it announced, or None.
-        synced: whether the table was brought up to date on this link and no sign came since that it moved.
+        presence: whether it is there.
+        sync: whether the table is still the vehicle's.
         fetch: the fetch under way, or None.
         last_fetch: the result of the last one that ended, or None.
         refresh: the reading of volatile values under way after a hash hit, or None.
@@ -114,8 +89,12 @@ class ComponentMachine:
         send: Callable[[Message], None],
         emit: Callable[[Event], None],
         encoding: Encoding | None = None,
+        upkeep: Upkeep | None = None,
+        is_link_busy: Callable[[], bool] = lambda: False,
+        another: Callable[[float], None] | None = None,
     ) -> None:
         target = (system, component)
+        upkeep = upkeep or Upkeep()
         self.system = system
         self.component = component
         self.version = 1
@@ -130,42 +109,56 @@ class ComponentMachine:
             self.reads,
             self.table.params,
             encoding=lambda: self.table.encoding,
-            is_certain=lambda: self.who.encoding_is_certain,
+            is_certain=lambda: self.who.may_be_written,
         )
-        self.announced: Announcement | None = None
-        self.synced = False
+        self.presence = Presence()
+        self.sync = Sync(
+            self.reads,
+            self.table,
+            upkeep,
+            is_px4=lambda: self.who.autopilot == MAV_AUTOPILOT_PX4,
+            is_writing=lambda: len(self.writes) > 0,
+            is_fetching=lambda: self.fetch is not None,
+            is_busy=lambda: self.who.is_doubted or is_link_busy(),
+            is_spared=lambda: self._is_spared,
+            begin_fetch=lambda now, refresh: self.begin_fetch(now, refresh=refresh),
+            end_fetch=self.end_fetch,
+            confirmed=self._refresh_unhashed,
+            resynced=lambda changed, confirmed: emit(TableResynced(self, changed, confirmed)),
+        )
         self.fetch: Fetch | None = None
         self.last_fetch: FetchResult | None = None
         self.refresh: Refresh | None = None
         self._own = own
         self._send = send
         self._emit = emit
-        self._last_heard = -math.inf
-        self._has_no_hash = False
-        self._hash_due = math.inf
-        self._moved_by_us_alone = False
+        self._policy = upkeep.policy
+        self._another = another or self.become_another
         self._known_as: str | None = None  # the key of the identity that was reported
         self._may_write = False
-        self._foreign_sets: dict[str, tuple[str, float]] = {}
-        self._changed_at: dict[str, float] = {}  # what changed lately; each heartbeat clears it
-        self._doubts: dict[str, float] = {}  # what changed again: when to ask for it
+        self._authors = Authors()
 
     # what comes in
 
     def receive(self, message: Message, now: float, *, version: int = 2) -> None:
         """Take a message that this component sent."""
-        silence = now - self._last_heard
-        self._last_heard = self.round_trip.heard_at = now
+        silence = self.presence.heard(now)
+        self.round_trip.heard_at = now
+        if self.presence.is_lost:
+            self._find(silence, now)
         if version > self.version:
             self.version = version
         if isinstance(message, ParamValue):
             self._receive_value(message, now)
         elif isinstance(message, Heartbeat):
             self.who.heartbeat(message)
-            self._changed_at = {name: at for name, at in self._changed_at.items() if now - at <= DOUBT}
+            if self.presence.heartbeat(message, now):
+                self._rebooted(now)
+            self.sync.silence(silence, now)
+            self._authors.forget(now)
         elif isinstance(message, AutopilotVersion):
             if self.who.version(message, now):
-                self._become_another(now)
+                self._another(now)
         elif isinstance(message, ParamError):
             addressee = (message.target_system, message.target_component)
             if addressee in (self._own, (0, 0)) and not self.writes.refused(message, now):
@@ -176,17 +169,22 @@ class ComponentMachine:
             denied = _WRITE_DENIED.search(message.text)
             if denied:
                 self.writes.denied(denied.group(1), now)
-        self.who.heard(silence, now)
+        elif isinstance(message, SystemTime):
+            if self.presence.system_time(message):
+                self._rebooted(now)
+        elif isinstance(message, HighLatency2):
+            self.who.heartbeat(message)
+            self.presence.high_latency()
+        if self.presence.was_away(silence):
+            self.who.doubt(now)
+        else:
+            self.who.heard(now)
         if not isinstance(message, ParamValue):  # a value tells nothing of who it is
             self._follow_identity(now)
 
     def foreign_set(self, name: str, station: str, now: float) -> None:
         """Another station was heard setting a parameter of this component."""
-        name = self.spelling(name)
-        self._foreign_sets.pop(name, None)
-        self._foreign_sets[name] = (station, now)
-        if len(self._foreign_sets) > MOST_FOREIGN_SETS:
-            del self._foreign_sets[next(iter(self._foreign_sets))]
+        self._authors.foreign_set(self.spelling(name), station, now)
 
     def use_cached(
         self,
@@ -209,43 +207,47 @@ class ComponentMachine:
             complete: whether it held every index below the count.
             volatile, volatile_known: as in `Table`.
         """
-        table = self.table
-        if table.complete:
+        if self.table.complete:
             return
-        self._report(table.fill(params))
-        if table.count not in (None, count):
-            return
-        table.count = count
-        table.complete = complete
-        if confirmed is None:
-            return
-        table.confirm(confirmed, volatile, proven=volatile_known)
-        if volatile_known:
-            table.rehash()  # what is in the table counts, not what stood beside it
-        elif any(
-            not table.params[name].same_value(param) for name, param in params.items() if name not in volatile
-        ):
-            table.unconfirm()
-        self._compare_hash(now)
+        changes = self.table.restore(
+            params,
+            count=count,
+            confirmed=confirmed,
+            complete=complete,
+            volatile=volatile,
+            volatile_known=volatile_known,
+        )
+        self._report(changes)
+        self.sync.compare(now)
 
     # what is asked of it
 
     def read(self, key: Key, now: float) -> Read:
-        """Ask for one parameter; give it back with `reads.release`."""
-        return self.reads.ask(self.spelling(key) if isinstance(key, str) else key, now)
+        """Ask for one parameter; give it back with `reads.release`.
+
+        Raises:
+            NoReply: the component is lost. Nothing was sent.
+        """
+        what = key if isinstance(key, str) else f"parameter {key}"
+        self._check_present(f"{what} of {self.system}/{self.component}", now)
+        read = self.reads.ask(self.spelling(key) if isinstance(key, str) else key, now)
+        read.is_of_caller = True
+        return read
 
     def write(self, name: str, value: Value, now: float) -> Write:
         """Write one parameter.
 
         Raises:
             UsageError: the type is known and the value does not fit it. Nothing was sent.
+            NoReply: the component is lost. Nothing was sent.
         """
+        self._check_present(f"PARAM_SET {name} to {self.system}/{self.component}", now)
         name = self.spelling(name)
         known = self.table.params.get(name)
-        if known is not None and known.trust is not Trust.CACHED and self.who.encoding_is_certain:
+        if known is not None and known.trust is not Trust.CACHED and self.who.may_be_written:
             encode(value, known.type, self.table.encoding)
         write = self.writes.set(name, value, now)
-        write.on_done.append(lambda: self._write_ended(write.ended_at))
+        write.on_done.append(lambda: self.sync.write_ended(write.ended_at))
         return write
 
     def begin_fetch(self, now: float, *, refresh: bool = False, listed: bool = False) -> Fetch:
@@ -255,8 +257,13 @@ class ComponentMachine:
             now: the time.
             refresh: download even if the vehicle's hash would confirm the cached table.
             listed: the list has been asked for already, of all components at once.
+
+        Raises:
+            NoReply: the component is lost, and no fetch is under way. Nothing was sent.
         """
         fetch = self.fetch
+        if fetch is None and self._policy is not Policy.CACHE_ONLY:
+            self._check_present(f"the parameters of {self.system}/{self.component}", now)
         if fetch is not None and refresh and fetch.download is None:
             fetch.restart(now)
         if fetch is None:
@@ -267,10 +274,11 @@ class ComponentMachine:
                 self.reads,
                 self.table,
                 now,
-                announced=self.announced,
-                expects_hash=self._expects_hash,
+                announced=self.sync.announced,
+                expects_hash=lambda: self.sync.expects_hash,
                 refresh=refresh,
                 listed=listed,
+                policy=self._policy,
                 changed=self._report,
                 doubt=self._doubt_identity,
             )
@@ -290,11 +298,6 @@ class ComponentMachine:
             if self.fetch is fetch:
                 self.fetch = None
 
-    def ask_hash(self, now: float) -> None:
-        """Ask for the hash ahead of a fetch, so that it need not wait for it, or after a write."""
-        read = self.reads.ask(HASH_CHECK, now)
-        read.on_done.append(lambda: self._hash_ended(read))
-
     def spelling(self, name: str) -> str:
         """The name as the vehicle has it. ArduPilot answers to any case; its own names have capitals only."""
         return name.upper() if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA else name
@@ -303,17 +306,16 @@ class ComponentMachine:
 
     def tick(self, now: float) -> None:
         """Do what is due."""
+        if self.presence.lost_at() <= now:
+            self._lose(now)
         self.reads.tick(now)
         self.writes.tick(now)
         if self.fetch is not None:
             self.fetch.tick(now)
         self.who.tick(now)
         self._follow_identity(now)
-        if self._hash_due <= now:
-            self._hash_due = math.inf
-            self.ask_hash(now)
-        while self._doubts and (name := next(iter(self._doubts))) and self._doubts[name] <= now:
-            del self._doubts[name]
+        self.sync.tick(now)
+        for name in self._authors.doubted(now):
             self.reads.ask(name, now, urgent=False)
 
     def next_deadline(self) -> float:
@@ -323,13 +325,18 @@ class ComponentMachine:
             self.writes.next_deadline(),
             math.inf if self.fetch is None else self.fetch.next_deadline(),
             self.who.next_deadline(),
-            self._hash_due,
-            next(iter(self._doubts.values()), math.inf),
+            self.sync.next_deadline(),
+            self.presence.lost_at(),
+            self._authors.next_deadline(),
         )
 
     def resume(self, now: float) -> None:
         """The link was away and is back: whatever waits for an answer is asked for again."""
-        self.round_trip.heard_at = now  # it could not be heard while the link was away
+        # it could not be heard while the link was away
+        if now - self.presence.heard_at >= self.presence.patience and not self.presence.is_lost:
+            self._doubt()
+            self.sync.check(now)
+        self.presence.heard_at = self.round_trip.heard_at = now
         self.reads.resume(now)
         self.writes.resume(now)
         if self.fetch is not None:
@@ -344,8 +351,23 @@ class ComponentMachine:
             self.refresh.fail(error, now)
         self.writes.fail_all(error, now)
         self.reads.fail_all(error, now)
-        self._hash_due = math.inf
-        self._doubts.clear()
+        self.sync.stop()
+        self._authors.clear()
+
+    def become_another(self, now: float) -> None:
+        """Another vehicle has taken this system id: nothing that is known is about it."""
+        self._report(self.table.remove(lambda param: True))
+        self.table.unconfirm()
+        self.table.volatile = frozenset()
+        self.table.volatile_known = False
+        self.table.count = None
+        self.table.complete = False
+        self.sync.forget()
+        self._known_as = None
+        what = f"writes to {self.system}/{self.component}: another vehicle answers there now"
+        self.writes.fail_all(NoReply(what, attempts=0, waited=0.0), now)
+        if self.fetch is not None:
+            self.fetch.restart(now)
 
     # how it stands
 
@@ -356,14 +378,26 @@ class ComponentMachine:
 
     @property
     def state(self) -> str:
-        """The table's state in a word: new, cached, fetching, synced, partial."""
+        """The table's state in a word: new, cached, fetching, synced, partial, lost."""
+        if self.presence.is_lost:
+            return "lost"
         if self.fetch is not None:
             return "fetching"
-        if self.synced:
+        if self.sync.synced:
             return "synced"
         if not self.table.params:
             return "new"
         return "cached" if self.table.complete else "partial"
+
+    @property
+    def sync_state(self) -> SyncState:
+        """How the table stands to the vehicle's."""
+        return SyncState.LOST if self.presence.is_lost else self.sync.state
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether anything is being asked of it."""
+        return self.fetch is not None or len(self.reads) > 0 or len(self.writes) > 0
 
     @property
     def can_hit(self) -> bool:
@@ -373,7 +407,7 @@ class ComponentMachine:
     @property
     def is_settling(self) -> bool:
         """Whether a write is under way, or the hash after one has not come yet."""
-        return len(self.writes) > 0 or self._hash_due < math.inf or HASH_CHECK in self.reads
+        return len(self.writes) > 0 or self.sync.is_settling
 
     def __repr__(self) -> str:
         kind = "unknown" if self.who.autopilot is None else autopilot_name(self.who.autopilot)
@@ -386,29 +420,24 @@ class ComponentMachine:
         if not name:
             return
         if name == HASH_CHECK:
-            announced = int.from_bytes(message.raw, "little")
-            self.announced = Announcement(announced, message.param_count, now)
-            self._has_no_hash = False
+            announced = self.sync.hash_heard(message, now)
             if self.fetch is not None:
-                self.fetch.announced(self.announced)
+                self.fetch.announced(announced)
             self.reads.heard(message, now)
             return
         if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
             name = name.upper()
             message = message._replace(param_id=name)
         if count != self.table.count and count != NO_INDEX:
-            self._count_moved(count)
+            self._count_moved(count, now)
         is_writing = len(self.writes) > 0
-        by = self._who_did(name, now) if is_writing or self._foreign_sets else "vehicle"
+        by = "us" if is_writing and name in self.writes else self._authors.of(name, now)
         change = self.table.hear(message, by)
         if name not in self.table.params:
             return  # more names than there can be
         if change is not None:
-            self._notice(name, now)
-            if name not in self.table.volatile:
-                self._moved_by_us_alone &= change.by == "us"
-                if self.announced is not None and self.announced.at != _NEVER:
-                    self.announced = replace(self.announced, at=_NEVER)
+            self._authors.changed(name, now, is_written=is_writing and name in self.writes)
+            self.sync.changed(change)
             self._emit(_new(ParamChanged, (self, change)))
         if self.fetch is not None:
             self.fetch.heard(message, now)
@@ -416,26 +445,52 @@ class ComponentMachine:
             self.writes.heard(message, now)
         self.reads.heard(message, now)
 
-    def _count_moved(self, count: int) -> None:
+    def _count_moved(self, count: int, now: float) -> None:
         if self.table.count is not None:
-            self.synced = self.table.complete = False
+            self.table.complete = False
+            self.sync.count_moved(now)
         self.table.count = count
 
-    def _notice(self, name: str, now: float) -> None:
-        """A value changed: the second time in a short while, the one that came last may be the older one."""
-        before = self._changed_at.pop(name, _NEVER)
-        if now - before <= DOUBT and name not in self.writes:
-            self._doubts.setdefault(name, now + DOUBT / 2)
-        self._changed_at[name] = now
+    @property
+    def _is_spared(self) -> bool:
+        """Whether it is in a mode in which nothing is asked of it unasked."""
+        return self.presence.is_high_latency or self.reads.pace.stream_gap >= LOW_BANDWIDTH_GAP
 
-    def _who_did(self, name: str, now: float) -> str:
-        if name in self.writes:
-            return "us"
-        if self._foreign_sets:
-            station, at = self._foreign_sets.get(name, ("", -math.inf))
-            if now - at <= FOREIGN_SET_MEMORY:
-                return station
-        return "vehicle"
+    def _check_present(self, what: str, now: float) -> None:
+        if self.presence.is_lost:
+            silence = now - self.presence.heard_at
+            raise NoReply(f"{what} (lost)", attempts=0, waited=silence)
+
+    def _doubt(self) -> None:
+        """What is known may be of the past: it counts again when the vehicle has confirmed it."""
+        self.table.doubt()
+        self.sync.doubt()
+
+    def _lose(self, now: float) -> None:
+        """It is not heard any more. A fetch goes on for a while: it may only be starting again."""
+        presence = self.presence
+        presence.is_lost = True
+        silence = now - presence.heard_at
+        self._doubt()
+        self._emit(ComponentLost(self, silence))
+        self.writes.lose(now)
+        self.reads.lose(now)
+
+    def _find(self, silence: float, now: float) -> None:
+        """It is heard again: who it is and its hash are asked for before anything counts."""
+        self.presence.is_lost = False
+        self._emit(ComponentFound(self, silence))
+        self.sync.check(now)
+
+    def _rebooted(self, now: float) -> None:
+        """The vehicle has started again: what it had not saved is gone, and its list begins anew."""
+        self._emit(ComponentRebooted(self))
+        self._doubt()
+        self._authors.clear()
+        self.sync.check(now)
+        self.who.doubt(now)
+        if self.fetch is not None and self.fetch.download is not None and not self.fetch.download.done:
+            self.fetch.restart(now)
 
     def _is_known(self, key: Key) -> bool:
         """Whether anything speaks for such a parameter."""
@@ -449,70 +504,19 @@ class ComponentMachine:
         if self.who.settled and self._known_as != self.identity.key:
             self._known_as = self.identity.key
             self._emit(ComponentIdentified(self))
-        if not self._may_write and self.who.encoding_is_certain:
-            self._may_write = True
+        may_write = self.who.may_be_written
+        if may_write and not self._may_write:
             self.writes.proceed(now)
+        self._may_write = may_write
 
     def _doubt_identity(self, now: float) -> None:
         """The table is not what it was: it may be another vehicle that answers by now."""
         if self.who.settled and now - self.who.known_at > FRESH_IDENTITY:
             self.who.ask_again(now)
 
-    def _become_another(self, now: float) -> None:
-        """Another vehicle has taken this system id: nothing that is known is about it."""
-        self._report(self.table.remove(lambda param: True))
-        self.table.unconfirm()
-        self.table.volatile = frozenset()
-        self.table.volatile_known = False
-        self.table.count = None
-        self.table.complete = False
-        self.announced = None
-        self.synced = False
-        self._has_no_hash = False
-        self._moved_by_us_alone = False
-        self._known_as = None
-        what = f"writes to {self.system}/{self.component}: another vehicle answers there now"
-        self.writes.fail_all(NoReply(what, attempts=0, waited=0.0), now)
-        if self.fetch is not None:
-            self.fetch.restart(now)
-
     def _report(self, changes: list[Change]) -> None:
         for change in changes:
             self._emit(ParamChanged(self, change))
-
-    def _expects_hash(self) -> bool:
-        if self._has_no_hash:
-            return False
-        return self.announced is not None or self.who.autopilot == MAV_AUTOPILOT_PX4
-
-    def _write_ended(self, now: float) -> None:
-        if self._expects_hash() and now < math.inf:
-            self._hash_due = now + SETTLING_TIME
-
-    def _hash_ended(self, read: Read) -> None:
-        """A hash has come, or will not come, for which nobody but us waits."""
-        table = self.table
-        if read.result is None:
-            self._has_no_hash = isinstance(read.error, UnknownParameter) and self.announced is None
-            return
-        if self._compare_hash(read.ended_at) or len(self.writes) or self.fetch is not None:
-            return
-        if table.complete and self._moved_by_us_alone and not table.volatile_known:
-            table.confirm(int.from_bytes(read.result.raw, "little"), table.volatile, proven=False)
-        else:
-            self.synced = False
-
-    def _compare_hash(self, now: float) -> bool:
-        """Whether the vehicle has just announced the hash that belongs to the table; then it is confirmed."""
-        table, announced = self.table, self.announced
-        if announced is None or now - announced.at > FRESH_HASH or announced.hash != table.hash:
-            return False
-        listed = table.listed()
-        if not table.complete or announced.count != len(listed):
-            return False
-        table.verify()
-        self._moved_by_us_alone = True
-        return True
 
     def _fetch_ended(self, fetch: Fetch) -> None:
         self.fetch = None
@@ -520,8 +524,9 @@ class ComponentMachine:
         if result is None:
             return
         self.last_fetch = result
-        self.synced = result.complete and self.table.complete
-        self._moved_by_us_alone = result.hash is not None
+        if result.source == "cache" and result.hash is None:
+            return  # the vehicle was not asked, or has not confirmed it
+        self.sync.fetched(result.complete and self.table.complete, result.hash, fetch.ended_at)
         self._emit(Fetched(self, result))
         if result.source == "cache" and result.hash is not None:
             self._refresh_unhashed(result.hash, fetch.ended_at)
@@ -539,6 +544,5 @@ class ComponentMachine:
             self.refresh = None
 
 
-_NEVER = -math.inf
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
 _WRITE_DENIED = re.compile(r"Param write denied \((\w{1,16})\)")

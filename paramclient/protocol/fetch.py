@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from enum import StrEnum
 from functools import partial
 from typing import Final
 
-from paramclient.errors import NoReply, UnknownParameter
+from paramclient.errors import CacheError, NoReply, UnknownParameter
 from paramclient.protocol.download import Download
 from paramclient.protocol.hashing import find_volatile
 from paramclient.protocol.operation import Operation
@@ -18,11 +19,28 @@ from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.wire import HASH_CHECK, Message, ParamValue
 from paramclient.values import Param
 
-__all__ = ["Announcement", "Fetch", "FetchResult", "Progress"]
+__all__ = ["Announcement", "Fetch", "FetchResult", "Policy", "Progress"]
 
 FRESH_HASH: Final = 1.0
 """Seconds for which an announced hash answers the question what the hash is. It is asked for when a component
 is found, so that a fetch right after that need not wait for another round trip."""
+MOST_RESTARTS: Final = 8
+"""Times that a vehicle may start again, or turn out to be another one, before a fetch is given up."""
+
+
+class Policy(StrEnum):
+    """What may be asked of a vehicle to bring a table up to date.
+
+    Attributes:
+        AUTO: whatever is the cheapest sure way.
+        HASH_ONLY: its hash and nothing more, for a vehicle in flight or a link that costs: a table that the
+            hash does not confirm stays as it was cached.
+        CACHE_ONLY: nothing.
+    """
+
+    AUTO = "auto"
+    HASH_ONLY = "hash-only"
+    CACHE_ONLY = "cache-only"
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,12 +76,13 @@ class FetchResult:
     Attributes:
         system, component: whose parameters.
         params: all that are known, by name, as they were at the end of the fetch.
-        source: "cache" when the vehicle's hash confirmed the cached table, "stream" when it was downloaded.
+        source: "cache" when the vehicle's hash confirmed the cached table, or when the policy allows no more
+            than the cache; "stream" when it was downloaded.
         count: parameters that the component says it has.
         received: how many of them are known.
         missing: indices that did not come, rising. Empty when the fetch is complete.
-        hash: the PX4 hash under which the vehicle confirmed the table; None for a vehicle without one, and
-            when the table moved during the download.
+        hash: the PX4 hash under which the vehicle confirmed the table; None for a vehicle without one, when
+            the table moved during the download, and when the policy kept it from being asked.
         elapsed: seconds from the call to the end.
         notes: what else is worth knowing, in sentences.
     """
@@ -116,6 +135,7 @@ class Fetch(Operation[FetchResult]):
         expects_hash: Callable[[], bool],
         refresh: bool,
         listed: bool,
+        policy: Policy,
         changed: Callable[[list[Change]], None],
         doubt: Callable[[float], None],
     ) -> None:
@@ -135,9 +155,11 @@ class Fetch(Operation[FetchResult]):
         self._is_hash_unknown = False  # the vehicle answers, but not to that
         self._first_value_at = math.inf
         self._listed = listed
+        self._policy = policy
+        self._restarts = 0
         self.holders = 0
         self.download: Download | None = None
-        if refresh or listed or table.hash is None or not table.complete:
+        if policy is Policy.CACHE_ONLY or refresh or listed or table.hash is None or not table.complete:
             self._begin_download(now)
         elif announced is not None and now - announced.at <= FRESH_HASH:
             self._compare(announced, now)
@@ -178,8 +200,14 @@ class Fetch(Operation[FetchResult]):
             self.download.resume(now)
 
     def restart(self, now: float) -> None:
-        """The table turned out to be another vehicle's: fetch it anew."""
+        """The vehicle is another one, or has started again: what came is not about it. Fetch it anew."""
         self._drop()
+        self._restarts += 1
+        if self._restarts > MOST_RESTARTS:
+            system, component = self._target
+            what = f"the parameters of {system}/{component}, which has started again {self._restarts} times"
+            self.fail(NoReply(what, attempts=self._restarts, waited=now - self.begun_at), now)
+            return
         self._before = self._meanwhile = None
         self._was_asked_meanwhile = False
         self._listed = False
@@ -257,12 +285,31 @@ class Fetch(Operation[FetchResult]):
         self.finish(self._result("cache", announcement.count, (), announcement.hash, now, notes), now)
 
     def _begin_download(self, now: float) -> None:
+        if self._policy is not Policy.AUTO:
+            self._stay_with_cache(now)
+            return
         self._doubt(now)
         download = self.download = Download(
             self._target, self._round_trip, self._send, self._reads, now, listed=self._listed
         )
 
         download.on_done.append(partial(self._download_ended, download))
+
+    def _stay_with_cache(self, now: float) -> None:
+        """The policy allows no download: give what is known, and say so."""
+        table = self._table
+        if not table.params:
+            system, component = self._target
+            what = (
+                f"nothing is cached of {system}/{component}, and the policy {self._policy} allows no download"
+            )
+            self.fail(CacheError(what), now)
+            return
+        present = {param.index for param in table.listed()}
+        count = len(present) if table.count is None else table.count
+        missing = tuple(index for index in range(count) if index not in present)
+        note = _NOT_ASKED if self._policy is Policy.CACHE_ONLY else _NOT_CONFIRMED
+        self.finish(self._result("cache", count, missing, None, now, (note,)), now)
 
     def _download_ended(self, download: Download) -> None:
         if download.error is not None:
@@ -359,5 +406,10 @@ _MOVED = "The table moved during the download, so no hash stands for it; the nex
 _UNBRACKETED = (
     "No hash was heard before the download, and what this firmware leaves out of it could not be proven, "
     "so none stands for the table; the next session downloads it again."
+)
+_NOT_ASKED = "The vehicle was not asked, as the policy is cache-only: the values are those last known."
+_NOT_CONFIRMED = (
+    "The vehicle's hash did not confirm the cached table, and the policy hash-only allows no download: "
+    "the values are those last known."
 )
 _UNSETTLED = "The number of parameters kept changing during the download."

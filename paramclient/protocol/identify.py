@@ -24,6 +24,7 @@ from paramclient.protocol.wire import (
     CommandAck,
     CommandLong,
     Heartbeat,
+    HighLatency2,
     Message,
 )
 from paramclient.values import Encoding
@@ -33,8 +34,6 @@ __all__ = ["Identification", "judge_encoding"]
 TRIES: Final = 4
 """AUTOPILOT_VERSION is asked for so often where nothing is known of the link, or where it was refused; many
 components (cameras, radios) never give one."""
-SILENCE: Final = 5.0
-"""Seconds without a heartbeat after which another vehicle may stand behind the same system id."""
 
 
 def judge_encoding(
@@ -73,6 +72,7 @@ class Identification:
         known_at: when the version came; minus infinity before that.
         settled: whether `identity` is as good as it gets: the version came, or it never will.
         autopilot, vehicle_type: of the heartbeat; None before one came.
+        is_doubted: whether another vehicle may have taken its place, and the answer is awaited.
         encoding, encoding_reason: how it writes values, and why that is believed.
     """
 
@@ -90,6 +90,7 @@ class Identification:
         self._chosen = chosen
         self.identity = Identity(target[0], link)
         self.settled = False
+        self.is_doubted = False
         self.known_at = -math.inf
         self.autopilot: int | None = None
         self.vehicle_type: int | None = None
@@ -112,6 +113,11 @@ class Identification:
         return self._chosen is not None or has_said or self.settled or not self.has_parameters
 
     @property
+    def may_be_written(self) -> bool:
+        """Whether it is certain whom a write reaches, and what it makes of it."""
+        return self.encoding_is_certain and not self.is_doubted
+
+    @property
     def has_spoken(self) -> bool:
         """Whether it has said what it is, by a heartbeat or its version, or has been asked in vain."""
         return self.vehicle_type is not None or self.settled
@@ -121,17 +127,23 @@ class Identification:
         """Whether its heartbeat names an autopilot."""
         return self.autopilot not in (None, MAV_AUTOPILOT_INVALID) and self.has_parameters
 
-    def heartbeat(self, message: Heartbeat) -> None:
-        """Take a heartbeat."""
+    def heartbeat(self, message: Heartbeat | HighLatency2) -> None:
+        """Take a heartbeat, or what stands for it."""
         if (message.autopilot, message.type) != (self.autopilot, self.vehicle_type):
             self.autopilot = message.autopilot
             self.vehicle_type = message.type
             self.identity = replace(self.identity, autopilot=message.autopilot, vehicle_type=message.type)
             self._judge()
 
-    def heard(self, silence: float, now: float) -> None:
-        """Something came, `silence` seconds after what came before: ask who it is, if that is not known."""
-        if (not self._attempts or silence > SILENCE) and self.has_parameters:
+    def heard(self, now: float) -> None:
+        """Something came: ask who it is, if that has not been asked."""
+        if not self._attempts and self.has_parameters:
+            self._ask(now)
+
+    def doubt(self, now: float) -> None:
+        """It was away, or has started again: ask who it is now."""
+        if self.has_parameters:
+            self.is_doubted = self.identity.uid is not None
             self._attempts = 0
             self._ask(now)
 
@@ -139,7 +151,7 @@ class Identification:
         """Take an AUTOPILOT_VERSION; true when it shows another vehicle than the one known so far."""
         if self._is_asking:
             self._round_trip.answered(self._asked_at, now, self._attempts)
-        self._is_asking = False
+        self._is_asking = self.is_doubted = False
         system, _ = self._target
         before = self.identity
         self.identity = Identity.from_version(
@@ -190,7 +202,7 @@ class Identification:
         is_blind = self._round_trip.smoothed is None or self._denied_at < math.inf
         tries = TRIES if is_blind else self._round_trip.tries
         if self._attempts >= tries:
-            self._is_asking = False
+            self._is_asking = self.is_doubted = False
             self.settled = True
             return
         self._attempts += 1

@@ -43,6 +43,9 @@ class Pace:
     first look and grows fourfold with each further one. When answers begin to queue up, or fewer come than
     should, it falls to what was answered, and from there on only creeps.
     It never takes more than a third of the rate at which the list's stream was seen to come.
+
+    Attributes:
+        stream_gap: seconds from one value of the list to the next, as last seen; 0 before one was.
     """
 
     __slots__ = (
@@ -58,10 +61,12 @@ class Pace:
         "_tokens",
         "_tokens_at",
         "_was_short",
+        "stream_gap",
     )
 
     def __init__(self, round_trip: RoundTrip) -> None:
         self._round_trip = round_trip
+        self.stream_gap = 0.0
         self._rate = FIRST_RATE
         self._cap = LARGEST_RATE
         self._tokens = SMALLEST_BURST
@@ -130,6 +135,7 @@ class Pace:
 
     def stream_seen(self, gap: float) -> None:
         """The list's stream brings a value every `gap` seconds."""
+        self.stream_gap = gap
         if gap > 0:
             self._cap = VALUE_SIZE / gap * UPSTREAM_SHARE / REQUEST_SIZE
 

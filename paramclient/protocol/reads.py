@@ -10,7 +10,7 @@ from typing import Final, TypeAlias
 from paramclient.errors import NoReply, ParamErrorCode, Refused, TypeMismatch, UnknownParameter, VehicleError
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.pacing import Pace
-from paramclient.protocol.timing import LONGEST_SILENCE, MOST_TRIES, RoundTrip
+from paramclient.protocol.timing import FEWEST_TRIES, LONGEST_SILENCE, MOST_TRIES, RoundTrip
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
 
 __all__ = ["Key", "Read", "Reads"]
@@ -27,6 +27,9 @@ COPY_RISK: Final = 0.01
 MOST_COPIES: Final = 6
 SILENCES_TO_SPARE: Final = 24
 """Time-outs in a row, with no answer at all between them, after which asking twice cannot be of help."""
+SILENCES_TO_GIVE_UP: Final = 16
+"""Time-outs in a row, within `LONGEST_SILENCE` at the least, after which the component is one that does not
+answer reads at all: where two exchanges of three are lost, it comes to that once in 650 times."""
 ENOUGH_CONTROLS: Final = 4
 """Answered controls, at the least, after which a silence is the component's and not the link's."""
 
@@ -39,6 +42,7 @@ class Read(Operation[ParamValue]):
         holders: how many want the answer; nobody any more: it is dropped.
         attempts: requests sent.
         copies: requests sent on top of the last one, before it had timed out.
+        is_of_caller: whether somebody waits for it, and not only a fetch.
         controls: reads of something that exists which were answered while this one stayed silent.
     """
 
@@ -49,6 +53,7 @@ class Read(Operation[ParamValue]):
         self.attempts = 0
         self.copies = 0
         self.holders = 0
+        self.is_of_caller = False
         self.controls = 0
 
 
@@ -218,6 +223,14 @@ class Reads:
             self._again.append(read)
         self._send_waiting(now)
 
+    def lose(self, now: float) -> None:
+        """The component is lost: callers wait no longer. What a fetch asks for goes on for a while."""
+        for read in list(self._open.values()):
+            if self._open.get(read.key) is read and read.is_of_caller:
+                self._drop(read)
+                what = f"{self._name(read.key)} (lost)"
+                read.fail(NoReply(what, attempts=read.attempts, waited=now - read.begun_at), now)
+
     def fail_all(self, error: Exception, now: float) -> None:
         """Nothing can be answered any more. What is asked for from now on stands."""
         for read in list(self._open.values()):
@@ -226,7 +239,10 @@ class Reads:
                 read.fail(error, now)
 
     def _is_hopeless(self, read: Read, now: float) -> bool:
-        if self._silences >= MOST_TRIES and now - self._silent_since >= LONGEST_SILENCE:
+        if now - self._silent_since >= LONGEST_SILENCE and (
+            self._silences >= MOST_TRIES
+            or (self._silences >= SILENCES_TO_GIVE_UP and read.attempts >= FEWEST_TRIES)
+        ):
             return True  # not one of all these was answered
         # half as often will do where nothing speaks for it and the link is good enough for others
         weight = 2 if self._seems_unknown(read) else 1
@@ -260,7 +276,11 @@ class Reads:
                 name=name,
                 index=index,
             )
-        return NoReply(f"{what} of {system}/{component}", attempts=read.attempts, waited=now - read.begun_at)
+        return NoReply(self._name(read.key), attempts=read.attempts, waited=now - read.begun_at)
+
+    def _name(self, key: Key) -> str:
+        what = key if isinstance(key, str) else f"parameter {key}"
+        return f"{what} of {self._target[0]}/{self._target[1]}"
 
     def _transmit(self, read: Read, now: float) -> None:
         read.attempts += 1

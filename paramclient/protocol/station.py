@@ -8,8 +8,10 @@ from typing import Final, TypeAlias
 
 from paramclient.errors import LinkError
 from paramclient.identity import Identity
-from paramclient.protocol.component import ComponentHeard, ComponentMachine, Event
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import ComponentHeard, Event
 from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.wire import (
     AUTOPILOT_COMPONENT,
     COMP_ID_ALL,
@@ -18,6 +20,7 @@ from paramclient.protocol.wire import (
     MAV_TYPE_GCS,
     Framer,
     Heartbeat,
+    HighLatency2,
     Message,
     ParamRequestList,
     ParamSet,
@@ -39,9 +42,9 @@ MOST_COMPONENTS: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each have. Further ones are not heard."""
 MOST_PEERS: Final = 256
 """Stream peers whose unfinished frames are kept."""
-HEARD: Final = frozenset({0, 22, 23, 77, 148, 253, 345})
-"""The message ids that matter here: HEARTBEAT, PARAM_VALUE, PARAM_SET (of others), COMMAND_ACK,
-AUTOPILOT_VERSION, STATUSTEXT, PARAM_ERROR."""
+HEARD: Final = frozenset({0, 2, 22, 23, 77, 148, 235, 253, 345})
+"""The message ids that matter here: HEARTBEAT, SYSTEM_TIME, PARAM_VALUE, PARAM_SET (of others), COMMAND_ACK,
+AUTOPILOT_VERSION, HIGH_LATENCY2, STATUSTEXT, PARAM_ERROR."""
 
 
 class Station:
@@ -54,6 +57,7 @@ class Station:
         is_stream: whether frames may be spread over several chunks.
         system, component: who we are.
         encoding: for all components, where the user knows better; None: judged by the evidence.
+        upkeep: what is done for tables without being asked; by default nothing.
 
     Attributes:
         components: every component heard, by (system, component).
@@ -68,6 +72,7 @@ class Station:
         system: int = 255,
         component: int = 190,
         encoding: Encoding | None = None,
+        upkeep: Upkeep | None = None,
     ) -> None:
         self.link = link
         self.own: Address = (system, component)
@@ -76,6 +81,7 @@ class Station:
         self.bytes_sent = 0
         self._is_stream = is_stream
         self._encoding = encoding
+        self._upkeep = upkeep
         self._framers: dict[Peer, Framer] = {}
         self._peers: dict[int, Peer] = {}
         self._outbox: list[tuple[bytes, Peer | None]] = []
@@ -195,7 +201,8 @@ class Station:
 
     def _meet(self, sender: Address, message: Message) -> ComponentMachine | None:
         """A component that was not heard before; only what shows that it has parameters makes it one."""
-        if not isinstance(message, Heartbeat | ParamValue) or len(self.components) >= MOST_COMPONENTS:
+        is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue)
+        if not is_sign or len(self.components) >= MOST_COMPONENTS:
             return None
         system, component = sender
         machine: ComponentMachine | None = None
@@ -211,10 +218,19 @@ class Station:
             send=send,
             emit=self._events.append,
             encoding=self._encoding,
+            upkeep=self._upkeep,
+            is_link_busy=lambda: any(machine.is_busy for machine in self.components.values()),
+            another=lambda now: self._become_another(system, now),
         )
         self.components[sender] = machine
         self._events.append(ComponentHeard(machine))
         return machine
+
+    def _become_another(self, system: int, now: float) -> None:
+        """Another vehicle has taken a system id, with all of its components."""
+        for machine in self.components.values():
+            if machine.system == system:
+                machine.become_another(now)
 
     def _receive_foreign_set(self, message: ParamSet, sender: Address, now: float) -> None:
         station = f"station {sender[0]}/{sender[1]}"

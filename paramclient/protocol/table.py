@@ -137,6 +137,41 @@ class Table:
                 changes.append(Change(name, old, new))
         return changes
 
+    def restore(
+        self,
+        params: Mapping[str, Param],
+        *,
+        count: int | None,
+        confirmed: int | None,
+        complete: bool,
+        volatile: frozenset[str],
+        volatile_known: bool,
+    ) -> list[Change]:
+        """Put in what the cache knows, as *cached*; what was heard on this link stays.
+
+        Args:
+            params: the cached table.
+            count: the param_count with it; with another one than was heard, nothing below counts.
+            confirmed: the hash under which the vehicle would confirm it, or None.
+            complete, volatile, volatile_known: as the attributes.
+        """
+        changes = self.fill(params)
+        if self.count not in (None, count):
+            return changes
+        self.count = count
+        self.complete = complete
+        if confirmed is not None:
+            self.confirm(confirmed, volatile, proven=volatile_known)
+            if volatile_known:
+                self.rehash()  # what is in the table counts, not what stood beside it
+            elif any(
+                not self.params[name].same_value(param)
+                for name, param in params.items()
+                if name not in volatile
+            ):
+                self.unconfirm()
+        return changes
+
     def fill(self, params: Mapping[str, Param]) -> list[Change]:
         """Put in what the cache knows, as *cached*; what was heard on this link stays."""
         changes = []
@@ -153,6 +188,13 @@ class Table:
         for param in self.listed():
             if param.trust is Trust.CACHED and param.name not in unhashed:
                 self.params[param.name] = param.with_trust(Trust.VERIFIED)
+
+    def doubt(self) -> None:
+        """It may have moved unheard: what was live or verified is no more than *cached*."""
+        self._wire.clear()  # the next value counts, also if it is the same
+        for name, param in self.params.items():
+            if param.trust is not Trust.CACHED:
+                self.params[name] = param.with_trust(Trust.CACHED)
 
     def remove(self, condition: Callable[[Param], bool]) -> list[Change]:
         """Take out the parameters that meet a condition."""

@@ -24,6 +24,7 @@ __all__ = [
     "Frame",
     "Framer",
     "Heartbeat",
+    "HighLatency2",
     "Message",
     "ParamError",
     "ParamRequestList",
@@ -31,6 +32,7 @@ __all__ = [
     "ParamSet",
     "ParamValue",
     "StatusText",
+    "SystemTime",
     "build_frame",
     "decode",
     "encode",
@@ -49,6 +51,7 @@ MAV_AUTOPILOT_GENERIC: Final = 0
 MAV_AUTOPILOT_ARDUPILOTMEGA: Final = 3
 MAV_AUTOPILOT_INVALID: Final = 8
 MAV_AUTOPILOT_PX4: Final = 12
+MAV_STATE_BOOT: Final = 1
 MAV_STATE_ACTIVE: Final = 4
 AUTOPILOT_VERSION_ID: Final = 148
 MAV_CMD_REQUEST_MESSAGE: Final = 512
@@ -184,6 +187,22 @@ class StatusText:
     text: str
 
 
+@dataclass(frozen=True, slots=True)
+class SystemTime:
+    """SYSTEM_TIME; `time_unix_usec` is 0 where the vehicle does not know it."""
+
+    time_unix_usec: int
+    time_boot_ms: int
+
+
+@dataclass(frozen=True, slots=True)
+class HighLatency2:
+    """HIGH_LATENCY2, in the place of the heartbeat on satellite links; its telemetry is left out, or zero."""
+
+    type: int
+    autopilot: int
+
+
 Message: TypeAlias = (
     Heartbeat
     | AutopilotVersion
@@ -195,6 +214,8 @@ Message: TypeAlias = (
     | ParamSet
     | ParamError
     | StatusText
+    | SystemTime
+    | HighLatency2
 )
 
 
@@ -369,6 +390,8 @@ _PARAM_VALUE = struct.Struct("<4sHH16sB")
 _PARAM_SET = struct.Struct("<4sBB16sB")
 _STATUSTEXT = struct.Struct("<B50s")  # its extension fields, for long texts in pieces, are not read
 _PARAM_ERROR = struct.Struct("<hBB16sB")
+_SYSTEM_TIME = struct.Struct("<QI")
+_HIGH_LATENCY2 = struct.Struct("<24xBB16x")
 _V1_LENGTHS = {77: 3, 148: 60}  # extension fields exist in MAVLink 2 only
 
 
@@ -431,8 +454,17 @@ def _decode_param_error(payload: bytes) -> ParamError:
     return ParamError(system, component, text_of(name), index, error)
 
 
+def _decode_system_time(payload: bytes) -> SystemTime:
+    return SystemTime(*_fields(_SYSTEM_TIME, payload))
+
+
+def _decode_high_latency2(payload: bytes) -> HighLatency2:
+    return HighLatency2(*_fields(_HIGH_LATENCY2, payload))
+
+
 _DECODERS: dict[int, Callable[[bytes], Message]] = {
     0: _decode_heartbeat,
+    2: _decode_system_time,
     20: _decode_param_request_read,
     21: _decode_param_request_list,
     22: _decode_param_value,
@@ -440,6 +472,7 @@ _DECODERS: dict[int, Callable[[bytes], Message]] = {
     76: _decode_command_long,
     77: _decode_command_ack,
     148: _decode_autopilot_version,
+    235: _decode_high_latency2,
     253: _decode_statustext,
     345: _decode_param_error,
 }
@@ -500,4 +533,6 @@ _ENCODERS: dict[type, Callable[..., tuple[int, bytes]]] = {
         345,
         _PARAM_ERROR.pack(m.param_index, m.target_system, m.target_component, _name(m.param_id), m.error),
     ),
+    SystemTime: lambda m: (2, _SYSTEM_TIME.pack(m.time_unix_usec, m.time_boot_ms)),
+    HighLatency2: lambda m: (235, _HIGH_LATENCY2.pack(m.type, m.autopilot)),
 }

@@ -226,6 +226,12 @@ class Writes:
                 queue[0].attempts -= 1
                 self._transmit(queue[0], now)
 
+    def lose(self, now: float) -> None:
+        """The component is lost: nobody waits any longer. What it has taken is not known."""
+        for queue in list(self._queues.values()):
+            for write in reversed(queue.copy()):
+                self._fail(write, self._no_reply(write, now, " (lost)"), now)
+
     def fail_all(self, error: Exception, now: float) -> None:
         """Nothing can be acknowledged any more."""
         queues, self._queues = self._queues, {}
@@ -331,8 +337,8 @@ class Writes:
         else:
             del self._queues[write.name]
 
-    def _no_reply(self, write: Write, now: float) -> Exception:
-        what = f"PARAM_SET {write.name} to {self._target[0]}/{self._target[1]}"
+    def _no_reply(self, write: Write, now: float, why: str = "") -> Exception:
+        what = f"PARAM_SET {write.name} to {self._target[0]}/{self._target[1]}{why}"
         return NoReply(what, attempts=write.attempts, waited=now - write.begun_at)
 
     def _not_applied(self, write: Write, actual: Param) -> Exception:

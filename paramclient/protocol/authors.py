@@ -1,0 +1,68 @@
+"""Who changed a value, as far as it was heard, and which changes are to be doubted."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+__all__ = ["Authors"]
+
+FOREIGN_SET_MEMORY: Final = 2.0
+"""Seconds for which a PARAM_SET of another station explains a change."""
+MOST_FOREIGN_SETS: Final = 256
+"""Names remembered for that; the oldest goes first."""
+DOUBT: Final = 2.0
+"""Seconds within which a second change of one value may be an old answer that came late: ArduPilot takes the
+values for a batch of answers up to 100 ms before it sends them, and what was set meanwhile overtakes them."""
+
+
+class Authors:
+    """What is remembered for a few seconds of the changes of one component's values."""
+
+    __slots__ = ("_changed_at", "_doubts", "_foreign_sets")
+
+    def __init__(self) -> None:
+        self._foreign_sets: dict[str, tuple[str, float]] = {}
+        self._changed_at: dict[str, float] = {}
+        self._doubts: dict[str, float] = {}  # what changed again: when to ask for it
+
+    def foreign_set(self, name: str, station: str, now: float) -> None:
+        """Another station was heard setting a parameter."""
+        self._foreign_sets.pop(name, None)
+        self._foreign_sets[name] = (station, now)
+        if len(self._foreign_sets) > MOST_FOREIGN_SETS:
+            del self._foreign_sets[next(iter(self._foreign_sets))]
+
+    def of(self, name: str, now: float) -> str:
+        """Who has changed a parameter that no write of ours is about."""
+        if self._foreign_sets:
+            station, at = self._foreign_sets.get(name, ("", -math.inf))
+            if now - at <= FOREIGN_SET_MEMORY:
+                return station
+        return "vehicle"
+
+    def changed(self, name: str, now: float, *, is_written: bool) -> None:
+        """A value changed: the second time in a short while, the one that came last may be the older one."""
+        before = self._changed_at.pop(name, -math.inf)
+        if now - before <= DOUBT and not is_written:
+            self._doubts.setdefault(name, now + DOUBT / 2)
+        self._changed_at[name] = now
+
+    def forget(self, now: float) -> None:
+        """Let go of what is too old to matter; once a second will do."""
+        self._changed_at = {name: at for name, at in self._changed_at.items() if now - at <= DOUBT}
+
+    def doubted(self, now: float) -> list[str]:
+        """Names whose values are to be asked for now."""
+        due = [name for name, at in self._doubts.items() if at <= now]
+        for name in due:
+            del self._doubts[name]
+        return due
+
+    def next_deadline(self) -> float:
+        """When `doubted` has something to give, or infinity."""
+        return next(iter(self._doubts.values()), math.inf)
+
+    def clear(self) -> None:
+        """Nothing is to be asked for any more."""
+        self._doubts.clear()

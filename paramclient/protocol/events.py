@@ -1,0 +1,103 @@
+"""What happens on a link, for those who follow it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+
+from paramclient.protocol.table import Change
+
+if TYPE_CHECKING:
+    from paramclient.protocol.component import ComponentMachine
+    from paramclient.protocol.fetch import FetchResult
+
+__all__ = [
+    "ComponentFound",
+    "ComponentHeard",
+    "ComponentIdentified",
+    "ComponentLost",
+    "ComponentRebooted",
+    "Event",
+    "Fetched",
+    "ParamChanged",
+    "TableResynced",
+]
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentHeard:
+    """A component was heard for the first time."""
+
+    machine: ComponentMachine
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentIdentified:
+    """It is settled who the component is, as far as it ever will be; its cached table can be looked for."""
+
+    machine: ComponentMachine
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentLost:
+    """Nothing has come from it for too long: `silence` seconds."""
+
+    machine: ComponentMachine
+    silence: float
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentFound:
+    """One that was lost is heard again, after `silence` seconds."""
+
+    machine: ComponentMachine
+    silence: float
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentRebooted:
+    """The vehicle has started again."""
+
+    machine: ComponentMachine
+
+
+class ParamChanged(NamedTuple):
+    """A parameter appeared, changed or went away. A named tuple: each first value makes one."""
+
+    machine: ComponentMachine
+    change: Change
+
+
+@dataclass(frozen=True, slots=True)
+class Fetched:
+    """A fetch has ended with a result."""
+
+    machine: ComponentMachine
+    result: FetchResult
+
+
+@dataclass(frozen=True, slots=True)
+class TableResynced:
+    """The table had fallen behind the vehicle's, or might have, and agrees with it again.
+
+    Attributes:
+        changed: names of what had moved, in the order in which that was found out; empty where the vehicle's
+            hash showed that nothing had.
+        hash: the hash that confirms it, or None for a vehicle without one.
+    """
+
+    machine: ComponentMachine
+    changed: tuple[str, ...]
+    hash: int | None
+
+
+Event: TypeAlias = (
+    ComponentHeard
+    | ComponentIdentified
+    | ComponentLost
+    | ComponentFound
+    | ComponentRebooted
+    | ParamChanged
+    | Fetched
+    | TableResynced
+)

@@ -1,0 +1,325 @@
+"""Whether a table is still the vehicle's, and what is done to keep it so."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+from typing import Final
+
+from paramclient.errors import UnknownParameter
+from paramclient.protocol.fetch import FRESH_HASH, Announcement, Fetch, Policy
+from paramclient.protocol.reads import Read, Reads
+from paramclient.protocol.table import Change, Table
+from paramclient.protocol.wire import HASH_CHECK, ParamValue
+
+__all__ = ["Sync", "SyncState", "Upkeep"]
+
+SETTLING_TIME: Final = 0.06
+"""Seconds from the last of our writes until the hash is asked for: what PX4 changed with it, it pushes 10 to
+24 ms later."""
+HEARTBEAT_GAP: Final = 2.5
+"""Seconds of silence in which an update may have been lost as well: two heartbeats."""
+BUSY_WAIT: Final = 0.1
+"""Seconds until it is looked again whether the link is idle."""
+SHORTEST_INTERVAL: Final = 5.0
+"""Seconds between two checks that gaps in the heartbeats bring about: they are many on a bad link."""
+LOW_BANDWIDTH_GAP: Final = 0.1
+"""Seconds from one value of the list to the next that tell of a low-bandwidth mode: PX4's sends 8 a second, a
+57600-baud radio carries 40."""
+
+
+class SyncState(StrEnum):
+    """How the table of a component stands to the vehicle's.
+
+    Attributes:
+        UNSYNCED: it was never brought up to date on this link, or a sign has come since that it moved.
+        SYNCED: it was brought up to date, and no sign has come since that it moved.
+        CHECKING: the vehicle was lost or has started again: its identity and its hash are being asked for.
+        RESYNCING: it has moved, and what did is being fetched.
+        LOST: the component is not heard any more.
+    """
+
+    UNSYNCED = "unsynced"
+    SYNCED = "synced"
+    CHECKING = "checking"
+    RESYNCING = "resyncing"
+    LOST = "lost"
+
+
+@dataclass(frozen=True, slots=True)
+class Upkeep:
+    """What is done for a table without being asked.
+
+    Attributes:
+        interval: seconds after which the vehicle is asked again whether it has moved; infinity for never.
+        without_hash: whether that goes for vehicles without a hash too; their whole list is then fetched.
+        policy: what may be asked.
+    """
+
+    interval: float = math.inf
+    without_hash: bool = False
+    policy: Policy = Policy.AUTO
+
+
+class Sync:
+    """Follows the hashes that one component announces, and asks for them when there is a reason to.
+
+    Reasons are a write of ours, which moves the hash; a silence, in which an update may have been lost; and
+    the interval of the upkeep, as PARAM_VALUEs of changes are sent once and never repeated. The interval and
+    the silences count only for a table that was brought up to date on this link. Nothing is asked for while
+    anything else goes on, in high-latency mode, or on a link that is measured to be a low-bandwidth one.
+
+    Args:
+        reads, table: the component's.
+        upkeep: what is done without being asked.
+        is_px4: whether its heartbeat says that it has a hash.
+        is_writing: whether a write of ours is under way.
+        is_fetching: whether a fetch of the component is under way.
+        is_busy: whether anything at all is, on the link.
+        is_spared: whether the component is in a mode in which it is asked for nothing.
+        begin_fetch: begins a fetch (with `refresh`, of everything), which `end_fetch` gives back.
+        end_fetch: as it says.
+        confirmed: is told of the hash that confirms a table which was in doubt, and when.
+        resynced: is told when the table agrees with the vehicle's again, of what had moved, and its hash.
+
+    Attributes:
+        announced: the last hash that was heard, or None.
+        synced: whether the table was brought up to date on this link and no sign came since that it moved.
+    """
+
+    def __init__(
+        self,
+        reads: Reads,
+        table: Table,
+        upkeep: Upkeep,
+        *,
+        is_px4: Callable[[], bool],
+        is_writing: Callable[[], bool],
+        is_fetching: Callable[[], bool],
+        is_busy: Callable[[], bool],
+        is_spared: Callable[[], bool],
+        begin_fetch: Callable[[float, bool], Fetch],
+        end_fetch: Callable[[Fetch], None],
+        confirmed: Callable[[int, float], None],
+        resynced: Callable[[tuple[str, ...], int | None], None],
+    ) -> None:
+        self._reads = reads
+        self._table = table
+        self._upkeep = upkeep
+        self._is_px4 = is_px4
+        self._is_writing = is_writing
+        self._is_fetching = is_fetching
+        self._is_busy = is_busy
+        self._is_spared = is_spared
+        self._begin_fetch = begin_fetch
+        self._end_fetch = end_fetch
+        self._confirmed = confirmed
+        self._resynced = resynced
+        self.announced: Announcement | None = None
+        self.synced = False
+        self._was_synced = False  # at any time on this link: only then is there something to keep up
+        self._has_no_hash = False
+        self._moved_by_us_alone = False
+        self._settle_at = math.inf  # when to ask for the hash after our writes
+        self._check_at = math.inf
+        self._checked_at = -math.inf
+        self._is_checking = False
+        self._resync: Fetch | None = None
+        self._has_fallen = False  # it was synced, and is not
+        self._moved: dict[str, None] = {}  # what has changed since then
+
+    @property
+    def state(self) -> SyncState:
+        """How the table stands to the vehicle's, of a component that is heard."""
+        if self._resync is not None:
+            return SyncState.RESYNCING
+        if self.synced:
+            return SyncState.SYNCED
+        return SyncState.CHECKING if self._is_checking else SyncState.UNSYNCED
+
+    @property
+    def expects_hash(self) -> bool:
+        """Whether the component has a hash, as far as is known."""
+        return not self._has_no_hash and (self.announced is not None or self._is_px4())
+
+    @property
+    def is_settling(self) -> bool:
+        """Whether the hash after a write of ours has not come yet."""
+        return self._settle_at < math.inf or HASH_CHECK in self._reads
+
+    # what is heard
+
+    def hash_heard(self, message: ParamValue, now: float) -> Announcement:
+        """A `_HASH_CHECK` has come."""
+        announced = int.from_bytes(message.raw, "little")
+        self.announced = Announcement(announced, message.param_count, now)
+        self._has_no_hash = False
+        return self.announced
+
+    def changed(self, change: Change) -> None:
+        """A parameter has changed: the hash that was announced is of the past, unless that leaves it out."""
+        name = change.name
+        if name not in self._table.volatile:
+            self._moved_by_us_alone &= change.by == "us"
+            if self.announced is not None and self.announced.at != -math.inf:
+                self.announced = replace(self.announced, at=-math.inf)
+        if self._has_fallen:
+            self._moved[name] = None
+
+    def count_moved(self, now: float) -> None:
+        """Another number of parameters was heard: the table is not what it was."""
+        self._fall()
+        if self._is_kept_up:
+            self._check_at = min(self._check_at, now)
+
+    def silence(self, seconds: float, now: float) -> None:
+        """The component is heard again after so many seconds."""
+        if seconds >= HEARTBEAT_GAP and self._is_kept_up:
+            self._check_at = min(self._check_at, max(now, self._checked_at + SHORTEST_INTERVAL))
+
+    def write_ended(self, now: float) -> None:
+        """A write of ours has ended, and may have moved the hash."""
+        if self.expects_hash and now < math.inf:
+            self._settle_at = now + SETTLING_TIME
+
+    def doubt(self) -> None:
+        """The component is lost, or has started again: the table counts once its hash has confirmed it."""
+        self._fall()
+        self.stop()
+        if self.announced is not None:
+            self.announced = replace(self.announced, at=-math.inf)
+
+    def check(self, now: float) -> None:
+        """It is there again: see whether the table still holds, as soon as the link is idle."""
+        if self._table.complete and self._upkeep.policy is not Policy.CACHE_ONLY:
+            self._is_checking = self.expects_hash
+            self._check_at = now
+
+    def fetched(self, complete: bool, confirmed: int | None, now: float) -> None:
+        """A fetch has ended with a result, not only one of ours."""
+        if not complete:
+            self._fall()
+        self.synced = complete
+        self._was_synced |= complete
+        self._moved_by_us_alone = confirmed is not None
+        self._settled(now)
+
+    def forget(self) -> None:
+        """Another vehicle has taken the address: nothing that is known is about it."""
+        self.announced = None
+        self.synced = self._was_synced = self._has_no_hash = self._moved_by_us_alone = False
+        self._has_fallen = False
+        self.stop()
+
+    # what is asked
+
+    def ask(self, now: float) -> None:
+        """Ask for the hash: ahead of a fetch, so that it need not wait for it, or to see whether it moved."""
+        if self._upkeep.policy is not Policy.CACHE_ONLY:
+            read = self._reads.ask(HASH_CHECK, now)
+            read.on_done.append(lambda: self._hash_came(read))
+
+    def compare(self, now: float) -> bool:
+        """Whether the vehicle has just announced the hash that belongs to the table; then it is confirmed."""
+        table, announced = self._table, self.announced
+        if announced is None or now - announced.at > FRESH_HASH or announced.hash != table.hash:
+            return False
+        if not table.complete or announced.count != len(table.listed()):
+            return False
+        table.verify()
+        self._moved_by_us_alone = True
+        return True
+
+    def tick(self, now: float) -> None:
+        """Ask for the hash when it is due."""
+        if self._settle_at <= now:
+            self._settle_at = math.inf
+            self.ask(now)
+        if self._check_at <= now:
+            self._check(now)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do, or infinity."""
+        return min(self._settle_at, self._check_at)
+
+    def stop(self) -> None:
+        """Ask for nothing any more, unless there is a new reason to."""
+        self._settle_at = self._check_at = math.inf
+        self._is_checking = False
+
+    # private
+
+    @property
+    def _is_kept_up(self) -> bool:
+        """Whether the table is to be followed without being asked."""
+        upkeep = self._upkeep
+        return self._was_synced and upkeep.interval < math.inf and upkeep.policy is Policy.AUTO
+
+    def _fall(self) -> None:
+        if self.synced:
+            self.synced = False
+            self._has_fallen = True
+            self._moved.clear()
+
+    def _check(self, now: float) -> None:
+        """See whether the table still is the vehicle's, if there is room for that on the link."""
+        if self._is_busy():
+            self._check_at = now + BUSY_WAIT
+            return
+        self._check_at = now + self._upkeep.interval if self._is_kept_up else math.inf
+        self._checked_at = now
+        if self._is_spared():
+            self._is_checking = False
+        elif self.expects_hash:
+            self.ask(now)
+        elif self._is_kept_up and self._upkeep.without_hash:
+            self._begin_resync(now, refresh=True)
+
+    def _hash_came(self, read: Read) -> None:
+        """A hash has come, or will not come, for which nobody but us waits."""
+        table, now = self._table, read.ended_at
+        if read.result is None:
+            self._has_no_hash = isinstance(read.error, UnknownParameter) and self.announced is None
+            self._is_checking = False
+            return
+        announced = int.from_bytes(read.result.raw, "little")
+        if self.compare(now):
+            if self._has_fallen:
+                self.synced = True
+                self._confirmed(announced, now)
+            self._settled(now)
+        elif self._is_writing() or self._is_fetching():
+            return
+        elif table.complete and table.hash is None and self._moved_by_us_alone:
+            # it cannot be computed here, and all that was heard to move it since was our own doing
+            table.confirm(announced, table.volatile, proven=False)
+        else:
+            self._fall()
+            self._is_checking = False
+            if self._is_kept_up and not self._is_spared():
+                self._begin_resync(now, refresh=False)
+
+    def _begin_resync(self, now: float, *, refresh: bool) -> None:
+        self._fall()
+        fetch = self._resync = self._begin_fetch(now, refresh)
+
+        def ended() -> None:
+            self._resync = None
+            self._end_fetch(fetch)
+
+        if fetch.done:
+            ended()
+        else:
+            fetch.on_done.append(ended)
+
+    def _settled(self, now: float) -> None:
+        """It is known how the table stands: say so, if it was in doubt."""
+        self._is_checking = False
+        self._check_at = now + self._upkeep.interval if self._is_kept_up else math.inf
+        self._checked_at = now
+        if self.synced and self._has_fallen:
+            self._has_fallen = False
+            self._resynced(tuple(self._moved), self._table.hash)
+            self._moved.clear()
