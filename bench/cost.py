@@ -276,7 +276,7 @@ def record_download() -> Download:
     """What a simulated PX4 vehicle sends when it is asked for its list."""
     vehicle = PX4Vehicle()
     vehicle.tick(0.0)
-    (heartbeat,) = vehicle.data_to_send()
+    heartbeat, _system_time = vehicle.data_to_send()
     request = wire.encode(wire.ParamRequestList(1, 1), system=255, component=190, sequence=0)
     vehicle.receive(request, 0.0)
     values: list[bytes] = []

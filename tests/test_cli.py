@@ -32,7 +32,7 @@ from paramclient.errors import CacheError, ClientClosed, ParamClientError
 from paramclient.links import Peer, SimLink
 from paramclient.protocol import wire
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
-from paramclient.sim.vehicle import Entry
+from paramclient.sim.table import Entry
 
 ROOT = Path(__file__).parent.parent
 PATIENCE = 60.0  # seconds after which a test gives up; nothing waits that long when all is well

@@ -6,9 +6,8 @@ import itertools
 import math
 import struct
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from time import process_time
-from typing import TypeVar
 
 import pytest
 from hypothesis import given, settings
@@ -20,7 +19,6 @@ from paramclient.protocol import wire
 from paramclient.sim import (
     Air,
     ArduPilotVehicle,
-    Endpoint,
     FaultyLink,
     GenericVehicle,
     PX4Vehicle,
@@ -29,99 +27,10 @@ from paramclient.sim import (
     ardupilot_table,
     px4_table,
 )
-from paramclient.values import Encoding, Param, ParamType, Value, encode, px4_hash
+from paramclient.values import Param, ParamType, Value, px4_hash
+from tests.ground import LIST, SIGNS_OF_LIFE, SMALL, Station, cast, indices, names, read, write
 
 NO_INDEX = wire.NO_INDEX
-SMALL: dict[str, Value | tuple[ParamType | int, Value]] = {
-    "A_FLOAT": 1.5,
-    "B_INT": 7,
-    "C_BYTE": (ParamType.UINT8, 200),
-    "D_SHORT": (ParamType.INT16, -3),
-}
-LIST = wire.ParamRequestList(1, 1)
-
-M = TypeVar("M")
-
-
-def read(name: str = "", index: int = -1, *, system: int = 1, component: int = 1) -> wire.ParamRequestRead:
-    return wire.ParamRequestRead(system, component, name, index)
-
-
-def write(
-    name: str, value: float, kind: int, *, cast: bool = False, system: int = 1, component: int = 1
-) -> wire.ParamSet:
-    raw = encode(value, kind, Encoding.C_CAST if cast else Encoding.BYTEWISE)
-    return wire.ParamSet(system, component, name, raw, kind)
-
-
-def cast(name: str, value: float, kind: int = ParamType.REAL32) -> wire.ParamSet:
-    """A set as for ArduPilot, whatever the value."""
-    return wire.ParamSet(1, 1, name, struct.pack("<f", value), kind)
-
-
-class Station:
-    """A ground station in a time of its own: `log` holds what came from the endpoint, and when."""
-
-    def __init__(self, endpoint: Endpoint, *, start: float = 0.0) -> None:
-        self.endpoint = endpoint
-        self.now = start
-        self.log: list[tuple[float, wire.Frame, wire.Message]] = []
-        endpoint.tick(start)
-        self._collect()
-
-    def send(self, *messages: wire.Message) -> Station:
-        for message in messages:
-            self.send_bytes(wire.encode(message, system=255, component=190, sequence=0))
-        return self
-
-    def send_bytes(self, data: bytes) -> None:
-        self.endpoint.receive(data, self.now)
-        self._collect()
-
-    def wait(self, seconds: float) -> Station:
-        """Let time pass, from deadline to deadline."""
-        until = self.now + seconds
-        while (due := self.endpoint.next_deadline()) is not None and due <= until:
-            self.now = max(due, self.now)
-            self.endpoint.tick(self.now)
-            self._collect()
-        self.now = until
-        self.endpoint.tick(until)
-        self._collect()
-        return self
-
-    def heard(self, kind: type[M]) -> list[M]:
-        """The messages of a kind since this was last asked, and forget the rest."""
-        found: list[M] = [message for _, _, message in self.log if isinstance(message, kind)]
-        self.log.clear()
-        return found
-
-    def values(self) -> list[wire.ParamValue]:
-        return self.heard(wire.ParamValue)
-
-    def times(self) -> list[float]:
-        """When the PARAM_VALUEs came."""
-        return [time for time, _, message in self.log if isinstance(message, wire.ParamValue)]
-
-    def ask(self, *messages: wire.Message, seconds: float = 0.2) -> list[wire.ParamValue]:
-        """What PARAM_VALUEs come within some time after these."""
-        self.log.clear()
-        return self.send(*messages).wait(seconds).values()
-
-    def _collect(self) -> None:
-        for data in self.endpoint.data_to_send():
-            (frame,) = wire.Framer(stream=False).receive(data)
-            message = wire.decode(frame)
-            if message is not None:
-                self.log.append((self.now, frame, message))
-
-
-def names(values: Sequence[wire.ParamValue]) -> list[str]:
-    return [value.param_id for value in values]
-
-
-def indices(values: Sequence[wire.ParamValue]) -> list[int]:
-    return [value.param_index for value in values]
 
 
 class TestTables:
@@ -291,7 +200,7 @@ class TestEveryVehicle:
         station.send(LIST).wait(1.9)
         assert station.log == []
         station.wait(0.2)
-        assert [type(message) for _, _, message in station.log] == [wire.Heartbeat]
+        assert [type(message) for _, _, message in station.log] == [wire.Heartbeat, wire.SystemTime]
         assert station.log[0][1].sequence == 0
         assert vehicle.param(name).value == 3
         assert len(station.ask(LIST, seconds=1.5)) >= len(vehicle.params)
@@ -300,7 +209,7 @@ class TestEveryVehicle:
         vehicle = kind()
         vehicle.receive(wire.encode(LIST, system=255, component=190, sequence=0), 0.0)
         vehicle.reboot(0.5)
-        assert len(vehicle.data_to_send()) == 1
+        assert len(vehicle.data_to_send()) == len(SIGNS_OF_LIFE)
 
     def test_switched_off_for_good(self, kind: Callable[[], Vehicle]) -> None:
         vehicle = kind()
@@ -331,7 +240,7 @@ class TestEveryVehicle:
         vehicle = _SHARED.setdefault(kind, kind())
         for piece in data:
             vehicle.receive(piece, 0.0)
-        assert len(vehicle.data_to_send()) <= 1
+        assert len(vehicle.data_to_send()) <= len(SIGNS_OF_LIFE)
 
 
 _SHARED: dict[Callable[[], Vehicle], Vehicle] = {}
@@ -393,14 +302,14 @@ class TestOptions:
         for step in range(1, 201):
             vehicle.tick(step * 0.01 + 0.001)
             seen.update(frame.message_id for data in vehicle.data_to_send() for frame in framer.receive(data))
-        assert seen == {30: 100, 0: 3}
+        assert seen == {30: 100, 0: 3, 2: 3}
         assert framer.skipped == 0
 
     def test_telemetry_is_made_up_for_one_second_at_most(self) -> None:
         vehicle = GenericVehicle(SMALL, telemetry=50.0)
         vehicle.tick(0.0)
         vehicle.tick(1e5)
-        assert len(vehicle.data_to_send()) == pytest.approx(51 + 2, abs=1)
+        assert len(vehicle.data_to_send()) == pytest.approx(51 + 2 * len(SIGNS_OF_LIFE), abs=1)
         assert vehicle.next_deadline() == pytest.approx(1e5 + 0.02, abs=0.02)
 
     def test_a_stream_joins_pieces(self) -> None:
@@ -449,7 +358,7 @@ class TestOptions:
             vehicle.receive(request, 0.0)
             vehicle.tick(1.0)
             spent.append(process_time() - start)
-            assert len(vehicle.data_to_send()) == 1382 + 3 + 2
+            assert len(vehicle.data_to_send()) == 1382 + 3 + 2 * len(SIGNS_OF_LIFE)
         assert min(spent) < 0.05
 
 

@@ -24,6 +24,7 @@ from __future__ import annotations
 from paramclient.sim.air import Air, Endpoint, FaultyLink
 from paramclient.sim.ardupilot import ArduPilotVehicle
 from paramclient.sim.generic import GenericVehicle
+from paramclient.sim.other import OtherStation
 from paramclient.sim.px4 import PX4Vehicle
 from paramclient.sim.table import SimParam, Table, ardupilot_table, px4_table
 from paramclient.sim.vehicle import Vehicle
@@ -34,6 +35,7 @@ __all__ = [
     "Endpoint",
     "FaultyLink",
     "GenericVehicle",
+    "OtherStation",
     "PX4Vehicle",
     "SimParam",
     "Table",

@@ -6,9 +6,10 @@ import math
 import random
 from collections.abc import Sequence
 from heapq import heappop, heappush
-from typing import Protocol
+from typing import Protocol, TypedDict, Unpack
 
 from paramclient.errors import UsageError
+from paramclient.sim.other import OtherStation
 
 __all__ = ["Air", "Endpoint", "FaultyLink"]
 
@@ -35,6 +36,20 @@ class Endpoint(Protocol):
 
     def data_to_send(self) -> list[bytes]:
         """Hand over what is to be sent, and forget it: each item one frame, to be sent as one datagram."""
+
+
+class Faults(TypedDict, total=False):
+    """What a link can do to datagrams; `FaultyLink` says what each is."""
+
+    loss: float
+    loss_burst: float
+    delay: float
+    jitter: float
+    duplicate: float
+    reorder: float
+    bit_errors: float
+    rate: float | None
+    queue: int | None
 
 
 class FaultyLink:
@@ -198,9 +213,11 @@ class Air:
         vehicles: any endpoints.
         uplink: from the program to the vehicles; None for a perfect one.
         downlink: from the vehicles to the program; None for a perfect one.
+        others: further ground stations on the channel. What they send takes its turn on both links, and
+            reaches the vehicles and the program.
 
     Attributes:
-        vehicles, uplink, downlink: as given.
+        vehicles, uplink, downlink, others: as given.
     """
 
     def __init__(
@@ -209,8 +226,10 @@ class Air:
         *,
         uplink: FaultyLink | None = None,
         downlink: FaultyLink | None = None,
+        others: Sequence[OtherStation] = (),
     ) -> None:
         self.vehicles = tuple(vehicles)
+        self.others = tuple(others)
         self.uplink = FaultyLink() if uplink is None else uplink
         self.downlink = FaultyLink() if downlink is None else downlink
         self._out: list[bytes] = []
@@ -220,38 +239,18 @@ class Air:
         cls,
         vehicles: Sequence[Endpoint],
         *,
-        loss: float = 0.0,
-        loss_burst: float = 1.0,
-        delay: float = 0.0,
-        jitter: float = 0.0,
-        duplicate: float = 0.0,
-        reorder: float = 0.0,
-        bit_errors: float = 0.0,
-        rate: float | None = None,
-        queue: int | None = None,
+        others: Sequence[OtherStation] = (),
         seed: int = 0,
+        **faults: Unpack[Faults],
     ) -> Air:
         """An air with the same faults in both directions; `delay` is for one way.
 
-        The arguments are those of `FaultyLink`. The two directions draw different random numbers, both
-        from this seed.
+        The faults are those of `FaultyLink`. The two directions draw different random numbers, both from
+        this seed.
         """
-
-        def link(own_seed: int) -> FaultyLink:
-            return FaultyLink(
-                loss=loss,
-                loss_burst=loss_burst,
-                delay=delay,
-                jitter=jitter,
-                duplicate=duplicate,
-                reorder=reorder,
-                bit_errors=bit_errors,
-                rate=rate,
-                queue=queue,
-                seed=own_seed,
-            )
-
-        return cls(vehicles, uplink=link(2 * seed), downlink=link(2 * seed + 1))
+        uplink = FaultyLink(seed=2 * seed, **faults)
+        downlink = FaultyLink(seed=2 * seed + 1, **faults)
+        return cls(vehicles, uplink=uplink, downlink=downlink, others=others)
 
     def receive(self, data: bytes, now: float) -> None:
         """Take one datagram for all vehicles."""
@@ -277,10 +276,17 @@ class Air:
         return out
 
     def _deadlines(self) -> list[float]:
-        return [_at(vehicle) for vehicle in self.vehicles]
+        return [*map(_at, self.vehicles), *map(_at, self.others)]
 
     def _step(self, now: float, due: list[float]) -> None:
         """Move everything on to `now`; a vehicle with nothing due and nothing to receive is left alone."""
+        for place, station in enumerate(self.others, start=len(self.vehicles)):
+            if due[place] <= now:
+                station.tick(now)
+                for data in station.data_to_send():
+                    self.uplink.send(data, now)
+                    self.downlink.send(data, now)
+                due[place] = _at(station)
         up = self.uplink.deliver(now)
         for place, vehicle in enumerate(self.vehicles):
             if up or due[place] <= now:
@@ -301,6 +307,6 @@ _HELD_BACK = 0.03
 _FAR = 1e9
 
 
-def _at(part: Endpoint | FaultyLink) -> float:
+def _at(part: Endpoint | OtherStation | FaultyLink) -> float:
     deadline = part.next_deadline()
     return math.inf if deadline is None else deadline

@@ -7,11 +7,12 @@ import struct
 from bisect import bisect_right
 from collections import deque
 from collections.abc import Iterable, Mapping
+from typing import Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.protocol import wire
-from paramclient.sim.table import Table, ardupilot_table, as_table, bits_of, ek2_group
-from paramclient.sim.vehicle import Entry, Vehicle
+from paramclient.sim.table import Entry, Table, ardupilot_table, as_table, bits_of, ek2_group
+from paramclient.sim.vehicle import Vehicle, VehicleOptions
 from paramclient.values import Encoding, ParamType
 
 __all__ = ["ArduPilotVehicle"]
@@ -46,8 +47,7 @@ class ArduPilotVehicle(Vehicle):
             their last bit. Names that are not in the table are passed over.
         live_period: seconds between two such changes; 0 for none.
         burst, period: by default UDP. On 57600 baud it is 1 every 0.025 s.
-        boot_time: seconds from switching on, in which PARAM_REQUEST_LIST is ignored.
-        param_error, telemetry, mavlink_version, stream: see `Vehicle`.
+        options: those of every `Vehicle`. Within its `boot_time`, PARAM_REQUEST_LIST is ignored.
 
     Raises:
         UsageError: an argument cannot be.
@@ -69,11 +69,7 @@ class ArduPilotVehicle(Vehicle):
         live_period: float = 30.0,
         burst: int = 10,
         period: float = 0.0059,
-        boot_time: float = 0.0,
-        param_error: bool = False,
-        telemetry: float = 0.0,
-        mavlink_version: int = 2,
-        stream: bool = False,
+        **options: Unpack[VehicleOptions],
     ) -> None:
         if groups is None:
             groups = {"EK2_ENABLE": ek2_group()} if table is None else {}
@@ -105,11 +101,7 @@ class ArduPilotVehicle(Vehicle):
             ),
             burst=burst,
             period=period,
-            boot_time=boot_time,
-            param_error=param_error,
-            telemetry=telemetry,
-            mavlink_version=mavlink_version,
-            stream=stream,
+            **options,
         )
 
     def _key(self, name: str) -> str:
@@ -128,7 +120,6 @@ class ArduPilotVehicle(Vehicle):
         for text in _BANNER:
             self._send(wire.StatusText(_INFO, text))
         self._list_count = len(self._listed)
-        self._last_order = -1
         self._start_list(self._next(_SLOT) if self._position is None else self._next_burst)
 
     def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
@@ -159,18 +150,13 @@ class ArduPilotVehicle(Vehicle):
         self._answers[entry.name] = entry
         self._answer_at = min(self._answer_at, self._next(_LOOP))
 
-    def _send_next(self) -> bool:
-        if self._position is None:
-            return False
-        at = bisect_right(self._listed, self._last_order, key=lambda entry: entry.order)
-        if at == len(self._listed):  # the rest was hidden since the last one
-            self._position = None
-            return False
-        entry = self._listed[at]
-        self._send_value(entry, index=self._position, count=self._list_count)
-        self._last_order = entry.order
-        self._position = None if at + 1 == len(self._listed) else self._position + 1
-        return True
+    def _next_place(self, position: int) -> int:
+        """The one behind the last that was sent, also where others were shown or hidden meanwhile."""
+        last = -1 if self._last_listed is None else self._last_listed.order
+        return bisect_right(self._listed, last, key=lambda entry: entry.order)
+
+    def _count_in_list(self) -> int:
+        return self._list_count
 
     def _switch_on(self, at: float) -> None:
         self._waiting: deque[tuple[wire.ParamRequestRead, wire.Frame]] = deque()
@@ -180,7 +166,6 @@ class ArduPilotVehicle(Vehicle):
         self._answer_at = math.inf
         self._live_at = at + self._live_period if self._live_period else math.inf
         self._list_count = 0
-        self._last_order = -1
         super()._switch_on(at)
 
     def _work(self, now: float) -> None:
@@ -223,7 +208,7 @@ class ArduPilotVehicle(Vehicle):
                 name, index = ("" if entry is None else entry.name), request.param_index
             if entry is None:
                 self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
-            else:
+            elif not self._is_dead(entry):
                 self._ready.append(wire.ParamValue(name, entry.raw, entry.type, len(self._listed), index))
 
     def _change_live(self) -> None:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from typing import Unpack
+
 from paramclient.errors import ParamErrorCode
 from paramclient.protocol import wire
-from paramclient.sim.table import Table, as_table
-from paramclient.sim.vehicle import Entry, Vehicle
+from paramclient.sim.table import Entry, Table, as_table
+from paramclient.sim.vehicle import Vehicle, VehicleOptions
 from paramclient.values import Encoding, ParamType
 
 __all__ = ["BytewiseVehicle", "GenericVehicle"]
@@ -21,7 +23,7 @@ class BytewiseVehicle(Vehicle):
         entry = self._wanted(request)
         if entry is None:
             self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
-        else:
+        elif not self._is_dead(entry):
             self._send_value(entry)
 
     def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
@@ -62,7 +64,8 @@ class GenericVehicle(BytewiseVehicle):
         uid: the hardware id that it reports; by default its own for every system.
         autopilot: MAV_AUTOPILOT in its heartbeat.
         capabilities: as in AUTOPILOT_VERSION; by default MAVLink 2 and byte-wise parameters.
-        burst, period, boot_time, param_error, telemetry, mavlink_version, stream: see `Vehicle`.
+        burst, period: see `Vehicle`.
+        options: those of every `Vehicle`.
 
     Raises:
         UsageError: an argument cannot be.
@@ -79,11 +82,7 @@ class GenericVehicle(BytewiseVehicle):
         capabilities: int = 8192 | wire.CAPABILITY_PARAM_ENCODE_BYTEWISE,
         burst: int = 10,
         period: float = 0.01,
-        boot_time: float = 0.0,
-        param_error: bool = False,
-        telemetry: float = 0.0,
-        mavlink_version: int = 2,
-        stream: bool = False,
+        **options: Unpack[VehicleOptions],
     ) -> None:
         super().__init__(
             as_table(table),
@@ -94,9 +93,5 @@ class GenericVehicle(BytewiseVehicle):
             version=wire.AutopilotVersion(capabilities, uid=0x5EED_0000 + system if uid is None else uid),
             burst=burst,
             period=period,
-            boot_time=boot_time,
-            param_error=param_error,
-            telemetry=telemetry,
-            mavlink_version=mavlink_version,
-            stream=stream,
+            **options,
         )

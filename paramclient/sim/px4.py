@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
+from typing import Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.protocol import wire
 from paramclient.sim.generic import BytewiseVehicle
-from paramclient.sim.table import SimParam, Table, as_table, px4_table
-from paramclient.sim.vehicle import Entry
+from paramclient.sim.table import Entry, SimParam, Table, as_table, px4_table
+from paramclient.sim.vehicle import VehicleOptions
 from paramclient.values import Encoding, ParamType, px4_hash
 
 __all__ = ["PX4Vehicle"]
@@ -43,8 +44,7 @@ class PX4Vehicle(BytewiseVehicle):
         autosave: seconds from a change until all that was unsaved is saved.
         burst, period: by default UDP and USB. A serial port has a burst of 3, the low-bandwidth mode 1
             every 0.125 s.
-        boot_time: seconds from switching on; a list asked for before starts then.
-        param_error, telemetry, mavlink_version, stream: see `Vehicle`.
+        options: those of every `Vehicle`. A list that is asked for within its `boot_time` starts then.
 
     Raises:
         UsageError: an argument cannot be.
@@ -68,11 +68,7 @@ class PX4Vehicle(BytewiseVehicle):
         autosave: float = 0.3,
         burst: int = 20,
         period: float = 0.020,
-        boot_time: float = 0.0,
-        param_error: bool = False,
-        telemetry: float = 0.0,
-        mavlink_version: int = 2,
-        stream: bool = False,
+        **options: Unpack[VehicleOptions],
     ) -> None:
         rows = px4_table() if table is None else as_table(table)
         if table is None and late_use is None:
@@ -107,11 +103,7 @@ class PX4Vehicle(BytewiseVehicle):
             ),
             burst=burst,
             period=period,
-            boot_time=boot_time,
-            param_error=param_error,
-            telemetry=telemetry,
-            mavlink_version=mavlink_version,
-            stream=stream,
+            **options,
         )
 
     def announced_hash(self) -> int | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -13,6 +14,7 @@ from typing import TypeAlias
 from paramclient.errors import UsageError
 from paramclient.values import (
     Encoding,
+    Param,
     ParamType,
     Value,
     check_name,
@@ -22,7 +24,7 @@ from paramclient.values import (
     known_type,
 )
 
-__all__ = ["SimParam", "Table", "ardupilot_table", "as_table", "bits_of", "ek2_group", "px4_table"]
+__all__ = ["Entry", "SimParam", "Table", "ardupilot_table", "as_table", "bits_of", "ek2_group", "px4_table"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,22 +59,55 @@ Table: TypeAlias = Iterable[SimParam] | Mapping[str, Value | tuple[ParamType | i
 INT32, a float a REAL32, and `(type, value)` is for the other types."""
 
 
+class Entry:
+    """A parameter as the vehicle holds it now.
+
+    Attributes:
+        name, type, volatile: as in `SimParam`.
+        bits: the value, as in `SimParam.bits`.
+        order: its place among all that the vehicle has, listed or not.
+        index: its place in the list, or None while it is not listed.
+        raw: the four bytes that stand for it in a message.
+    """
+
+    __slots__ = ("_encoding", "bits", "index", "name", "order", "raw", "type", "volatile")
+
+    def __init__(self, row: SimParam, order: int, encoding: Encoding) -> None:
+        self._encoding = encoding
+        self.name = row.name
+        self.type = row.type
+        self.volatile = row.volatile
+        self.order = order
+        self.index: int | None = None
+        self.store(row.bits)
+
+    @property
+    def value(self) -> Value:
+        return from_bits(self.bits, self.type)
+
+    @property
+    def param(self) -> Param:
+        return Param(self.name, self.value, self.type, self.index, self.bits)
+
+    def store(self, bits: int) -> None:
+        """Hold another value."""
+        self.bits = bits
+        value = self.value
+        if self._encoding is Encoding.BYTEWISE or self.type == ParamType.REAL32 or isinstance(value, bytes):
+            self.raw = (bits & 0xFFFFFFFF).to_bytes(4, "little")
+        else:
+            self.raw = _cast(value)
+
+
 def as_table(table: Table) -> tuple[SimParam, ...]:
     """Any form of `Table` as a tuple of `SimParam`, in the order given.
 
     Raises:
-        UsageError: a name or value cannot be, a name comes twice, or the table is longer than an index.
+        UsageError: a name or value cannot be.
     """
     if isinstance(table, Mapping):
-        rows = tuple(_row(name, entry) for name, entry in table.items())
-    else:
-        rows = tuple(table)
-    names = {row.name for row in rows}
-    if len(names) < len(rows):
-        raise UsageError("a parameter name stands twice in the table")
-    if len(rows) > _LONGEST:
-        raise UsageError(f"a table holds at most {_LONGEST} parameters, not {len(rows)}")
-    return rows
+        return tuple(_row(name, entry) for name, entry in table.items())
+    return tuple(table)
 
 
 def bits_of(value: Value, number: int) -> int:
@@ -118,9 +153,6 @@ def ek2_group() -> tuple[SimParam, ...]:
     return tuple(map(_plain, _read("ardupilot_ek2.csv")))
 
 
-_LONGEST = 65535  # param_count has 16 bits, and index 65535 means none
-
-
 def _row(name: str, entry: Value | tuple[ParamType | int, Value]) -> SimParam:
     if isinstance(entry, tuple):
         return SimParam(name, *entry)
@@ -136,3 +168,11 @@ def _plain(row: dict[str, str]) -> SimParam:
 def _read(name: str) -> Iterable[dict[str, str]]:
     text = resources.files(__package__).joinpath("tables", name).read_text(encoding="ascii")
     return csv.DictReader(text.splitlines())
+
+
+def _cast(value: float) -> bytes:
+    """What a C-cast to float gives; a REAL64 beyond its range becomes infinite."""
+    try:
+        return struct.pack("<f", value)
+    except OverflowError:
+        return struct.pack("<f", math.copysign(math.inf, value))

@@ -6,55 +6,32 @@ import math
 import struct
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
+from dataclasses import replace
+from typing import TypedDict
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.protocol import wire
 from paramclient.sim.air import OUT_LIMIT
-from paramclient.sim.table import SimParam, bits_of
-from paramclient.values import Encoding, Param, ParamType, Value, from_bits
+from paramclient.sim.table import Entry, SimParam, bits_of
+from paramclient.values import Encoding, Param, Value
 
-__all__ = ["Entry", "Vehicle"]
+__all__ = ["Vehicle", "VehicleOptions"]
 
 
-class Entry:
-    """A parameter as the vehicle holds it now.
+class VehicleOptions(TypedDict, total=False):
+    """What every kind of vehicle takes beside its own arguments; `Vehicle` says what each is."""
 
-    Attributes:
-        name, type, volatile: as in `SimParam`.
-        bits: the value, as in `SimParam.bits`.
-        order: its place among all that the vehicle has, listed or not.
-        index: its place in the list, or None while it is not listed.
-        raw: the four bytes that stand for it in a message.
-    """
-
-    __slots__ = ("_encoding", "bits", "index", "name", "order", "raw", "type", "volatile")
-
-    def __init__(self, row: SimParam, order: int, encoding: Encoding) -> None:
-        self._encoding = encoding
-        self.name = row.name
-        self.type = row.type
-        self.volatile = row.volatile
-        self.order = order
-        self.index: int | None = None
-        self.store(row.bits)
-
-    @property
-    def value(self) -> Value:
-        return from_bits(self.bits, self.type)
-
-    @property
-    def param(self) -> Param:
-        return Param(self.name, self.value, self.type, self.index, self.bits)
-
-    def store(self, bits: int) -> None:
-        """Hold another value."""
-        self.bits = bits
-        value = self.value
-        if self._encoding is Encoding.BYTEWISE or self.type == ParamType.REAL32 or isinstance(value, bytes):
-            self.raw = (bits & 0xFFFFFFFF).to_bytes(4, "little")
-        else:
-            self.raw = _cast(value)
+    boot_time: float
+    param_error: bool
+    telemetry: float
+    mavlink_version: int
+    stream: bool
+    dead: Iterable[int | str]
+    list_stops_at: int | None
+    list_stops: float
+    repeated_names: bool
+    high_latency: bool
 
 
 class Vehicle(ABC):
@@ -70,16 +47,29 @@ class Vehicle(ABC):
 
     Args of every vehicle:
         burst, period: parameters in one go of the list, and the seconds from one go to the next.
-        boot_time: seconds from switching on in which it does not yet send its list.
+        boot_time: seconds from switching on in which it does not yet send its list; its heartbeat says
+            MAV_STATE_BOOT meanwhile.
         param_error: answer what cannot be done with PARAM_ERROR, as newer firmware does.
         telemetry: other messages per second (ATTITUDE), which a client has to step over.
         mavlink_version: 2, or 1 to speak like an old vehicle.
         stream: whether it hangs on a byte stream, where a frame may be spread over several `receive`
             calls; datagrams are never joined.
+        dead: indices, and names, that the list leaves out and no read is answered for. They still count,
+            and a set of them is answered.
+        list_stops_at: after how many values a list falls silent; None for never. It is over then: one that
+            is asked for again begins at its start.
+        list_stops: how many lists that happens to; `math.inf` for all.
+        repeated_names: whether a name may stand in the table more than once, as it does where names are cut
+            at 16 bytes. Each has its index; by name the first is meant.
+        high_latency: see the attribute.
     """
 
     _ack_first = True  # whether COMMAND_ACK comes before what the command asked for
     _position: int | None  # where the list stands, None while it is not being sent
+    _last_listed: Entry | None  # what it sent last
+    _list_sent: int  # values since its start
+    _next_telemetry: float
+    _next_burst: float
 
     def __init__(
         self,
@@ -92,12 +82,22 @@ class Vehicle(ABC):
         version: wire.AutopilotVersion,
         burst: int,
         period: float,
-        boot_time: float,
-        param_error: bool,
-        telemetry: float,
-        mavlink_version: int,
-        stream: bool,
+        boot_time: float = 0.0,
+        param_error: bool = False,
+        telemetry: float = 0.0,
+        mavlink_version: int = 2,
+        stream: bool = False,
+        dead: Iterable[int | str] = (),
+        list_stops_at: int | None = None,
+        list_stops: float = 1,
+        repeated_names: bool = False,
+        high_latency: bool = False,
     ) -> None:
+        rows = tuple(table)
+        if not repeated_names and len({row.name for row in rows}) < len(rows):
+            raise UsageError("a parameter name stands twice in the table")
+        if len(rows) > _LONGEST:
+            raise UsageError(f"a table holds at most {_LONGEST} parameters, not {len(rows)}")
         for what, number in (("system", system), ("component", component)):
             if not 1 <= number <= 255:
                 raise UsageError(f"{what} is a number from 1 to 255, not {number}")
@@ -111,12 +111,25 @@ class Vehicle(ABC):
             raise UsageError(f"boot_time is a number of seconds from 0 up, not {boot_time}")
         if not 0.0 <= telemetry <= 10_000.0:
             raise UsageError(f"telemetry is a number of messages per second from 0 to 10000, not {telemetry}")
+        if list_stops_at is not None and list_stops_at < 0:
+            raise UsageError(f"list_stops_at is a number of values from 0 up, not {list_stops_at}")
+        if not list_stops >= 0:
+            raise UsageError(f"list_stops is a number of lists from 0 up, not {list_stops}")
         self.system = system
         self.component = component
         self.requests: Counter[str] = Counter()
-        self._entries = [Entry(row, order, encoding) for order, row in enumerate(table)]
-        self._by_name = {self._key(entry.name): entry for entry in self._entries}
+        self._entries = [Entry(row, order, encoding) for order, row in enumerate(rows)]
+        self._by_name = {self._key(entry.name): entry for entry in reversed(self._entries)}
         self._listed: list[Entry] = []
+        self._dead: set[int | str] = set()
+        for each in dead:
+            if isinstance(each, int) and not 0 <= each < _LONGEST:
+                raise UsageError(f"an index is a number from 0 to {_LONGEST - 1}, not {each}")
+            self._dead.add(self._entry(each).name if isinstance(each, str) else each)
+        self._list_stops_at = math.inf if list_stops_at is None else list_stops_at
+        self._list_stops = list_stops
+        self._when_listed: dict[int, list[Callable[[], object]]] = {}
+        self._high_latency = high_latency
         self._heartbeat = heartbeat
         self._version = version
         self._burst = burst
@@ -143,14 +156,56 @@ class Vehicle(ABC):
         return self._entry(name).param
 
     @property
+    def listed(self) -> list[Param]:
+        """The listed parameters in the order of their indices, those with repeated names one by one."""
+        return [entry.param for entry in self._listed]
+
+    @property
     def params(self) -> dict[str, Param]:
-        """The listed parameters by name, in the order of their indices: what a full download should give."""
-        return {entry.name: entry.param for entry in self._listed}
+        """The listed parameters by name, in the order of their indices: what a full download should give.
+
+        Of a repeated name the first one.
+        """
+        found: dict[str, Param] = {}
+        for entry in self._listed:
+            found.setdefault(entry.name, entry.param)
+        return found
 
     @property
     def values(self) -> dict[str, Value]:
-        """The listed values by name, in the order of their indices."""
-        return {entry.name: entry.value for entry in self._listed}
+        """The listed values by name, as `params`."""
+        return {name: param.value for name, param in self.params.items()}
+
+    @property
+    def high_latency(self) -> bool:
+        """Whether it speaks as on a satellite link; can be set at any moment, also in flight.
+
+        HIGH_LATENCY2 every 5 s then stands in for heartbeat, SYSTEM_TIME and telemetry. Reads and sets are
+        answered; a list waits until it is off, and what PX4 pushes too (its `MAVLINK_MODE_IRIDIUM`).
+        """
+        return self._high_latency
+
+    @high_latency.setter
+    def high_latency(self, is_on: bool) -> None:
+        if is_on != self._high_latency:
+            self._high_latency = is_on
+            self._next_heartbeat = max(self._now, self._on_at)
+            self._next_telemetry = max(self._now, self._next_telemetry)
+            self._next_burst = max(self._now, self._next_burst)
+
+    def when_listed(self, count: int, do: Callable[[], object]) -> None:
+        """Call something once, as soon as a list has sent so many values since its start.
+
+        For what happens in mid-stream: `px4.when_listed(300, lambda: px4.use("WV_EN"))` moves the count,
+        `px4.when_listed(300, px4.reboot)` ends it. The call may change the vehicle in any way; several for
+        one count are made in the order given.
+
+        Raises:
+            UsageError: the count is below 1.
+        """
+        if count < 1:
+            raise UsageError(f"count is a number of values from 1 up, not {count}")
+        self._when_listed.setdefault(count, []).append(do)
 
     def set_param(self, name: str, value: Value) -> None:
         """Change a value as if on board or by another station; the vehicle tells of it if its kind does.
@@ -161,11 +216,14 @@ class Vehicle(ABC):
         entry = self._entry(name)
         self._write(entry, bits_of(value, entry.type))
 
-    def reboot(self, now: float, *, down: float = 0.0) -> None:
+    def reboot(self, now: float | None = None, *, down: float = 0.0) -> None:
         """Switch off at `now` and on again `down` seconds later, never if that is `math.inf`.
 
-        All that was going on ends and what is received while it is off is gone; the values stay.
+        All that was going on ends, and what is received while it is off is gone, as is what it had ready to
+        be fetched; the values stay. Without `now` it happens at the time that the vehicle was last given.
         """
+        if now is None:
+            now = self._now
         self._out.clear()
         self._framer.flush()
         self._started = True
@@ -193,7 +251,8 @@ class Vehicle(ABC):
         """When `tick` is wanted next; None before the first call and when switched off for good."""
         if self._now < self._on_at:
             return None if self._on_at == math.inf else self._on_at
-        return min(self._next_heartbeat, self._next_telemetry, self._next_burst, *self._timers())
+        due = [self._next_heartbeat, *self._timers()]
+        return min(due) if self._high_latency else min(self._next_telemetry, self._next_burst, *due)
 
     def data_to_send(self) -> list[bytes]:
         """Hand over the frames to send, and forget them."""
@@ -232,16 +291,41 @@ class Vehicle(ABC):
         """Deadlines besides those of the heartbeat, the telemetry and the list."""
         return ()
 
+    def _next_place(self, position: int) -> int:
+        """Which of the listed comes at this position of the list that is being sent."""
+        return position
+
+    def _count_in_list(self) -> int:
+        """The count that the values of a list carry."""
+        return len(self._listed)
+
     def _send_next(self) -> bool:
         """Send the next item of the list; False when there is none."""
-        if self._position is None or self._position >= len(self._listed):
+        if self._position is None:
+            return False
+        index = self._position
+        place = self._next_place(index)
+        if place >= len(self._listed) or self._falls_silent():
             self._position = None
             return False
-        self._send_value(self._listed[self._position])
-        self._position += 1
-        if self._position >= len(self._listed):
-            self._position = None
+        entry = self._last_listed = self._listed[place]
+        self._position = index + 1 if place + 1 < len(self._listed) else None
+        if not self._is_dead(entry):
+            self._send_value(entry, index=index, count=self._count_in_list())
+            self._list_sent += 1
+            for do in self._when_listed.pop(self._list_sent, ()):
+                do()
         return True
+
+    def _falls_silent(self) -> bool:
+        """Whether the list breaks off here, where it still has a value to send."""
+        if self._list_sent < self._list_stops_at or self._list_stops < 1:
+            return False
+        self._list_stops -= 1
+        return True
+
+    def _is_dead(self, entry: Entry) -> bool:
+        return bool(self._dead) and (entry.index in self._dead or entry.name in self._dead)
 
     def _switch_on(self, at: float) -> None:
         """Begin anew, with nothing going on, at the time `at`; `math.inf` leaves it off."""
@@ -251,19 +335,24 @@ class Vehicle(ABC):
         self._next_telemetry = at + self._telemetry_period
         self._next_burst = math.inf
         self._position = None
+        self._last_listed = None
+        self._list_sent = 0
         self._relist()
 
     def _work(self, now: float) -> None:
         """Do what is due, each thing at its own pace; of what repeats for ever, a late call skips some."""
         if self._next_heartbeat <= now:
-            self._send(self._heartbeat)
-            self._next_heartbeat += 1.0
+            pause = _HIGH_LATENCY_PAUSE if self._high_latency else 1.0
+            self._send_signs_of_life(now)
+            self._next_heartbeat += pause
             if self._next_heartbeat <= now:
-                self._next_heartbeat = now + 1.0
+                self._next_heartbeat = now + pause
+        if self._high_latency:
+            return
         if self._next_telemetry <= now:
             late = now - self._next_telemetry
             for _ in range(int(min(late, 1.0) / self._telemetry_period) + 1):
-                self._send_attitude()
+                self._send_attitude(now)
             self._next_telemetry += (int(late / self._telemetry_period) + 1) * self._telemetry_period
             if self._next_telemetry <= now:
                 self._next_telemetry = now + self._telemetry_period
@@ -279,6 +368,8 @@ class Vehicle(ABC):
     def _start_list(self, at: float) -> None:
         """Send the list from its start, from `at` on, and not before the vehicle has booted."""
         self._position = 0
+        self._last_listed = None
+        self._list_sent = 0
         self._next_burst = max(at, self._on_at + self._boot_time)
 
     def _entry(self, name: str) -> Entry:
@@ -331,11 +422,24 @@ class Vehicle(ABC):
 
     # The rest
 
-    def _send_attitude(self) -> None:
+    def _send_signs_of_life(self, now: float) -> None:
+        beat = self._heartbeat
+        if self._high_latency:
+            self._send(wire.HighLatency2(beat.type, beat.autopilot))
+            return
+        is_booting = now < self._on_at + self._boot_time
+        self._send(replace(beat, system_status=wire.MAV_STATE_BOOT) if is_booting else beat)
+        self._send(wire.SystemTime(0, self._time_boot_ms(now)))
+
+    def _time_boot_ms(self, now: float) -> int:
+        """Since it was switched on, as it is sent: in 32 bits."""
+        return int((now - self._on_at) * 1000.0) & 0xFFFFFFFF
+
+    def _send_attitude(self, now: float) -> None:
         self._queue(
             wire.build_frame(
                 _ATTITUDE,
-                _LEVEL_FLIGHT,
+                self._time_boot_ms(now).to_bytes(4, "little") + _LEVEL_FLIGHT,
                 system=self.system,
                 component=self.component,
                 sequence=self._sequence,
@@ -390,12 +494,6 @@ _NAMES = {
 }
 _AUTOPILOT_VERSION = 148
 _ATTITUDE = 30
-_LEVEL_FLIGHT = struct.pack("<I6f", 0, 0.0, 0.0, 0.5, 0.0, 0.0, 0.01)
-
-
-def _cast(value: float) -> bytes:
-    """What a C-cast to float gives; a REAL64 beyond its range becomes infinite."""
-    try:
-        return struct.pack("<f", value)
-    except OverflowError:
-        return struct.pack("<f", math.copysign(math.inf, value))
+_LEVEL_FLIGHT = struct.pack("<6f", 0.0, 0.0, 0.5, 0.0, 0.0, 0.01)
+_HIGH_LATENCY_PAUSE = 5.0
+_LONGEST = 65535  # param_count has 16 bits, and index 65535 means none

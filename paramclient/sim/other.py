@@ -1,0 +1,104 @@
+"""Another ground station on the same channel, which does as it likes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+
+from paramclient.errors import UsageError
+from paramclient.protocol import wire
+from paramclient.sim.table import Entry, SimParam
+from paramclient.values import Encoding
+
+__all__ = ["OtherStation"]
+
+
+class OtherStation:
+    """A second ground station of an `Air`: the vehicles hear it, and so does the program.
+
+    It sends a heartbeat each second, asks for the list, which starts the vehicle's stream again, and sets
+    parameters. It never listens, and takes no notice of what becomes of its requests.
+
+    Args:
+        system, component: its own ids, 1 to 255.
+        target_system, target_component: to whom it speaks.
+        list_every: seconds from the first call to its first PARAM_REQUEST_LIST, and from one to the next;
+            `math.inf` for none.
+        sets: what it sets, each with the seconds from the first call.
+        encoding: of the values that it sets.
+
+    Raises:
+        UsageError: an argument cannot be.
+    """
+
+    def __init__(
+        self,
+        *,
+        system: int = 254,
+        component: int = 190,
+        target_system: int = 1,
+        target_component: int = wire.AUTOPILOT_COMPONENT,
+        list_every: float = math.inf,
+        sets: Iterable[tuple[float, SimParam]] = (),
+        encoding: Encoding = Encoding.BYTEWISE,
+    ) -> None:
+        for what, number in (("system", system), ("component", component)):
+            if not 1 <= number <= 255:
+                raise UsageError(f"{what} is a number from 1 to 255, not {number}")
+        if not list_every > 0.0:
+            raise UsageError(f"list_every is a number of seconds above 0, not {list_every}")
+        self.system = system
+        self.component = component
+        self._target = (target_system, target_component)
+        self._list_every = list_every
+        self._encoding = encoding
+        self._sets = sorted(sets, key=lambda each: each[0])
+        if not all(0.0 <= when < math.inf for when, _ in self._sets):
+            raise UsageError("a parameter is set at a number of seconds from 0 up")
+        self._started_at: float | None = None
+        self._next_heartbeat = math.inf
+        self._next_list = math.inf
+        self._sequence = 0
+        self._out: list[bytes] = []
+
+    def tick(self, now: float) -> None:
+        """Do what has become due by `now`; of what repeats, a late call skips some."""
+        if self._started_at is None:
+            self._started_at = self._next_heartbeat = now
+            self._next_list = now + self._list_every
+        if self._next_heartbeat <= now:
+            beat = wire.Heartbeat(
+                wire.MAV_TYPE_GCS, wire.MAV_AUTOPILOT_INVALID, system_status=wire.MAV_STATE_ACTIVE
+            )
+            self._send(beat)
+            self._next_heartbeat = _next(self._next_heartbeat, 1.0, now)
+        if self._next_list <= now:
+            self._send(wire.ParamRequestList(*self._target))
+            self._next_list = _next(self._next_list, self._list_every, now)
+        while self._sets and self._started_at + self._sets[0][0] <= now:
+            row = self._sets.pop(0)[1]
+            raw = Entry(row, 0, self._encoding).raw
+            self._send(wire.ParamSet(*self._target, row.name, raw, row.type))
+
+    def next_deadline(self) -> float | None:
+        """When `tick` is wanted next; None before the first call."""
+        if self._started_at is None:
+            return None
+        due = min(self._next_heartbeat, self._next_list)
+        return min(due, self._started_at + self._sets[0][0]) if self._sets else due
+
+    def data_to_send(self) -> list[bytes]:
+        """Hand over the frames to send, and forget them."""
+        out, self._out = self._out, []
+        return out
+
+    def _send(self, message: wire.Message) -> None:
+        frame = wire.encode(message, system=self.system, component=self.component, sequence=self._sequence)
+        self._sequence = (self._sequence + 1) & 0xFF
+        self._out.append(frame)
+
+
+def _next(due: float, pause: float, now: float) -> float:
+    """The next turn of what was due; after a late call a whole pause from now."""
+    due += pause
+    return due if due > now else now + pause

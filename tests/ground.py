@@ -1,0 +1,106 @@
+"""A ground station that asks simulated vehicles by hand, and what it says to them."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Sequence
+from typing import TypeVar
+
+from paramclient.protocol import wire
+from paramclient.sim import Endpoint
+from paramclient.values import Encoding, ParamType, Value, encode
+
+__all__ = ["LIST", "SIGNS_OF_LIFE", "SMALL", "Station", "cast", "indices", "names", "read", "write"]
+
+SMALL: dict[str, Value | tuple[ParamType | int, Value]] = {
+    "A_FLOAT": 1.5,
+    "B_INT": 7,
+    "C_BYTE": (ParamType.UINT8, 200),
+    "D_SHORT": (ParamType.INT16, -3),
+}
+LIST = wire.ParamRequestList(1, 1)
+SIGNS_OF_LIFE = (wire.Heartbeat, wire.SystemTime)
+"""What a vehicle sends each second from the first call on."""
+
+M = TypeVar("M")
+
+
+def read(name: str = "", index: int = -1, *, system: int = 1, component: int = 1) -> wire.ParamRequestRead:
+    return wire.ParamRequestRead(system, component, name, index)
+
+
+def write(
+    name: str, value: float, kind: int, *, cast: bool = False, system: int = 1, component: int = 1
+) -> wire.ParamSet:
+    raw = encode(value, kind, Encoding.C_CAST if cast else Encoding.BYTEWISE)
+    return wire.ParamSet(system, component, name, raw, kind)
+
+
+def cast(name: str, value: float, kind: int = ParamType.REAL32) -> wire.ParamSet:
+    """A set as for ArduPilot, whatever the value."""
+    return wire.ParamSet(1, 1, name, struct.pack("<f", value), kind)
+
+
+class Station:
+    """A ground station in a time of its own: `log` holds what came from the endpoint, and when."""
+
+    def __init__(self, endpoint: Endpoint, *, start: float = 0.0) -> None:
+        self.endpoint = endpoint
+        self.now = start
+        self.log: list[tuple[float, wire.Frame, wire.Message]] = []
+        endpoint.tick(start)
+        self._collect()
+
+    def send(self, *messages: wire.Message) -> Station:
+        for message in messages:
+            self.send_bytes(wire.encode(message, system=255, component=190, sequence=0))
+        return self
+
+    def send_bytes(self, data: bytes) -> None:
+        self.endpoint.receive(data, self.now)
+        self._collect()
+
+    def wait(self, seconds: float) -> Station:
+        """Let time pass, from deadline to deadline."""
+        until = self.now + seconds
+        while (due := self.endpoint.next_deadline()) is not None and due <= until:
+            self.now = max(due, self.now)
+            self.endpoint.tick(self.now)
+            self._collect()
+        self.now = until
+        self.endpoint.tick(until)
+        self._collect()
+        return self
+
+    def heard(self, kind: type[M]) -> list[M]:
+        """The messages of a kind since this was last asked, and forget the rest."""
+        found: list[M] = [message for _, _, message in self.log if isinstance(message, kind)]
+        self.log.clear()
+        return found
+
+    def values(self) -> list[wire.ParamValue]:
+        return self.heard(wire.ParamValue)
+
+    def times(self) -> list[float]:
+        """When the PARAM_VALUEs came."""
+        return [time for time, _, message in self.log if isinstance(message, wire.ParamValue)]
+
+    def ask(self, *messages: wire.Message, seconds: float = 0.2) -> list[wire.ParamValue]:
+        """What PARAM_VALUEs come within some time after these."""
+        self.log.clear()
+        return self.send(*messages).wait(seconds).values()
+
+    def _collect(self) -> None:
+        for data in self.endpoint.data_to_send():
+            (frame,) = wire.Framer(stream=False).receive(data)
+            message = wire.decode(frame)
+            if message is not None:
+                self.log.append((self.now, frame, message))
+
+
+def names(values: Sequence[wire.ParamValue]) -> list[str]:
+    return [value.param_id for value in values]
+
+
+def indices(values: Sequence[wire.ParamValue]) -> list[int]:
+    return [value.param_index for value in values]
