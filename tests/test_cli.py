@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Self
 
 import pytest
 
@@ -669,6 +669,10 @@ def test_a_vehicle_can_be_forgotten(command: Command, warm: Path) -> None:
         (["sim", "px5"], "px4"),
         (["sim", "px4", "--link", "sim:px4"], "vehicle itself"),
         (["sim", "px4", "--loss", "2", "--link", "tcp:127.0.0.1:1"], "loss"),
+        (["sim", "px4", "--dead", "NOPE", "--link", "tcp:127.0.0.1:1"], "NOPE"),
+        (["sim", "px4", "--list-stops-at", "-1", "--link", "tcp:127.0.0.1:1"], "list_stops_at"),
+        (["sim", "px4", "--reboot-at", "0", "--link", "tcp:127.0.0.1:1"], "values from 1 up"),
+        (["sim", "px4", "--other-list-every", "0", "--link", "tcp:127.0.0.1:1"], "list_every"),
         (["cache", "history"], "VEHICLE"),
     ],
 )
@@ -800,6 +804,79 @@ def test_sim_ends_cleanly() -> None:
         )
         started.send_signal(signal.SIGINT)
         assert ended(started) == Outcome(130, "", "")
+
+
+class FarEnd:
+    """Speaks to a simulated vehicle in another process: takes its messages until one is what was wanted."""
+
+    def __init__(self, url: str) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.settimeout(PATIENCE)
+        self._socket.connect(("127.0.0.1", int(url.rpartition(":")[2])))
+
+    def ask(self, *requests: wire.Message) -> None:
+        for request in requests:
+            self._socket.send(wire.encode(request, system=255, component=190, sequence=0))
+
+    def until(self, is_last: Callable[[wire.Frame, wire.Message | None], bool]) -> list[wire.Message | None]:
+        messages: list[wire.Message | None] = []
+        while True:
+            [frame] = wire.Framer(stream=False).receive(self._socket.recv(300))
+            messages.append(wire.decode(frame))
+            if is_last(frame, messages[-1]):
+                return messages
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+
+def test_sim_with_dead_indices_and_lists_that_stop() -> None:
+    misfortunes = ["--dead", "3", "--dead", "ATT_EN", "--list-stops-at", 10, "--list-stops", "inf"]
+    with simulated("px4", *map(str, misfortunes)) as url, FarEnd(url) as far:
+        dead = PX4Vehicle().param("ATT_EN").index
+        far.ask(wire.ParamRequestList(1, 1))
+        for _ in range(2):
+            found = far.until(lambda _, message: isinstance(message, wire.SystemTime))
+            listed = [each.param_index for each in found if isinstance(each, wire.ParamValue)][1:]
+            if listed:
+                break
+        assert listed == [index for index in range(12) if index not in (3, dead)]
+        far.ask(wire.ParamRequestRead(1, 1, "", 3), wire.ParamRequestRead(1, 1, "", 100))
+        *_, answer = far.until(lambda _, message: isinstance(message, wire.ParamValue))
+        assert isinstance(answer, wire.ParamValue)
+        assert answer.param_index == 100
+
+
+def test_sim_that_boots_and_reboots_in_mid_stream() -> None:
+    def says(status: int) -> Callable[[wire.Frame, wire.Message | None], bool]:
+        return lambda _, message: isinstance(message, wire.Heartbeat) and message.system_status == status
+
+    misfortunes = ["--boot-time", "1", "--reboot-at", "50", "--reboot-down", "0.2"]
+    with simulated("ardupilot", *misfortunes) as url, FarEnd(url) as far:
+        far.ask(wire.Heartbeat(6, 8))
+        far.until(says(3))
+        far.ask(wire.ParamRequestList(1, 1))
+        found = far.until(says(wire.MAV_STATE_BOOT))
+        assert sum(isinstance(each, wire.ParamValue) for each in found) <= 50
+
+
+def test_sim_on_a_satellite_link_beside_another_station() -> None:
+    misfortunes = ["--system", "7", "--high-latency", "--other-list-every", "0.2"]
+    with simulated("px4", *misfortunes) as url, FarEnd(url) as far:
+        far.ask(wire.Heartbeat(6, 8))
+        heard = set()
+
+        def is_both(frame: wire.Frame, message: wire.Message | None) -> bool:
+            if isinstance(message, wire.ParamRequestList):
+                assert message == wire.ParamRequestList(7, 1)
+            heard.add((frame.system, type(message)))
+            return {(7, wire.HighLatency2), (254, wire.ParamRequestList)} <= heard
+
+        far.until(is_both)
+        assert {kind for system, kind in heard if system == 7} == {wire.HighLatency2}
 
 
 def test_a_closed_pipe_ends_it_without_a_word(warm: Path) -> None:

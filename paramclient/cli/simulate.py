@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
-from typing import Annotated, Final, Literal
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from anyio.abc import TaskStatus
 from cyclopts import Parameter
@@ -15,7 +16,11 @@ from paramclient.links import Link, LinkKind, LinkSpec, create_link, parse_link,
 from paramclient.links.tcp import TcpIn
 from paramclient.links.udp import UdpIn
 
-__all__ = ["Faults", "sim"]
+if TYPE_CHECKING:
+    from paramclient.sim import OtherStation, Vehicle
+    from paramclient.sim.vehicle import VehicleOptions
+
+__all__ = ["Faults", "Misfortunes", "sim"]
 
 
 @Parameter(name="*")
@@ -54,7 +59,65 @@ class Faults:
     """Of the random numbers: the same faults for the same seed."""
 
 
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True, slots=True)
+class Misfortunes:
+    """What befalls the vehicle. The texts below the fields are their help."""
+
+    dead: tuple[str, ...] = ()
+    """An index or a name that is never listed, and never answered when it is read; may be given again."""
+
+    list_stops_at: int | None = None
+    """After how many values the list falls silent. Without it, never."""
+
+    list_stops: float = 1
+    """How many lists --list-stops-at happens to; inf for all."""
+
+    boot_time: float = 0.0
+    """Seconds after each start in which it says that it boots, and does not send its list."""
+
+    reboot_at: int | None = None
+    """After how many values of a list it starts anew, once. Without it, never."""
+
+    reboot_down: float = 0.0
+    """Seconds for which it is off then."""
+
+    high_latency: bool = False
+    """Speak as on a satellite link: HIGH_LATENCY2 every 5 s, and no list."""
+
+    other_list_every: float | None = None
+    """Seconds after which another ground station asks for the list, again and again. Without it, never."""
+
+    @property
+    def options(self) -> VehicleOptions:
+        """What is said when the vehicle is made."""
+        return {
+            "dead": [int(each) if each.isdecimal() else each for each in self.dead],
+            "list_stops_at": self.list_stops_at,
+            "list_stops": self.list_stops,
+            "boot_time": self.boot_time,
+            "high_latency": self.high_latency,
+        }
+
+    def befall(self, vehicle: Vehicle) -> list[OtherStation]:
+        """See to the rest; the other stations on the channel."""
+        from paramclient.sim import OtherStation
+
+        if self.reboot_at is not None:
+            vehicle.when_listed(self.reboot_at, partial(vehicle.reboot, down=self.reboot_down))
+        if self.other_list_every is None:
+            return []
+        return [
+            OtherStation(
+                target_system=vehicle.system,
+                target_component=vehicle.component,
+                list_every=self.other_list_every,
+            )
+        ]
+
+
 _NO_FAULTS: Final = Faults()
+_NO_MISFORTUNES: Final = Misfortunes()
 _Id = Annotated[int, Parameter(validator=Number(gte=1, lte=255))]
 
 
@@ -66,6 +129,7 @@ async def sim(
     system: _Id = 1,
     component: _Id = 1,
     param_error: bool = False,
+    misfortunes: Misfortunes = _NO_MISFORTUNES,
     faults: Faults = _NO_FAULTS,
 ) -> None:
     """Run a simulated vehicle for other programs, until Ctrl-C.
@@ -84,8 +148,10 @@ async def sim(
         raise UsageError(f"{spec.name} is a vehicle itself; a simulated one needs a link to other programs")
     real = create_link(spec)
     make = PX4Vehicle if autopilot == "px4" else ArduPilotVehicle
-    vehicle = make(system=system, component=component, param_error=param_error, stream=real.is_stream)
-    air = Air.symmetric([vehicle], **asdict(faults))
+    options = misfortunes.options
+    options.update({"param_error": param_error, "stream": real.is_stream})
+    vehicle = make(system=system, component=component, **options)
+    air = Air.symmetric([vehicle], others=misfortunes.befall(vehicle), **asdict(faults))
     announcement = _Announcement(f"{autopilot} {system}/{component}", spec)
     await serve_endpoint(air, real, task_status=announcement)
 
