@@ -428,17 +428,18 @@ class ComponentMachine:
         if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
             name = name.upper()
             message = message._replace(param_id=name)
-        if count != self.table.count and count != NO_INDEX:
+        table = self.table
+        if count != table.count and count != NO_INDEX:
             self._count_moved(count, now)
         is_writing = len(self.writes) > 0
-        by = "us" if is_writing and name in self.writes else self._authors.of(name, now)
-        change = self.table.hear(message, by)
-        if name not in self.table.params:
-            return  # more names than there can be
+        is_ours = is_writing and name in self.writes
+        change = table.hear(message, "us" if is_ours else self._authors.of(name, now))
         if change is not None:
-            self._authors.changed(name, now, is_written=is_writing and name in self.writes)
+            self._authors.changed(name, now, is_written=is_ours)
             self.sync.changed(change)
             self._emit(_new(ParamChanged, (self, change)))
+        elif name not in table.params:
+            return  # more names than there can be
         if self.fetch is not None:
             self.fetch.heard(message, now)
         if is_writing:

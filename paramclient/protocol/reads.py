@@ -126,9 +126,10 @@ class Reads:
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here after it went into the table."""
-        found = [self._open.get(message.param_id), self._open.get(message.param_index)] if self._open else []
+        wanted = self._open
+        found = (wanted.get(message.param_id), wanted.get(message.param_index)) if wanted else ()
         for read in found:
-            if read is None or self._open.get(read.key) is not read:
+            if read is None or wanted.get(read.key) is not read:
                 continue
             if read.attempts:
                 self._count_answer(read, now)

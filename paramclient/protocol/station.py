@@ -18,6 +18,8 @@ from paramclient.protocol.wire import (
     MAV_AUTOPILOT_INVALID,
     MAV_STATE_ACTIVE,
     MAV_TYPE_GCS,
+    PARAM_VALUE_ID,
+    Frame,
     Framer,
     Heartbeat,
     HighLatency2,
@@ -26,6 +28,7 @@ from paramclient.protocol.wire import (
     ParamSet,
     ParamValue,
     decode,
+    decode_param_value,
     encode,
 )
 from paramclient.values import Encoding
@@ -82,7 +85,8 @@ class Station:
         self._is_stream = is_stream
         self._encoding = encoding
         self._upkeep = upkeep
-        self._framers: dict[Peer, Framer] = {}
+        self._framer = Framer(HEARD, stream=False)  # for datagrams, whoever they come from
+        self._framers: dict[Peer, Framer] = {}  # for streams
         self._peers: dict[int, Peer] = {}
         self._outbox: list[tuple[bytes, Peer | None]] = []
         self._events: list[Event] = []
@@ -90,33 +94,24 @@ class Station:
         self._heartbeat_at = -math.inf
         self._is_paused = False
 
-    def receive(self, data: bytes, peer: Peer, now: float) -> None:
-        """Take a datagram, or a chunk of a stream. An empty chunk says that the peer's stream has ended."""
+    def receive(self, data: bytes, peer: Peer, now: float) -> bool:
+        """Take a datagram, or a chunk of a stream. An empty chunk says that the peer's stream has ended.
+
+        Gives whether there was anything of interest in it; all that is not telemetry is.
+        """
         self.bytes_received += len(data)
-        key = peer if self._is_stream else None
-        framer = self._framers.get(key)
-        if framer is None:
-            framer = self._framers[key] = Framer(HEARD, stream=self._is_stream)
-            if len(self._framers) > MOST_PEERS:
-                del self._framers[next(iter(self._framers))]
-        frames = framer.receive(data)
-        if not data:
-            frames += framer.flush()
-            self._framers.pop(key, None)
+        frames = self._cut_stream(data, peer) if self._is_stream else self._framer.receive(data)
         for frame in frames:
-            _, system, component, _, _, version = frame
-            sender = (system, component)
-            if sender == self.own or system == 0 or (message := decode(frame)) is None:
-                continue
-            self._peers[system] = peer
-            if isinstance(message, ParamSet):
-                self._receive_foreign_set(message, sender, now)
-                continue
-            machine = self.components.get(sender) or self._meet(sender, message)
-            if machine is not None:
-                machine.receive(message, now, version=version)
+            number, system, component, _, payload, version = frame
+            machine = self.components.get((system, component))
+            if number == PARAM_VALUE_ID and machine is not None:  # the short way for what comes in thousands
+                self._peers[system] = peer
+                machine.receive(decode_param_value(payload), now, version=version)
+            else:
+                self._receive_other(frame, peer, now)
         if self._is_stream and not data:
             self._peers = {system: each for system, each in self._peers.items() if each != peer}
+        return bool(frames)
 
     def tick(self, now: float) -> None:
         """Do what is due: our heartbeat, and every component's time-outs."""
@@ -198,6 +193,31 @@ class Station:
                 self._send(ParamRequestList(system, COMP_ID_ALL), system, version)
                 return [machine.begin_fetch(now, refresh=refresh, listed=True) for machine in machines]
         return [machine.begin_fetch(now, refresh=refresh) for machine in machines]
+
+    def _cut_stream(self, data: bytes, peer: Peer) -> list[Frame]:
+        """The frames that a chunk of a peer's stream completes, or that its end leaves."""
+        framer = self._framers.get(peer)
+        if framer is None:
+            framer = self._framers[peer] = Framer(HEARD)
+            if len(self._framers) > MOST_PEERS:
+                del self._framers[next(iter(self._framers))]
+        if data:
+            return framer.receive(data)
+        self._framers.pop(peer, None)
+        return framer.flush()
+
+    def _receive_other(self, frame: Frame, peer: Peer, now: float) -> None:
+        """Take a frame that is no value of a known component."""
+        sender = (frame.system, frame.component)
+        if sender == self.own or frame.system == 0 or (message := decode(frame)) is None:
+            return
+        self._peers[frame.system] = peer
+        if isinstance(message, ParamSet):
+            self._receive_foreign_set(message, sender, now)
+            return
+        machine = self.components.get(sender) or self._meet(sender, message)
+        if machine is not None:
+            machine.receive(message, now, version=frame.version)
 
     def _meet(self, sender: Address, message: Message) -> ComponentMachine | None:
         """A component that was not heard before; only what shows that it has parameters makes it one."""

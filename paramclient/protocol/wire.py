@@ -35,6 +35,7 @@ __all__ = [
     "SystemTime",
     "build_frame",
     "decode",
+    "decode_param_value",
     "encode",
 ]
 
@@ -53,6 +54,7 @@ MAV_AUTOPILOT_INVALID: Final = 8
 MAV_AUTOPILOT_PX4: Final = 12
 MAV_STATE_BOOT: Final = 1
 MAV_STATE_ACTIVE: Final = 4
+PARAM_VALUE_ID: Final = 22
 AUTOPILOT_VERSION_ID: Final = 148
 MAV_CMD_REQUEST_MESSAGE: Final = 512
 MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: Final = 520
@@ -246,32 +248,17 @@ class Framer:
         self.frames = 0
         self.skipped = 0
 
-    def receive(self, data: bytes) -> list[Frame]:
+    def receive(self, data: bytes, *, final: bool = False) -> list[Frame]:
         """Take bytes from the link; give the frames that are complete now, in order.
 
-        Of a stream, at most one unfinished frame (less than 280 bytes) is kept between calls.
+        Of a stream, at most one unfinished frame (less than 280 bytes) is kept between calls. Where `data` is
+        final, as datagrams always are, nothing will complete such a candidate, and it is passed over like any
+        other that fails. The loop is the hot path of the library: about ten operations for each frame,
+        nothing for each byte.
         """
-        if not self._stream:
-            return self._scan(data, final=True)[0]
         if self._tail:
             data = self._tail + data
-        found, rest = self._scan(data, final=False)
-        self._tail = data[rest:]
-        return found
-
-    def flush(self) -> list[Frame]:
-        """The stream has ended or was interrupted: give what stands behind the unfinished candidate."""
-        found, _ = self._scan(self._tail, final=True)
-        self._tail = b""
-        return found
-
-    def _scan(self, data: bytes, *, final: bool) -> tuple[list[Frame], int]:
-        """The frames in `data`, and where the first candidate starts that its end cuts off.
-
-        Where `data` is final, nothing will complete such a candidate, and it is passed over like any other
-        that fails. The loop is the hot path of the library: about ten operations for each frame, nothing
-        for each byte.
-        """
+        may_go_on = self._stream and not final
         found: list[Frame] = []
         number_of = self._wanted.get
         extra_of = _EXTRA_BY_ID_BYTES.get
@@ -299,7 +286,7 @@ class Framer:
             extra = extra_of(key)
             if end > length:
                 header_is_cut = crc_at - size > length
-                if not final and (header_is_cut or extra is not None):
+                if may_go_on and (header_is_cut or extra is not None):
                     break
             elif extra is not None and _CRC_AT(data, crc_at)[0] == mcrf4xx(data[at + 1 : crc_at] + extra):
                 good += 1
@@ -320,7 +307,12 @@ class Framer:
             at = next_at
         self.frames += good
         self.skipped += skipped
-        return found, at
+        self._tail = data[at:]
+        return found
+
+    def flush(self) -> list[Frame]:
+        """The stream has ended or was interrupted: give what stands behind the unfinished candidate."""
+        return self.receive(b"", final=True)
 
 
 def decode(frame: Frame) -> Message | None:
@@ -330,6 +322,14 @@ def decode(frame: Frame) -> Message | None:
     """
     decoder = _DECODERS.get(frame.message_id)
     return None if decoder is None else decoder(frame.payload)
+
+
+def decode_param_value(payload: bytes) -> ParamValue:
+    """The message in the payload of a PARAM_VALUE, as `decode` gives it: for those who know the id."""
+    if len(payload) < 25:
+        payload = payload.ljust(25, b"\0")
+    raw, count, index, name, number = _PARAM_VALUE.unpack_from(payload)
+    return _new(ParamValue, (text_of(name), raw, number, count, index))
 
 
 def encode(message: Message, *, system: int, component: int, sequence: int, version: int = 2) -> bytes:
@@ -432,13 +432,6 @@ def _decode_param_request_list(payload: bytes) -> ParamRequestList:
     return ParamRequestList(*_fields(_PARAM_REQUEST_LIST, payload))
 
 
-def _decode_param_value(payload: bytes) -> ParamValue:
-    if len(payload) < 25:
-        payload = payload.ljust(25, b"\0")
-    raw, count, index, name, number = _PARAM_VALUE.unpack_from(payload)
-    return _new(ParamValue, (text_of(name), raw, number, count, index))
-
-
 def _decode_param_set(payload: bytes) -> ParamSet:
     raw, system, component, name, number = _fields(_PARAM_SET, payload)
     return ParamSet(system, component, text_of(name), raw, number)
@@ -467,7 +460,7 @@ _DECODERS: dict[int, Callable[[bytes], Message]] = {
     2: _decode_system_time,
     20: _decode_param_request_read,
     21: _decode_param_request_list,
-    22: _decode_param_value,
+    PARAM_VALUE_ID: decode_param_value,
     23: _decode_param_set,
     76: _decode_command_long,
     77: _decode_command_ack,
