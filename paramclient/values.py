@@ -12,7 +12,7 @@ import math
 import struct
 import zlib
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum, StrEnum
 from typing import SupportsFloat, SupportsIndex, TypeAlias
 
@@ -99,7 +99,7 @@ class Trust(StrEnum):
     """From the cache: the last value known."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, init=False)
 class Param:
     """One parameter as a component holds it.
 
@@ -122,6 +122,23 @@ class Param:
     bits: int
     trust: Trust = Trust.LIVE
 
+    def __init__(
+        self,
+        name: str,
+        value: Value,
+        type: ParamType | int,  # noqa: A002 - the name of the field
+        index: int | None,
+        bits: int,
+        trust: Trust = Trust.LIVE,
+    ) -> None:
+        # A generated one takes twice as long, and each value that comes makes a Param.
+        _set_name(self, name)
+        _set_value(self, value)
+        _set_type(self, type)
+        _set_index(self, index)
+        _set_bits(self, bits)
+        _set_trust(self, trust)
+
     @property
     def is_raw(self) -> bool:
         """Whether `value` holds the undecoded wire bytes."""
@@ -142,6 +159,10 @@ class Param:
     def __str__(self) -> str:
         return f"{self.name} = {format_value(self.value, self.type)}"
 
+
+_set_name, _set_value, _set_type, _set_index, _set_bits, _set_trust = (
+    vars(Param)[each.name].__set__ for each in fields(Param)
+)
 
 # What `decode` needs, without the detours of an enumeration: it runs for every value that comes.
 _REAL32 = int(ParamType.REAL32)
