@@ -11,7 +11,7 @@ which other work on the machine disturbs less than those of the clock on the wal
   value is left out: with it a fetch ends and proves the hash, which is timed on its own.
 - Listening: a client on a real UDP socket hears telemetry that it has no use for, and a heartbeat a second.
   The frames come one by one, evenly, which is the worst case; and in bursts every 10 ms, as from the loop
-  of a vehicle.
+  of a vehicle. Nothing is awaited of the vehicle meanwhile, so the client rests between the frames.
 - Memory: what a component holds after a download.
 """
 
@@ -47,8 +47,8 @@ MOST_MEMORY = 300
 
 TELEMETRY = 2_000
 """Frames a second for the client that listens."""
-WARM_UP = 1.5
-"""Seconds before its CPU time is read first: until then it asks the component who it is."""
+WARM_UP = 5.0
+"""Seconds before its CPU time is read first: until then it asks the component, in vain, who it is."""
 
 
 @dataclass(frozen=True)

@@ -35,8 +35,9 @@ from paramclient import (
     ValueNotApplied,
 )
 from paramclient import client as client_module
-from paramclient.links import create_link, serve_endpoint
+from paramclient.links import Peer, create_link, serve_endpoint
 from paramclient.protocol import wire
+from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
 from tests.shell import (
     PATIENCE,
@@ -1246,6 +1247,168 @@ async def test_a_tcp_server_that_stays_away(monkeypatch: pytest.MonkeyPatch) -> 
         await served.__aenter__()
         await until(lambda: " open, " in repr(client))
         assert (await component.get("PARAM_01")).value == 1
+
+
+# Rests
+
+
+class Chatter(Tap):
+    """An endpoint beside which telemetry comes at an even pace.
+
+    Attributes:
+        portions: what was handed over, as it was taken together.
+    """
+
+    def __init__(self, endpoint: Endpoint, interval: float) -> None:
+        super().__init__(endpoint)
+        self.portions: list[list[bytes]] = []
+        self._interval = interval
+        self._next_at = -math.inf
+        self._count = 0
+        self._said: list[bytes] = []
+
+    def say(self, data: bytes) -> None:
+        """Send this beside all else."""
+        self._said.append(data)
+
+    def tick(self, now: float) -> None:
+        super().tick(now)
+        if self._next_at == -math.inf:
+            self._next_at = now
+        while self._next_at <= now:
+            self._count += 1
+            payload = self._count.to_bytes(4, "little").rjust(28, b"\1")
+            self.say(wire.build_frame(30, payload, system=1, component=1, sequence=0))
+            self._next_at += self._interval
+
+    def next_deadline(self) -> float:
+        return min(self._next_at, super().next_deadline() or math.inf)
+
+    def data_to_send(self) -> list[bytes]:
+        said, self._said = self._said, []
+        portion = super().data_to_send() + said
+        if portion:
+            self.portions.append(portion)
+        return portion
+
+
+async def known_component(client: ParamClient) -> Component:
+    """The component, after it has said who it is."""
+    component = await client.component()
+    await until(lambda: not client._station.is_waiting)
+    return component
+
+
+@swiftly
+async def test_telemetry_alone_lets_the_reader_rest() -> None:
+    vehicle = Chatter(generic(), 1 / 2000)
+    async with a_client(vehicle) as client:
+        await known_component(client)
+        vehicle.portions.clear()
+        await asyncio.sleep(1.0)
+        assert sum(map(len, vehicle.portions)) >= 1950
+        assert len(vehicle.portions) < 1.2 / client_module.REST
+
+
+@swiftly
+async def test_nothing_rests_while_an_answer_is_awaited() -> None:
+    vehicle = Chatter(generic(), 1 / 2000)
+    async with a_client(vehicle) as client:
+        component = await known_component(client)
+        vehicle.is_deaf = True
+        call = asyncio.create_task(component.get("PARAM_01"))
+        await settled()
+        vehicle.portions.clear()
+        await asyncio.sleep(0.1)
+        assert not call.done()
+        assert len(vehicle.portions) >= 190
+        call.cancel()
+
+
+@swiftly
+async def test_what_comes_during_a_rest_is_taken_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[bytes] = []
+    receive = Station.receive
+
+    def record(station: Station, data: bytes, peer: Peer, now: float) -> bool:
+        taken.append(data)
+        return receive(station, data, peer, now)
+
+    monkeypatch.setattr(Station, "receive", record)
+    vehicle = small_px4()
+    chatter = Chatter(vehicle, 1 / 2000)
+    async with a_client(chatter) as client:
+        component = await known_component(client)
+        for value in range(50, 70):
+            vehicle.set_param("PARAM_04", value)
+            vehicle.set_param("PARAM_01", value + 100)
+            await asyncio.sleep(0.025)
+        await asyncio.sleep(0.1)
+        assert component.params["PARAM_01"].value == vehicle.param("PARAM_01").value
+        given = [data for portion in chatter.portions for data in portion]
+        assert len(taken) >= 1000
+        assert taken == given
+
+
+@swiftly
+async def test_a_change_waits_for_the_end_of_a_rest_at_the_most() -> None:
+    vehicle = Chatter(generic(), 1 / 2000)
+    async with a_client(vehicle) as client:
+        component = await known_component(client)
+        changes = component.changes()
+        for value in range(20):
+            await asyncio.sleep(0.0137)
+            began = anyio.current_time()
+            message = wire.ParamValue("PARAM_01", bytes((value + 1, 0, 0, 0)), ParamType.INT32, 24, 1)
+            vehicle.say(wire.encode(message, system=1, component=1, sequence=0))
+            with anyio.fail_after(1.0):
+                assert (await anext(changes)).name == "PARAM_01"
+            assert anyio.current_time() - began < client_module.REST + 0.001
+
+
+@swiftly
+async def test_a_busy_link_shortens_the_rests() -> None:
+    vehicle = Chatter(generic(), 1 / 20_000)
+    async with a_client(vehicle) as client:
+        await known_component(client)
+        await asyncio.sleep(0.1)
+        vehicle.portions.clear()
+        await asyncio.sleep(0.5)
+        largest = max(map(len, vehicle.portions))
+    assert 0.9 * client_module.MOST_PER_REST < largest < 1.1 * client_module.MOST_PER_REST
+
+
+@pytest.mark.parametrize("call", ["get", "set", "fetch_all", "client.fetch_all"])
+@swiftly
+async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def seconds(rest: float) -> float:
+        """How long the call takes where a rest, once begun, would last until our next heartbeat."""
+        monkeypatch.setattr(client_module, "REST", rest)
+        vehicle = Chatter(small_px4(), 0.005)
+        async with a_client(vehicle) as client:
+            component = await known_component(client)
+            vehicle.heard.clear()
+            await until(lambda: vehicle.messages(wire.Heartbeat))
+            await asyncio.sleep(0.05)
+            began = anyio.current_time()
+            await CALLS[call](client, component)
+            return anyio.current_time() - began
+
+    monkeypatch.setattr(client_module, "MOST_PER_REST", math.inf)
+    with_rests, without = await seconds(60.0), await seconds(0.0)
+    assert with_rests < without + 0.05
+
+
+@swiftly
+async def test_closing_does_not_wait_for_the_end_of_a_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(client_module, "REST", 60.0)
+    monkeypatch.setattr(client_module, "MOST_PER_REST", math.inf)
+    async with a_client(Chatter(generic(), 0.005)) as client:
+        await known_component(client)
+        await asyncio.sleep(1.0)
+        began = anyio.current_time()
+    assert anyio.current_time() - began < 0.01
+    assert not tasks_beside()
 
 
 # How they look

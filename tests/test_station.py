@@ -29,7 +29,7 @@ from paramclient.protocol.wire import (
 )
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
 from paramclient.values import Encoding, ParamType, Trust
-from tests.simulation import Simulation, known, param_value
+from tests.simulation import Simulation, is_so, known, param_value
 
 PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
 GCS = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID)
@@ -137,6 +137,41 @@ def test_bytes_that_mean_nothing() -> None:
     station.receive(wire.build_frame(30, bytes(28), system=1, component=1, sequence=0), "peer", 0.0)
     assert station.components == {}
     assert station.bytes_received > 9
+
+
+def test_what_is_of_interest() -> None:
+    for is_stream in (False, True):
+        station = a_station(is_stream=is_stream)
+        telemetry = wire.build_frame(30, bytes(28), system=1, component=1, sequence=0)
+        assert station.receive(frame(PX4), "peer", 0.0)
+        assert not station.receive(telemetry + b"noise" + telemetry, "peer", 0.0)
+        assert station.receive(telemetry + frame(param_value("A")), "peer", 0.0)
+        assert not station.receive(frame(PX4)[:-1], "peer", 0.0)
+        assert station.receive(frame(PX4)[-1:], "peer", 0.0) is is_stream
+
+
+def test_what_is_waited_for() -> None:
+    station = a_station()
+    assert not station.is_waiting
+    hear(station, PX4)
+    assert is_so(station.is_waiting), "for who it is"
+    hear(station, AutopilotVersion(0, uid=1))
+    assert not is_so(station.is_waiting)
+    machine = station.components[1, 1]
+    read = machine.read("A", 0.0)
+    assert is_so(station.is_waiting)
+    machine.reads.release(read)
+    assert not is_so(station.is_waiting)
+    write = machine.write("A", 1.0, 0.0)
+    assert is_so(station.is_waiting)
+    machine.writes.cancel(write, 0.0)
+    assert not is_so(station.is_waiting)
+    hear(station, PX4, 2, 1)
+    hear(station, AutopilotVersion(0, uid=2), 2, 1)
+    fetch = station.components[2, 1].begin_fetch(0.0)
+    assert is_so(station.is_waiting)
+    station.components[2, 1].end_fetch(fetch)
+    assert not station.is_waiting
 
 
 def test_a_ground_station_is_not_asked_for_anything() -> None:

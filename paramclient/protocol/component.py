@@ -119,7 +119,7 @@ class ComponentMachine:
             is_px4=lambda: self.who.autopilot == MAV_AUTOPILOT_PX4,
             is_writing=lambda: len(self.writes) > 0,
             is_fetching=lambda: self.fetch is not None,
-            is_busy=lambda: self.who.is_doubted or is_link_busy(),
+            is_busy=is_link_busy,
             is_spared=lambda: self._is_spared,
             begin_fetch=lambda now, refresh: self.begin_fetch(now, refresh=refresh),
             end_fetch=self.end_fetch,
@@ -395,14 +395,14 @@ class ComponentMachine:
         return SyncState.LOST if self.presence.is_lost else self.sync.state
 
     @property
-    def is_busy(self) -> bool:
-        """Whether anything is being asked of it."""
-        return self.fetch is not None or len(self.reads) > 0 or len(self.writes) > 0
-
-    @property
     def can_hit(self) -> bool:
         """Whether the vehicle's hash may confirm the table as it stands."""
         return self.table.complete and self.table.hash is not None
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether an answer is awaited: to a read, a write or a fetch, or to the question who it is."""
+        return len(self.reads) > 0 or len(self.writes) > 0 or self.fetch is not None or self.who.is_asking
 
     @property
     def is_settling(self) -> bool:

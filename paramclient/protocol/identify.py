@@ -127,6 +127,11 @@ class Identification:
         """Whether its heartbeat names an autopilot."""
         return self.autopilot not in (None, MAV_AUTOPILOT_INVALID) and self.has_parameters
 
+    @property
+    def is_asking(self) -> bool:
+        """Whether its AUTOPILOT_VERSION is awaited."""
+        return self._is_asking
+
     def heartbeat(self, message: Heartbeat | HighLatency2) -> None:
         """Take a heartbeat, or what stands for it."""
         if (message.autopilot, message.type) != (self.autopilot, self.vehicle_type):

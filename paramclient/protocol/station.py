@@ -156,6 +156,11 @@ class Station:
         for machine in self.components.values():
             machine.resume(now)
 
+    @property
+    def is_waiting(self) -> bool:
+        """Whether anything is awaited of any component."""
+        return any(machine.is_waiting for machine in self.components.values())
+
     def fail_all(self, error: LinkError, now: float) -> None:
         """The link is gone for good: everyone who waits gets its error."""
         for machine in list(self.components.values()):
@@ -239,7 +244,7 @@ class Station:
             emit=self._events.append,
             encoding=self._encoding,
             upkeep=self._upkeep,
-            is_link_busy=lambda: any(machine.is_busy for machine in self.components.values()),
+            is_link_busy=lambda: self.is_waiting,
             another=lambda now: self._become_another(system, now),
         )
         self.components[sender] = machine
