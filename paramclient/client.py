@@ -58,9 +58,6 @@ LINK_PATIENCE: Final = 10.0
 FIRST_BACKOFF: Final = 0.25
 LONGEST_BACKOFF: Final = 5.0
 """Seconds between two attempts to open a link again: doubled from the first to the longest."""
-WATCH_INTERVAL: Final = 30.0
-"""Seconds after which a vehicle with a hash is asked for it again, unless the caller says otherwise."""
-SHORTEST_WATCH: Final = 1.0
 CLOSING_PATIENCE: Final = 0.5
 """Seconds that closing waits for the hash after a write, where the next session could not do without it."""
 
@@ -89,7 +86,7 @@ class ParamClient:
         encoding: how all components lay out values, for those who know better than the evidence.
         watch_interval: seconds after which it is looked again whether a table that was fetched still is the
             vehicle's, while the link is idle. An update is sent once, and lost with its frame: so it is found
-            within one interval. None: every `WATCH_INTERVAL` seconds where the vehicle has a hash, which
+            within one interval. None: every 30 seconds where the vehicle has a hash, which
             costs two small messages, and never elsewhere. A number goes for every vehicle; of one without a
             hash the whole list is fetched each time. 0 for never. See `Component.sync_state`.
         policy: what may be asked of vehicles to bring tables up to date, see `Policy`: "auto", "hash-only"
@@ -133,7 +130,7 @@ class ParamClient:
             system=system,
             component=component,
             encoding=encoding,
-            upkeep=_upkeep(watch_interval, policy),
+            upkeep=Upkeep.chosen(watch_interval, policy),
         )
         self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self._components: dict[Address, Component] = {}
@@ -537,19 +534,6 @@ class ParamClient:
             if address[1] == component and system in (None, address[0]) and found._machine.who.has_spoken:
                 return found
         return None
-
-
-def _upkeep(watch_interval: float | None, policy: Policy | str) -> Upkeep:
-    """What the two options of the client mean."""
-    try:
-        policy = Policy(policy)
-    except ValueError:
-        raise UsageError(f"policy is one of {', '.join(Policy)}, not {policy!r}") from None
-    if watch_interval is None:
-        return Upkeep(WATCH_INTERVAL, policy=policy)
-    if not (watch_interval == 0 or watch_interval >= SHORTEST_WATCH):
-        raise UsageError(f"watch_interval is 0 or seconds from {SHORTEST_WATCH:g} up, not {watch_interval}")
-    return Upkeep(watch_interval or math.inf, without_hash=True, policy=policy)
 
 
 def _wanted(system: int | None, component: int | None) -> str:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Final
 
-from paramclient.errors import UnknownParameter
+from paramclient.errors import UnknownParameter, UsageError
 from paramclient.protocol.fetch import FRESH_HASH, Announcement, Fetch, Policy
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.table import Change, Table
@@ -16,6 +16,10 @@ from paramclient.protocol.wire import HASH_CHECK, ParamValue
 
 __all__ = ["Sync", "SyncState", "Upkeep"]
 
+WATCH_INTERVAL: Final = 30.0
+"""Seconds after which a vehicle with a hash is asked for it again, unless the user says otherwise."""
+SHORTEST_INTERVAL: Final = 1.0
+"""Seconds that may be chosen instead, at the least."""
 SETTLING_TIME: Final = 0.06
 """Seconds from the last of our writes until the hash is asked for: what PX4 changed with it, it pushes 10 to
 24 ms later."""
@@ -23,7 +27,7 @@ HEARTBEAT_GAP: Final = 2.5
 """Seconds of silence in which an update may have been lost as well: two heartbeats."""
 BUSY_WAIT: Final = 0.1
 """Seconds until it is looked again whether the link is idle."""
-SHORTEST_INTERVAL: Final = 5.0
+GAPS_INTERVAL: Final = 5.0
 """Seconds between two checks that gaps in the heartbeats bring about: they are many on a bad link."""
 LOW_BANDWIDTH_GAP: Final = 0.1
 """Seconds from one value of the list to the next that tell of a low-bandwidth mode: PX4's sends 8 a second, a
@@ -61,6 +65,23 @@ class Upkeep:
     interval: float = math.inf
     without_hash: bool = False
     policy: Policy = Policy.AUTO
+
+    @classmethod
+    def chosen(cls, interval: float | None, policy: Policy | str) -> Upkeep:
+        """What a user's choice means; see `ParamClient`.
+
+        Raises:
+            UsageError: there is no such policy, or the interval is too short.
+        """
+        try:
+            policy = Policy(policy)
+        except ValueError:
+            raise UsageError(f"policy is one of {', '.join(Policy)}, not {policy!r}") from None
+        if interval is None:
+            return cls(WATCH_INTERVAL, policy=policy)
+        if not (interval == 0 or interval >= SHORTEST_INTERVAL):
+            raise UsageError(f"watch_interval is 0 or seconds from {SHORTEST_INTERVAL:g} up, not {interval}")
+        return cls(interval or math.inf, without_hash=True, policy=policy)
 
 
 class Sync:
@@ -177,7 +198,7 @@ class Sync:
     def silence(self, seconds: float, now: float) -> None:
         """The component is heard again after so many seconds."""
         if seconds >= HEARTBEAT_GAP and self._is_kept_up:
-            self._check_at = min(self._check_at, max(now, self._checked_at + SHORTEST_INTERVAL))
+            self._check_at = min(self._check_at, max(now, self._checked_at + GAPS_INTERVAL))
 
     def write_ended(self, now: float) -> None:
         """A write of ours has ended, and may have moved the hash."""
