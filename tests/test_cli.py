@@ -40,6 +40,7 @@ ESCAPE = "\x1b"
 
 FETCH_KEYS = [
     *("system", "component", "autopilot", "uid", "count", "received", "source", "hash", "missing"),
+    *("lost", "repeated", "round_trip_s"),
     *("elapsed_s", "bytes_received", "bytes_sent", "params"),
 ]
 PARAM_KEYS = ["value", "type", "index", "bits"]
@@ -204,6 +205,8 @@ def test_fetch_prints_one_object_with_exactly_these_keys(command: Command, tmp_p
     assert first["bytes_received"] > 903 * 25
     assert 0 < first["bytes_sent"] < 1000
     assert first["elapsed_s"] > 0
+    assert (first["lost"], first["repeated"]) == (0, 0)
+    assert 0 <= first["round_trip_s"] < first["elapsed_s"]
     assert list(first["params"].values()) == sorted(
         first["params"].values(), key=lambda param: param["index"]
     )
@@ -266,10 +269,24 @@ def test_people_see_a_table_and_a_summary(command: Command, warm: Path) -> None:
     volatile = {row.name for row in px4_table() if row.volatile}
     assert {name for name, row in by_name.items() if row[-1] == "live"} == volatile
     assert re.fullmatch(
-        r"903 parameters of 1/1 px4 from cache in [0-9.]+ s, [0-9,]+ bytes received, [0-9,]+ sent; "
+        r"903 parameters of 1/1 px4 from cache in [0-9.]+ s, round trip [0-9.]+ ms, "
+        r"[0-9,]+ bytes received, [0-9,]+ sent; "
         rf"hash {HASH}\n",
         fetched.err,
     )
+
+
+def test_people_see_what_a_bad_link_has_cost(command: Command) -> None:
+    fetched = command("fetch", "sim:px4?loss=0.1&delay=0.01&seed=1", "--no-cache")
+    assert fetched.code == 0
+    found = re.fullmatch(
+        r"903 parameters of 1/1 px4 from stream in [0-9.]+ s, ([0-9]+) lost, [0-9]+ repeated, "
+        r"round trip ([0-9.]+) ms, [0-9,]+ bytes received, [0-9,]+ sent; hash [0-9a-f]{8}\n",
+        fetched.err,
+    )
+    assert found is not None
+    assert 50 <= int(found[1]) <= 300
+    assert float(found[2]) >= 20
 
 
 class Gappy(GenericVehicle):

@@ -370,6 +370,33 @@ def test_a_push_at_the_very_start() -> None:
     assert desk.take() == ["list"]
 
 
+def test_lost_is_what_had_to_be_asked_for_each_index_once() -> None:
+    desk = Desk()
+    desk.stream([0, 2, 1, *range(4, 40), *range(41, 90)])  # 1 comes late, 3 and 40 do not come
+    assert desk.download.lost == 2
+    desk.pass_time(0.3)
+    assert desk.download.lost == 12
+    desk.pass_time(2.0)  # asked for again and again, they are lost once
+    desk.answer()
+    assert (desk.download.lost, desk.download.missing) == (12, ())
+
+
+def test_what_another_pass_brings_was_lost() -> None:
+    desk = Desk()
+    desk.stream(range(30), count=1000)
+    desk.pass_time(0.3)
+    assert desk.take().count("list") == 2
+    assert desk.download.lost == 970
+
+
+def test_what_was_lost_under_another_count_does_not_count() -> None:
+    desk = Desk()
+    desk.stream([0, *range(5, 20)])
+    assert is_so(desk.download.lost == 4)
+    desk.stream(range(101), count=101)
+    assert (desk.download.done, desk.download.lost) == (True, 0)
+
+
 # the list starts anew
 
 

@@ -22,6 +22,7 @@ __all__ = [
     "bits_text",
     "by_index",
     "hash_text",
+    "milliseconds",
     "param_json",
     "print_json",
     "print_line",
@@ -29,6 +30,7 @@ __all__ = [
     "printable",
     "progress_bar",
     "report",
+    "rounded",
     "say",
     "time_text",
     "value_json",
@@ -58,6 +60,12 @@ def hash_text(crc: int | None) -> str | None:
     return None if crc is None else f"{crc:08x}"
 
 
+def milliseconds(seconds: float) -> str:
+    """A short time for people: `103 ms`, and `0.4 ms` where whole ones say nothing."""
+    text = f"{seconds * 1000:.0f}" if seconds >= 0.01 else f"{seconds * 1000:.1f}"
+    return f"{text} ms"
+
+
 def bits_text(param: Param) -> str:
     """`Param.bits` as hexadecimal digits: 16 for the types of 8 bytes, else 8."""
     is_wide = isinstance(param.type, ParamType) and param.type.size == 8
@@ -84,6 +92,11 @@ def value_json(value: Value, number: ParamType | int) -> int | float | str:
     if math.isfinite(value):
         return shortest_float(value) if number == ParamType.REAL32 else value
     return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
+
+
+def rounded(seconds: float | None) -> float | None:
+    """Seconds to a tenth of a millisecond."""
+    return None if seconds is None else round(seconds, 4)
 
 
 def param_json(param: Param) -> dict[str, Any]:

@@ -19,12 +19,14 @@ from paramclient.cli.output import (
     as_json,
     by_index,
     hash_text,
+    milliseconds,
     print_json,
     print_line,
     print_table,
     printable,
     progress_bar,
     report,
+    rounded,
     say,
     time_text,
     value_json,
@@ -198,9 +200,12 @@ class _Fetched:
         result = self.result
         of = f" of {result.count}" if self.missing else ""
         crc = "" if result.hash is None else f"; hash {hash_text(result.hash)}"
+        lost = "" if result.source == "cache" else f"{result.lost} lost, {result.repeated} repeated, "
+        trip = "" if result.round_trip is None else f"round trip {milliseconds(result.round_trip)}, "
         return (
             f"{self.received}{of} parameters of {self.session.who} from {result.source} in "
-            f"{result.elapsed:.2f} s, {self.bytes_received:,} bytes received, {self.bytes_sent:,} sent{crc}"
+            f"{result.elapsed:.2f} s, {lost}{trip}{self.bytes_received:,} bytes received, "
+            f"{self.bytes_sent:,} sent{crc}"
         )
 
     def as_json(self) -> dict[str, Any]:
@@ -215,7 +220,10 @@ class _Fetched:
             "source": self.result.source,
             "hash": hash_text(self.result.hash),
             "missing": self.missing,
-            "elapsed_s": round(self.result.elapsed, 4),
+            "lost": self.result.lost,
+            "repeated": self.result.repeated,
+            "round_trip_s": rounded(self.result.round_trip),
+            "elapsed_s": rounded(self.result.elapsed),
             "bytes_received": self.bytes_received,
             "bytes_sent": self.bytes_sent,
             "params": as_json(self.params),

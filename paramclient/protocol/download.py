@@ -86,6 +86,7 @@ class Download(Operation[None]):
         self.names: dict[int, str] = {}
         self.given_up: set[int] = set()
         self.repeated = 0
+        self._lost: set[int] = set()
         self.lists = 0
         self._passes = 1
         self._vain_passes = 0
@@ -118,6 +119,12 @@ class Download(Operation[None]):
     @property
     def received(self) -> int:
         return len(self.names)
+
+    @property
+    def lost(self) -> int:
+        """Values that the list should have brought and did not: how many of its indices had to be asked for one
+        by one, or by another pass. What comes late counts as lost once it was asked for."""
+        return len(self._lost)
 
     @property
     def missing(self) -> tuple[int, ...]:
@@ -297,6 +304,7 @@ class Download(Operation[None]):
         self._moves += 1
         self.count = count
         self.names.clear()
+        self._lost.clear()
         self.given_up.clear()
         self._holes.clear()
         self._front = self._jump = -1
@@ -317,6 +325,7 @@ class Download(Operation[None]):
                 if index not in self._asked and index not in self.given_up:
                     self._ask(index, now)
         elif self._another_pass_is_faster(count - len(self.names) - len(self.given_up)):
+            self._lost.update(self.missing)
             self._ask_for_another_pass(now)
         else:
             while len(self._asked) < MOST_ASKED and self._next < count:
@@ -335,6 +344,7 @@ class Download(Operation[None]):
         return by_reads > RELIST_GAIN * (self.count * self._gap + (trip.smoothed or trip.timeout))
 
     def _ask(self, index: int, now: float) -> None:
+        self._lost.add(index)
         read = self._asked[index] = self._reads.ask(index, now, urgent=False)
 
         def ended() -> None:

@@ -85,6 +85,10 @@ class FetchResult:
             the table moved during the download, and when the policy kept it from being asked.
         elapsed: seconds from the call to the end.
         notes: what else is worth knowing, in sentences.
+        lost: values that the list should have brought and did not, so that they had to be asked for one by
+            one or by listing again; 0 from the cache.
+        repeated: values that came although they had come before; 0 from the cache.
+        round_trip: the component's measured round trip in seconds, smoothed, or None.
     """
 
     system: int
@@ -97,6 +101,9 @@ class FetchResult:
     hash: int | None
     elapsed: float
     notes: tuple[str, ...] = ()
+    lost: int = 0
+    repeated: int = 0
+    round_trip: float | None = None
 
     @property
     def complete(self) -> bool:
@@ -388,7 +395,21 @@ class Fetch(Operation[FetchResult]):
         params = dict(self._table.params)
         received = count - len(missing)
         elapsed = now - self.begun_at
-        return FetchResult(*self._target, params, source, count, received, missing, confirmed, elapsed, notes)
+        download = self.download
+        return FetchResult(
+            *self._target,
+            params,
+            source,
+            count,
+            received,
+            missing,
+            confirmed,
+            elapsed,
+            notes,
+            lost=0 if download is None else download.lost,
+            repeated=0 if download is None else download.repeated,
+            round_trip=self._round_trip.smoothed,
+        )
 
     def _drop(self) -> None:
         read, self._hash_read = self._hash_read, None
