@@ -25,6 +25,7 @@ from paramclient.params import ParamMap
 from paramclient.protocol.fetch import FetchResult, Policy, Progress
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
+from paramclient.protocol.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport
 from paramclient.protocol.writes import SetResult
 from paramclient.values import Encoding, Param, ParamType, Trust
 from paramclient.version import __version__
@@ -37,6 +38,7 @@ __all__ = [
     "Changes",
     "ClientClosed",
     "Component",
+    "ComponentTraffic",
     "Encoding",
     "Event",
     "Events",
@@ -48,6 +50,7 @@ __all__ = [
     "Identity",
     "LinkError",
     "Lost",
+    "MessageTraffic",
     "NoReply",
     "Param",
     "ParamCache",
@@ -59,10 +62,12 @@ __all__ = [
     "Policy",
     "Progress",
     "Rebooted",
+    "RadioStatus",
     "Refused",
     "Resynced",
     "SetResult",
     "SyncState",
+    "TrafficReport",
     "Trust",
     "TypeMismatch",
     "UnknownParameter",

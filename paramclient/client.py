@@ -24,16 +24,15 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import (
     ComponentHeard,
     ComponentIdentified,
+    Event,
     Fetched,
     ParamChanged,
     TableResynced,
 )
-from paramclient.protocol.events import (
-    Event as Event,
-)
 from paramclient.protocol.fetch import Policy, Progress
 from paramclient.protocol.station import Address, Station
 from paramclient.protocol.sync import Upkeep
+from paramclient.protocol.traffic import TrafficReport
 from paramclient.together import FetchedAll, FetchTogether
 from paramclient.values import Encoding
 from paramclient.writethrough import FLUSH_INTERVAL, RETRY_INTERVAL, WriteThrough
@@ -92,6 +91,8 @@ class ParamClient:
         policy: what may be asked of vehicles to bring tables up to date, see `Policy`: "auto", "hash-only"
             or "cache-only". Anything but "auto" also ends the watch. Single reads and writes go out all the
             same.
+        traffic: whether to count everything that is heard, for `traffic_report`. That takes time for each
+            frame, also of those that a client otherwise steps over.
 
     Attributes:
         cache: where tables are kept, or None.
@@ -112,6 +113,7 @@ class ParamClient:
         encoding: Encoding | None = None,
         watch_interval: float | None = None,
         policy: Policy | str = Policy.AUTO,
+        traffic: bool = False,
     ) -> None:
         for number in (system, component):
             if not 1 <= number <= 255:
@@ -131,6 +133,7 @@ class ParamClient:
             component=component,
             encoding=encoding,
             upkeep=Upkeep.chosen(watch_interval, policy),
+            counts_traffic=traffic,
         )
         self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self._components: dict[Address, Component] = {}
@@ -319,6 +322,18 @@ class ParamClient:
             attempts = max((error.attempts for error in fetched.silent.values()), default=0)
             raise NoReply(f"the parameters of {whose}", attempts=attempts, waited=now - began)
         return fetched
+
+    def traffic_report(self) -> TrafficReport:
+        """What has gone over the link so far: who was heard, how fast, and what was lost on the way.
+
+        Raises:
+            UsageError: the client was made without `traffic=True`.
+            LinkError: the link failed, or the client was closed.
+        """
+        if self._station.traffic is None:
+            raise UsageError("nothing is counted; use ParamClient(..., traffic=True)")
+        self._check_open()
+        return self._station.traffic.report(anyio.current_time())
 
     # the tasks
 

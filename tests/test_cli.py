@@ -564,6 +564,151 @@ def test_watch_tells_what_has_changed_since_the_cache_was_written(
     assert (change["name"], change["old"], change["new"]) == ("B", 2, 3)
 
 
+# link
+
+LINK_KEYS = [
+    *("link", "seconds", "bytes_received", "bytes_sent", "received_per_s", "sent_per_s"),
+    *("frames", "unknown", "damaged", "other_bytes", "components"),
+]
+HEARD_KEYS = [
+    *("system", "component", "mavlink", "autopilot", "type", "state", "heartbeat_age_s", "age_s"),
+    *("frames", "bytes", "frames_per_s", "bytes_per_s", "lost", "loss", "repeated", "late", "signed"),
+    *("round_trip_s", "messages", "radio"),
+]
+
+
+def test_link_prints_one_object_with_exactly_these_keys(command: Command) -> None:
+    with simulated("px4", "--system", "7", "--delay", "0.02", "--bit-errors", "0.0001") as url:
+        heard = command("link", url, "--json", "--seconds", 3)
+    assert (heard.code, heard.err) == (0, "")
+    assert list(heard.json) == LINK_KEYS
+    assert heard.json["link"] == url
+    assert 2.5 <= heard.json["seconds"] < 10
+    assert 21 * 3 <= heard.json["bytes_sent"] < 1000
+    [component] = heard.json["components"]
+    assert list(component) == HEARD_KEYS
+    assert (component["system"], component["component"], component["mavlink"]) == (7, 1, 2)
+    assert (component["autopilot"], component["type"], component["state"]) == ("px4", "quadrotor", "standby")
+    assert 0 <= component["age_s"] <= component["heartbeat_age_s"] < heard.json["seconds"]
+    assert 0.03 < component["round_trip_s"] < 2
+    beats = component["messages"]["HEARTBEAT"]
+    assert beats["id"] == 0
+    assert 1 <= beats["count"] <= component["frames"] <= heard.json["frames"]
+    assert component["radio"] is None
+
+
+class Modem(PX4Vehicle):
+    """A vehicle with a telemetry radio, and with a message that no dialect has."""
+
+    def data_to_send(self) -> list[bytes]:
+        frames = super().data_to_send()
+        if frames:
+            status = b"\x03\x00\x02\x00\xc8\xbe\x60\x28\x2a"
+            frames.append(wire.build_frame(109, status, system=51, component=68, sequence=0))
+            frames.append(b"\xfd\x01\x00\x00\x00\x33\x44\xff\xff\x7f" + b"abc")
+        return frames
+
+
+def test_people_see_what_is_heard(command: Command, put: Callable[[Endpoint], str]) -> None:
+    heard = command("link", put(Modem(telemetry=20)), "--seconds", 2)
+    assert (heard.code, heard.err) == (0, "")
+    lines = heard.out.splitlines()
+    assert re.split("  +", lines[0]) == [
+        *("from", "what", "v", "frames/s", "bytes/s", "loss", "round trip", "heartbeat")
+    ]
+    assert re.fullmatch(r"1/1 +px4 quadrotor +2 +[0-9.]+ +[0-9,]+ +0\.0% +[0-9.]+ ms +[0-9.]+ s", lines[1])
+    assert re.match(r"51/68 +radio +2 +[0-9.]+ ", lines[2])
+    assert lines[3] == ""
+    assert re.match(r"1/1 standby: ATTITUDE [0-9.]+/s, HEARTBEAT [0-9.]+/s, ", lines[4])
+    assert re.match(r"51/68: RADIO_STATUS [0-9.]+/s, UNKNOWN_8388607 [0-9.]+/s$", lines[5])
+    assert lines[6] == (
+        "  signal 200 here, 190 there; noise 40 and 42; buffer 96 % free; 3 packets with errors, 2 corrected"
+    )
+    assert lines[7] == ""
+    assert re.fullmatch(r"sim:custom, [0-9.]+ s: [0-9,]+ bytes/s received, [0-9,]+ sent", lines[8])
+    assert re.fullmatch(
+        r"[0-9,]+ frames, 0 lost, 0 with a wrong checksum, [1-9][0-9]* of unknown ids, 0 signed; "
+        r"0 other bytes",
+        lines[9],
+    )
+    assert len(lines) == 10
+
+
+def test_a_link_on_which_nothing_is_heard_is_code_3(command: Command, put: Callable[..., str]) -> None:
+    silent = command("link", "udpin:127.0.0.1:0", "--seconds", 0.3, "--json")
+    assert (silent.code, silent.out) == (3, "")
+    assert re.fullmatch(r"paramclient: no reply: anything on udpin:127\.0\.0\.1:0 in [0-9.]+ s\n", silent.err)
+
+    class Noise(SimLink):
+        async def receive(self) -> list[tuple[Peer, bytes]]:
+            return [(peer, b"x" * len(data)) for peer, data in await super().receive()]
+
+    noisy = command("link", put(Noise(PX4Vehicle())), "--seconds", 0.3)
+    assert (noisy.code, noisy.out) == (3, "")
+    assert re.search(r"anything on sim:custom \(but [0-9,]+ other bytes\) in", noisy.err)
+
+
+def test_a_link_that_fails_while_it_is_looked_at_is_code_4(command: Command, put: Callable[..., str]) -> None:
+    class Failing(SimLink):
+        async def receive(self) -> list[tuple[Peer, bytes]]:
+            raise LinkError(f"{self.name}: gone", link=self.name)
+
+    failed = command("link", put(Failing(PX4Vehicle())), "--seconds", PATIENCE)
+    assert (failed.code, failed.out, failed.err) == (4, "", "paramclient: sim:custom: gone\n")
+
+
+def test_the_round_trip_is_measured_where_nobody_says_who_he_is(
+    command: Command, put: Callable[[Endpoint], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Shy(PX4Vehicle):
+        def _on_command(self, *_: object) -> None:
+            pass
+
+    monkeypatch.setattr("paramclient.cli.link.FIRST_MEASURE", 0.2)
+    vehicle = Shy()
+    heard = command("link", put(vehicle), "--seconds", 2, "--json")
+    [component] = heard.json["components"]
+    assert vehicle.requests["PARAM_REQUEST_READ"] == 1
+    assert 0 <= component["round_trip_s"] < 1
+
+
+def test_link_is_live_on_a_terminal() -> None:
+    shown = on_terminal("link", "sim:px4", "--seconds", 1.5, COLUMNS="80")
+    assert shown.code == 0
+    assert shown.out.count("round trip") >= 3
+    assert shown.out.count("\x1b[?25l") == shown.out.count("\x1b[?25h") > 0  # the cursor is back
+    *_, last = shown.out.split("heartbeat")
+    assert "px4 quadrotor" in last  # and the last table stands
+    assert "1/1 standby: " in last
+    waiting = on_terminal("link", "udpin:127.0.0.1:0", "--seconds", 0.5)
+    assert waiting.code == 3
+    assert "nothing heard yet: udpin:127.0.0.1:0" in waiting.out
+    one = on_terminal("link", "sim:px4", "--seconds", 1, "--json")
+    assert strict(one.out)["components"][0]["system"] == 1
+
+
+def test_a_live_link_ends_with_ctrl_c() -> None:
+    ours, theirs = pty.openpty()
+    try:
+        with process("link", "sim:px4", stdout=theirs, env={**PLAIN, "TERM": "xterm"}) as looking:
+            os.close(theirs)
+            printed = b""
+            while b"1/1 standby" not in printed:
+                assert select.select([ours], [], [], PATIENCE)[0]
+                printed += os.read(ours, 65536)
+            looking.send_signal(signal.SIGINT)
+            while select.select([ours], [], [], PATIENCE)[0]:
+                try:
+                    printed += os.read(ours, 65536)
+                except OSError:
+                    break
+            assert (looking.wait(PATIENCE), looking.stderr and looking.stderr.read()) == (130, "")
+        *_, last = printed.decode().split("heartbeat")
+        assert "1/1 standby: " in last
+    finally:
+        os.close(ours)
+
+
 # with no link
 
 
@@ -955,7 +1100,11 @@ def test_the_module_is_the_command() -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [[], *([name] for name in ("fetch", "get", "set", "watch", "show", "sim", "cache")), ["cache", "list"]],
+    [
+        [],
+        *([name] for name in ("fetch", "get", "set", "watch", "link", "show", "sim", "cache")),
+        ["cache", "list"],
+    ],
     ids=" ".join,
 )
 def test_help_has_examples(command: Command, arguments: Sequence[str]) -> None:

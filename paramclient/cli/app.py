@@ -14,6 +14,7 @@ from typing import Final
 import anyio
 from cyclopts import App, CycloptsError, Parameter
 
+from paramclient.cli.link import link
 from paramclient.cli.offline import cache_history, cache_list, cache_path, cache_remove, show
 from paramclient.cli.outcome import ExitCode, code_of
 from paramclient.cli.output import report
@@ -151,6 +152,9 @@ _app.command(
     watch,
     usage="Usage: paramclient watch [OPTIONS] URL [NAME...]",
     help_epilogue=_examples("watch udpin:0.0.0.0:14550", "watch udpin:0.0.0.0:14550 MC_ROLL_P --json"),
+)
+_app.command(
+    link, help_epilogue=_examples("link udpin:0.0.0.0:14550", "link udpin:0.0.0.0:14550 --seconds 10 --json")
 )
 _app.command(
     show,

@@ -13,7 +13,7 @@ from cyclopts.validators import Number
 from paramclient.errors import UsageError
 from paramclient.values import Encoding
 
-__all__ = ["CacheOptions", "Id", "LinkOptions"]
+__all__ = ["CacheOptions", "Id", "LinkOptions", "Seconds"]
 
 Id: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))]
 """A system or component id."""
@@ -22,6 +22,10 @@ Id: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255)
 def _check_seconds(_: object, seconds: float | None) -> None:
     if seconds is not None and not 0 < seconds < math.inf:
         raise ValueError("It is a number of seconds above 0.")
+
+
+Seconds: TypeAlias = Annotated[float | None, Parameter(validator=_check_seconds)]
+"""A time limit."""
 
 
 @Parameter(name="*")
@@ -50,7 +54,7 @@ class LinkOptions:
     component: Id = None
     """The component to speak to, 1 to 255. Without it, the autopilot."""
 
-    timeout: Annotated[float | None, Parameter(validator=_check_seconds)] = None
+    timeout: Seconds = None
     """Seconds for everything together. Without it, 10 to hear the vehicle, then as many as it takes."""
 
     encoding: Encoding | None = None

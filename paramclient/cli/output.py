@@ -9,19 +9,23 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
-from typing import Any, Final
+from typing import TYPE_CHECKING, Any, Final
 
 from paramclient.protocol.fetch import Progress
 from paramclient.values import Param, ParamType, Value, format_value, shortest_float, type_name
+
+if TYPE_CHECKING:
+    from rich.table import Table
 
 __all__ = [
     "as_json",
     "bits_text",
     "by_index",
     "hash_text",
+    "live_view",
     "milliseconds",
     "param_json",
     "print_json",
@@ -136,20 +140,32 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
         right: the headings of the columns that are aligned to the right.
     """
     from rich.console import Console  # only here: not needed to get started
-    from rich.table import Table
-    from rich.text import Text
 
-    table = Table(box=None, pad_edge=False, header_style="bold")
-    for column in columns:
-        table.add_column(column, justify="right" if column in right.split() else "left", overflow="fold")
-    for row in rows:
-        table.add_row(*(Text("" if cell is None else printable(str(cell))) for cell in row))
+    table = _table(columns, rows, right.split())
     console = Console(width=None if sys.stdout.isatty() else UNLIMITED)
     # rich would end the process by itself when the output is closed
     with console.capture() as captured:
         console.print(table)
     lines = [line.rstrip() for line in captured.get().splitlines()]
     print(*lines, sep="\n", flush=True)
+
+
+@contextmanager
+def live_view() -> Iterator[Callable[[Sequence[str], Iterable[Sequence[object]], Iterable[str]], None]]:
+    """What draws a table with lines below it, each time in the place of the one before, for the time of the
+    block. The last one stays. All columns but the first two are aligned to the right.
+    """
+    from rich.console import Console, Group  # only here: not needed to get started
+    from rich.live import Live
+    from rich.text import Text
+
+    with Live(console=Console(), auto_refresh=False) as live:
+
+        def draw(columns: Sequence[str], rows: Iterable[Sequence[object]], lines: Iterable[str]) -> None:
+            below = [Text(printable(line)) for line in lines]
+            live.update(Group(_table(columns, rows, columns[2:]), *below), refresh=True)
+
+        yield draw
 
 
 def report(text: str) -> None:
@@ -217,6 +233,18 @@ def _start_bar(title: str, stack: ExitStack) -> Callable[[Progress], None]:
         )
 
     return update
+
+
+def _table(columns: Sequence[str], rows: Iterable[Sequence[object]], right: Container[str]) -> Table:
+    from rich.table import Table  # only here: not needed to get started
+    from rich.text import Text
+
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in columns:
+        table.add_column(column, justify="right" if column in right else "left", overflow="fold")
+    for row in rows:
+        table.add_row(*(Text("" if cell is None else printable(str(cell))) for cell in row))
+    return table
 
 
 def _escaped(character: str) -> str:

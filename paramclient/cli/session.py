@@ -13,7 +13,7 @@ from paramclient.cli.options import LinkOptions
 from paramclient.client import ParamClient
 from paramclient.component import Component
 
-__all__ = ["Deadline", "Session", "connect"]
+__all__ = ["Deadline", "Session", "connect", "listen"]
 
 HEARING_PATIENCE: Final = 10.0
 """Seconds for a vehicle to be heard, where the user sets no limit."""
@@ -66,3 +66,8 @@ async def connect(url: str, options: LinkOptions) -> AsyncIterator[Session]:
         patience = HEARING_PATIENCE if options.timeout is None else deadline.left()
         component = await client.component(options.system, options.component, timeout=patience)
         yield Session(client, component, deadline)
+
+
+def listen(url: str) -> ParamClient:
+    """A client that counts everything it hears, and neither reads nor writes a cache."""
+    return ParamClient(url, cache=False, traffic=True)

@@ -122,8 +122,11 @@ class Download(Operation[None]):
 
     @property
     def lost(self) -> int:
-        """Values that the list should have brought and did not: how many of its indices had to be asked for one
-        by one, or by another pass. What comes late counts as lost once it was asked for."""
+        """Values that the list should have brought and did not.
+
+        So many of its indices had to be asked for one by one, or by another pass. What comes late counts as
+        lost once it was asked for.
+        """
         return len(self._lost)
 
     @property

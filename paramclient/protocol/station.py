@@ -12,6 +12,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentHeard, Event
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.sync import Upkeep
+from paramclient.protocol.traffic import Traffic
 from paramclient.protocol.wire import (
     AUTOPILOT_COMPONENT,
     COMP_ID_ALL,
@@ -61,10 +62,12 @@ class Station:
         system, component: who we are.
         encoding: for all components, where the user knows better; None: judged by the evidence.
         upkeep: what is done for tables without being asked; by default nothing.
+        counts_traffic: whether everything on the link is counted, which takes time for each frame.
 
     Attributes:
         components: every component heard, by (system, component).
         bytes_received, bytes_sent: on this link, by this station.
+        traffic: the counts, or None where they are not wanted.
     """
 
     def __init__(
@@ -76,7 +79,9 @@ class Station:
         component: int = 190,
         encoding: Encoding | None = None,
         upkeep: Upkeep | None = None,
+        counts_traffic: bool = False,
     ) -> None:
+        self.traffic = Traffic(is_stream=is_stream) if counts_traffic else None
         self.link = link
         self.own: Address = (system, component)
         self.components: dict[Address, ComponentMachine] = {}
@@ -100,6 +105,8 @@ class Station:
         Gives whether there was anything of interest in it; all that is not telemetry is.
         """
         self.bytes_received += len(data)
+        if self.traffic is not None:
+            self.traffic.receive(data, peer, now)
         frames = self._cut_stream(data, peer) if self._is_stream else self._framer.receive(data)
         for frame in frames:
             number, system, component, _, payload, version = frame
@@ -124,6 +131,8 @@ class Station:
         for machine in list(self.components.values()):
             if machine.next_deadline() <= now:
                 machine.tick(now)
+        if self.traffic is not None:
+            self.traffic.sent(self.bytes_sent, now)
 
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity while the link is away."""
@@ -147,6 +156,8 @@ class Station:
         self._is_paused = True
         self._outbox.clear()
         self._framers.clear()
+        if self.traffic is not None:
+            self.traffic.pause()
         self._peers.clear()  # the link that comes back has others
 
     def resume(self, now: float) -> None:

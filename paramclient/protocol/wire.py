@@ -34,9 +34,12 @@ __all__ = [
     "StatusText",
     "SystemTime",
     "build_frame",
+    "checksum",
     "decode",
     "decode_param_value",
     "encode",
+    "enum_word",
+    "message_name",
 ]
 
 NO_INDEX: Final = 65535
@@ -366,6 +369,26 @@ def build_frame(
         magic = b"\xfd"
     crc: int = mcrf4xx(body + bytes((_CRC_EXTRA[message_id],)))
     return magic + body + crc.to_bytes(2, "little")
+
+
+def checksum(message_id: int, body: bytes) -> int | None:
+    """The checksum of a frame's bytes between its first one and the checksum; None for an unknown id."""
+    extra = _CRC_EXTRA.get(message_id)
+    return None if extra is None else int(mcrf4xx(body + bytes((extra,))))
+
+
+def message_name(message_id: int) -> str:
+    """`HEARTBEAT` for 0, and so on; `UNKNOWN_4711` for an id that the dialect does not have."""
+    known = dialect.mavlink_map.get(message_id)
+    return f"UNKNOWN_{message_id}" if known is None else str(known.msgname)
+
+
+def enum_word(enum: str, number: int) -> str:
+    """A number of one of the dialect's enums in words, `fixed wing` for 1 of MAV_TYPE; else the number."""
+    entry = dialect.enums[enum].get(number)
+    return (
+        str(number) if entry is None else str(entry.name.removeprefix(f"{enum}_").lower().replace("_", " "))
+    )
 
 
 @lru_cache(maxsize=4096)

@@ -1,0 +1,243 @@
+"""The command that looks at the link itself: link."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Awaitable, Callable, Iterator
+from contextlib import suppress
+from dataclasses import asdict
+from typing import Any, Final
+
+import anyio
+
+from paramclient.cli.options import Seconds
+from paramclient.cli.outcome import ExitCode
+from paramclient.cli.output import live_view, milliseconds, print_json, print_line, print_table, rounded
+from paramclient.cli.session import Deadline, listen
+from paramclient.client import ParamClient
+from paramclient.component import Component
+from paramclient.errors import NoReply, ParamClientError
+from paramclient.identity import autopilot_name
+from paramclient.protocol.traffic import ComponentTraffic, TrafficReport
+from paramclient.protocol.wire import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, enum_word
+
+__all__ = ["link"]
+
+LISTENING_TIME: Final = 5.0
+"""Seconds to listen where no terminal shows it live and the user sets no limit."""
+REFRESH_INTERVAL: Final = 0.25
+"""Seconds between two looks."""
+MOST_MESSAGES: Final = 5
+"""Kinds of messages that are named to people, for each component."""
+FIRST_MEASURE: Final = 2.0
+MEASURE_INTERVAL: Final = 4.0
+"""Seconds until the round trip is measured by reading a value, and between two such reads: request and answer
+together take less of the link than our heartbeats."""
+NO_AUTOPILOT: Final = ("unknown", autopilot_name(MAV_AUTOPILOT_INVALID))
+
+
+async def link(url: str, /, *, seconds: Seconds = None, json: bool = False) -> int:
+    """Print who is heard on a link, how much comes, and what is lost on the way.
+
+    On a terminal the table is live until Ctrl-C. Elsewhere, and with --json, it is printed once, after
+    --seconds or 5. Loss is counted by the gaps in the frames' sequence numbers.
+
+    Args:
+        url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
+        seconds: How long to listen.
+        json: Print JSON, for programs.
+    """
+    is_live = sys.stdout.isatty() and not json
+    deadline = Deadline(seconds if is_live or seconds is not None else LISTENING_TIME)
+    async with listen(url) as client:
+        report = await _while_measuring(client, _show if is_live else _listen, deadline)
+    if not report.frames:
+        noise = f" (but {report.bytes_received:,} other bytes)" if report.bytes_received else ""
+        raise NoReply(f"anything on {client.link.name}{noise}", attempts=0, waited=report.seconds)
+    if json:
+        print_json(_as_json(client, report))
+    elif not is_live:
+        print_table(_COLUMNS, _rows(client, report), right=" ".join(_COLUMNS[2:]))
+        for line in _lines(client, report):
+            print_line(line)
+    return ExitCode.DONE
+
+
+async def _while_measuring(
+    client: ParamClient, look: Callable[[ParamClient, Deadline], Awaitable[TrafficReport]], deadline: Deadline
+) -> TrafficReport:
+    outcome: TrafficReport | Exception
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(_measure, client)
+        try:
+            outcome = await look(client, deadline)
+        except Exception as error:  # out of the group it would come wrapped
+            outcome = error
+        tasks.cancel_scope.cancel()
+    if isinstance(outcome, Exception):
+        raise outcome
+    return outcome
+
+
+async def _listen(client: ParamClient, deadline: Deadline) -> TrafficReport:
+    while left := deadline.left(REFRESH_INTERVAL):
+        client.traffic_report()  # a link that fails ends it
+        await anyio.sleep(left)
+    return client.traffic_report()
+
+
+async def _show(client: ParamClient, deadline: Deadline) -> TrafficReport:
+    with live_view() as draw:
+        while True:
+            report = client.traffic_report()
+            if report.frames:
+                draw(_COLUMNS, _rows(client, report), _lines(client, report))
+            else:
+                draw(_COLUMNS, (), ["", f"nothing heard yet: {_pace(client, report)}"])
+            left = deadline.left(REFRESH_INTERVAL)
+            if not left:
+                return report
+            await anyio.sleep(left)
+
+
+async def _measure(client: ParamClient) -> None:
+    """Keep the round trips up to date: each autopilot is asked for a value now and then."""
+    await anyio.sleep(FIRST_MEASURE)
+    async with anyio.create_task_group() as tasks:
+        while True:
+            for component in client.components.values():
+                if component.autopilot not in NO_AUTOPILOT:
+                    tasks.start_soon(_read_a_value, component)
+            await anyio.sleep(MEASURE_INTERVAL)
+
+
+async def _read_a_value(component: Component) -> None:
+    with suppress(ParamClientError):
+        await component.get(0, timeout=MEASURE_INTERVAL)
+
+
+# for people
+
+_COLUMNS: Final = ("from", "what", "v", "frames/s", "bytes/s", "loss", "round trip", "heartbeat")
+
+
+def _rows(client: ParamClient, report: TrafficReport) -> Iterator[tuple[object, ...]]:
+    for each in report.components:
+        trip = _round_trip(client, each)
+        yield (
+            f"{each.system}/{each.component}",
+            _what(each),
+            each.version,
+            f"{each.frame_rate:.1f}",
+            f"{each.byte_rate:,.0f}",
+            None if each.loss is None else f"{each.loss:.1%}",
+            None if trip is None else milliseconds(trip),
+            None if each.heartbeat_age is None else f"{each.heartbeat_age:.1f} s",
+        )
+
+
+def _lines(client: ParamClient, report: TrafficReport) -> Iterator[str]:
+    yield ""
+    for each in report.components:
+        state = "" if each.heartbeat is None else f" {_state(each.heartbeat.system_status)}"
+        current = [message for message in each.messages if message.rate]
+        shown = [f"{message.name} {message.rate:.1f}/s" for message in current[:MOST_MESSAGES]]
+        more = len(current) - len(shown)
+        kinds = f"{', '.join(shown)}{f' and {more} more' if more else ''}" if shown else "silent"
+        yield f"{each.system}/{each.component}{state}: {kinds}"
+        if each.radio is not None:
+            yield (
+                f"  signal {each.radio.rssi} here, {each.radio.remote_rssi} there; "
+                f"noise {each.radio.noise} and {each.radio.remote_noise}; buffer {each.radio.free} % free; "
+                f"{each.radio.errors} packets with errors, {each.radio.fixed} corrected"
+            )
+    yield ""
+    yield _pace(client, report)
+    signed = sum(each.signed for each in report.components)
+    lost = sum(each.lost for each in report.components)
+    yield (
+        f"{report.frames:,} frames, {lost:,} lost, {report.damaged:,} with a wrong checksum, "
+        f"{report.unknown:,} of unknown ids, {signed:,} signed; {report.other_bytes:,} other bytes"
+    )
+
+
+def _pace(client: ParamClient, report: TrafficReport) -> str:
+    return (
+        f"{client.link.name}, {report.seconds:.1f} s: "
+        f"{report.received_rate:,.0f} bytes/s received, {report.sent_rate:,.0f} sent"
+    )
+
+
+def _what(each: ComponentTraffic) -> str:
+    beat = each.heartbeat
+    if beat is None:
+        return "radio" if each.radio is not None else ""
+    words = [_type(beat.type)]
+    if beat.autopilot != MAV_AUTOPILOT_INVALID:
+        words.insert(0, autopilot_name(beat.autopilot))
+    return " ".join(dict.fromkeys(words))
+
+
+def _type(number: int) -> str:
+    return "ground station" if number == MAV_TYPE_GCS else enum_word("MAV_TYPE", number)
+
+
+def _state(number: int) -> str:
+    return enum_word("MAV_STATE", number)
+
+
+# for programs
+
+
+def _as_json(client: ParamClient, report: TrafficReport) -> dict[str, Any]:
+    return {
+        "link": client.link.name,
+        "seconds": round(report.seconds, 3),
+        "bytes_received": report.bytes_received,
+        "bytes_sent": report.bytes_sent,
+        "received_per_s": round(report.received_rate, 1),
+        "sent_per_s": round(report.sent_rate, 1),
+        "frames": report.frames,
+        "unknown": report.unknown,
+        "damaged": report.damaged,
+        "other_bytes": report.other_bytes,
+        "components": [_component_json(client, each) for each in report.components],
+    }
+
+
+def _component_json(client: ParamClient, each: ComponentTraffic) -> dict[str, Any]:
+    beat = each.heartbeat
+    return {
+        "system": each.system,
+        "component": each.component,
+        "mavlink": each.version,
+        "autopilot": None if beat is None else autopilot_name(beat.autopilot),
+        "type": None if beat is None else _type(beat.type),
+        "state": None if beat is None else _state(beat.system_status),
+        "heartbeat_age_s": rounded(each.heartbeat_age),
+        "age_s": rounded(each.age),
+        "frames": each.frames,
+        "bytes": each.bytes,
+        "frames_per_s": round(each.frame_rate, 2),
+        "bytes_per_s": round(each.byte_rate, 1),
+        "lost": each.lost,
+        "loss": None if each.loss is None else round(each.loss, 4),
+        "repeated": each.repeated,
+        "late": each.late,
+        "signed": each.signed,
+        "round_trip_s": rounded(_round_trip(client, each)),
+        "messages": {
+            message.name: {
+                "id": message.message_id,
+                "count": message.count,
+                "per_s": round(message.rate, 2),
+            }
+            for message in each.messages
+        },
+        "radio": None if each.radio is None else asdict(each.radio),
+    }
+
+
+def _round_trip(client: ParamClient, each: ComponentTraffic) -> float | None:
+    component = client.components.get((each.system, each.component))
+    return None if component is None else component.round_trip

@@ -1,0 +1,146 @@
+"""Everything that goes over a link, what cannot be used included: frames, damaged frames, and other bytes.
+
+`Framer` gives out what is proven and passes over the rest as fast as it can. Here the rest counts too, and
+speed does not matter: this runs only where somebody wants to look at the link itself.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Final, NamedTuple
+
+from paramclient.protocol.wire import checksum
+
+__all__ = ["Seen", "Sniffer"]
+
+MOST_KEPT: Final = 4096
+"""Bytes of a stream in which nothing was proven that are kept to see what follows them."""
+
+_MAGIC_V1 = 0xFE
+_MAGIC_V2 = 0xFD
+_MAGIC = re.compile(b"[\xfd\xfe]").search
+_SIGNED = 0x01
+_SIGNATURE_LENGTH = 13
+
+
+class Seen(NamedTuple):
+    """One frame.
+
+    Attributes:
+        message_id, system, component, sequence, payload, version: as in `Frame`.
+        size: of the whole frame, in bytes.
+        is_signed: whether it carries a signature, which is not verified.
+        is_known: false for an id that the dialect does not have, so that no checksum proves the frame.
+    """
+
+    message_id: int
+    system: int
+    component: int
+    sequence: int
+    payload: bytes
+    version: int
+    size: int
+    is_signed: bool
+    is_known: bool
+
+
+class Sniffer:
+    """Finds every frame in what a link delivers, and accounts for each other byte.
+
+    What stands between two proven frames is explained from its beginning: a whole frame with a known id is
+    one with a wrong checksum; one with an unknown id counts as a frame when another one, or the end, follows
+    right behind it; whatever is neither is other bytes.
+
+    Args:
+        stream: whether a frame may be spread over several calls; see `Framer`.
+
+    Attributes:
+        damaged: frames with a wrong checksum.
+        other_bytes: bytes that belong to no frame.
+    """
+
+    def __init__(self, *, stream: bool) -> None:
+        self.damaged = 0
+        self.other_bytes = 0
+        self._stream = stream
+        self._tail = b""
+
+    def receive(self, data: bytes) -> list[Seen]:
+        """Take bytes from the link; give the frames that are told by now, in order."""
+        seen, rest = self._scan(self._tail + data, final=not self._stream)
+        self._tail = rest
+        return seen
+
+    def flush(self) -> list[Seen]:
+        """The stream has ended or was interrupted: give what stands in its unfinished end."""
+        seen, self._tail = self._scan(self._tail, final=True)
+        return seen
+
+    def _scan(self, data: bytes, *, final: bool) -> tuple[list[Seen], bytes]:
+        """The frames in `data`, and what of its end is to be looked at again when more has come."""
+        seen: list[Seen] = []
+        explained = at = 0
+        while (found := _MAGIC(data, at)) is not None:
+            at = found.start()
+            frame = _frame_at(data, at)
+            if frame is None or at + frame.size > len(data):
+                if not final and (frame is None or frame.is_known):
+                    break
+            elif frame.is_known and _is_proven(data, at, frame):
+                seen += self._explain(data[explained:at])
+                seen.append(frame)
+                explained = at = at + frame.size
+                continue
+            at += 1
+        else:
+            at = len(data)
+        if final or at - explained > MOST_KEPT:
+            seen += self._explain(data[explained:at])
+            explained = at
+        return seen, data[explained:]
+
+    def _explain(self, gap: bytes) -> list[Seen]:
+        """What stands between two proven frames: those that nothing proves are given."""
+        seen: list[Seen] = []
+        at = 0
+        while at < len(gap):
+            frame = _frame_at(gap, at)
+            end = len(gap) + 1 if frame is None else at + frame.size
+            if frame is not None and frame.is_known and end <= len(gap):
+                self.damaged += 1
+            elif frame is not None and (end == len(gap) or gap[end : end + 1] in _MAGICS):
+                seen.append(frame)
+            else:
+                found = _MAGIC(gap, at + 1)
+                end = len(gap) if found is None else found.start()
+                self.other_bytes += end - at
+            at = end
+        return seen
+
+
+_MAGICS = (bytes((_MAGIC_V1,)), bytes((_MAGIC_V2,)))
+
+
+def _frame_at(data: bytes, at: int) -> Seen | None:
+    """What the header there says, true or not; None where it is none or is cut off by the end."""
+    magic = data[at]
+    if magic == _MAGIC_V1 and at + 6 <= len(data):
+        size, sequence, system, component, message_id = data[at + 1 : at + 6]
+        payload = data[at + 6 : at + 6 + size]
+        known = checksum(message_id, b"") is not None
+        return Seen(message_id, system, component, sequence, payload, 1, size + 8, False, known)
+    if magic == _MAGIC_V2 and at + 10 <= len(data):
+        size, flags, _, sequence, system, component = data[at + 1 : at + 7]
+        message_id = int.from_bytes(data[at + 7 : at + 10], "little")
+        payload = data[at + 10 : at + 10 + size]
+        whole = size + 12 + (_SIGNATURE_LENGTH if flags else 0)
+        known = flags in (0, _SIGNED) and checksum(message_id, b"") is not None
+        return Seen(message_id, system, component, sequence, payload, 2, whole, flags == _SIGNED, known)
+    return None
+
+
+def _is_proven(data: bytes, at: int, frame: Seen) -> bool:
+    crc_at = at + frame.size - 2 - (_SIGNATURE_LENGTH if frame.is_signed else 0)
+    return checksum(frame.message_id, data[at + 1 : crc_at]) == int.from_bytes(
+        data[crc_at : crc_at + 2], "little"
+    )
