@@ -232,6 +232,24 @@ def test_after_a_silence_a_jump_tells_of_nothing(before: int, first: int, after:
     assert check.lost <= SURE_GAP
 
 
+def test_what_comes_late_and_twice_is_both() -> None:
+    check = check_of([0, 2, 1, 1])
+    assert (check.lost, check.late, check.repeated) == (0, 1, 1)
+
+
+def test_what_was_not_lost_between_two_numberings_cannot_come_late() -> None:
+    check = check_of([0, 40, 1, 39])
+    assert (check.lost, check.late, check.repeated) == (0, 0, 1)
+    assert check_of([0, 40, 39, 1]).lost == 0
+
+
+def test_what_came_before_several_gaps_is_forgotten() -> None:
+    check = check_of(
+        [*range(6), *range(50, 56), *range(100, 261), 263, 264]
+    )  # 261 is 5, the end of the first
+    assert check.lost == 44 + 44 + 2
+
+
 def test_a_jump_back_by_a_little_is_none() -> None:
     check = check_of([*range(12), *range(100)])
     assert check.lost == 0
@@ -326,6 +344,24 @@ def test_what_comes_twice_does_not_hide_what_is_lost() -> None:
     assert component.loss == pytest.approx(0.5, abs=0.01)
 
 
+def test_a_frame_that_comes_late_makes_no_loss_negative() -> None:
+    traffic = Traffic(is_stream=False)
+    for sequence, now in ((0, 0.0), (2, 0.1), (1, 4 * WINDOW), (3, 4 * WINDOW)):
+        traffic.receive(frame(30, sequence), "peer", now)
+    assert only(traffic.report(4 * WINDOW)).loss == 0.0
+
+
+def test_a_heartbeat_in_a_format_to_come_is_not_read() -> None:
+    traffic = Traffic(is_stream=False)
+    traffic.receive(heartbeat(0), "peer", 0.0)
+    strange = bytearray(heartbeat(1) + bytes(13))
+    strange[2] = 0x02
+    strange[10] ^= 0xFF
+    traffic.receive(bytes(strange), "peer", 0.0)
+    report = traffic.report(0.0)
+    assert (report.unknown, only(report).frames, only(report).heartbeat) == (1, 2, PX4)
+
+
 def test_frames_that_nothing_proves_count_where_the_sender_is_known() -> None:
     traffic = Traffic(is_stream=False)
     traffic.receive(unknown(0, system=77), "peer", 0.0)
@@ -370,13 +406,13 @@ def test_a_stream_is_followed_for_each_peer_and_its_end_counts() -> None:
     traffic.receive(one[:9], "one", 0.0)
     traffic.receive(two[:5], "two", 0.0)
     traffic.receive(one[9:], "one", 0.0)
-    traffic.receive(two[5:] + one[:4], "two", 0.0)
+    traffic.receive(two[5:] + damaged() + one[:4], "two", 0.0)
     traffic.receive(b"", "two", 0.0)
     traffic.receive(one[:3], "one", 0.0)
     traffic.pause()
     traffic.receive(one, "one", 0.0)
     report = traffic.report(0.0)
-    assert (report.frames, report.other_bytes) == (3, 7)
+    assert (report.frames, report.damaged, report.other_bytes) == (3, 1, 7)
 
 
 def test_what_others_can_stretch_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -412,6 +448,14 @@ def test_a_station_counts_only_where_that_is_wanted() -> None:
     assert only(report).frames == 2
     assert (report.seconds, report.bytes_sent) == (2.0, station.bytes_sent)
     assert station.bytes_sent > 21
+
+
+def test_a_link_that_comes_back_begins_anew() -> None:
+    station = Station(link="x", is_stream=True, counts_traffic=True)
+    assert station.traffic is not None
+    station.receive(heartbeat(1)[:10], "peer", 0.0)
+    station.pause()
+    assert station.traffic.report(0.0).other_bytes == 10
 
 
 @pytest.mark.parametrize("loss", [0.05, 0.3])

@@ -16,8 +16,6 @@ SILENCE: Final = 5.0
 after a reboot, or may have sent the numbers round and round."""
 PROBATION: Final = 32
 """Numbers after which the numbering before a jump counts as over, if nothing has continued it."""
-STALE: Final = 256
-"""Frames after which a numbering that nothing continues is forgotten."""
 MOST_NUMBERINGS: Final = 4
 """Numberings side by side: a vehicle counts for each of its own links, and a router may join those."""
 
@@ -25,15 +23,14 @@ MOST_NUMBERINGS: Final = 4
 class _Numbering:
     """One run of sequence numbers, each the successor of the one before but for what was lost."""
 
-    __slots__ = ("before", "gap", "last", "missing", "span", "used_at")
+    __slots__ = ("before", "gap", "last", "missing", "span")
 
-    def __init__(self, last: int, before: _Numbering | None, gap: int, used_at: int) -> None:
+    def __init__(self, last: int, before: _Numbering | None, gap: int) -> None:
         self.last = last
         self.missing = 0  # bit n: the number n + 1 before the last has not come
         self.before = before  # what it may be the continuation of, as long as that is open
         self.gap = gap  # what is counted as lost between the two
         self.span = 0  # numbers since the first
-        self.used_at = used_at
         self.skip(gap)
 
     def skip(self, gap: int) -> None:
@@ -64,14 +61,12 @@ class SequenceCheck:
         self.repeated = 0
         self.late = 0
         self._numberings: list[_Numbering] = []  # the one that was used last comes first
-        self._frames = 0
         self._heard_at = 0.0
 
     def heard(self, sequence: int, now: float) -> None:
         """Take the number of a frame."""
         silence = now - self._heard_at
         self._heard_at = now
-        self._frames += 1
         gap, nearest = min(
             (((sequence - each.last - 1) % 256, index) for index, each in enumerate(self._numberings)),
             default=(255, 0),
@@ -85,7 +80,6 @@ class SequenceCheck:
         numbering = self._numberings.pop(index)
         numbering.last = sequence
         numbering.span += gap + 1
-        numbering.used_at = self._frames
         numbering.skip(gap)
         self.lost += gap
         for other in self._numberings:
@@ -100,14 +94,7 @@ class SequenceCheck:
             while before is not None:
                 over.add(before)
                 before = before.before
-        self._numberings = [
-            numbering,
-            *(
-                other
-                for other in self._numberings
-                if other not in over and self._frames - other.used_at < STALE
-            ),
-        ]
+        self._numberings = [numbering, *(other for other in self._numberings if other not in over)]
 
     def _came_late(self, sequence: int) -> bool:
         for each in self._numberings:
@@ -131,7 +118,7 @@ class SequenceCheck:
         if gap > LONGEST_GAP or silence >= SILENCE:
             gap = 0
         self.lost += gap
-        self._numberings.insert(0, _Numbering(sequence, before, gap, self._frames))
+        self._numberings.insert(0, _Numbering(sequence, before, gap))
         del self._numberings[MOST_NUMBERINGS:]
 
 
