@@ -125,7 +125,6 @@ class ParamClient:
             self.cache = None
         else:
             self.cache = ParamCache(None if cache is None or cache is True else cache)
-        self._writer = WriteThrough(self.cache, owned=self.cache is not cache)
         self._station = Station(
             link=self._link.name,
             is_stream=self._link.is_stream,
@@ -134,6 +133,9 @@ class ParamClient:
             encoding=encoding,
             upkeep=Upkeep.chosen(watch_interval, policy),
             counts_traffic=traffic,
+        )
+        self._writer = WriteThrough(
+            self.cache, owned=self.cache is not cache, identity_of=self._station.identity_of
         )
         self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self._components: dict[Address, Component] = {}
@@ -216,8 +218,8 @@ class ParamClient:
         with anyio.CancelScope(shield=True):
             try:
                 await self._link.close()
-                for component in self._components.values():
-                    await self._keep(component)
+                for machine in self._station.components.values():
+                    await self._writer.keep_late(machine)
             finally:
                 await self._writer.close()
 
@@ -418,29 +420,11 @@ class ParamClient:
                 await anyio.sleep(RETRY_INTERVAL)
                 self._something_to_write.set()
 
-    async def _keep(self, component: Component) -> None:
-        """Let the cache have a table that there was no time to load it for.
-
-        A component that has not said who it is by now may be one that never does: what is whole is kept.
-        """
-        machine = component._machine
-        known = self._station.identity_of(machine)
-        if not (machine.table.complete or (known is not None and machine.table.params)):
-            return
-        identity = known or machine.identity
-        if not self._writer.follow(machine, identity):
-            self._writer.keep(machine, identity, await self._writer.load(machine, identity))
-
     async def _load(self, component: Component, identity: Identity) -> None:
-        machine = component._machine
-        cached = await self._writer.load(machine, identity)
-        current = self._station.identity_of(machine)
-        if current is None or current.key != identity.key or self._writer.follow(machine, current):
-            return  # overtaken: by another vehicle, or by the same call for another reason
-        self._writer.keep(machine, current, cached)
-        component._cache_is_read.set()
-        self._something_to_write.set()
-        self._dispatch()
+        if await self._writer.bring(component._machine, identity):
+            component._cache_is_read.set()
+            self._something_to_write.set()
+            self._dispatch()
 
     def _dispatch(self) -> None:
         """Hand out what has happened."""

@@ -42,10 +42,18 @@ class WriteThrough:
     Args:
         cache: where to, or None for nowhere.
         owned: whether `close` closes it.
+        identity_of: says who the vehicle is that a component belongs to; None while that is open.
     """
 
-    def __init__(self, cache: ParamCache | None, *, owned: bool) -> None:
+    def __init__(
+        self,
+        cache: ParamCache | None,
+        *,
+        owned: bool,
+        identity_of: Callable[[ComponentMachine], Identity | None],
+    ) -> None:
         self._cache = cache
+        self._identity_of = identity_of
         self._owned = owned
         self._worker = _Worker()
         self._kept: dict[ComponentMachine, _Kept] = {}
@@ -76,7 +84,7 @@ class WriteThrough:
         return self._tables.get((system, component), False)
 
     def follow(self, machine: ComponentMachine, identity: Identity) -> bool:
-        """Go on under an identity; false where `load` and `keep` must come first, as for another vehicle.
+        """Go on under an identity; false where `bring` must come first, as for another vehicle.
 
         What becomes of the table when another vehicle takes the address is no news of the one before.
         """
@@ -89,32 +97,29 @@ class WriteThrough:
             machine.table.take_dirty()
         return False
 
-    async def load(self, machine: ComponentMachine, identity: Identity) -> CachedComponent | None:
-        """A component's cached table, or None."""
-        if self._cache is None:
-            return None
-        return await self._run(partial(self._cache.load, identity.key, machine.component))
+    async def bring(self, machine: ComponentMachine, identity: Identity) -> bool:
+        """Give a component the table that is cached under an identity, and keep what it learns under that.
 
-    def keep(self, machine: ComponentMachine, identity: Identity, cached: CachedComponent | None) -> None:
-        """Give a component its cached table; from now on what it learns is kept under this identity."""
-        table = machine.table
-        kept = self._kept[machine] = _Kept(machine, identity, is_whole=table.complete)
-        for name in table.params:
-            table.dirty.setdefault(name, "vehicle")
-        if cached is not None:
-            machine.use_cached(
-                cached.params,
-                anyio.current_time(),
-                count=cached.count,
-                confirmed=cached.hash,
-                complete=cached.complete,
-                volatile=cached.volatile,
-                volatile_known=cached.volatile_known,
-            )
-            kept.synced_at = cached.synced_at
-            kept.state = self._state(machine, kept)
-        if machine.sync.synced:
-            kept.synced_at = time.time()
+        False where it was overtaken meanwhile: by another vehicle, or by the same call for another reason.
+        """
+        cached = await self._load(machine, identity)
+        current = self._identity_of(machine)
+        if current is None or current.key != identity.key or self.follow(machine, current):
+            return False
+        self._keep(machine, current, cached)
+        return True
+
+    async def keep_late(self, machine: ComponentMachine) -> None:
+        """Keep a table that there was no time to bring the cached one for.
+
+        A component that has not said who it is by now may be one that never does: what is whole is kept.
+        """
+        known = self._identity_of(machine)
+        if not (machine.table.complete or (known is not None and machine.table.params)):
+            return
+        identity = known or machine.identity
+        if not self.follow(machine, identity):
+            self._keep(machine, identity, await self._load(machine, identity))
 
     def synced(self, machine: ComponentMachine, *, is_whole: bool) -> None:
         """The table was proven to be the vehicle's just now; `is_whole` by a download of all of it."""
@@ -144,6 +149,31 @@ class WriteThrough:
         if is_written:
             self._has_failed = False
         return is_written
+
+    async def _load(self, machine: ComponentMachine, identity: Identity) -> CachedComponent | None:
+        if self._cache is None:
+            return None
+        return await self._run(partial(self._cache.load, identity.key, machine.component))
+
+    def _keep(self, machine: ComponentMachine, identity: Identity, cached: CachedComponent | None) -> None:
+        table = machine.table
+        kept = self._kept[machine] = _Kept(machine, identity, is_whole=table.complete)
+        for name in table.params:
+            table.dirty.setdefault(name, "vehicle")
+        if cached is not None:
+            machine.use_cached(
+                cached.params,
+                anyio.current_time(),
+                count=cached.count,
+                confirmed=cached.hash,
+                complete=cached.complete,
+                volatile=cached.volatile,
+                volatile_known=cached.volatile_known,
+            )
+            kept.synced_at = cached.synced_at
+            kept.state = self._state(machine, kept)
+        if machine.sync.synced:
+            kept.synced_at = time.time()
 
     def _news_of(self, kept: _Kept) -> list[_News]:
         """What the cache does not know of a table yet; it counts as written from now on."""

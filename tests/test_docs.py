@@ -123,8 +123,9 @@ def test_every_public_name_is_in_the_pages(module: ModuleType) -> None:
 def test_the_page_of_the_design_names_every_room() -> None:
     text = (DOCS / "design.md").read_text(encoding="utf-8")
     package = ROOT / "paramclient"
-    modules = {path.name for folder in (package, package / "protocol") for path in folder.glob("*.py")}
-    folders = {f"{path.parent.name}/" for path in package.glob("*/__init__.py")}
+    shown = (package, package / "protocol")
+    modules = {path.name for folder in shown for path in folder.glob("*.py")}
+    folders = {f"{path.parent.name}/" for folder in shown for path in folder.glob("*/__init__.py")}
     rooms = (modules | folders) - {"__init__.py", "__main__.py", "version.py"}
     assert set(re.findall(r"^ {2,4}(\w+(?:\.py|/)) ", text, re.MULTILINE)) == rooms
 

@@ -469,7 +469,7 @@ def test_what_it_counts_as_lost_is_what_the_link_has_lost(loss: float) -> None:
     assert faulty.lost > 100
     # of what is lost before the first frame and after the last one, nothing tells
     assert faulty.lost - 5 <= component.lost <= faulty.lost
-    assert component.frames - component.repeated + component.lost == pytest.approx(60 * 51, rel=0.02)
+    assert component.frames - component.repeated + component.lost == pytest.approx(60 * 52, rel=0.02)
     assert component.loss == pytest.approx(loss, abs=0.1)
 
 

@@ -39,6 +39,7 @@ from paramclient.protocol.wire import (
     build_frame,
     decode,
     encode,
+    frames,
 )
 
 DATA = Path(__file__).parent / "data"
@@ -565,7 +566,7 @@ def test_work_and_memory_are_bounded_on_hostile_input(
     data = (pattern * size)[:size]
     checked: list[int] = []
     headers: list[int] = []
-    read_header = wire._START
+    read_header = frames._START
 
     def counting_checksum(covered: bytes) -> int:
         checked.append(len(covered))
@@ -576,8 +577,8 @@ def test_work_and_memory_are_bounded_on_hostile_input(
         headers.append(at)
         return read_header(buffer, at)
 
-    monkeypatch.setattr("paramclient.protocol.wire.mcrf4xx", counting_checksum)
-    monkeypatch.setattr("paramclient.protocol.wire._START", counting_header)
+    monkeypatch.setattr("paramclient.protocol.wire.frames.mcrf4xx", counting_checksum)
+    monkeypatch.setattr("paramclient.protocol.wire.frames._START", counting_header)
     framer = Framer(stream=stream)
     calls = 0
     for at in range(0, size, chunk):

@@ -1,0 +1,227 @@
+"""Frames to messages, and messages to bytes: the few of this protocol, on raw bytes.
+
+A parameter's value must not pass through a Python float on its way (see `paramclient.values`).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from functools import lru_cache
+from typing import Final
+
+from paramclient.protocol.wire.frames import Frame, build_frame
+from paramclient.protocol.wire.messages import (
+    PARAM_VALUE_ID,
+    AutopilotVersion,
+    CommandAck,
+    CommandLong,
+    Heartbeat,
+    HighLatency2,
+    Message,
+    ParamError,
+    ParamRequestList,
+    ParamRequestRead,
+    ParamSet,
+    ParamValue,
+    StatusText,
+    SystemTime,
+)
+
+__all__ = ["UNDERSTOOD", "decode", "decode_param_value", "encode"]
+
+_new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
+
+
+def decode(frame: Frame) -> Message | None:
+    """The message in a frame, or None where this library has no use for its id.
+
+    Missing trailing bytes count as zero and further ones are passed over, as MAVLink 2 asks.
+    """
+    decoder = _DECODERS.get(frame.message_id)
+    return None if decoder is None else decoder(frame.payload)
+
+
+def decode_param_value(payload: bytes) -> ParamValue:
+    """The message in the payload of a PARAM_VALUE, as `decode` gives it: for those who know the id."""
+    if len(payload) < 25:
+        payload = payload.ljust(25, b"\0")
+    raw, count, index, name, number = _PARAM_VALUE.unpack_from(payload)
+    return _new(ParamValue, (text_of(name), raw, number, count, index))
+
+
+def encode(message: Message, *, system: int, component: int, sequence: int, version: int = 2) -> bytes:
+    """Pack a message into a frame.
+
+    Args:
+        message: any of this room's messages.
+        system, component: the sender, 1 to 255.
+        sequence: 0 to 255.
+        version: 2, or 1 for peers that know only that; ids above 255 (PARAM_ERROR) exist in 2 alone.
+    """
+    number, payload = _ENCODERS[type(message)](message)
+    if version == 1:
+        payload = payload[: _V1_LENGTHS.get(number)]
+    return build_frame(
+        number, payload, system=system, component=component, sequence=sequence, version=version
+    )
+
+
+@lru_cache(maxsize=4096)
+def text_of(field: bytes) -> str:
+    """A text field: cut at the first NUL. Latin-1 keeps every byte, so that odd names can be told apart.
+
+    Remembered, because the same names come again and again: equal names are then one object.
+    """
+    return field.split(b"\0", 1)[0].decode("latin-1")
+
+
+_HEARTBEAT = struct.Struct("<IBBBBB")
+_AUTOPILOT_VERSION = struct.Struct("<QQIIIIHH8s8s8s18s")
+_COMMAND_LONG = struct.Struct("<7fHBBB")
+_COMMAND_ACK = struct.Struct("<HBBiBB")
+_PARAM_REQUEST_READ = struct.Struct("<hBB16s")
+_PARAM_REQUEST_LIST = struct.Struct("<BB")
+_PARAM_VALUE = struct.Struct("<4sHH16sB")
+_PARAM_SET = struct.Struct("<4sBB16sB")
+_STATUSTEXT = struct.Struct("<B50s")  # its extension fields, for long texts in pieces, are not read
+_PARAM_ERROR = struct.Struct("<hBB16sB")
+_SYSTEM_TIME = struct.Struct("<QI")
+_HIGH_LATENCY2 = struct.Struct("<24xBB16x")
+_V1_LENGTHS = {77: 3, 148: 60}  # extension fields exist in MAVLink 2 only
+
+
+def _fields(layout: struct.Struct, payload: bytes) -> tuple:  # type: ignore[type-arg]  # struct gives no types
+    if len(payload) < layout.size:
+        payload = payload.ljust(layout.size, b"\0")
+    return layout.unpack_from(payload)
+
+
+def _decode_heartbeat(payload: bytes) -> Heartbeat:
+    custom_mode, kind, autopilot, base_mode, status, version = _fields(_HEARTBEAT, payload)
+    return Heartbeat(kind, autopilot, base_mode, custom_mode, status, version)
+
+
+def _decode_autopilot_version(payload: bytes) -> AutopilotVersion:
+    capabilities, uid, flight, _, _, board, vendor, product, git, _, _, uid2 = _fields(
+        _AUTOPILOT_VERSION, payload
+    )
+    return AutopilotVersion(capabilities, flight, git, board, vendor, product, uid, uid2)
+
+
+def _decode_command_long(payload: bytes) -> CommandLong:
+    *params, command, system, component, confirmation = _fields(_COMMAND_LONG, payload)
+    return CommandLong(system, component, command, tuple(params), confirmation)
+
+
+def _decode_command_ack(payload: bytes) -> CommandAck:
+    command, result, _, _, system, component = _fields(_COMMAND_ACK, payload)
+    return CommandAck(command, result, system, component)
+
+
+def _decode_param_request_read(payload: bytes) -> ParamRequestRead:
+    index, system, component, name = _fields(_PARAM_REQUEST_READ, payload)
+    return ParamRequestRead(system, component, text_of(name), index)
+
+
+def _decode_param_request_list(payload: bytes) -> ParamRequestList:
+    return ParamRequestList(*_fields(_PARAM_REQUEST_LIST, payload))
+
+
+def _decode_param_set(payload: bytes) -> ParamSet:
+    raw, system, component, name, number = _fields(_PARAM_SET, payload)
+    return ParamSet(system, component, text_of(name), raw, number)
+
+
+def _decode_statustext(payload: bytes) -> StatusText:
+    severity, text = _fields(_STATUSTEXT, payload)
+    return StatusText(severity, text_of(text))
+
+
+def _decode_param_error(payload: bytes) -> ParamError:
+    index, system, component, name, error = _fields(_PARAM_ERROR, payload)
+    return ParamError(system, component, text_of(name), index, error)
+
+
+def _decode_system_time(payload: bytes) -> SystemTime:
+    return SystemTime(*_fields(_SYSTEM_TIME, payload))
+
+
+def _decode_high_latency2(payload: bytes) -> HighLatency2:
+    return HighLatency2(*_fields(_HIGH_LATENCY2, payload))
+
+
+_DECODERS: dict[int, Callable[[bytes], Message]] = {
+    0: _decode_heartbeat,
+    2: _decode_system_time,
+    20: _decode_param_request_read,
+    21: _decode_param_request_list,
+    PARAM_VALUE_ID: decode_param_value,
+    23: _decode_param_set,
+    76: _decode_command_long,
+    77: _decode_command_ack,
+    148: _decode_autopilot_version,
+    235: _decode_high_latency2,
+    253: _decode_statustext,
+    345: _decode_param_error,
+}
+
+UNDERSTOOD: Final = frozenset(_DECODERS)
+"""The message ids that `decode` knows."""
+
+
+def _name(param_id: str) -> bytes:
+    return param_id.encode("latin-1")
+
+
+_ENCODERS: dict[type, Callable[..., tuple[int, bytes]]] = {
+    Heartbeat: lambda m: (
+        0,
+        _HEARTBEAT.pack(m.custom_mode, m.type, m.autopilot, m.base_mode, m.system_status, m.mavlink_version),
+    ),
+    ParamRequestRead: lambda m: (
+        20,
+        _PARAM_REQUEST_READ.pack(m.param_index, m.target_system, m.target_component, _name(m.param_id)),
+    ),
+    ParamRequestList: lambda m: (21, _PARAM_REQUEST_LIST.pack(m.target_system, m.target_component)),
+    ParamValue: lambda m: (
+        22,
+        _PARAM_VALUE.pack(m.raw, m.param_count, m.param_index, _name(m.param_id), m.param_type),
+    ),
+    ParamSet: lambda m: (
+        23,
+        _PARAM_SET.pack(m.raw, m.target_system, m.target_component, _name(m.param_id), m.param_type),
+    ),
+    CommandLong: lambda m: (
+        76,
+        _COMMAND_LONG.pack(*m.params, m.command, m.target_system, m.target_component, m.confirmation),
+    ),
+    CommandAck: lambda m: (
+        77,
+        _COMMAND_ACK.pack(m.command, m.result, 0, 0, m.target_system, m.target_component),
+    ),
+    AutopilotVersion: lambda m: (
+        148,
+        _AUTOPILOT_VERSION.pack(
+            m.capabilities,
+            m.uid,
+            m.flight_sw_version,
+            0,
+            0,
+            m.board_version,
+            m.vendor_id,
+            m.product_id,
+            m.git_hash,
+            b"",
+            b"",
+            m.uid2,
+        ),
+    ),
+    StatusText: lambda m: (253, _STATUSTEXT.pack(m.severity, m.text.encode("latin-1"))),
+    ParamError: lambda m: (
+        345,
+        _PARAM_ERROR.pack(m.param_index, m.target_system, m.target_component, _name(m.param_id), m.error),
+    ),
+    SystemTime: lambda m: (2, _SYSTEM_TIME.pack(m.time_unix_usec, m.time_boot_ms)),
+    HighLatency2: lambda m: (235, _HIGH_LATENCY2.pack(m.type, m.autopilot)),
+}

@@ -1,0 +1,184 @@
+"""Bytes to frames and back: framing and checking, on raw bytes, for every message of the dialect.
+
+pymavlink gives the CRC_EXTRA byte of every message of its `all` dialect, and the names of messages and
+enums. Most frames on a link need no decoding at all, so framing makes no objects of those that nobody wants.
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Collection
+from typing import NamedTuple
+
+from fastcrc.crc16 import mcrf4xx
+from pymavlink.dialects.v20 import all as dialect
+
+__all__ = ["Frame", "Framer", "build_frame", "checksum", "enum_word", "message_name"]
+
+_MAGIC_V1 = 0xFE
+_MAGIC_V2 = 0xFD
+_SIGNED = 0x01
+_SIGNATURE_LENGTH = 13
+_MAGIC = re.compile(b"[\xfd\xfe]").search
+_START = struct.Struct("<BBBxBBB3s").unpack_from  # a header of MAVLink 2; version 1 shares two bytes
+_CRC_AT = struct.Struct("<H").unpack_from
+_PADDING = bytes(10)  # behind the data: a header can be read at its last byte
+_new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
+_NO_KEY = b""  # of no message
+
+
+class Frame(NamedTuple):
+    """One frame, its checksum proven. A named tuple, because making one is part of the hot path.
+
+    Attributes:
+        message_id: 24 bits.
+        system, component: who sent it.
+        sequence: 0 to 255.
+        payload: as sent; MAVLink 2 cuts trailing zero bytes.
+        version: 1 or 2.
+    """
+
+    message_id: int
+    system: int
+    component: int
+    sequence: int
+    payload: bytes
+    version: int
+
+
+class Framer:
+    """Finds the frames in what a link delivers.
+
+    Every frame whose message id is known is checked by its CRC; one with an unknown id cannot be checked
+    and is passed over. A candidate that fails is retried from its second byte, so that no noise can hide a
+    frame that stands whole outside a longer valid one. Signatures are not verified: the 13 bytes behind the
+    checksum of a signed frame count as its signature, whatever they are.
+
+    Args:
+        wanted: the message ids to give out; None for every known one. Frames with other ids are still
+            checked and stepped over, but no object is made of them.
+        stream: whether a frame may be spread over several calls (TCP, serial). Datagrams are taken one by
+            one and never joined.
+
+    Attributes:
+        frames: frames that were found whole, wanted or not.
+        skipped: bytes that belonged to no such frame.
+    """
+
+    def __init__(self, wanted: Collection[int] | None = None, *, stream: bool = True) -> None:
+        ids = _CRC_EXTRA if wanted is None else wanted
+        self._wanted = {number.to_bytes(3, "little"): number for number in ids}
+        self._stream = stream
+        self._tail = b""
+        self.frames = 0
+        self.skipped = 0
+
+    def receive(self, data: bytes, *, final: bool = False) -> list[Frame]:
+        """Take bytes from the link; give the frames that are complete now, in order.
+
+        Of a stream, at most one unfinished frame (less than 280 bytes) is kept between calls. Where `data` is
+        final, as datagrams always are, nothing will complete such a candidate, and it is passed over like any
+        other that fails. The loop is the hot path of the library: about ten operations for each frame,
+        nothing for each byte.
+        """
+        if self._tail:
+            data = self._tail + data
+        may_go_on = self._stream and not final
+        found: list[Frame] = []
+        number_of = self._wanted.get
+        extra_of = _EXTRA_BY_ID_BYTES.get
+        length = len(data)
+        padded = data + _PADDING
+        good = 0
+        skipped = 0
+        at = 0
+        while at < length:
+            magic, size, flags, sequence, system, component, key = _START(padded, at)
+            if magic == _MAGIC_V2:
+                crc_at = at + 10 + size
+                end = crc_at + 2
+                if flags:
+                    end += _SIGNATURE_LENGTH
+                    if flags != _SIGNED:
+                        key = _NO_KEY  # a format that is not defined yet
+            elif magic == _MAGIC_V1:
+                crc_at = at + 6 + size
+                end = crc_at + 2
+                key = padded[at + 5 : at + 6] + b"\0\0"
+            else:
+                crc_at = end = at
+                key = _NO_KEY
+            extra = extra_of(key)
+            if end > length:
+                header_is_cut = crc_at - size > length
+                if may_go_on and (header_is_cut or extra is not None):
+                    break
+            elif extra is not None and _CRC_AT(data, crc_at)[0] == mcrf4xx(data[at + 1 : crc_at] + extra):
+                good += 1
+                number = number_of(key)
+                if number is not None:
+                    if magic == _MAGIC_V2:
+                        payload = data[at + 10 : crc_at]
+                        found.append(_new(Frame, (number, system, component, sequence, payload, 2)))
+                    else:
+                        sequence, system, component = data[at + 2 : at + 5]
+                        payload = data[at + 6 : crc_at]
+                        found.append(Frame(number, system, component, sequence, payload, 1))
+                at = end
+                continue
+            candidate = _MAGIC(data, at + 1)
+            next_at = candidate.start() if candidate else length
+            skipped += next_at - at
+            at = next_at
+        self.frames += good
+        self.skipped += skipped
+        self._tail = data[at:]
+        return found
+
+    def flush(self) -> list[Frame]:
+        """The stream has ended or was interrupted: give what stands behind the unfinished candidate."""
+        return self.receive(b"", final=True)
+
+
+def build_frame(
+    message_id: int, payload: bytes, *, system: int, component: int, sequence: int, version: int = 2
+) -> bytes:
+    """Put a payload into a frame; for messages that have no class here, any id of the dialect.
+
+    MAVLink 2 drops the payload's trailing zeros. The other arguments are those of `encode`.
+    """
+    if version == 1:
+        body = bytes((len(payload), sequence, system, component, message_id)) + payload
+        magic = b"\xfe"
+    else:
+        payload = payload.rstrip(b"\0") or b"\0"
+        head = bytes((len(payload), 0, 0, sequence, system, component))
+        body = head + message_id.to_bytes(3, "little") + payload
+        magic = b"\xfd"
+    crc: int = mcrf4xx(body + bytes((_CRC_EXTRA[message_id],)))
+    return magic + body + crc.to_bytes(2, "little")
+
+
+def checksum(message_id: int, body: bytes) -> int | None:
+    """The checksum of a frame's bytes between its first one and the checksum; None for an unknown id."""
+    extra = _CRC_EXTRA.get(message_id)
+    return None if extra is None else int(mcrf4xx(body + bytes((extra,))))
+
+
+def message_name(message_id: int) -> str:
+    """`HEARTBEAT` for 0, and so on; `UNKNOWN_4711` for an id that the dialect does not have."""
+    known = dialect.mavlink_map.get(message_id)
+    return f"UNKNOWN_{message_id}" if known is None else str(known.msgname)
+
+
+def enum_word(enum: str, number: int) -> str:
+    """A number of one of the dialect's enums in words, `fixed wing` for 1 of MAV_TYPE; else the number."""
+    entry = dialect.enums[enum].get(number)
+    return (
+        str(number) if entry is None else str(entry.name.removeprefix(f"{enum}_").lower().replace("_", " "))
+    )
+
+
+_CRC_EXTRA: dict[int, int] = {number: message.crc_extra for number, message in dialect.mavlink_map.items()}
+_EXTRA_BY_ID_BYTES = {number.to_bytes(3, "little"): bytes((extra,)) for number, extra in _CRC_EXTRA.items()}

@@ -1,0 +1,192 @@
+"""The messages that this library understands, and the numbers in them that mean something to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple, TypeAlias
+
+__all__ = [
+    "AUTOPILOT_COMPONENT",
+    "AUTOPILOT_VERSION_ID",
+    "AutopilotVersion",
+    "CAPABILITY_PARAM_ENCODE_BYTEWISE",
+    "CAPABILITY_PARAM_ENCODE_C_CAST",
+    "COMP_ID_ALL",
+    "CommandAck",
+    "CommandLong",
+    "HASH_CHECK",
+    "Heartbeat",
+    "HighLatency2",
+    "MAV_AUTOPILOT_ARDUPILOTMEGA",
+    "MAV_AUTOPILOT_GENERIC",
+    "MAV_AUTOPILOT_INVALID",
+    "MAV_AUTOPILOT_PX4",
+    "MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES",
+    "MAV_CMD_REQUEST_MESSAGE",
+    "MAV_RESULT_ACCEPTED",
+    "MAV_RESULT_UNSUPPORTED",
+    "MAV_STATE_ACTIVE",
+    "MAV_STATE_BOOT",
+    "MAV_TYPE_GCS",
+    "Message",
+    "NO_INDEX",
+    "PARAM_VALUE_ID",
+    "ParamError",
+    "ParamRequestList",
+    "ParamRequestRead",
+    "ParamSet",
+    "ParamValue",
+    "StatusText",
+    "SystemTime",
+]
+
+NO_INDEX: Final = 65535
+"""param_index of a PARAM_VALUE that has no place in the list (PX4: `_HASH_CHECK` and parameters not in use;
+ArduPilot: replies by name and unasked updates)."""
+HASH_CHECK: Final = "_HASH_CHECK"
+"""param_id under which PX4 gives the hash of its table."""
+COMP_ID_ALL: Final = 0
+AUTOPILOT_COMPONENT: Final = 1
+
+MAV_TYPE_GCS: Final = 6
+MAV_AUTOPILOT_GENERIC: Final = 0
+MAV_AUTOPILOT_ARDUPILOTMEGA: Final = 3
+MAV_AUTOPILOT_INVALID: Final = 8
+MAV_AUTOPILOT_PX4: Final = 12
+MAV_STATE_BOOT: Final = 1
+MAV_STATE_ACTIVE: Final = 4
+PARAM_VALUE_ID: Final = 22
+AUTOPILOT_VERSION_ID: Final = 148
+MAV_CMD_REQUEST_MESSAGE: Final = 512
+MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: Final = 520
+MAV_RESULT_ACCEPTED: Final = 0
+MAV_RESULT_UNSUPPORTED: Final = 3
+CAPABILITY_PARAM_ENCODE_BYTEWISE: Final = 16
+CAPABILITY_PARAM_ENCODE_C_CAST: Final = 131072
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    type: int
+    autopilot: int
+    base_mode: int = 0
+    custom_mode: int = 0
+    system_status: int = 0
+    mavlink_version: int = 3
+
+
+@dataclass(frozen=True, slots=True)
+class AutopilotVersion:
+    """AUTOPILOT_VERSION; `git_hash` is flight_custom_version, `uid2` has 18 bytes."""
+
+    capabilities: int
+    flight_sw_version: int = 0
+    git_hash: bytes = bytes(8)
+    board_version: int = 0
+    vendor_id: int = 0
+    product_id: int = 0
+    uid: int = 0
+    uid2: bytes = bytes(18)
+
+
+@dataclass(frozen=True, slots=True)
+class CommandLong:
+    target_system: int
+    target_component: int
+    command: int
+    params: tuple[float, ...] = (0.0,) * 7
+    confirmation: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class CommandAck:
+    command: int
+    result: int
+    target_system: int = 0
+    target_component: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class ParamRequestRead:
+    """PARAM_REQUEST_READ by `param_index`, or by `param_id` where the index is −1."""
+
+    target_system: int
+    target_component: int
+    param_id: str
+    param_index: int = -1
+
+
+@dataclass(frozen=True, slots=True)
+class ParamRequestList:
+    target_system: int
+    target_component: int
+
+
+class ParamValue(NamedTuple):
+    """PARAM_VALUE; `raw` is the four value bytes, undecoded. A named tuple for the same reason as `Frame`."""
+
+    param_id: str
+    raw: bytes
+    param_type: int
+    param_count: int
+    param_index: int
+
+
+@dataclass(frozen=True, slots=True)
+class ParamSet:
+    """PARAM_SET; `raw` is the four value bytes."""
+
+    target_system: int
+    target_component: int
+    param_id: str
+    raw: bytes
+    param_type: int
+
+
+@dataclass(frozen=True, slots=True)
+class ParamError:
+    """PARAM_ERROR; `param_index` −1 says that `param_id` counts; the id may be empty for a read by index."""
+
+    target_system: int
+    target_component: int
+    param_id: str
+    param_index: int
+    error: int
+
+
+@dataclass(frozen=True, slots=True)
+class StatusText:
+    severity: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class SystemTime:
+    """SYSTEM_TIME; `time_unix_usec` is 0 where the vehicle does not know it."""
+
+    time_unix_usec: int
+    time_boot_ms: int
+
+
+@dataclass(frozen=True, slots=True)
+class HighLatency2:
+    """HIGH_LATENCY2, in the place of the heartbeat on satellite links; its telemetry is left out, or zero."""
+
+    type: int
+    autopilot: int
+
+
+Message: TypeAlias = (
+    Heartbeat
+    | AutopilotVersion
+    | CommandLong
+    | CommandAck
+    | ParamRequestRead
+    | ParamRequestList
+    | ParamValue
+    | ParamSet
+    | ParamError
+    | StatusText
+    | SystemTime
+    | HighLatency2
+)
