@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from queue import SimpleQueue
 from typing import Final, TypeVar
@@ -21,6 +21,7 @@ from paramclient.cache import CachedComponent, ParamCache, StoredParam, TableSta
 from paramclient.errors import CacheError, UsageError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentMachine
+from paramclient.values import Param
 
 __all__ = ["WriteThrough"]
 
@@ -162,7 +163,7 @@ class WriteThrough:
             table.dirty.setdefault(name, "vehicle")
         if cached is not None:
             machine.use_cached(
-                cached.params,
+                _of_firmware(cached, identity),
                 anyio.current_time(),
                 count=cached.count,
                 confirmed=cached.hash,
@@ -306,6 +307,14 @@ class _Worker:
 def _save(cache: ParamCache, updates: list[TableUpdate]) -> bool:
     cache.save(updates)
     return True
+
+
+def _of_firmware(cached: CachedComponent, identity: Identity) -> Mapping[str, Param]:
+    """The cached parameters, without the defaults of another firmware than the present one."""
+    before = cached.identity
+    if (before.firmware, before.git_hash) == (identity.firmware, identity.git_hash):
+        return cached.params
+    return {name: replace(param, default=None) for name, param in cached.params.items()}
 
 
 def _nothing() -> None:

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 from paramclient.protocol.wire import NO_INDEX, ParamValue
-from paramclient.values import Encoding, Param, Trust, decode, known_type, px4_hash
+from paramclient.values import Encoding, Param, Trust, Value, as_sent, decode, from_bits, known_type, px4_hash
 
 __all__ = ["Change", "Table"]
 
 MOST_NAMES: Final = 65_535
 """Names that one table may hold. No more can have an index; a component that invents further ones is ill."""
 
+_EXACT = 1 << 24  # up to here every integer is a float32
 _LIVE = Trust.LIVE  # each look into an enumeration takes a tenth of what a value takes here
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
 
@@ -107,11 +109,16 @@ class Table:
                 return None
         elif old.type == number and self._wire.get(name) == raw:
             if old.index != index:
-                self.params[name] = Param(name, old.value, old.type, index, old.bits, Trust.LIVE)
+                self.params[name] = Param(name, old.value, old.type, index, old.bits, Trust.LIVE, old.default)
                 self.dirty.setdefault(name, by)
             return None
         value, bits = decode(raw, number, self._encoding)
-        new = Param(name, value, known_type(number), index, bits, _LIVE)
+        default: Value | None = None
+        if old is not None and old.type == number:
+            default = old.default
+            if self._rounds(old, raw):
+                value, bits = old.value, old.bits
+        new = Param(name, value, known_type(number), index, bits, _LIVE, default)
         self.params[name] = new
         self._wire[name] = raw
         if old is not None and old.same_value(new):
@@ -123,6 +130,38 @@ class Table:
             self._moved(name)
         return _new(Change, (name, old, new, by))
 
+    def take(
+        self, name: str, number: int, bits: int, index: int, default: int | None, *, is_older: bool
+    ) -> Change | None:
+        """Take one entry of a packed parameter file; give the change if it brought one.
+
+        Its integers are exact, also where a PARAM_VALUE rounds them.
+
+        Args:
+            name, number: param_id and type.
+            bits, default: the value and the firmware's default, as in `Param.bits`.
+            index: its place in the list.
+            is_older: whether a PARAM_VALUE of it was heard since the file was asked for: then that counts,
+                unless it rounds what the file says.
+        """
+        kind = known_type(number)
+        initial = None if default is None else from_bits(default, number)
+        old = self.params.get(name)
+        raw = as_sent(bits, number, self._encoding)
+        if is_older and old is not None and (old.type != number or self._wire.get(name) != raw):
+            self.params[name] = replace(old, index=index, default=initial)
+            self.dirty.setdefault(name, "vehicle")
+            return None
+        new = self.params[name] = Param(name, from_bits(bits, number), kind, index, bits, _LIVE, initial)
+        self._wire[name] = raw
+        if old is None or old.index != index or old.default != initial:
+            self.dirty.setdefault(name, "vehicle")
+        if old is not None and old.same_value(new):
+            return None
+        self.dirty[name] = "vehicle"
+        self._moved(name)
+        return Change(name, old, new)
+
     def use_encoding(self, encoding: Encoding) -> list[Change]:
         """Read everything that was heard in another encoding; give what looks different now."""
         if encoding is self._encoding:
@@ -132,7 +171,7 @@ class Table:
         for name, raw in self._wire.items():
             old = self.params[name]
             value, bits = decode(raw, old.type, encoding)
-            new = Param(name, value, old.type, old.index, bits, old.trust)
+            new = Param(name, value, old.type, old.index, bits, old.trust, old.default)
             self.params[name] = new
             if not old.same_value(new):
                 self.dirty.setdefault(name, "vehicle")
@@ -221,6 +260,15 @@ class Table:
         """Names that changed since the last call, each with who did it; gone names too."""
         dirty, self.dirty = self.dirty, {}
         return dirty
+
+    def _rounds(self, known: Param, raw: bytes) -> bool:
+        """Whether a message rounds what is known exactly: an integer beyond the 24 bits of a float32."""
+        return (
+            self._encoding is Encoding.C_CAST
+            and isinstance(known.value, int)
+            and abs(known.value) > _EXACT
+            and as_sent(known.bits, known.type, self._encoding) == raw
+        )
 
     def _moved(self, name: str) -> None:
         if name in self.volatile:

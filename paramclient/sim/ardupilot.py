@@ -11,9 +11,9 @@ from typing import Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.protocol import wire
-from paramclient.sim.table import Entry, Table, ardupilot_table, as_table, bits_of, ek2_group
+from paramclient.sim.table import Entry, Table, ardupilot_table, as_table, ek2_group
 from paramclient.sim.vehicle import Vehicle, VehicleOptions
-from paramclient.values import Encoding, ParamType
+from paramclient.values import Encoding, ParamType, bits_of
 
 __all__ = ["ArduPilotVehicle"]
 

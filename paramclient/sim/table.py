@@ -11,20 +11,19 @@ from functools import cache
 from importlib import resources
 from typing import TypeAlias
 
-from paramclient.errors import UsageError
 from paramclient.values import (
     Encoding,
     Param,
     ParamType,
     Value,
+    bits_of,
     check_name,
     check_value,
-    encode,
     from_bits,
     known_type,
 )
 
-__all__ = ["Entry", "SimParam", "Table", "ardupilot_table", "as_table", "bits_of", "ek2_group", "px4_table"]
+__all__ = ["Entry", "SimParam", "Table", "ardupilot_table", "as_table", "ek2_group", "px4_table"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,25 +107,6 @@ def as_table(table: Table) -> tuple[SimParam, ...]:
     if isinstance(table, Mapping):
         return tuple(_row(name, entry) for name, entry in table.items())
     return tuple(table)
-
-
-def bits_of(value: Value, number: int) -> int:
-    """The value's own bytes in its type, read as a little-endian unsigned number.
-
-    Raises:
-        UsageError: the value does not fit the type.
-    """
-    value = check_value(value)
-    if number in (ParamType.UINT64, ParamType.INT64) and isinstance(value, int):
-        kind = ParamType(number)
-        low, high = kind.bounds
-        if not low <= value <= high:
-            raise UsageError(f"{value} does not fit {kind.name}, which holds {low} to {high}")
-        return value & 0xFFFFFFFF_FFFFFFFF
-    if number == ParamType.REAL64 and not isinstance(value, bytes):
-        return int.from_bytes(struct.pack("<d", value), "little")
-    size = ParamType(number).size if 1 <= number <= ParamType.REAL64 else 4
-    return int.from_bytes(encode(value, number, Encoding.BYTEWISE)[:size], "little")
 
 
 @cache

@@ -13,8 +13,8 @@ from typing import TypedDict
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.protocol import wire
 from paramclient.sim.air import OUT_LIMIT
-from paramclient.sim.table import Entry, SimParam, bits_of
-from paramclient.values import Encoding, Param, Value
+from paramclient.sim.table import Entry, SimParam
+from paramclient.values import Encoding, Param, Value, bits_of
 
 __all__ = ["Vehicle", "VehicleOptions"]
 
