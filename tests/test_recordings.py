@@ -62,7 +62,8 @@ class TestDecoding:
     @pytest.mark.parametrize("name", NAMES)
     def test_encoding_what_was_decoded_gives_the_bytes_of_the_log(self, name: str) -> None:
         """For the messages of the protocol itself, which `wire` holds in full."""
-        kinds = wire.ParamValue | wire.ParamSet | wire.ParamRequestRead | wire.ParamRequestList
+        values = wire.ParamValue | wire.ParamSet | wire.ParamRequestRead | wire.ParamRequestList
+        kinds = values | wire.FileTransfer
         for record in read(name):
             message = record.message
             if isinstance(message, kinds):
