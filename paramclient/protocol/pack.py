@@ -26,6 +26,9 @@ LARGEST_FILE: Final = 6 + 65535 * (2 + NAME_LENGTH + 2 * 4 + 7)
 """Bytes of the largest file there can be: as many entries as the header can count, each with the longest
 name, a default, and the most padding that is ever useful. What is longer is not looked at."""
 
+PACKABLE: Final = frozenset({ParamType.INT8, ParamType.INT16, ParamType.INT32, ParamType.REAL32})
+"""The types that a file can hold."""
+
 _MAGIC = 0x671B
 _MAGIC_WITH_DEFAULTS = 0x671C
 _HEADER = struct.Struct("<HHH")
