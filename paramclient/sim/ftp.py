@@ -101,6 +101,11 @@ class FileServer:
         if not (math.isfinite(self.rate) and self.rate > 0.0):
             raise UsageError(f"the rate of MAVFTP is a number of bytes per second above 0, not {self.rate}")
 
+    @property
+    def open_files(self) -> list[str]:
+        """The paths of the files that are open."""
+        return [session.path for session in self._open.values()]
+
     def reset(self) -> None:
         """The vehicle was switched off."""
         self._open.clear()

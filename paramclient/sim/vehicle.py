@@ -221,6 +221,11 @@ class Vehicle(ABC):
             raise UsageError("this vehicle does not speak MAVFTP")
         return self._ftp.files
 
+    @property
+    def open_files(self) -> list[str]:
+        """The paths of the files that are open in a session of MAVFTP."""
+        return [] if self._ftp is None else self._ftp.open_files
+
     def set_param(self, name: str, value: Value) -> None:
         """Change a value as if on board or by another station; the vehicle tells of it if its kind does.
 
