@@ -245,6 +245,7 @@ class TestSessions:
         assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)) == (FileErrorCode.FAIL,)
         assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4)) == (FileErrorCode.INVALID_SESSION,)
         assert refusal(pilot.ask(Opcode.READ_FILE, session=4, size=1)) == (FileErrorCode.INVALID_SESSION,)
+        assert refusal(pilot.ask(Opcode.WRITE_FILE, b"x", session=4)) == (FileErrorCode.INVALID_SESSION,)
         assert pilot.ask(Opcode.RESET_SESSIONS, session=4).opcode == Opcode.ACK
         assert pilot.ask(Opcode.READ_FILE, session=3, size=1).data == b"a"
         assert pilot.ask(Opcode.RESET_SESSIONS, session=3).opcode == Opcode.ACK

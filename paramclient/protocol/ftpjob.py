@@ -174,7 +174,10 @@ class Job(Operation[Result]):
     def _open_file(
         self, opcode: Opcode, then: Callable[[Packet, float], None], now: float, *, copies: int = 1
     ) -> None:
-        """Open the file in a session of its own, which `session` names when `then` is called."""
+        """Open the file in a session of its own, which `session` names when `then` is called.
+
+        Where an open is on its way already, its number is used again.
+        """
 
         def opened(packet: Packet, now: float) -> None:
             code = self._code(packet)
@@ -196,7 +199,8 @@ class Job(Operation[Result]):
         def again(now: float) -> None:
             self._ask(opcode, opened, now, data=self._path_data, session=number)
 
-        self.asked_session = number = self._line.next_session()
+        number = self._line.next_session() if self.asked_session is None else self.asked_session
+        self.asked_session = number
         self._ask(opcode, opened, now, data=self._path_data, session=number, copies=copies)
 
     def _is_patience_over(self, code: int, now: float) -> bool:

@@ -17,7 +17,7 @@ LARGEST_FILE: Final = 64 * 1024 * 1024
 """Bytes that a file may have unless it is said otherwise: more than any log of a flight, less than memory."""
 BURST_ANSWERS: Final = 4096
 """Numbers that the answers to one burst may take; ArduPilot ends one after 2000 (GCS_FTP.cpp)."""
-MOST_DOUBLINGS: Final = 2
+MOST_DOUBLINGS: Final = 1
 """How often the time to wait for a burst doubles."""
 BURSTS_KEPT: Final = 4
 """Bursts whose late answers are still taken."""
@@ -53,7 +53,9 @@ ArduPilot's estimate for param.pck is a tenth too large."""
 LATE_KEPT: Final = 256
 """Reads that count as lost and whose answers are taken all the same, should they still come."""
 MOST_OPENINGS: Final = 3
-"""How often a file is opened when its session is lost on board."""
+MOST_RESTARTS: Final = 2
+"""How often a file is opened when its session is lost on board, and how often it is opened anew when nobody
+can tell whether it is open."""
 SESSION_LOST = frozenset((FileErrorCode.INVALID_SESSION, FileErrorCode.FILE_NOT_FOUND))
 """What servers say to a read in a session that is not open."""
 ROUNDING: Final = 1e-9
@@ -83,6 +85,7 @@ class FileRead(Job[bytes]):
         self._read_size = read_size
         self._limit = limit
         self._openings = 1
+        self._restarts = 0
         self._has_bursts = True
         self._start_anew()
         self._gap = UNKNOWN_GAP
@@ -107,7 +110,9 @@ class FileRead(Job[bytes]):
         self._first_block: tuple[float, int] | None = None
         self._flights: dict[int, _Flight] = {}  # by the number of the request
         self._late: dict[int, _Flight] = {}
-        self._asked: dict[int, int] = {}  # how often each offset that is missing was asked for in vain
+        self._unheard = 0  # blocks that came before the answer to the open
+        self._is_silent = False  # nothing came since what timed out last was sent
+        self._asked: dict[int, tuple[int, float]] = {}  # how often each offset was so in vain, and when last
 
     @property
     def received(self) -> int:
@@ -116,17 +121,37 @@ class FileRead(Job[bytes]):
 
     def begin(self, now: float) -> None:
         round_trip = self._line.round_trip
-        is_early = round_trip.smoothed is not None and round_trip.seen_loss < COPY_RISK
-        self._open_file(Opcode.OPEN_FILE_RO, self._opened, now, copies=2 if is_early else 1)
-        if is_early:
-            # A server that gives the session the number that was asked for can begin at once. What it sends
-            # counts when it has said so, which therefore must not get lost: it is asked for twice.
-            self._burst(now)
+        if round_trip.smoothed is not None and round_trip.seen_loss < COPY_RISK:
+            self._begin_early(now)
+        else:
+            self._open_file(Opcode.OPEN_FILE_RO, self._opened, now)
+
+    def _begin_early(self, now: float) -> None:
+        """Ask for the burst together with the open: a server that keeps to our number of the session begins.
+
+        What it sends counts when it has said so, which therefore is asked for twice.
+        """
+        self._open_file(Opcode.OPEN_FILE_RO, self._opened, now, copies=2)
+        self._burst(now)
+
+    def _is_unheard(self, packet: Packet) -> bool:
+        """Whether this shows that the answer to our open got lost: it comes of the burst behind it."""
+        if packet.session != self.asked_session or packet.requested != Opcode.BURST_READ_FILE:
+            return False
+        self._unheard += packet.opcode == Opcode.ACK and self._is_of_a_burst(packet)
+        return self._unheard == OVERTAKEN and self._restarts < MOST_RESTARTS
 
     def take(self, packet: Packet, now: float) -> None:
         super().take(packet, now)
+        if not self.done and self.session is None and self._is_unheard(packet):
+            # whether the file is ours nobody can tell any more: close it, and begin anew when the burst ends
+            self._restarts += 1
+            self._line.reset_sessions(packet.session)
+            self._start_anew()
+            self._begin_early(now)
         if self.done or self.session is None or packet.session != self.session:
             return
+        self._is_silent = False
         if packet.requested == Opcode.BURST_READ_FILE and self._is_of_a_burst(packet):
             self._take_burst(packet, now)
         elif packet.requested == Opcode.READ_FILE:
@@ -254,6 +279,8 @@ class FileRead(Job[bytes]):
         if code == FileErrorCode.EOF:
             if packet.offset >= self._blocks.reached:  # else the server does not say where, and a read will
                 self._ends_at(packet.offset)
+        elif not is_latest:
+            return
         elif code == FileErrorCode.UNKNOWN_COMMAND:
             self._has_bursts = False
         elif self._has_early_burst and self._blocks.reached == 0:
@@ -316,11 +343,16 @@ class FileRead(Job[bytes]):
             del self._late[next(iter(self._late))]
 
     def _in_vain(self, flight: _Flight, now: float) -> None:
-        """A read stayed without an answer."""
-        if not self._is_wanted(flight.offset):
+        """A read stayed without an answer; those of one offset that went out meanwhile count as one."""
+        attempts, counted_at = self._asked.get(flight.offset, (0, -math.inf))
+        if not self._is_wanted(flight.offset) or flight.sent_at < counted_at:
             return
-        attempts = self._asked[flight.offset] = self._asked.get(flight.offset, 0) + 1
-        self._line.round_trip.timed_out(attempts)
+        attempts += 1
+        self._asked[flight.offset] = attempts, now
+        is_silence = self._line.heard_at < flight.sent_at
+        if not (is_silence and self._is_silent):  # of a silence that all share one tells enough
+            self._line.round_trip.timed_out(attempts)
+        self._is_silent = is_silence
         if self._line.round_trip.is_hopeless(attempts, now):
             self.fail(self._no_reply(attempts, now), now)
 
@@ -331,10 +363,15 @@ class FileRead(Job[bytes]):
         is_behind = self._blocks.end is None and offset >= self._blocks.reached
         return is_behind or self._blocks.is_missing(offset)
 
+    def _is_asked_for(self, offset: int) -> bool:
+        return any(flight.offset == offset for flight in self._flights.values())
+
     @property
     def _window(self) -> int:
         if self._burst_runs:
             return HELD
+        if self._is_silent:
+            return SMALLEST_WINDOW
         round_trip = self._line.round_trip.smoothed or self._line.round_trip.timeout
         return min(max(math.ceil(round_trip / self._gap) + 2, SMALLEST_WINDOW), LARGEST_WINDOW)
 
@@ -381,8 +418,7 @@ class FileRead(Job[bytes]):
 
     def _read(self, offset: int, now: float) -> None:
         sequence = self._line.next_sequence()
-        is_only = not self._burst_runs and offset not in self._asked
-        is_only = is_only and all(flight.offset != offset for flight in self._flights.values())
+        is_only = not (self._burst_runs or offset in self._asked or self._is_asked_for(offset))
         self._number += 1
         self._flights[sequence] = _Flight(offset, self._number, now, len(self._flights), is_only)
         self._tokens -= 1.0
