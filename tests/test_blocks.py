@@ -7,7 +7,7 @@ import tracemalloc
 from hypothesis import given
 from hypothesis import strategies as st
 
-from paramclient.protocol.blocks import Blocks
+from paramclient.protocol.ftp.blocks import Blocks
 from tests.simulation import is_so
 
 FILE = bytes(range(256)) * 8

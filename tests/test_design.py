@@ -24,13 +24,13 @@ MAY_IMPORT = {
     "params": {"errors", "values"},
     "identity": {"errors", "values"},
     "protocol.wire": {"errors", "values", "protocol.wire"},
-    "protocol.ftpwire": {"errors", "values"},
+    "protocol.ftp.packets": {"errors", "values"},
     "protocol.pack": {"errors", "values"},
     "protocol": {
         *("errors", "values", "identity", "params"),
-        *("protocol", "protocol.wire", "protocol.ftpwire", "protocol.pack"),
+        *("protocol", "protocol.wire", "protocol.ftp.packets", "protocol.pack"),
     },
-    "sim": {"errors", "values", "protocol.wire", "protocol.ftpwire", "protocol.pack", "sim"},
+    "sim": {"errors", "values", "protocol.wire", "protocol.ftp.packets", "protocol.pack", "sim"},
     "links": {"errors", "values", "sim", "links"},
     "cache": {"errors", "values", "identity", "params", "cache"},
 }

@@ -6,7 +6,7 @@ import pytest
 
 from paramclient.errors import FileErrorCode, UsageError
 from paramclient.protocol import pack, wire
-from paramclient.protocol.ftpwire import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
 from paramclient.protocol.pack import PackedParam
 from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from paramclient.values import ParamType, crc32_px4

@@ -10,7 +10,7 @@ from typing import Final, NamedTuple, TypeAlias
 
 from paramclient.errors import FileErrorCode, PackError, UsageError
 from paramclient.protocol import pack
-from paramclient.protocol.ftpwire import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
 from paramclient.protocol.pack import PackedParam
 from paramclient.values import crc32_px4
 

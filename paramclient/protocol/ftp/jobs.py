@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Final, TypeVar
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, UsageError
-from paramclient.protocol.ftpwire import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.timing import LONGEST_SILENCE, RoundTrip
 from paramclient.protocol.wire import FileTransfer, Message

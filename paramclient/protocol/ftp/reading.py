@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from typing import Final, NamedTuple
 
 from paramclient.errors import FileErrorCode, FileTransferError, UsageError
-from paramclient.protocol.blocks import Blocks
-from paramclient.protocol.ftpjob import Job, Line
-from paramclient.protocol.ftpwire import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.blocks import Blocks
+from paramclient.protocol.ftp.jobs import Job, Line
+from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
 
 __all__ = ["FileRead"]
 

@@ -12,9 +12,9 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeVar
 
 from paramclient.errors import FileErrorCode, NoReply, UsageError
-from paramclient.protocol.ftpjob import Close, Job, Line
-from paramclient.protocol.ftpread import LARGEST_FILE, FileRead
-from paramclient.protocol.ftpwire import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.jobs import Close, Job, Line
+from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.reading import LARGEST_FILE, FileRead
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.wire import FileTransfer, Message
 
