@@ -264,6 +264,7 @@ class ParamClient:
             fetched = together.outcome(now)
         finally:
             together.end()
+            self._wake()  # they may have been in the way of others
         if not fetched.results:
             whose = "any component" if system is None else f"any component of system {system}"
             attempts = max((error.attempts for error in fetched.silent.values()), default=0)

@@ -199,7 +199,8 @@ class Component:
 
         Args:
             refresh: download even when the hash would confirm the cached table.
-            timeout: seconds, after which what has come is given with `missing`.
+            timeout: seconds, after which what has come is given with `missing`. The time for which it waits
+                while the lists of other components fill the link does not count.
             progress: called about ten times a second, from this task.
 
         Raises:
@@ -217,6 +218,7 @@ class Component:
             result = await self._wait_for_fetch(fetch, None if timeout is None else began + timeout, progress)
         finally:
             machine.end_fetch(fetch)
+            self._client._wake()  # it may have been in the way of others
         return replace(result, elapsed=anyio.current_time() - began)
 
     async def refreshed(self, *, timeout: float | None = None) -> None:
@@ -307,11 +309,12 @@ class Component:
         try:
             while not fetch.done:
                 now = anyio.current_time()
-                if deadline is not None and now >= deadline:
+                ends_at = None if deadline is None else deadline + fetch.held_up(now)
+                if ends_at is not None and now >= ends_at:
                     return fetch.partial(now, TIME_IS_OVER)
                 until = now + PROGRESS_INTERVAL if progress is not None else None
-                if deadline is not None:
-                    until = deadline if until is None else min(until, deadline)
+                if ends_at is not None:
+                    until = ends_at if until is None else min(until, ends_at)
                 with anyio.move_on_after(None if until is None else until - now):
                     await ended.wait()
                 if progress is not None:

@@ -17,6 +17,7 @@ from paramclient.protocol.reads import Key, Read, Reads
 from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -91,6 +92,7 @@ class ComponentMachine:
         send: takes each message for it, in order.
         emit: takes each event.
         encoding: what the user said about its encoding, or None.
+        turns: those of the lists on the link; None for a link that it has for itself.
 
     Attributes:
         version: the MAVLink version that it speaks, as far as heard.
@@ -114,6 +116,7 @@ class ComponentMachine:
         send: Callable[[Message], None],
         emit: Callable[[Event], None],
         encoding: Encoding | None = None,
+        turns: Turns | None = None,
     ) -> None:
         target = (system, component)
         self.system = system
@@ -122,7 +125,8 @@ class ComponentMachine:
         self.round_trip = RoundTrip()
         self.who = Identification(target, link, self.round_trip, send, encoding)
         self.table = Table(self.who.encoding)
-        self.reads = Reads(target, self.round_trip, send, self._is_known)
+        self.turns = Turns() if turns is None else turns
+        self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share)
         self.writes = Writes(
             target,
             self.round_trip,
@@ -266,6 +270,7 @@ class ComponentMachine:
                 self._send,
                 self.reads,
                 self.table,
+                self.turns,
                 now,
                 announced=self.announced,
                 expects_hash=self._expects_hash,

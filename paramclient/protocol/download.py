@@ -9,7 +9,8 @@ from typing import Final
 from paramclient.errors import NoReply
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.reads import Read, Reads
-from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.timing import LONGEST_SILENCE, RoundTrip
+from paramclient.protocol.turns import Seen, Turns
 from paramclient.protocol.wire import NO_INDEX, Message, ParamRequestList, ParamValue
 
 __all__ = ["Download"]
@@ -45,6 +46,11 @@ MOST_ASKED: Final = 256
 """Indices asked for at a time; the pace of the reads says how many of them are in flight."""
 RELIST_GAIN: Final = 1.5
 """How many times faster another pass of the list must be than single reads, by the rates measured so far."""
+DEAD: Final = 1e-3
+"""The chance of bad luck below which an index counts as dead, by what was answered while it kept silent."""
+AT_ONCE: Final = 0.0005
+MOSTLY: Final = 0.75
+"""Seconds between two values that come together, and the share of them that makes a stream one of bursts."""
 
 
 class Download(Operation[None]):
@@ -59,12 +65,18 @@ class Download(Operation[None]):
     reads tell the count of now while a running stream of ArduPilot goes by that of its beginning; so a
     different count in an answer is noted, and settled by another pass when the stream is over.
 
+    The list waits for its turn where others of the same link run. It does not end before its time while the
+    component answers, however slowly: an index is given up when others are answered that are asked for
+    together with it, and all of them when nothing at all is for `LONGEST_SILENCE`.
+
     Attributes:
         count: parameters that the vehicle said it has; None before the first value.
         names: what came under that count, by index.
         given_up: indices that stayed silent too often, or were answered with what cannot be true.
         repeated: values that came although they had come before.
         lists: how often the list was asked for.
+        held_up: seconds for which it waited for its turn; with `held_since` while it waits.
+        held_since: since when it waits, or None.
     """
 
     def __init__(
@@ -73,6 +85,7 @@ class Download(Operation[None]):
         round_trip: RoundTrip,
         send: Callable[[Message], None],
         reads: Reads,
+        turns: Turns,
         now: float,
         *,
         listed: bool = False,
@@ -82,11 +95,14 @@ class Download(Operation[None]):
         self._round_trip = round_trip
         self._send = send
         self._reads = reads
+        self._turns = turns
         self.count: int | None = None
         self.names: dict[int, str] = {}
         self.given_up: set[int] = set()
         self.repeated = 0
         self.lists = 0
+        self.held_up = 0.0
+        self.held_since: float | None = None
         self._passes = 1
         self._vain_passes = 0
         self._moves = 0
@@ -102,6 +118,10 @@ class Download(Operation[None]):
         self._other_count: int | None = None
         self._heard_at = now  # the last value of the stream
         self._began = (0, now)  # where and when the stream began
+        self._came_before = 0  # how often others went forward before it
+        self._together = 0  # values that came at once with the one before
+        self._silent_at = math.inf  # when an unanswered list no longer takes anything of the link
+        self._tries: dict[int, tuple[int, int]] = {}  # what reads in vain have shown: requests, controls
         self._gap = 0.0  # the mean time between two values of it
         self._longest = 0.0  # the longest of late
         self._is_awaited = True  # the list was asked for, and no value of it has come
@@ -112,8 +132,10 @@ class Download(Operation[None]):
         if listed:
             self.lists = 1
             self._list_wait = round_trip.timeout
+            self._silent_at = now + self._list_wait
+            turns.has_begun(self)
         else:
-            self._ask_for_list(now)
+            self._ask_for_turn(now)
 
     @property
     def received(self) -> int:
@@ -134,6 +156,43 @@ class Download(Operation[None]):
         """Received, and total where it is known."""
         return self.received, self.count
 
+    @property
+    def is_awaited(self) -> bool:
+        """Whether nothing has come of the list since it was asked for."""
+        return self._is_awaited
+
+    @property
+    def silent_at(self) -> float:
+        """While nothing has come of the list: when that has lasted too long."""
+        return self._silent_at if self._is_awaited else math.inf
+
+    def seen(self) -> Seen:
+        """What the list has shown since it was asked for."""
+        if self._is_awaited:
+            return Seen(0, 0, 0.0, False)
+        came = self._advances - self._came_before
+        return Seen(came, self._front - self._began[0] + 1, self._longest, self._together >= MOSTLY * came)
+
+    def begin(self, now: float) -> None:
+        """It is this list's turn."""
+        if self.held_since is not None:
+            self.held_up += now - self.held_since
+            self.held_since = None
+        self._patient_since = now
+        is_running = self._advances >= ENOUGH_ADVANCES and now < self._quiet_at
+        if self.lists == 0 and is_running:
+            return  # somebody else has asked for it meanwhile
+        self._front = self._jump = -1
+        self._holes.clear()
+        self._heard_at = now
+        self._list_wait = 0.0
+        self._ask_for_list(now)
+        self._silent_at = now + self._list_wait
+
+    def held_for(self, now: float) -> float:
+        """Seconds for which it has waited for its turn so far."""
+        return self.held_up + (0.0 if self.held_since is None else now - self.held_since)
+
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
         name, _, _, count, index = message
@@ -153,7 +212,7 @@ class Download(Operation[None]):
             self._take(index, name)
         else:
             self._follow(index, name, now)
-        if self._holes or self._asked or not self._is_streaming:
+        if (self._holes and self.held_since is None) or self._asked or not self._is_streaming:
             self._ask_for_gaps(now)
             self._finish_if_complete(now)
 
@@ -166,25 +225,28 @@ class Download(Operation[None]):
 
     def tick(self, now: float) -> None:
         """Ask for the list again, or see that the stream is over."""
-        if self.done:
+        if self.done or self.held_since is not None:
             return
         if self.count is None:
             if self._list_at + self._list_wait <= now:
+                if self._turns.is_beside_others(self):
+                    self._patient_since = now  # it may have no room to answer
                 if now - self._patient_since >= LIST_PATIENCE:
                     system, component = self._target
                     what = f"the parameter list of {system}/{component}"
-                    self._end_with_error(NoReply(what, attempts=self.lists, waited=now - self.begun_at), now)
+                    waited = now - self.begun_at - self.held_up
+                    self._end_with_error(NoReply(what, attempts=self.lists, waited=waited), now)
                 else:
                     self._ask_for_list(now)
             return
         if self._is_streaming and self._quiet_at <= now:
-            self._stream_ends()
+            self._stream_ends(is_cut=True)
         self._ask_for_gaps(now)
         self._finish_if_complete(now)
 
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity. The reads have deadlines of their own."""
-        if self.done:
+        if self.done or self.held_since is not None:
             return math.inf
         if self.count is None:
             return self._list_at + self._list_wait
@@ -194,6 +256,7 @@ class Download(Operation[None]):
         """The link is back: what was not sent while it was away is worth asking for now."""
         self._list_at = now - self._list_wait
         self._patient_since = self._heard_at = now
+        self._silent_at = now + self._round_trip.timeout
 
     def cancel(self) -> None:
         """Nobody waits for it any more; a stream that runs goes on and still fills the table."""
@@ -208,9 +271,13 @@ class Download(Operation[None]):
         return self._heard_at + max(QUIET_GAPS * self._longest, SHORTEST_QUIET_AT_PACE)
 
     def _note_answer(self, now: float) -> None:
-        if not self._is_answered:
+        if not self._is_answered and self.lists:
             self._is_answered = True
             self._round_trip.answered(self._list_at, now, self.lists)
+
+    def _ask_for_turn(self, now: float) -> None:
+        self.held_since = now
+        self._turns.ask(self, now)
 
     def _ask_for_list(self, now: float) -> None:
         self.lists += 1
@@ -224,13 +291,9 @@ class Download(Operation[None]):
     def _ask_for_another_pass(self, now: float) -> None:
         self._passes += 1
         self._vain_passes += 1
-        self._list_wait = 0.0
-        self._front = self._jump = -1
         self._vain = 0
-        self._holes.clear()
         self._is_streaming = self._reads.list_runs_again = True
-        self._heard_at = now
-        self._ask_for_list(now)
+        self._ask_for_turn(now)
 
     def _follow(self, index: int, name: str, now: float) -> None:
         """The stream has brought an index, or the vehicle has pushed a change into it."""
@@ -245,10 +308,15 @@ class Download(Operation[None]):
             if self._is_awaited:
                 self._is_awaited = False
                 self._began = (index, now)
+                self._came_before = self._advances
+                self._together = 0
             else:
                 self._longest *= 0.99
-                if now - self._heard_at > self._longest:
-                    self._longest = now - self._heard_at
+                gap = now - self._heard_at
+                if gap > self._longest:
+                    self._longest = gap
+                elif gap < AT_ONCE:
+                    self._together += 1
             self._advances += 1
             if index - self._front > 1:
                 for hole in range(self._front + 1, index):
@@ -283,21 +351,27 @@ class Download(Operation[None]):
         if self._front > first:
             self._gap = (self._front_at - since) / (self._front - first)
         if self._advances >= ENOUGH_ADVANCES:
-            self._reads.pace.stream_seen(self._gap)
+            came, passed, _, _ = self.seen()
+            self._reads.pace.stream_seen(self._gap, 1 - came / passed if passed else 0.0)
 
-    def _stream_ends(self) -> None:
+    def _stream_ends(self, *, is_cut: bool = False) -> None:
         self._learn_pace()
         self._is_streaming = self._reads.list_runs_again = False
         self._reads.is_idle = True
+        self.held_since = None
+        self._reads.pace.stream_ended()
+        self._turns.give_back(self, is_cut=is_cut)
 
     def _start_over(self, count: int | None) -> None:
         """The count has moved: indices heard before may mean other parameters now."""
-        self._learn_pace()
+        if self._is_streaming:
+            self._learn_pace()
         self._forget_reads()
         self._moves += 1
         self.count = count
         self.names.clear()
         self.given_up.clear()
+        self._tries.clear()
         self._holes.clear()
         self._front = self._jump = -1
         self._next = self._vain = 0
@@ -328,13 +402,15 @@ class Download(Operation[None]):
     def _another_pass_is_faster(self, missing: int) -> bool:
         if self.count is None or self._passes >= MOST_PASSES or missing <= FEW:
             return False
-        if self._vain_passes >= MOST_VAIN_PASSES:
+        if self._vain_passes >= MOST_VAIN_PASSES or not self._turns.is_free:
             return False
         trip = self._round_trip
         by_reads = missing / (self._reads.pace.prospect * (1 - trip.loss))
         return by_reads > RELIST_GAIN * (self.count * self._gap + (trip.smoothed or trip.timeout))
 
     def _ask(self, index: int, now: float) -> None:
+        if self._front in self.names:
+            self._reads.control = self._front
         read = self._asked[index] = self._reads.ask(index, now, urgent=False)
 
         def ended() -> None:
@@ -342,13 +418,31 @@ class Download(Operation[None]):
                 return
             del self._asked[index]
             if index not in self.names and self._other_count is None:
-                self.given_up.add(index)
-                if isinstance(read.error, NoReply) and self._reads.answered_at <= read.begun_at:
-                    self._give_up_the_rest()
+                self._unanswered(index, read)
             self._ask_for_gaps(read.ended_at)
             self._finish_if_complete(read.ended_at)
 
         read.on_done.append(ended)
+
+    def _unanswered(self, index: int, read: Read) -> None:
+        """A read has ended without its value: for good, or is it worth asking again?"""
+        if not isinstance(read.error, NoReply) or self._seems_dead(index, read):
+            self.given_up.add(index)
+            return
+        is_gone = read.ended_at - self._round_trip.heard_at >= LONGEST_SILENCE
+        if self._turns.is_beside_others(self):
+            self._reads.forgive()  # it may have no room to answer
+        elif is_gone or self._reads.is_silent(read.ended_at):
+            self._give_up_the_rest()
+        self._next = min(self._next, index)
+
+    def _seems_dead(self, index: int, read: Read) -> bool:
+        """Whether what was asked for together with it was answered too often for this to be bad luck."""
+        attempts, controls = self._tries.get(index, (0, 0))
+        attempts, controls = attempts + read.attempts, controls + read.controls
+        self._tries[index] = attempts, controls
+        answered = min(controls / max(attempts - 2, 1), 1.0)
+        return (1.0 - answered) ** attempts < DEAD
 
     def _finish_if_complete(self, now: float) -> None:
         if self.done or self.count is None or self._is_streaming or self._asked:

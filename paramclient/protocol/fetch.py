@@ -15,6 +15,7 @@ from paramclient.protocol.operation import Operation
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import HASH_CHECK, Message, ParamValue
 from paramclient.values import Param
 
@@ -110,6 +111,7 @@ class Fetch(Operation[FetchResult]):
         send: Callable[[Message], None],
         reads: Reads,
         table: Table,
+        turns: Turns,
         now: float,
         *,
         announced: Announcement | None,
@@ -125,6 +127,7 @@ class Fetch(Operation[FetchResult]):
         self._send = send
         self._reads = reads
         self._table = table
+        self._turns = turns
         self._changed = changed
         self._doubt = doubt
         self._expects_hash = expects_hash
@@ -134,6 +137,7 @@ class Fetch(Operation[FetchResult]):
         self._was_asked_meanwhile = False
         self._is_hash_unknown = False  # the vehicle answers, but not to that
         self._first_value_at = math.inf
+        self._held_before = 0.0  # by a download that was begun anew
         self._listed = listed
         self.holders = 0
         self.download: Download | None = None
@@ -180,6 +184,7 @@ class Fetch(Operation[FetchResult]):
     def restart(self, now: float) -> None:
         """The table turned out to be another vehicle's: fetch it anew."""
         self._drop()
+        self._held_before = self.held_up(now)
         self._before = self._meanwhile = None
         self._was_asked_meanwhile = False
         self._listed = False
@@ -199,7 +204,7 @@ class Fetch(Operation[FetchResult]):
         if download is None or download.count is None:
             system, component = self._target
             attempts = 1 if download is None else download.lists
-            waited = now - self.begun_at
+            waited = now - self.begun_at - self.held_up(now)
             raise NoReply(f"the parameters of {system}/{component}", attempts=attempts, waited=waited)
         return self._result("stream", download.count, download.missing, None, now, (note,))
 
@@ -210,6 +215,10 @@ class Fetch(Operation[FetchResult]):
             return self.download.count is None and self.download.lists > 1
         read = self._hash_read
         return read is not None and read.attempts > 1 and not read.controls
+
+    def held_up(self, now: float) -> float:
+        """Seconds for which its list has waited for its turn: other lists of the same link ran."""
+        return self._held_before + (0.0 if self.download is None else self.download.held_for(now))
 
     def progress(self, now: float) -> Progress:
         """How far it is."""
@@ -259,7 +268,13 @@ class Fetch(Operation[FetchResult]):
     def _begin_download(self, now: float) -> None:
         self._doubt(now)
         download = self.download = Download(
-            self._target, self._round_trip, self._send, self._reads, now, listed=self._listed
+            self._target,
+            self._round_trip,
+            self._send,
+            self._reads,
+            self._turns,
+            now,
+            listed=self._listed,
         )
 
         download.on_done.append(partial(self._download_ended, download))

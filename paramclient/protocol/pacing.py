@@ -7,7 +7,7 @@ from typing import Final
 
 from paramclient.protocol.timing import RoundTrip
 
-__all__ = ["Pace"]
+__all__ = ["Pace", "Share"]
 
 FIRST_RATE: Final = 50.0
 """Requests a second before anything is known: what ArduPilot serves, the slowest autopilot there is."""
@@ -36,34 +36,94 @@ VALUE_SIZE: Final = 37
 """Bytes of a PARAM_REQUEST_READ by index and of a PARAM_VALUE, in MAVLink 2."""
 
 
+class Share:
+    """What the reads of all components of one link may take of it together: a third of its rate.
+
+    That is the rate at which their lists were seen to come, of those that ran beside each other the sum. It
+    is divided evenly among the components that are asked for something.
+
+    Attributes:
+        each: requests a second that every one of them may send.
+    """
+
+    __slots__ = ("_askers", "_best", "_streams", "each")
+
+    def __init__(self) -> None:
+        self._askers: set[Pace] = set()
+        self._streams: dict[Pace, tuple[float, float]] = {}
+        self._best: dict[Pace, float] = {}
+        self.each = LARGEST_RATE
+
+    def join(self, pace: Pace) -> None:
+        """A component is asked for something."""
+        self._askers.add(pace)
+        self._divide()
+
+    def leave(self, pace: Pace) -> None:
+        """Nothing is asked of it any more."""
+        self._askers.discard(pace)
+        self._divide()
+
+    def stream_seen(self, pace: Pace, rate: float, loss: float) -> None:
+        """A component sends its list with so many values a second, of which a share is lost."""
+        if pace in self._best:
+            self._best = {}  # of an earlier list of it
+        self._streams[pace] = rate, rate * (1.0 - loss)
+        self._divide()
+
+    def stream_ended(self, pace: Pace) -> None:
+        """Its list is over. What it has shown of the link counts on until it sends another."""
+        if pace in self._streams:
+            rates = self._rates()
+            if sum(rates.values()) > sum(self._best.values()):
+                self._best = rates
+            del self._streams[pace]
+            self._divide()
+
+    def _rates(self) -> dict[Pace, float]:
+        """Values a second of the lists that run: beside another one, lost values show no room on the link."""
+        is_alone = len(self._streams) == 1
+        return {pace: sent if is_alone else came for pace, (sent, came) in self._streams.items()}
+
+    def _divide(self) -> None:
+        values = max(sum(self._best.values()), sum(self._rates().values()))
+        if values:
+            requests = values * VALUE_SIZE * UPSTREAM_SHARE / REQUEST_SIZE
+            self.each = max(requests, SMALLEST_RATE) / max(len(self._askers), 1)
+
+
 class Pace:
     """A token bucket whose rate follows what the component serves.
 
     As long as requests wait for their turn and answers come no later than before, the rate doubles with the
     first look and grows fourfold with each further one. When answers begin to queue up, or fewer come than
     should, it falls to what was answered, and from there on only creeps.
-    It never takes more than a third of the rate at which the list's stream was seen to come.
+    It never takes more than the component's share of the link.
+
+    Args:
+        round_trip: the component's.
+        share: the link's; None for a component that has the link for itself.
     """
 
     __slots__ = (
         "_answers",
-        "_cap",
         "_epoch_at",
         "_is_found",
         "_late",
         "_quickest",
         "_rate",
         "_round_trip",
+        "_share",
         "_timed",
         "_tokens",
         "_tokens_at",
         "_was_short",
     )
 
-    def __init__(self, round_trip: RoundTrip) -> None:
+    def __init__(self, round_trip: RoundTrip, share: Share | None = None) -> None:
         self._round_trip = round_trip
+        self._share = Share() if share is None else share
         self._rate = FIRST_RATE
-        self._cap = LARGEST_RATE
         self._tokens = SMALLEST_BURST
         self._tokens_at = -math.inf
         self._epoch_at = math.inf
@@ -77,12 +137,12 @@ class Pace:
     @property
     def rate(self) -> float:
         """Requests a second."""
-        return max(min(self._rate, self._cap), SMALLEST_RATE)
+        return min(self._rate, self._share.each)
 
     @property
     def prospect(self) -> float:
         """Requests a second that the next look may allow: what is served is not found yet."""
-        return self.rate if self._is_found else min(self.rate * self._growth, self._cap)
+        return self.rate if self._is_found else min(self.rate * self._growth, self._share.each)
 
     @property
     def _growth(self) -> float:
@@ -93,7 +153,7 @@ class Pace:
 
     @property
     def _burst(self) -> float:
-        return max(self.rate * BURST_TIME, min(SMALLEST_BURST, self._cap * BURST_TIME * 2), 1.0)
+        return max(self.rate * BURST_TIME, min(SMALLEST_BURST, self._share.each * BURST_TIME * 2), 1.0)
 
     def may_send(self, now: float, reserve: float = 0.0) -> bool:
         """Whether a request may go out now; with a reserve, whether that many more still could."""
@@ -113,6 +173,7 @@ class Pace:
         self._fill(now)
         self._tokens -= 1.0
         if self._epoch_at == math.inf:
+            self._share.join(self)
             self._epoch_at = now + (self._round_trip.smoothed or 0.0)
 
     def answered(self, delay: float | None, now: float) -> None:
@@ -128,14 +189,22 @@ class Pace:
         if self._answers >= EPOCH_ANSWERS and now - self._epoch_at >= EPOCH:
             self._look(now)
 
-    def stream_seen(self, gap: float) -> None:
-        """The list's stream brings a value every `gap` seconds."""
+    def stream_seen(self, gap: float, loss: float = 0.0) -> None:
+        """The list's stream brings a value every `gap` seconds, but for the share of them that is lost."""
         if gap > 0:
-            self._cap = VALUE_SIZE / gap * UPSTREAM_SHARE / REQUEST_SIZE
+            self._share.stream_seen(self, 1.0 / gap, loss)
+
+    def stream_ended(self) -> None:
+        """It brings no more."""
+        self._share.stream_ended(self)
 
     def idle(self) -> None:
         """Nothing is asked for any more: what is measured next begins anew."""
-        self._epoch_at = math.inf
+        self._share.leave(self)
+        self._begin_epoch(math.inf)
+
+    def _begin_epoch(self, at: float) -> None:
+        self._epoch_at = at
         self._answers = 0
         self._timed = 0
         self._late = 0.0
@@ -153,9 +222,8 @@ class Pace:
             self._is_found = True
         elif self._was_short:
             self._rate = min(self._rate * self._growth, LARGEST_RATE)
-        self.idle()
         # what comes within the next round trip answers to the rate before
-        self._epoch_at = now + self._quickest
+        self._begin_epoch(now + self._quickest)
 
     def _fill(self, now: float) -> None:
         if now > self._tokens_at:

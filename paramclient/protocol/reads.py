@@ -9,7 +9,7 @@ from typing import Final, TypeAlias
 
 from paramclient.errors import NoReply, ParamErrorCode, Refused, TypeMismatch, UnknownParameter, VehicleError
 from paramclient.protocol.operation import Operation
-from paramclient.protocol.pacing import Pace
+from paramclient.protocol.pacing import Pace, Share
 from paramclient.protocol.timing import LONGEST_SILENCE, MOST_TRIES, RoundTrip
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
 
@@ -19,7 +19,7 @@ Key: TypeAlias = str | int
 """What a read asks for: a name, or an index."""
 
 CONTROL: Final = 0
-"""The index that is asked for to learn whether the component answers at all."""
+"""The index that every component with parameters has, and that is asked for where none is known to answer."""
 COPY_RESERVE: Final = 2.0
 """Requests that must remain possible when one is sent again early."""
 COPY_RISK: Final = 0.01
@@ -56,7 +56,7 @@ class Reads:
     """Every read of one component: as fast as it serves them, single ones before a download's.
 
     Silence is not an answer: PX4 up to 1.17 and ArduPilot say nothing to what they do not have. What stays
-    silent is therefore asked for together with index 0, which every component with parameters has. When that
+    silent is therefore asked for together with an index that it has. When that
     keeps being answered, and a name that nobody has heard of or an index that is not below the count does
     not, the link is not the reason: the parameter is unknown.
 
@@ -66,6 +66,8 @@ class Reads:
         list_runs_again: set while a list comes for another time: then it may answer reads by index, and that
             tells nothing of the round trip.
         is_idle: false while a list comes: then nothing is asked for twice to save time.
+        control: the index that is asked for to learn whether the component answers at all: one that is known
+            to be there.
     """
 
     def __init__(
@@ -74,12 +76,13 @@ class Reads:
         round_trip: RoundTrip,
         send: Callable[[Message], None],
         is_known: Callable[[Key], bool],
+        share: Share | None = None,
     ) -> None:
         self._target = target
         self._round_trip = round_trip
         self._send = send
         self._is_known = is_known
-        self.pace = Pace(round_trip)
+        self.pace = Pace(round_trip, share)
         self._open: dict[Key, Read] = {}
         self._flying: dict[Key, Read] = {}
         self._again: deque[Read] = deque()
@@ -90,7 +93,9 @@ class Reads:
         self.is_idle = True
         self._silences = 0  # time-outs since anything was answered
         self._silent_since = math.inf  # the first request since then
+        self.control = CONTROL
         self._control_at = math.inf
+        self._control_index = CONTROL  # of the one under way
         self._control_attempts = 0
 
     def __len__(self) -> int:
@@ -130,7 +135,7 @@ class Reads:
             self._drop(read)
             read.finish(message, now)
             self._send_waiting(now)
-        if message.param_index == CONTROL and self._control_at < math.inf:
+        if message.param_index == self._control_index and self._control_at < math.inf:
             # one that was lost may have nobody left to ask again; then this is not its answer
             is_late = now - self._control_at > 2 * self._round_trip.timeout
             self._round_trip.answered(self._control_at, now, self._control_attempts + is_late)
@@ -197,6 +202,16 @@ class Reads:
                 self._again.append(read)
         self._send_waiting(now)
 
+    def is_silent(self, now: float) -> bool:
+        """Whether nothing at all was answered for so long, and so often, that it leads nowhere."""
+        tries = min(self._round_trip.tries, MOST_TRIES)
+        return self._silences >= tries and now - self._silent_since >= LONGEST_SILENCE
+
+    def forgive(self) -> None:
+        """The silence so far has another reason."""
+        self._silences = 0
+        self._silent_since = math.inf
+
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity."""
         earliest = math.inf
@@ -245,8 +260,7 @@ class Reads:
 
     def _not_silent(self, now: float) -> None:
         self.answered_at = now
-        self._silences = 0
-        self._silent_since = math.inf
+        self.forgive()
 
     def _silence(self, read: Read, now: float) -> Exception:
         system, component = self._target
@@ -269,7 +283,7 @@ class Reads:
         self._silent_since = min(self._silent_since, now)
         self.pace.sent(now)
         self._request(read)
-        if read.key != CONTROL and read.attempts > (2 if self._is_known(read.key) else 1):
+        if read.key != self.control and read.attempts > (2 if self._is_known(read.key) else 1):
             self._send_control(now)
 
     def _request(self, read: Read) -> None:
@@ -288,8 +302,9 @@ class Reads:
         else:
             self._control_attempts = 1
         self._control_at = now
+        self._control_index = self.control
         self.pace.sent(now)
-        self._send(ParamRequestRead(*self._target, "", CONTROL))
+        self._send(ParamRequestRead(*self._target, "", self.control))
 
     def _send_waiting(self, now: float) -> None:
         """Send what waits, as far as the pace allows; on an idle link ask twice rather than wait."""
