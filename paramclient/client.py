@@ -375,8 +375,10 @@ class ParamClient:
                 for component in self._components.values():
                     if component.system == machine.system:
                         self._read_cache(component)
-            elif event.result.complete:
-                self._writer.synced(machine, is_whole=event.result.source != "cache")
+            elif event.result.complete and event.result.is_confirmed:
+                self._writer.synced(
+                    machine, is_whole=event.result.source != "cache" and not event.result.resumed
+                )
                 self._something_to_write.set()
 
     def _meet(self, machine: ComponentMachine) -> None:

@@ -102,6 +102,9 @@ class WriteThrough:
         for name in table.params:
             table.dirty.setdefault(name, "vehicle")
         if cached is not None:
+            # the indices of an unfinished table are gone on with: they must be this firmware's on this board
+            is_same = identity.uid is not None and _firmware(cached.identity) == _firmware(identity)
+            is_placed = cached.complete or (is_same and cached.count is not None)
             machine.use_cached(
                 cached.params,
                 anyio.current_time(),
@@ -110,9 +113,10 @@ class WriteThrough:
                 complete=cached.complete,
                 volatile=cached.volatile,
                 volatile_known=cached.volatile_known,
+                placed=is_placed,
             )
             kept.synced_at = cached.synced_at
-            kept.state = self._state(machine, kept)
+            kept.state = None if table.is_displaced else self._state(machine, kept)
         if machine.synced:
             kept.synced_at = time.time()
 
@@ -176,7 +180,7 @@ class WriteThrough:
         table = machine.table
         return TableState(
             hash=table.hash if table.complete else None,
-            count=table.count,
+            count=None if table.is_displaced else table.count,  # the cache keeps the indices of before
             complete=table.complete,
             volatile_known=table.volatile_known,
             synced_at=kept.synced_at,
@@ -264,6 +268,10 @@ class _Worker:
     def _main(self) -> None:
         while (call := self._calls.get()) is not None:
             call()
+
+
+def _firmware(identity: Identity) -> tuple[int, str]:
+    return identity.firmware, identity.git_hash
 
 
 def _save(cache: ParamCache, updates: list[TableUpdate]) -> bool:

@@ -10,11 +10,14 @@ import pytest
 from paramclient.errors import LinkError, NoReply
 from paramclient.protocol import download as room
 from paramclient.protocol.download import (
+    EVEN_LISTS,
     FEW,
     LIST_PATIENCE,
+    LIST_TRIES,
     LONGEST_JUMP,
     LONGEST_LIST_WAIT,
     MOST_ASKED,
+    MOST_LISTS_AT_ONCE,
     MOST_MOVES,
     MOST_VAIN_PASSES,
     REORDER_DEPTH,
@@ -123,8 +126,13 @@ def test_the_list_is_asked_for_again_as_long_as_nothing_comes() -> None:
     assert desk.take() == ["list"]
     desk.pass_time(0.02)
     assert desk.take() == ["list"]
-    desk.pass_time(2 * INITIAL_TIMEOUT)
+    for _ in range(EVEN_LISTS - 2):
+        desk.pass_time(INITIAL_TIMEOUT)
+        assert desk.take() == ["list"]
+    desk.pass_time(INITIAL_TIMEOUT)
     assert desk.take() == ["list"]
+    desk.pass_time(1.9 * INITIAL_TIMEOUT)  # from now on less often: it may not want to answer yet
+    assert desk.take() == []
     desk.stream(range(40))
     desk.pass_time(0.05)
     assert desk.take() == []
@@ -157,10 +165,38 @@ def test_silence_ends_with_no_reply() -> None:
     desk.pass_time()
     assert isinstance(desk.download.error, NoReply)
     assert LIST_PATIENCE <= desk.now <= LIST_PATIENCE + LONGEST_LIST_WAIT
-    assert desk.download.error.attempts == desk.download.lists == desk.take().count("list") < 12
+    assert desk.download.error.attempts == desk.download.lists == desk.take().count("list")
+    assert LIST_TRIES <= desk.download.lists < LIST_TRIES + 4
     assert "list of 1/1" in str(desk.download.error)
     assert desk.download.missing == ()
     assert desk.reads.is_idle
+
+
+def test_a_list_that_is_lost_often_is_asked_for_often_enough() -> None:
+    desk = Desk(round_trip=3.0)
+    desk.pass_time(LIST_PATIENCE + 5.0)
+    assert not desk.download.done, "not before it was asked for often enough"
+    desk.pass_time()
+    assert desk.download.lists == LIST_TRIES
+
+
+def test_a_component_that_is_not_heard_either_is_given_up_sooner() -> None:
+    desk = Desk(round_trip=3.0)
+    desk.trip.heard_at = 0.0
+    desk.pass_time()
+    assert isinstance(desk.download.error, NoReply)
+    assert desk.now < LIST_PATIENCE + 5.0
+
+
+def test_another_pass_is_asked_for_twice_at_once_on_a_link_that_loses() -> None:
+    desk = Desk()
+    for _ in range(100):
+        desk.trip.timed_out(1)
+        desk.trip.answered(0.0, 0.02, 1)
+    desk.stream(range(50), count=1000)
+    assert desk.take() == ["list"]
+    desk.pass_time(0.3)
+    assert desk.take().count("list") == MOST_LISTS_AT_ONCE
 
 
 def test_on_a_slow_link_the_list_is_not_asked_for_while_the_answer_is_on_its_way() -> None:

@@ -202,6 +202,7 @@ class ComponentMachine:
         complete: bool,
         volatile: frozenset[str],
         volatile_known: bool,
+        placed: bool = True,
     ) -> None:
         """Take what the cache knows of this component. What was heard on this link stays as it is.
 
@@ -210,13 +211,13 @@ class ComponentMachine:
             now: the time.
             count: the param_count with it.
             confirmed: the hash under which the vehicle would confirm it, or None.
-            complete: whether it held every index below the count.
+            complete, placed: whether it held every index below the count, and whether these still hold.
             volatile, volatile_known: as in `Table`.
         """
         table = self.table
         if table.complete:
             return
-        self._report(table.fill(params))
+        self._report(table.fill(params, placed=placed and table.count in (None, count)))
         if table.count not in (None, count):
             return
         table.count = count
@@ -261,7 +262,7 @@ class ComponentMachine:
             listed: the list has been asked for already, of all components at once.
         """
         fetch = self.fetch
-        if fetch is not None and refresh and fetch.download is None:
+        if fetch is not None and refresh and (fetch.download is None or fetch.download.resumed):
             fetch.restart(now)
         if fetch is None:
             fetch = self.fetch = Fetch(
@@ -423,8 +424,8 @@ class ComponentMachine:
 
     def _count_moved(self, count: int) -> None:
         if self.table.count is not None:
-            self.synced = self.table.complete = False
-        self.table.count = count
+            self.synced = False
+        self.table.move(count)
 
     def _notice(self, name: str, now: float) -> None:
         """A value changed: the second time in a short while, the one that came last may be the older one."""
@@ -525,10 +526,10 @@ class ComponentMachine:
         if result is None:
             return
         self.last_fetch = result
-        self.synced = result.complete and self.table.complete
+        self.synced = result.complete and self.table.complete and result.is_confirmed
         self._moved_by_us_alone = result.hash is not None
         self._emit(Fetched(self, result))
-        if result.source == "cache" and result.hash is not None:
+        if result.hash is not None and (result.source == "cache" or result.resumed):
             self._refresh_unhashed(result.hash, fetch.ended_at)
 
     def _refresh_unhashed(self, confirmed: int, now: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from paramclient.errors import NoReply
@@ -18,8 +18,19 @@ __all__ = ["Download"]
 LIST_PATIENCE: Final = 20.0
 """Seconds of silence after which PARAM_REQUEST_LIST counts as not answered: longer than ArduPilot leaves it
 unanswered after a boot."""
-LONGEST_LIST_WAIT: Final = 5.0
+LIST_VARIATION: Final = 3.0
+"""How many times longer than the first list another one may take to begin: reads, which wait for each other,
+say less of that."""
+LIST_RISK: Final = 0.05
+MOST_LISTS_AT_ONCE: Final = 3
+"""The chance of no answer to go below, where the list is asked for another time, by asking twice at once. The
+first time PX4 would take the second for a restart, and leave out its hash."""
+LIST_TRIES: Final = 12
+"""Times that it is asked for, at the least, when the component is heard: enough where many are lost."""
+LONGEST_LIST_WAIT: Final = 2.5
 """Seconds between two of them, at the most, on a link that answers sooner than that."""
+EVEN_LISTS: Final = 3
+"""Of these the first follow each other without a longer wait: they were lost rather than left unanswered."""
 MOST_PASSES: Final = 20
 """Times that the list may be asked for: anew when the count has moved, or when too much is missing to be read
 one by one."""
@@ -46,11 +57,16 @@ MOST_ASKED: Final = 256
 """Indices asked for at a time; the pace of the reads says how many of them are in flight."""
 RELIST_GAIN: Final = 1.5
 """How many times faster another pass of the list must be than single reads, by the rates measured so far."""
+ASSUMED_LIST: Final = 5.0
+"""Seconds that a list is taken to last before its pace was measured: on a cable one, on a radio thirty."""
 DEAD: Final = 1e-3
 """The chance of bad luck below which an index counts as dead, by what was answered while it kept silent."""
-AT_ONCE: Final = 0.0005
-MOSTLY: Final = 0.75
+AT_ONCE: Final = 0.00025
+MOSTLY: Final = 0.5
 """Seconds between two values that come together, and the share of them that makes a stream one of bursts."""
+BURST_GAIN: Final = 3.0
+"""How many times faster than such a stream the link is taken to be: within a burst of PX4 it is a lot more,
+but a program that was busy sees bursts on any link."""
 
 
 class Download(Operation[None]):
@@ -69,11 +85,15 @@ class Download(Operation[None]):
     component answers, however slowly: an index is given up when others are answered that are asked for
     together with it, and all of them when nothing at all is for `LONGEST_SILENCE`.
 
+    With what is there already only the rest is asked for. Should that turn out to be of another count, or to
+    have other names, it counts as nothing.
+
     Attributes:
         count: parameters that the vehicle said it has; None before the first value.
         names: what came under that count, by index.
         given_up: indices that stayed silent too often, or were answered with what cannot be true.
         repeated: values that came although they had come before.
+        resumed: how many of them were there already.
         lists: how often the list was asked for.
         held_up: seconds for which it waited for its turn; with `held_since` while it waits.
         held_since: since when it waits, or None.
@@ -89,6 +109,8 @@ class Download(Operation[None]):
         now: float,
         *,
         listed: bool = False,
+        count: int | None = None,
+        present: Mapping[int, str] | None = None,
     ) -> None:
         super().__init__(now)
         self._target = target
@@ -96,8 +118,9 @@ class Download(Operation[None]):
         self._send = send
         self._reads = reads
         self._turns = turns
-        self.count: int | None = None
-        self.names: dict[int, str] = {}
+        self.count = count if present else None
+        self.names = dict(present or {})
+        self.resumed = len(self.names)
         self.given_up: set[int] = set()
         self.repeated = 0
         self.lists = 0
@@ -122,18 +145,25 @@ class Download(Operation[None]):
         self._together = 0  # values that came at once with the one before
         self._silent_at = math.inf  # when an unanswered list no longer takes anything of the link
         self._tries: dict[int, tuple[int, int]] = {}  # what reads in vain have shown: requests, controls
+        self._places = {name: index for index, name in self.names.items()}  # of what was there already
+        self._is_heard = False  # whether anything has come
         self._gap = 0.0  # the mean time between two values of it
         self._longest = 0.0  # the longest of late
         self._is_awaited = True  # the list was asked for, and no value of it has come
+        self._list_patience = math.inf  # how long another pass may let its first value be waited for
         self._is_answered = False  # the first answer to it tells the round trip
         self._list_wait = 0.0
+        self._list_asked = 0  # times since the turn began
         self._list_at = now
         self._patient_since = now
         if listed:
             self.lists = 1
-            self._list_wait = round_trip.timeout
+            self._list_wait = round_trip.prompt_timeout
+            self._list_asked = 1
             self._silent_at = now + self._list_wait
             turns.has_begun(self)
+        elif present:
+            self._go_on(now)
         else:
             self._ask_for_turn(now)
 
@@ -186,6 +216,7 @@ class Download(Operation[None]):
         self._holes.clear()
         self._heard_at = now
         self._list_wait = 0.0
+        self._list_asked = 0
         self._ask_for_list(now)
         self._silent_at = now + self._list_wait
 
@@ -198,9 +229,13 @@ class Download(Operation[None]):
         name, _, _, count, index = message
         if index == NO_INDEX or count == NO_INDEX or index >= count or self.done:
             return
+        self._is_heard = True
         if self.count is None:
             self._note_answer(now)
             self.count = count
+        elif self.resumed and self._contradicts(index, name) and count == self.count:
+            self._start_over(count)
+            self._ask_for_another_pass(now)
         elif count != self.count and self._moves < MOST_MOVES:
             if index in self._asked or not self._is_streaming:
                 self._other_count = count
@@ -231,11 +266,10 @@ class Download(Operation[None]):
             if self._list_at + self._list_wait <= now:
                 if self._turns.is_beside_others(self):
                     self._patient_since = now  # it may have no room to answer
-                if now - self._patient_since >= LIST_PATIENCE:
-                    system, component = self._target
-                    what = f"the parameter list of {system}/{component}"
-                    waited = now - self.begun_at - self.held_up
-                    self._end_with_error(NoReply(what, attempts=self.lists, waited=waited), now)
+                is_gone = now - self._round_trip.heard_at >= LONGEST_SILENCE
+                is_enough = is_gone or self._list_asked >= LIST_TRIES
+                if is_enough and now - self._patient_since >= LIST_PATIENCE:
+                    self._end_in_vain(now)
                 else:
                     self._ask_for_list(now)
             return
@@ -260,6 +294,9 @@ class Download(Operation[None]):
 
     def cancel(self) -> None:
         """Nobody waits for it any more; a stream that runs goes on and still fills the table."""
+        if self._is_streaming and not self._is_awaited and self.count is not None:
+            self._learn_pace()
+            self._reads.list_until = self._quiet_at + (self.count - self._front) * self._gap
         self._stream_ends()
         self._forget_reads()
 
@@ -267,13 +304,32 @@ class Download(Operation[None]):
     def _quiet_at(self) -> float:
         """When a stream from which nothing more has come is taken to be over."""
         if self._advances < ENOUGH_ADVANCES or self._is_awaited:
-            return self._heard_at + max(SHORTEST_QUIET, self._round_trip.timeout)
+            timeout = self._round_trip.timeout
+            if self._is_awaited and self._passes > 1:
+                timeout = min(timeout, self._list_patience)
+            return self._heard_at + max(SHORTEST_QUIET, timeout)
         return self._heard_at + max(QUIET_GAPS * self._longest, SHORTEST_QUIET_AT_PACE)
 
     def _note_answer(self, now: float) -> None:
         if not self._is_answered and self.lists:
             self._is_answered = True
             self._round_trip.answered(self._list_at, now, self.lists)
+            if self.lists == 1:
+                self._list_patience = LIST_VARIATION * (now - self._list_at)
+
+    def _go_on(self, now: float) -> None:
+        """Ask for what is missing, unless a list still comes that will bring it."""
+        assert self.count is not None
+        self._gap = self._reads.pace.gap or ASSUMED_LIST / self.count
+        self._is_streaming = now < self._reads.list_until
+        self._reads.is_idle = not self._is_streaming
+        if not self._is_streaming:
+            self._ask(max(self.names), now)  # its answer tells whether count and indices are still the same
+            self._ask_for_gaps(now)
+
+    def _contradicts(self, index: int, name: str) -> bool:
+        """Whether a value shows that what was there already is not of the vehicle as it is now."""
+        return self.names.get(index, name) != name or self._places.get(name, index) != index
 
     def _ask_for_turn(self, now: float) -> None:
         self.held_since = now
@@ -282,11 +338,14 @@ class Download(Operation[None]):
     def _ask_for_list(self, now: float) -> None:
         self.lists += 1
         self._list_at = now
-        timeout = self._round_trip.timeout
-        self._list_wait = max(min(self._list_wait * 2, LONGEST_LIST_WAIT), timeout)
+        timeout = self._round_trip.prompt_timeout
+        self._list_asked += 1
+        growth = 2 if self._list_asked > EVEN_LISTS else 1
+        self._list_wait = max(min(self._list_wait * growth, LONGEST_LIST_WAIT), timeout)
         self._is_awaited = True
         self._reads.is_idle = False
-        self._send(ParamRequestList(*self._target))
+        for _ in range(1 if self._passes == 1 else self._round_trip.copies(LIST_RISK, MOST_LISTS_AT_ONCE)):
+            self._send(ParamRequestList(*self._target))
 
     def _ask_for_another_pass(self, now: float) -> None:
         self._passes += 1
@@ -351,11 +410,14 @@ class Download(Operation[None]):
         if self._front > first:
             self._gap = (self._front_at - since) / (self._front - first)
         if self._advances >= ENOUGH_ADVANCES:
-            came, passed, _, _ = self.seen()
-            self._reads.pace.stream_seen(self._gap, 1 - came / passed if passed else 0.0)
+            came, passed, _, is_bursty = self.seen()
+            loss = 1 - came / passed if passed else 0.0
+            self._reads.pace.stream_seen(self._gap, loss, BURST_GAIN if is_bursty else 1.0)
 
     def _stream_ends(self, *, is_cut: bool = False) -> None:
         self._learn_pace()
+        if self._reads.list_runs_again:
+            self._reads.pace.rest()  # answers that the list may have given were not counted
         self._is_streaming = self._reads.list_runs_again = False
         self._reads.is_idle = True
         self.held_since = None
@@ -370,6 +432,8 @@ class Download(Operation[None]):
         self._moves += 1
         self.count = count
         self.names.clear()
+        self._places.clear()
+        self.resumed = 0
         self.given_up.clear()
         self._tries.clear()
         self._holes.clear()
@@ -454,6 +518,8 @@ class Download(Operation[None]):
                 self._ask_for_another_pass(now)
             else:
                 self._ask_for_gaps(now)
+        elif self.resumed and not self._is_heard:
+            self._end_in_vain(now)
         else:
             self.finish(None, now)  # whatever has not come was asked for and given up
 
@@ -468,6 +534,10 @@ class Download(Operation[None]):
         for read in asked.values():
             self._reads.release(read)
 
-    def _end_with_error(self, error: Exception, now: float) -> None:
+    def _end_in_vain(self, now: float) -> None:
+        """Nothing has come."""
         self._stream_ends()
-        self.fail(error, now)
+        system, component = self._target
+        what = f"the parameter list of {system}/{component}"
+        waited = now - self.begun_at - self.held_up
+        self.fail(NoReply(what, attempts=self.lists, waited=waited), now)

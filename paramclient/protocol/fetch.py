@@ -17,13 +17,16 @@ from paramclient.protocol.table import Change, Table
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import HASH_CHECK, Message, ParamValue
-from paramclient.values import Param
+from paramclient.values import Param, Trust
 
-__all__ = ["Announcement", "Fetch", "FetchResult", "Progress"]
+__all__ = ["Announcement", "Fetch", "FetchResult", "Progress", "present_of"]
 
 FRESH_HASH: Final = 1.0
 """Seconds for which an announced hash answers the question what the hash is. It is asked for when a component
 is found, so that a fetch right after that need not wait for another round trip."""
+ENOUGH_PRESENT: Final = 0.5
+"""The share of a table that must be there for its rest to be worth asking for one by one, where it is not
+known how fast the list comes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,6 +69,7 @@ class FetchResult:
         hash: the PX4 hash under which the vehicle confirmed the table; None for a vehicle without one, and
             when the table moved during the download.
         elapsed: seconds from the call to the end.
+        resumed: how many were known already from an earlier download that did not come to its end.
         notes: what else is worth knowing, in sentences.
     """
 
@@ -79,10 +83,18 @@ class FetchResult:
     hash: int | None
     elapsed: float
     notes: tuple[str, ...] = ()
+    resumed: int = 0
 
     @property
     def complete(self) -> bool:
         return not self.missing
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether every value was heard in this session, or the vehicle's hash stands for it."""
+        if not self.resumed or self.hash is not None:
+            return True
+        return all(param.trust is not Trust.CACHED or param.index is None for param in self.params.values())
 
     def __repr__(self) -> str:
         missing = f", {len(self.missing)} missing" if self.missing else ""
@@ -98,6 +110,10 @@ class Fetch(Operation[FetchResult]):
     The table that a download brought is confirmed when the hash that is computed from it is one that the
     vehicle announced in the course of it, or when the vehicle announced the same before and after: then
     nothing moved between. For the latter it is asked for once more after the download.
+
+    What an earlier download has left unfinished is gone on with, when the count is still the same. With a
+    hash it must be proven in the end, or all is downloaded after all; without one what the cache knows stays
+    *cached*.
 
     Attributes:
         holders: how many wait for it; with none left it is cancelled.
@@ -141,8 +157,11 @@ class Fetch(Operation[FetchResult]):
         self._listed = listed
         self.holders = 0
         self.download: Download | None = None
-        if refresh or listed or table.hash is None or not table.complete:
+        self._notes: tuple[str, ...] = ()
+        if refresh or listed:
             self._begin_download(now)
+        elif table.hash is None or not table.complete:
+            self._begin_or_resume(announced, now)
         elif announced is not None and now - announced.at <= FRESH_HASH:
             self._compare(announced, now)
         else:
@@ -224,7 +243,8 @@ class Fetch(Operation[FetchResult]):
         """How far it is."""
         received, total = (0, self._table.count) if self.download is None else self.download.progress
         running = now - self._first_value_at
-        rate = received / running if received and running > 0 else 0.0
+        came = received - (0 if self.download is None else self.download.resumed)
+        rate = came / running if came > 0 and running > 0 else 0.0
         left = (total - received) / rate if rate and total is not None else None
         return Progress(received, total, rate, left)
 
@@ -265,7 +285,39 @@ class Fetch(Operation[FetchResult]):
         notes = () if table.volatile_known else (_UNPROVEN,)
         self.finish(self._result("cache", announcement.count, (), announcement.hash, now, notes), now)
 
-    def _begin_download(self, now: float) -> None:
+    def _begin_or_resume(self, announced: Announcement | None, now: float) -> None:
+        """Go on with what is there, if that is enough and the vehicle's count is still the same."""
+        if not present_of(self._table, self._reads):
+            self._begin_download(now)
+        elif not self._expects_hash():
+            self._resume(now)
+        elif announced is not None and now - announced.at <= FRESH_HASH:
+            self._resume_under(announced, now)
+        else:
+            self._ask_hash(self._hash_came_to_resume, now)
+
+    def _hash_came_to_resume(self, read: Read) -> None:
+        if read.result is not None:
+            message = read.result
+            announced = int.from_bytes(message.raw, "little")
+            self._resume_under(Announcement(announced, message.param_count, read.ended_at), read.ended_at)
+        elif isinstance(read.error, UnknownParameter):
+            self._is_hash_unknown = True
+            self._resume(read.ended_at)
+        else:
+            self._begin_download(read.ended_at)
+
+    def _resume_under(self, announcement: Announcement, now: float) -> None:
+        self._before = announcement.hash
+        if announcement.count == self._table.count:
+            self._resume(now)
+        else:
+            self._begin_download(now)
+
+    def _resume(self, now: float) -> None:
+        self._begin_download(now, present=present_of(self._table, self._reads))
+
+    def _begin_download(self, now: float, present: Mapping[int, str] | None = None) -> None:
         self._doubt(now)
         download = self.download = Download(
             self._target,
@@ -275,8 +327,12 @@ class Fetch(Operation[FetchResult]):
             self._turns,
             now,
             listed=self._listed,
+            count=self._table.count,
+            present=present,
         )
 
+        if download.done:
+            self._download_ended(download)
         download.on_done.append(partial(self._download_ended, download))
 
     def _download_ended(self, download: Download) -> None:
@@ -304,11 +360,19 @@ class Fetch(Operation[FetchResult]):
         volatile, is_proven = find_volatile(table.listed(), announced, believed=table.volatile)
         if is_proven:
             table.confirm(announced, volatile, proven=True)
+            table.verify()
         return is_proven
 
     def _remove_what_is_gone(self, download: Download) -> None:
+        table = self._table
+        table.place(download.names)
         present = frozenset(download.names.values())
-        gone = self._table.remove(lambda param: param.index is not None and param.name not in present)
+        gone = table.remove(
+            lambda param: (
+                param.name not in present and (param.index is not None or param.name in table.displaced)
+            )
+        )
+        table.displaced.clear()
         self._changed(gone)
 
     def _hash_came_last(self, download: Download, read: Read) -> None:
@@ -326,8 +390,16 @@ class Fetch(Operation[FetchResult]):
             table.unconfirm()
         if after is not None and not download.missing:
             volatile, proven = find_volatile(table.listed(), after, believed=table.volatile)
+            if download.resumed and not proven:
+                # what was heard earlier is not what the vehicle has now, or cannot be told from it
+                self._notes = (_NOT_RESUMED,)
+                self._before = self._meanwhile = None
+                self._was_asked_meanwhile = False
+                self._begin_download(now)
+                return
             if proven or after == self._before:
                 table.confirm(after, volatile, proven=proven)
+                table.verify()
                 notes += () if proven else (_UNPROVEN,)
             else:
                 notes += (_UNBRACKETED,) if self._before is None else (_MOVED,)
@@ -339,7 +411,12 @@ class Fetch(Operation[FetchResult]):
         table = self._table
         if not missing:
             table.complete = download.is_settled
+        else:
+            table.place(download.names)
         table.count = count
+        if download.resumed and table.hash is None:
+            earlier = sum(param.trust is Trust.CACHED for param in table.listed())
+            notes += (_FROM_MEMORY.format(earlier),) if earlier else ()
         self.finish(
             self._result("stream", count, missing, table.hash if not missing else None, now, notes), now
         )
@@ -356,7 +433,11 @@ class Fetch(Operation[FetchResult]):
         params = dict(self._table.params)
         received = count - len(missing)
         elapsed = now - self.begun_at
-        return FetchResult(*self._target, params, source, count, received, missing, confirmed, elapsed, notes)
+        resumed = 0 if self.download is None else self.download.resumed
+        notes = self._notes + notes
+        return FetchResult(
+            *self._target, params, source, count, received, missing, confirmed, elapsed, notes, resumed
+        )
 
     def _drop(self) -> None:
         read, self._hash_read = self._hash_read, None
@@ -364,6 +445,16 @@ class Fetch(Operation[FetchResult]):
             self._reads.release(read)
         if self.download is not None:
             self.download.cancel()
+
+
+def present_of(table: Table, reads: Reads) -> dict[int, str]:
+    """What is there of an unfinished table, by index; nothing where that is too little to go on with."""
+    count = table.count
+    if table.complete or not count:
+        return {}
+    present = table.present()
+    # with a list's pace measured, the download finds out itself whether another one is faster
+    return present if reads.pace.gap or len(present) >= ENOUGH_PRESENT * count else {}
 
 
 _UNPROVEN = (
@@ -376,3 +467,11 @@ _UNBRACKETED = (
     "so none stands for the table; the next session downloads it again."
 )
 _UNSETTLED = "The number of parameters kept changing during the download."
+_NOT_RESUMED = (
+    "What an earlier download had brought could not be confirmed by the vehicle's hash, "
+    "so all was downloaded anew."
+)
+_FROM_MEMORY = (
+    "{} values are those of an earlier session: this vehicle has no hash to confirm them. "
+    "A fetch with refresh=True reads them anew."
+)

@@ -25,6 +25,9 @@ QUEUEING: Final = 0.12
 answers once in 100 ms."""
 ENOUGH_SERVED: Final = 0.5
 """The share of the requests that must be answered for a rate to count as served."""
+LOSS_MARGIN: Final = 0.1
+"""By how much more exchanges may fail than the list's losses explain before that is the component's doing:
+one that is asked too fast drops requests, and that must not pass for a bad link."""
 ROUNDING: Final = 1e-9
 """Of a token: without it, what `next_at` promises could be missed by the last bit of a float, for ever."""
 ENOUGH_SERVED_LATE: Final = 0.8
@@ -103,6 +106,9 @@ class Pace:
     Args:
         round_trip: the component's.
         share: the link's; None for a component that has the link for itself.
+
+    Attributes:
+        gap: seconds between two values of its list, as far as it was measured; 0 before.
     """
 
     __slots__ = (
@@ -110,24 +116,30 @@ class Pace:
         "_epoch_at",
         "_is_found",
         "_late",
+        "_likely_loss",
         "_quickest",
         "_rate",
         "_round_trip",
+        "_sent",
         "_share",
         "_timed",
         "_tokens",
         "_tokens_at",
         "_was_short",
+        "gap",
     )
 
     def __init__(self, round_trip: RoundTrip, share: Share | None = None) -> None:
         self._round_trip = round_trip
         self._share = Share() if share is None else share
+        self.gap = 0.0
+        self._likely_loss = 1.0  # of exchanges, by what the list has lost
         self._rate = FIRST_RATE
         self._tokens = SMALLEST_BURST
         self._tokens_at = -math.inf
         self._epoch_at = math.inf
         self._answers = 0
+        self._sent = 0
         self._timed = 0
         self._late = 0.0
         self._quickest = math.inf
@@ -172,6 +184,7 @@ class Pace:
         """A request went out."""
         self._fill(now)
         self._tokens -= 1.0
+        self._sent += 1
         if self._epoch_at == math.inf:
             self._share.join(self)
             self._epoch_at = now + (self._round_trip.smoothed or 0.0)
@@ -189,14 +202,23 @@ class Pace:
         if self._answers >= EPOCH_ANSWERS and now - self._epoch_at >= EPOCH:
             self._look(now)
 
-    def stream_seen(self, gap: float, loss: float = 0.0) -> None:
-        """The list's stream brings a value every `gap` seconds, but for the share of them that is lost."""
+    def stream_seen(self, gap: float, loss: float = 0.0, gain: float = 1.0) -> None:
+        """The list's stream brings a value every `gap` seconds, but for the share of them that is lost.
+
+        The link is known to be so many times faster.
+        """
         if gap > 0:
-            self._share.stream_seen(self, 1.0 / gap, loss)
+            self.gap = gap
+            self._likely_loss = 1.0 - (1.0 - loss) ** 2 + LOSS_MARGIN
+            self._share.stream_seen(self, gain / gap, loss)
 
     def stream_ended(self) -> None:
         """It brings no more."""
         self._share.stream_ended(self)
+
+    def rest(self) -> None:
+        """What was answered of late tells nothing: what is measured next begins anew."""
+        self._begin_epoch(math.inf)
 
     def idle(self) -> None:
         """Nothing is asked for any more: what is measured next begins anew."""
@@ -206,18 +228,20 @@ class Pace:
     def _begin_epoch(self, at: float) -> None:
         self._epoch_at = at
         self._answers = 0
+        self._sent = 0
         self._timed = 0
         self._late = 0.0
         self._was_short = False
 
     def _look(self, now: float) -> None:
         elapsed = now - self._epoch_at
-        served = self._answers / elapsed / (1.0 - min(self._round_trip.loss, 0.9))
+        served = self._answers / elapsed / (1.0 - min(self._round_trip.loss, self._likely_loss, 0.9))
         late = self._late / self._timed if self._timed else 0.0
         is_queueing = late > 1.25 * self._quickest + QUEUEING
         # few answers say little; that those which came were late as well says more
         enough = ENOUGH_SERVED_LATE if late > LATE * self._quickest else ENOUGH_SERVED
-        if is_queueing or (self._was_short and served < enough * self._rate):
+        expected = min(self._rate, self._sent / elapsed)  # it may have been asked for less
+        if is_queueing or (self._was_short and served < enough * expected):
             self._rate = max(min(served, self._rate), FIRST_RATE)
             self._is_found = True
         elif self._was_short:

@@ -66,6 +66,7 @@ class Reads:
         list_runs_again: set while a list comes for another time: then it may answer reads by index, and that
             tells nothing of the round trip.
         is_idle: false while a list comes: then nothing is asked for twice to save time.
+        list_until: until when a list may still come that nobody follows any more.
         control: the index that is asked for to learn whether the component answers at all: one that is known
             to be there.
     """
@@ -93,6 +94,7 @@ class Reads:
         self.is_idle = True
         self._silences = 0  # time-outs since anything was answered
         self._silent_since = math.inf  # the first request since then
+        self.list_until = -math.inf
         self.control = CONTROL
         self._control_at = math.inf
         self._control_index = CONTROL  # of the one under way
@@ -327,10 +329,9 @@ class Reads:
         """A read that is worth asking for once more while its answer may be on the way."""
         if not self.is_idle or not self._flying or self._silences >= SILENCES_TO_SPARE:
             return None
-        loss = self._round_trip.seen_loss
-        if loss < COPY_RISK:
+        most = self._round_trip.copies(COPY_RISK, MOST_COPIES + 1) - 1
+        if not most:
             return None
-        most = min(math.ceil(math.log(COPY_RISK) / math.log(loss)) - 1, MOST_COPIES)
         fewest = min(self._flying.values(), key=lambda read: read.copies)
         return fewest if fewest.copies < most and fewest.sent_at < math.inf else None
 

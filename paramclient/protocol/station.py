@@ -9,7 +9,7 @@ from typing import Final, TypeAlias
 from paramclient.errors import LinkError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentHeard, ComponentMachine, Event
-from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.fetch import Fetch, present_of
 from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import (
     AUTOPILOT_COMPONENT,
@@ -187,11 +187,15 @@ class Station:
     ) -> list[Fetch]:
         """Begin a fetch of several components of one system.
 
-        When they are all that is known of it, none of them can be confirmed by its hash, none is being
+        When they are all that is known of it, none of them has a table worth going on with, none is being
         fetched, and no other list runs, the list is asked for once, of all components.
         """
         is_new = self._turns.is_free and all(machine.fetch is None for machine in machines)
-        if len(machines) > 1 and is_new and (refresh or not any(machine.can_hit for machine in machines)):
+        if (
+            len(machines) > 1
+            and is_new
+            and (refresh or not any(m.can_hit or present_of(m.table, m.reads) for m in machines))
+        ):
             system = machines[0].system
             known = [m for m in self.components.values() if m.system == system and m.who.has_parameters]
             if len(known) == len(machines):

@@ -11,10 +11,15 @@ INITIAL_TIMEOUT: Final = 1.0
 """Seconds before anything was measured (RFC 6298, 2.1)."""
 SHORTEST_TIMEOUT: Final = 0.1
 """ArduPilot answers reads in batches every 100 ms, PX4 once in its loop: asking sooner gains nothing."""
+SERVING_TIME: Final = 0.22
+"""Seconds that the first reads get beyond the first samples, which may be of what is answered at once:
+ArduPilot answers ten reads in two batches."""
 LONGEST_TIMEOUT: Final = 4.0
 """To which backing off leads; a link that is measured to be slower than that gets what it needs."""
-SILENCES_TO_BACK_OFF: Final = 6
-"""Time-outs in a row that loss alone hardly explains."""
+FEWEST_SILENCES: Final = 6
+MOST_SILENCES: Final = 30
+UNEXPLAINED: Final = 1e-3
+"""Time-outs in a row that lead to backing off: as many as loss alone explains with this chance."""
 FEW_SAMPLES: Final = 8
 """Samples below which the variation is a guess: the time-out is then at most two round trips."""
 GRANULARITY: Final = 0.02
@@ -68,11 +73,19 @@ class RoundTrip:
     @property
     def timeout(self) -> float:
         """Seconds to wait for an answer before asking again."""
+        return self._wait(0.0 if self.smoothed is None else self.smoothed + SERVING_TIME)
+
+    @property
+    def prompt_timeout(self) -> float:
+        """The same for what is answered at once, or as soon as the vehicle looks at it."""
+        return self._wait(0.0)
+
+    def _wait(self, least_at_first: float) -> float:
         base = (
             INITIAL_TIMEOUT if self.smoothed is None else self.smoothed + max(4 * self.variation, GRANULARITY)
         )
         if self._samples < FEW_SAMPLES and self.smoothed is not None:
-            base = min(base, 2 * self.smoothed)
+            base = max(min(base, 2 * self.smoothed), least_at_first)
         base = max(base, SHORTEST_TIMEOUT)
         return min(base * self._backoff, max(LONGEST_TIMEOUT, base))
 
@@ -85,6 +98,11 @@ class RoundTrip:
     def seen_loss(self) -> float:
         """The same as far as it was seen: 0 as long as everything was answered."""
         return self._unanswered / (self._unanswered + self._answered + 1.0)
+
+    def copies(self, risk: float, most: int) -> int:
+        """How many requests at once bring the chance of no answer below a risk; one without loss."""
+        loss = self.seen_loss
+        return 1 if loss < risk else min(math.ceil(math.log(risk) / math.log(loss)), most)
 
     @property
     def tries(self) -> int:
@@ -109,7 +127,9 @@ class RoundTrip:
         sample = now - sent_at
         if attempts != 1:
             if sample >= LIKELY * (self.smoothed or math.inf):
-                self._silences = 0  # it may well be the answer to the last of them
+                # it may well be the answer to the last of them
+                self._silences = 0
+                self._backoff = max(self._backoff / 2, 1.0)
             return
         if self.smoothed is None:
             self.smoothed = sample
@@ -131,5 +151,7 @@ class RoundTrip:
             self._unanswered = self._unanswered * _MEMORY + 1
             self._answered *= _MEMORY
         self._silences += 1
-        if self._silences % SILENCES_TO_BACK_OFF == 0:
+        likely = math.log(UNEXPLAINED) / math.log(self.loss)
+        if self._silences >= min(max(likely, FEWEST_SILENCES), MOST_SILENCES):
+            self._silences = 0
             self._backoff = min(self._backoff * 2, LONGEST_TIMEOUT / SHORTEST_TIMEOUT)
