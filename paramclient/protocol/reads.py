@@ -10,7 +10,7 @@ from typing import Final, TypeAlias
 from paramclient.errors import NoReply, ParamErrorCode, Refused, TypeMismatch, UnknownParameter, VehicleError
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.pacing import Pace, Share
-from paramclient.protocol.timing import LONGEST_SILENCE, MOST_TRIES, RoundTrip
+from paramclient.protocol.timing import FEWEST_TRIES, LONGEST_SILENCE, MEMORY, MOST_TRIES, RoundTrip
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
 
 __all__ = ["Key", "Read", "Reads"]
@@ -27,6 +27,10 @@ COPY_RISK: Final = 0.01
 MOST_COPIES: Final = 6
 SILENCES_TO_SPARE: Final = 24
 """Time-outs in a row, with no answer at all between them, after which asking twice cannot be of help."""
+FEWEST_CONTROLS: Final = 3
+BAD_LUCK: Final = 1e-6
+"""Answered controls, at the least, and the chance of bad luck below which a silence is the component's doing,
+by the share of the controls that were answered. Where much is silent, no other share tells of the link."""
 ENOUGH_CONTROLS: Final = 4
 """Answered controls, at the least, after which a silence is the component's and not the link's."""
 
@@ -99,6 +103,8 @@ class Reads:
         self._control_at = math.inf
         self._control_index = CONTROL  # of the one under way
         self._control_attempts = 0
+        self._controls_sent = 0.0  # the last fifty or so count
+        self._controls_answered = 0.0
 
     def __len__(self) -> int:
         return len(self._open)
@@ -143,8 +149,10 @@ class Reads:
             self._round_trip.answered(self._control_at, now, self._control_attempts + is_late)
             self._control_at = math.inf
             self._not_silent(now)
-            for read in self._flying.values():
-                read.controls += read.attempts > 1
+            if not self.list_runs_again:  # else it may have brought the value
+                self._controls_answered += 1
+                for read in self._flying.values():
+                    read.controls += read.attempts > 1
 
     def refused(self, message: ParamError, now: float) -> None:
         """A PARAM_ERROR that may be about a read."""
@@ -245,6 +253,10 @@ class Reads:
     def _is_hopeless(self, read: Read, now: float) -> bool:
         if self._silences >= MOST_TRIES and now - self._silent_since >= LONGEST_SILENCE:
             return True  # not one of all these was answered
+        if read.controls >= FEWEST_CONTROLS and read.attempts >= FEWEST_TRIES:
+            lost = 1 - (self._controls_answered + 0.5) / (self._controls_sent + 1)
+            if lost**read.attempts < BAD_LUCK:
+                return True
         # half as often will do where nothing speaks for it and the link is good enough for others
         weight = 2 if self._seems_unknown(read) else 1
         return self._round_trip.is_hopeless(weight * read.attempts, now)
@@ -305,6 +317,8 @@ class Reads:
             self._control_attempts = 1
         self._control_at = now
         self._control_index = self.control
+        self._controls_sent = self._controls_sent * MEMORY + 1
+        self._controls_answered *= MEMORY
         self.pace.sent(now)
         self._send(ParamRequestRead(*self._target, "", self.control))
 

@@ -33,7 +33,8 @@ LONGEST_SILENCE: Final = 20.0
 """Seconds without a word, not even one of the heartbeats that come every second, after which a component that
 was asked `FEWEST_TRIES` times counts as gone."""
 _CHANCE_OF_BAD_LUCK = 1e-6
-_MEMORY = 0.98  # weight that older answers keep with each new one: about the last 50 count
+MEMORY: Final = 0.98
+"""Weight that older answers keep with each new one: about the last fifty count."""
 
 
 class RoundTrip:
@@ -122,8 +123,8 @@ class RoundTrip:
     def answered(self, sent_at: float, now: float, attempts: int) -> None:
         """A request got its answer; it had been sent `attempts` times, the last time at `sent_at`."""
         if attempts <= 2:
-            self._answered = self._answered * _MEMORY + 1
-            self._unanswered *= _MEMORY
+            self._answered = self._answered * MEMORY + 1
+            self._unanswered *= MEMORY
         sample = now - sent_at
         if attempts != 1:
             if sample >= LIKELY * (self.smoothed or math.inf):
@@ -148,8 +149,8 @@ class RoundTrip:
         have no answer at all.
         """
         if attempts <= 2:
-            self._unanswered = self._unanswered * _MEMORY + 1
-            self._answered *= _MEMORY
+            self._unanswered = self._unanswered * MEMORY + 1
+            self._answered *= MEMORY
         self._silences += 1
         likely = math.log(UNEXPLAINED) / math.log(self.loss)
         if self._silences >= min(max(likely, FEWEST_SILENCES), MOST_SILENCES):
