@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
 
+from paramclient import ParamClient
 from paramclient.errors import LinkError, NoReply
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.turns import (
@@ -23,6 +25,7 @@ from paramclient.protocol.turns import (
 )
 from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
+from tests.shell import swiftly
 from tests.simulation import Simulation
 
 TIMEOUT = 0.2
@@ -437,3 +440,40 @@ def test_a_starved_vehicle_is_not_given_up_while_the_lists_of_others_fill_the_li
     assert second.result.complete
     assert heard.loss > 0.0
     assert len(world.sent_of(ParamRequestRead)) > 0
+
+
+@swiftly
+async def test_the_time_limit_of_a_fetch_does_not_run_while_it_waits_for_its_turn() -> None:
+    slow, quick = (
+        PX4Vehicle(system=1, table=table(40), burst=1, period=0.1),
+        PX4Vehicle(system=2, table=table(40)),
+    )
+    async with ParamClient(Air.symmetric([slow, quick], delay=0.02), cache=False) as client:
+        first, second = await client.component(1), await client.component(2)
+        await asyncio.sleep(1.0)
+        began = asyncio.get_running_loop().time()
+        running = asyncio.create_task(first.fetch_all())
+        await asyncio.sleep(0)
+        result = await second.fetch_all(timeout=0.3)
+        assert asyncio.get_running_loop().time() - began > 0.3
+        assert result.complete
+        assert (await running).complete
+
+
+@swiftly
+async def test_a_cancelled_fetch_makes_room_at_once() -> None:
+    vehicles = [MAKES["ArduPilot"](system) for system in (1, 2)]
+    async with ParamClient(Air.symmetric(vehicles, delay=0.02, rate=5760.0), cache=False) as client:
+        first, second = await client.component(1), await client.component(2)
+        await asyncio.sleep(1.0)
+        began = asyncio.get_running_loop().time()
+        leaving = asyncio.create_task(first.fetch_all())
+        await asyncio.sleep(0.1)
+        waiting = asyncio.create_task(second.fetch_all())
+        await asyncio.sleep(0.1)
+        assert vehicles[1].requests["PARAM_REQUEST_LIST"] == 0
+        leaving.cancel()
+        await asyncio.sleep(0.05)
+        assert vehicles[1].requests["PARAM_REQUEST_LIST"] == 1
+        assert (await waiting).complete
+        assert asyncio.get_running_loop().time() - began < 6.0

@@ -257,6 +257,7 @@ class Download(Operation[None]):
             self._note_answer(now)
             self._list_at = now
             self._list_wait = max(self._list_wait, SHORTEST_QUIET)
+            self._silent_at = now + self._list_wait
 
     def tick(self, now: float) -> None:
         """Ask for the list again, or see that the stream is over."""
