@@ -106,6 +106,31 @@ def test_a_list_that_still_runs_brings_the_rest(kind: str) -> None:
 
 
 @both
+@pytest.mark.parametrize("left", range(0, 12, 3))
+def test_a_fetch_right_after_one_that_was_cancelled_near_its_end(kind: str, left: int) -> None:
+    vehicle = MAKES[kind]()
+    world = Simulation(vehicle)
+    machine = world.meet()
+    fetch = machine.begin_fetch(world.now)
+    world.until(lambda: len(machine.table.params) >= SIZE - 10)
+    machine.end_fetch(fetch)
+    world.run(left * 0.01)
+    assert is_right(world.fetch(), vehicle)
+
+
+def test_a_list_that_was_expected_and_has_broken_off_is_not_the_vehicles_end() -> None:
+    vehicle = MAKES["ArduPilot"]()
+    world = Simulation(vehicle)
+    machine = world.meet()
+    fetch = machine.begin_fetch(world.now)
+    world.until(lambda: len(machine.table.params) >= 150)
+    machine.end_fetch(fetch)
+    vehicle._position = None
+    result = world.fetch()
+    assert is_right(result, vehicle)
+
+
+@both
 def test_what_came_after_all_needs_only_to_be_asked_whether_it_is_still_so(kind: str) -> None:
     vehicle = MAKES[kind]()
     world = Simulation(vehicle)

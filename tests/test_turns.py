@@ -420,7 +420,8 @@ def test_when_the_link_is_gone_nobody_waits_any_more() -> None:
 
 
 def test_a_starved_vehicle_is_not_given_up_while_the_lists_of_others_fill_the_link() -> None:
-    quick, starved = MAKES["ArduPilot"](1), PX4Vehicle(system=2, table=table(40), burst=1, period=0.3)
+    quick = ArduPilotVehicle(system=1, table=table(1400), burst=1, period=0.025)  # 35 s
+    starved = PX4Vehicle(system=2, table=table(40), burst=1, period=0.3)
     world = a_radio([quick, starved])
     first, second = begin_all(world, 2)
     world.until(lambda: second.download is not None and second.download.received > 3)

@@ -146,7 +146,7 @@ class Download(Operation[None]):
         self._silent_at = math.inf  # when an unanswered list no longer takes anything of the link
         self._tries: dict[int, tuple[int, int]] = {}  # what reads in vain have shown: requests, controls
         self._places = {name: index for index, name in self.names.items()}  # of what was there already
-        self._is_heard = False  # whether anything has come
+        self._is_heard = self._is_checked = False  # whether anything has come, and was asked for to see that
         self._gap = 0.0  # the mean time between two values of it
         self._longest = 0.0  # the longest of late
         self._is_awaited = True  # the list was asked for, and no value of it has come
@@ -322,11 +322,16 @@ class Download(Operation[None]):
         """Ask for what is missing, unless a list still comes that will bring it."""
         assert self.count is not None
         self._gap = self._reads.pace.gap or ASSUMED_LIST / self.count
-        self._is_streaming = now < self._reads.list_until
+        self._is_streaming = now < self._reads.list_until and len(self.names) < self.count
         self._reads.is_idle = not self._is_streaming
         if not self._is_streaming:
-            self._ask(max(self.names), now)  # its answer tells whether count and indices are still the same
+            self._check(now)
             self._ask_for_gaps(now)
+
+    def _check(self, now: float) -> None:
+        """Ask for one value that is there: its answer tells whether count and indices are still the same."""
+        self._is_checked = True
+        self._ask(max(self.names), now)
 
     def _contradicts(self, index: int, name: str) -> bool:
         """Whether a value shows that what was there already is not of the vehicle as it is now."""
@@ -520,7 +525,7 @@ class Download(Operation[None]):
             else:
                 self._ask_for_gaps(now)
         elif self.resumed and not self._is_heard:
-            self._end_in_vain(now)
+            (self._end_in_vain if self._is_checked else self._check)(now)
         else:
             self.finish(None, now)  # whatever has not come was asked for and given up
 
