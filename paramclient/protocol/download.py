@@ -496,13 +496,13 @@ class Download(Operation[None]):
 
     def _unanswered(self, index: int, read: Read) -> None:
         """A read has ended without its value: for good, or is it worth asking again?"""
-        if not isinstance(read.error, NoReply) or self._seems_dead(index, read):
+        now = read.ended_at
+        if isinstance(read.error, NoReply) and read.begun_at <= self._turns.beside_others_at(self):
+            self._reads.forgive()  # there may have been no room for an answer
+        elif not isinstance(read.error, NoReply) or self._seems_dead(index, read):
             self.given_up.add(index)
             return
-        is_gone = read.ended_at - self._round_trip.heard_at >= LONGEST_SILENCE
-        if self._turns.is_beside_others(self):
-            self._reads.forgive()  # it may have no room to answer
-        elif is_gone or self._reads.is_silent(read.ended_at):
+        elif now - self._round_trip.heard_at >= LONGEST_SILENCE or self._reads.is_silent(now):
             self._give_up_the_rest()
         self._next = min(self._next, index)
 

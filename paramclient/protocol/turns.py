@@ -92,6 +92,9 @@ class Turns:
         self._failures = 0
         self._again_at = -math.inf  # when more may be tried
         self._idle_since = -math.inf
+        self._crowded_at = -math.inf  # when several lists came last
+        self._lone: Stream | None = None  # the list that came alone last
+        self._lone_at = -math.inf  # when that was
         self._waiting: deque[Stream] = deque()
         self._running: dict[Stream, Seen] = {}  # with what it had shown when the newest began to come
         self._newest: set[Stream] = set()
@@ -144,9 +147,21 @@ class Turns:
         """Whether lists of others come now."""
         return any(each is not stream and not each.is_awaited for each in self._running)
 
+    def beside_others_at(self, stream: Stream) -> float:
+        """When a list of another one came last."""
+        return max(self._crowded_at, -math.inf if self._lone is stream else self._lone_at)
+
     def tick(self, now: float) -> None:
         """Let the next ones begin, if there is room."""
         self._now = now
+        coming = [stream for stream in self._running if not stream.is_awaited]
+        if len(coming) > 1:
+            self._crowded_at = now
+        elif coming:
+            if self._lone is not coming[0]:
+                self._crowded_at = max(self._crowded_at, self._lone_at)
+                self._lone = coming[0]
+            self._lone_at = now
         if self._waiting and not self._newest and self._again_at <= now:
             self._newest.update(self._running)
         if self._newest:
