@@ -319,6 +319,7 @@ class ParamClient:
             fetched = together.outcome(now)
         finally:
             together.end()
+            self._wake()  # they may have been in the way of others
         if not fetched.results:
             whose = "any component" if system is None else f"any component of system {system}"
             attempts = max((error.attempts for error in fetched.silent.values()), default=0)
@@ -441,8 +442,10 @@ class ParamClient:
                 for component in self._components.values():
                     if component.system == machine.system:
                         self._read_cache(component)
-            elif isinstance(event, Fetched) and event.result.complete:
-                self._writer.synced(machine, is_whole=event.result.source != "cache")
+            elif isinstance(event, Fetched) and event.result.complete and event.result.is_confirmed:
+                self._writer.synced(
+                    machine, is_whole=event.result.source != "cache" and not event.result.resumed
+                )
                 self._something_to_write.set()
             elif isinstance(event, TableResynced):
                 self._writer.synced(machine, is_whole=False)

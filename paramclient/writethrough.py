@@ -162,6 +162,8 @@ class WriteThrough:
         for name in table.params:
             table.dirty.setdefault(name, "vehicle")
         if cached is not None:
+            # the indices of an unfinished table are gone on with: they must be this firmware's on this board
+            is_same = identity.uid is not None and _firmware(cached.identity) == _firmware(identity)
             machine.use_cached(
                 _of_firmware(cached, identity),
                 anyio.current_time(),
@@ -170,9 +172,10 @@ class WriteThrough:
                 complete=cached.complete,
                 volatile=cached.volatile,
                 volatile_known=cached.volatile_known,
+                placed=cached.complete or (is_same and cached.count is not None),
             )
             kept.synced_at = cached.synced_at
-            kept.state = self._state(machine, kept)
+            kept.state = None if table.is_displaced else self._state(machine, kept)
         if machine.sync.synced:
             kept.synced_at = time.time()
 
@@ -214,7 +217,7 @@ class WriteThrough:
         table = machine.table
         return TableState(
             hash=table.hash if table.complete else None,
-            count=table.count,
+            count=None if table.is_displaced else table.count,  # the cache keeps the indices of before
             complete=table.complete,
             volatile_known=table.volatile_known,
             synced_at=kept.synced_at,
@@ -304,6 +307,10 @@ class _Worker:
             call()
 
 
+def _firmware(identity: Identity) -> tuple[int, str]:
+    return identity.firmware, identity.git_hash
+
+
 def _save(cache: ParamCache, updates: list[TableUpdate]) -> bool:
     cache.save(updates)
     return True
@@ -311,8 +318,7 @@ def _save(cache: ParamCache, updates: list[TableUpdate]) -> bool:
 
 def _of_firmware(cached: CachedComponent, identity: Identity) -> Mapping[str, Param]:
     """The cached parameters, without the defaults of another firmware than the present one."""
-    before = cached.identity
-    if (before.firmware, before.git_hash) == (identity.firmware, identity.git_hash):
+    if _firmware(cached.identity) == _firmware(identity):
         return cached.params
     return {name: replace(param, default=None) for name, param in cached.params.items()}
 

@@ -40,11 +40,14 @@ class Table:
 
     Attributes:
         params: by name, in the order in which they were first heard. Shared with readers; never replaced.
-        count: the param_count heard last, or None.
+        count: the param_count heard last, or None. Indices are those under this count: when it moves, none is
+            known any more.
         volatile: names that the vehicle leaves out of its hash, as far as known.
         volatile_known: whether a recomputed hash has proven that set.
         complete: whether every index below `count` has its parameter here.
         hash: the PX4 hash under which the vehicle would confirm exactly this table, or None while unknown.
+        displaced: names whose index was of an earlier count, and that the vehicle may no longer have; some of
+            them may have come again since.
         dirty: names whose value, type or index changed since `take_dirty` was called last.
     """
 
@@ -54,6 +57,7 @@ class Table:
         self.volatile: frozenset[str] = frozenset()
         self.volatile_known = False
         self.complete = False
+        self.displaced: set[str] = set()
         self.dirty: dict[str, str] = {}
         self._hash: int | None = None
         self._hash_is_stale = False
@@ -185,6 +189,7 @@ class Table:
         count: int | None,
         confirmed: int | None,
         complete: bool,
+        placed: bool,
         volatile: frozenset[str],
         volatile_known: bool,
     ) -> list[Change]:
@@ -194,9 +199,10 @@ class Table:
             params: the cached table.
             count: the param_count with it; with another one than was heard, nothing below counts.
             confirmed: the hash under which the vehicle would confirm it, or None.
+            placed: whether its indices still hold.
             complete, volatile, volatile_known: as the attributes.
         """
-        changes = self.fill(params)
+        changes = self.fill(params, placed=placed and self.count in (None, count))
         if self.count not in (None, count):
             return changes
         self.count = count
@@ -213,15 +219,56 @@ class Table:
                 self.unconfirm()
         return changes
 
-    def fill(self, params: Mapping[str, Param]) -> list[Change]:
-        """Put in what the cache knows, as *cached*; what was heard on this link stays."""
+    def fill(self, params: Mapping[str, Param], *, placed: bool = True) -> list[Change]:
+        """Put in what the cache knows, as *cached*; what was heard on this link stays.
+
+        Args:
+            params: the cached table.
+            placed: whether its indices are still worth anything.
+        """
         changes = []
         for name, param in params.items():
             if name not in self.params:
                 new = param.with_trust(Trust.CACHED)
+                if not placed and new.index is not None:
+                    new = self._displaced(new)
                 self.params[name] = new
                 changes.append(Change(name, None, new))
         return changes
+
+    def move(self, count: int) -> None:
+        """Another count was heard: which parameter has which index is open again."""
+        if self.count is not None:
+            self.complete = False
+            for param in self.listed():
+                self.params[param.name] = self._displaced(param)
+        self.count = count
+
+    @property
+    def is_displaced(self) -> bool:
+        """Whether there are names whose index is open since the count moved."""
+        params = self.params
+        self.displaced = {name for name in self.displaced if name in params and params[name].index is None}
+        return bool(self.displaced)
+
+    def place(self, names: Mapping[int, str]) -> None:
+        """A download has settled which parameter has which index."""
+        for index, name in names.items():
+            param = self.params.get(name)
+            if param is not None and param.index != index:
+                self.params[name] = Param(name, param.value, param.type, index, param.bits, param.trust)
+                self.dirty.setdefault(name, "vehicle")
+
+    def present(self) -> dict[int, str]:
+        """Names by index, as far as they are known under the count of now; none where two claim one index."""
+        names: dict[int, str] = {}
+        twice = set()
+        for param in self.listed():
+            assert param.index is not None
+            if names.setdefault(param.index, param.name) != param.name:
+                twice.add(param.index)
+        count = self.count or 0
+        return {index: name for index, name in names.items() if index < count and index not in twice}
 
     def verify(self) -> None:
         """The vehicle's hash has confirmed it: what is cached and counts into it becomes *verified*."""
@@ -269,6 +316,10 @@ class Table:
             and abs(known.value) > _EXACT
             and as_sent(known.bits, known.type, self._encoding) == raw
         )
+
+    def _displaced(self, param: Param) -> Param:
+        self.displaced.add(param.name)
+        return replace(param, index=None)
 
     def _moved(self, name: str) -> None:
         if name in self.volatile:
