@@ -249,13 +249,13 @@ def print_memory(download: Download) -> bool:
         fetch = machine.begin_fetch(1.0)
         deliver(station, [download.announcement, *download.values], 1.0)
         check(fetch.result is not None and fetch.result.complete, "the download is not complete")
-        machine.end_fetch(fetch)
+        machine.end_fetch(fetch, 1.0)
         del fetch
         # what the client takes over, and what the next heartbeats clear
         station.events()
         station.data_to_send()
         machine.table.take_dirty()
-        machine.last_fetch = None
+        machine.fetches.last = None
         for now in (10.0, 11.0):
             station.receive(download.heartbeat, None, now)
         gc.collect()

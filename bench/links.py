@@ -19,7 +19,8 @@ from typing import Any
 
 from oracle import TellingLink, oracle_time
 
-from paramclient.protocol.fetch import Fetch, FetchResult
+from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.result import FetchResult
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
 
@@ -68,7 +69,7 @@ def rows() -> Iterator[Row]:
     """Every row, in the order in which they are printed."""
     kinds: tuple[tuple[str, Callable[..., Vehicle], float], ...] = (
         ("PX4", PX4Vehicle, 5000.0),
-        ("ArduPilot", ArduPilotVehicle, 50.0),
+        ("ArduPilot", partial(ArduPilotVehicle, ftp=False), 50.0),
     )
     for beside, telemetry in (("", 0.0), (" + telemetry", 50.0)):
         for kind, make, served in kinds:

@@ -22,7 +22,7 @@ from paramclient.errors import (
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
-from paramclient.protocol.fetch import FetchResult, Policy, Progress
+from paramclient.protocol.result import FetchResult, Policy, Progress
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
 from paramclient.protocol.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport

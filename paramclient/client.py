@@ -18,6 +18,7 @@ from paramclient.cache import ParamCache
 from paramclient.component import PROGRESS_INTERVAL, Component
 from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
 from paramclient.events import Events, told
+from paramclient.ftp import Ftp
 from paramclient.identity import Identity
 from paramclient.links import Link, create_link
 from paramclient.protocol.component import ComponentMachine
@@ -29,7 +30,7 @@ from paramclient.protocol.events import (
     ParamChanged,
     TableResynced,
 )
-from paramclient.protocol.fetch import Policy, Progress
+from paramclient.protocol.result import Policy, Progress
 from paramclient.protocol.station import Address, Station
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.traffic import TrafficReport
@@ -240,6 +241,10 @@ class ParamClient:
             events.end(self._ended)
         return events
 
+    def ftp(self, component: Component) -> Ftp:
+        """The files of a component, over MAVFTP."""
+        return Ftp(component)
+
     async def component(
         self,
         system: int | None = None,
@@ -318,7 +323,7 @@ class ParamClient:
                     progress(together.progress(anyio.current_time()))
             fetched = together.outcome(now)
         finally:
-            together.end()
+            together.end(anyio.current_time())
             self._wake()  # they may have been in the way of others
         if not fetched.results:
             whose = "any component" if system is None else f"any component of system {system}"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import random
 import weakref
 from collections.abc import Callable
 from contextlib import suppress
@@ -15,8 +16,10 @@ from paramclient.events import Changes
 from paramclient.identity import Identity, autopilot_name
 from paramclient.params import ParamMap
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.fetch import Fetch, FetchResult, Progress
+from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.operation import Operation
+from paramclient.protocol.result import FetchResult, Progress, Sampled
+from paramclient.protocol.sampling import SAMPLE_SIZE
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
 from paramclient.protocol.wire import HASH_CHECK, NO_INDEX, ParamValue
@@ -116,7 +119,7 @@ class Component:
         return self._machine.round_trip.smoothed
 
     def __repr__(self) -> str:
-        last = self._machine.last_fetch
+        last = self._machine.fetches.last
         origin = f" from {last.source} in {last.elapsed:.2f} s" if last is not None else ""
         known = len(self.params)
         of = f" of {self.count}" if self.count is not None and self.state in ("partial", "fetching") else ""
@@ -200,6 +203,9 @@ class Component:
         self,
         *,
         refresh: bool = False,
+        accept: str = "verified",
+        sample: int = SAMPLE_SIZE,
+        seed: int | None = None,
         timeout: float | None = None,
         progress: Callable[[Progress], None] | None = None,
     ) -> FetchResult:
@@ -209,29 +215,47 @@ class Component:
         table, nothing is downloaded. Then the values that the hash does not cover are read afresh in the
         background: they stay *cached* until they have come, and `refreshed` waits for them.
 
+        Otherwise the table comes as one packed file over MAVFTP where the component serves that: quicker than
+        the list, exact, and with the firmware's defaults. Else it comes by list. `source` and `notes` of the
+        result say what was done, and why.
+
         It ends by itself in every case: indices that never answer are given up and named in `missing`.
         Calls at the same time share one fetch. Cancelling it leaves what has come in the table.
 
         Args:
             refresh: download even when the hash would confirm the cached table.
+            accept: "sampled" where a vehicle without a hash may be believed to have the cached table when a
+                sample of it agrees (name, value, index and count), of the same hardware id, firmware version
+                and git hash. `sample` of the result then says how far that can be trusted, and nothing counts
+                as verified. Else "verified".
+            sample: how many parameters are read for that.
+            seed: of their draw; None for another one each time.
             timeout: seconds, after which what has come is given with `missing`.
             progress: called about ten times a second, from this task.
 
         Raises:
+            UsageError: there is no such `accept`, or the sample is empty.
             NoReply: nothing came at all.
             LinkError: the link failed, or the client was closed.
         """
         self._client._check_open()
+        if accept not in ("verified", "sampled"):
+            raise UsageError(f'accept is "verified" or "sampled", not {accept!r}')
+        if sample < 1:
+            raise UsageError(f"a sample has at least one parameter, not {sample}")
+        sampled = None
+        if accept == "sampled" and not refresh:
+            sampled = Sampled(sample, random.getrandbits(32) if seed is None else seed)
         began = anyio.current_time()
         if not refresh:
             with anyio.move_on_after(timeout):
                 await self._wait_for_cache()
         machine = self._machine
-        fetch = machine.begin_fetch(anyio.current_time(), refresh=refresh)
+        fetch = machine.begin_fetch(anyio.current_time(), refresh=refresh, sampled=sampled)
         try:
             result = await self._wait_for_fetch(fetch, None if timeout is None else began + timeout, progress)
         finally:
-            machine.end_fetch(fetch)
+            machine.end_fetch(fetch, anyio.current_time())
             self._client._wake()  # it may have been in the way of others
         return replace(result, elapsed=anyio.current_time() - began)
 
@@ -245,7 +269,7 @@ class Component:
             LinkError: the link failed, or the client was closed.
         """
         self._client._check_open()
-        refresh = self._machine.refresh
+        refresh = self._machine.fetches.refresh
         if refresh is not None:
             await self._wait(refresh, timeout, lambda: ("the values that no hash covers", 0))
 
@@ -295,17 +319,27 @@ class Component:
             changes.end(error)
 
     async def _wait(
-        self, operation: Operation[Result], patience: float | None, describe: Callable[[], tuple[str, int]]
+        self,
+        operation: Operation[Result],
+        patience: float | None,
+        describe: Callable[[], tuple[str, int]],
+        tell: Callable[[], None] | None = None,
     ) -> Result:
-        """Wait until an operation ends; `describe` tells for NoReply what was awaited and asked how often."""
+        """Wait until an operation ends; `describe` tells for NoReply what was awaited and asked how often.
+
+        Meanwhile `tell` is called about ten times a second.
+        """
         began = anyio.current_time()
         ended = anyio.Event()
         operation.on_done.append(ended.set)
         self._client._wake()
         try:
-            if not operation.done:
-                with anyio.move_on_after(patience):
-                    await ended.wait()
+            with anyio.move_on_after(patience):
+                while not operation.done:
+                    with anyio.move_on_after(None if tell is None else PROGRESS_INTERVAL):
+                        await ended.wait()
+                    if tell is not None:
+                        tell()
         finally:
             with suppress(ValueError):
                 operation.on_done.remove(ended.set)

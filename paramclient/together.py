@@ -13,7 +13,8 @@ import anyio
 from paramclient.component import TIME_IS_OVER, Component
 from paramclient.errors import NoReply
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.fetch import Fetch, FetchResult, Progress
+from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.result import FetchResult, Progress
 from paramclient.protocol.station import Address, Station
 
 __all__ = ["FetchTogether", "FetchedAll"]
@@ -138,7 +139,7 @@ class FetchTogether:
                 silent[address] = NoReply(what, attempts=0, waited=component.silence)
         return FetchedAll(results, silent)
 
-    def end(self) -> None:
+    def end(self, now: float) -> None:
         """Nobody waits for them any longer."""
         for address, fetch in self._fetches.items():
-            self._station.components[address].end_fetch(fetch)
+            self._station.components[address].end_fetch(fetch, now)

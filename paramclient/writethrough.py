@@ -174,6 +174,9 @@ class WriteThrough:
                 volatile_known=cached.volatile_known,
                 placed=cached.complete or (is_same and cached.count is not None),
             )
+            machine.fetches.is_same_firmware = is_same
+            if is_same and machine.fetches.file_works is None:
+                machine.fetches.file_works = cached.file_works
             kept.synced_at = cached.synced_at
             kept.state = None if table.is_displaced else self._state(machine, kept)
         if machine.sync.synced:
@@ -221,6 +224,7 @@ class WriteThrough:
             complete=table.complete,
             volatile_known=table.volatile_known,
             synced_at=kept.synced_at,
+            file_works=machine.fetches.file_works,
         )
 
     async def _run(self, work: Callable[[], Result]) -> Result | None:

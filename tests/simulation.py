@@ -4,25 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from functools import partial
 from typing import TypedDict, TypeVar
 
 from paramclient.errors import ParamClientError
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import Event
-from paramclient.protocol.fetch import Fetch, FetchResult
+from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.operation import Operation
+from paramclient.protocol.result import FetchResult
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import NO_INDEX, Framer, Message, ParamValue
 from paramclient.protocol.writes import SetResult
-from paramclient.sim import Air, Endpoint
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint
 from paramclient.values import Encoding, Param, ParamType, Trust, Value, encode
 
-__all__ = ["Memory", "Simulation", "is_so", "known", "param_value"]
+__all__ = ["Memory", "Simulation", "is_so", "known", "listing_ardupilot", "param_value"]
 
 MOST_STEPS = 2000
 """Steps without any time passing that look like an endless loop."""
 PEER = "the only peer"
+
+listing_ardupilot = partial(ArduPilotVehicle, ftp=False)
+"""An ArduPilot without MAVFTP, which gives its table by list alone."""
 
 Message_ = TypeVar("Message_")
 Result = TypeVar("Result")
@@ -177,7 +182,7 @@ class Simulation:
         try:
             return self.outcome(fetch, limit)
         finally:
-            machine.end_fetch(fetch)
+            machine.end_fetch(fetch, self.now)
 
     def get(self, key: str | int, limit: float = 120.0) -> Param:
         """Read one parameter of 1/1."""

@@ -234,7 +234,7 @@ async def test_what_the_vehicle_no_longer_has_goes_from_the_cache(path: Path) ->
 
 @swiftly
 async def test_a_vehicle_without_a_hash_is_shown_from_the_cache_and_downloaded(path: Path) -> None:
-    vehicle = ArduPilotVehicle(live=())
+    vehicle = ArduPilotVehicle(ftp=False, live=())
     await session(vehicle, path)
     tap = Tap(vehicle)
     async with ParamClient(tap, cache=path) as client:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import pytest
 
@@ -34,7 +34,7 @@ from paramclient.protocol.wire import (
     ParamRequestRead,
 )
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle
-from tests.simulation import Simulation, is_so, param_value
+from tests.simulation import Simulation, is_so, listing_ardupilot, param_value
 
 GAP = 0.001
 """Seconds between two values of the streams here."""
@@ -738,7 +738,7 @@ def test_px4_without_loss_costs_one_list() -> None:
 
 
 def test_ardupilot_without_loss_costs_one_list() -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = listing_ardupilot()
     world = Simulation(vehicle)
     result = world.fetch()
     assert result.complete
@@ -750,7 +750,7 @@ def test_ardupilot_without_loss_costs_one_list() -> None:
 
 
 def test_ardupilot_that_has_just_booted() -> None:
-    world = Simulation(ArduPilotVehicle(table={f"P{n}": n for n in range(50)}, boot_time=5.0))
+    world = Simulation(listing_ardupilot(table={f"P{n}": n for n in range(50)}, boot_time=5.0))
     world.meet()
     result = world.fetch()
     assert result.complete
@@ -758,7 +758,7 @@ def test_ardupilot_that_has_just_booted() -> None:
 
 
 def test_ardupilot_that_boots_for_longer() -> None:
-    vehicle = ArduPilotVehicle(table={f"P{n}": n for n in range(50)}, boot_time=15.0)
+    vehicle = listing_ardupilot(table={f"P{n}": n for n in range(50)}, boot_time=15.0)
     world = Simulation(air=Air.symmetric([vehicle], delay=0.05))
     assert world.fetch().complete
 
@@ -776,11 +776,11 @@ def test_a_stream_slower_than_any_known() -> None:
     assert world.fetch().complete
 
 
-@pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
+@pytest.mark.parametrize("make", [PX4Vehicle, listing_ardupilot])
 @pytest.mark.parametrize("loss", [0.0, 0.2])
 @pytest.mark.parametrize("seconds", [0.1, 0.45, 0.8])
 def test_a_vehicle_that_dies_in_the_middle(
-    make: type[PX4Vehicle] | type[ArduPilotVehicle], loss: float, seconds: float
+    make: Callable[..., PX4Vehicle | ArduPilotVehicle], loss: float, seconds: float
 ) -> None:
     vehicle = make()
     world = Simulation(air=Air.symmetric([vehicle], loss=loss, delay=0.02, seed=4))

@@ -3,21 +3,22 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 
 import pytest
 
 from paramclient.errors import LinkError, NoReply
 from paramclient.protocol import wire
 from paramclient.protocol.events import Fetched, ParamChanged
-from paramclient.protocol.fetch import FRESH_HASH, FetchResult
+from paramclient.protocol.fetch import FRESH_HASH
 from paramclient.protocol.reads import Read
+from paramclient.protocol.result import FetchResult
 from paramclient.protocol.table import Change
 from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
 from paramclient.sim.table import Table
 from paramclient.values import ParamType, Trust, Value
-from tests.simulation import Memory, Simulation, is_so, known
+from tests.simulation import Memory, Simulation, is_so, known, listing_ardupilot
 
 VOLATILE = ("CAL_MAG0_XOFF", "COM_FLIGHT_UUID")
 SMALL: list[SimParam] = [
@@ -84,13 +85,13 @@ def test_a_first_fetch_from_px4() -> None:
     assert machine.table.complete
     assert machine.table.volatile_known
     assert len(machine.table.volatile) == 58
-    assert machine.last_fetch is result
+    assert machine.fetches.last is result
     assert [event.result for event in world.events if isinstance(event, Fetched)] == [result]
     assert {param.trust for param in result.params.values()} == {Trust.LIVE}
 
 
 def test_a_first_fetch_from_ardupilot_asks_for_no_hash() -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = listing_ardupilot()
     world = Simulation(vehicle)
     result = world.fetch()
     assert result.hash is None
@@ -172,14 +173,14 @@ def test_a_hit_costs_one_request_and_the_volatile_values() -> None:
     assert {result.params[name].trust for name in volatile} == {Trust.CACHED}
     assert {param.trust for name, param in result.params.items() if name not in volatile} == {Trust.VERIFIED}
     assert names_read(world)[0] == HASH_CHECK
-    refresh = world.machine.refresh
+    refresh = world.machine.fetches.refresh
     assert refresh is not None
     world.until(lambda: refresh.done)
     assert sorted(names_read(world)) == sorted([HASH_CHECK, *volatile])
     assert world.sent_of(ParamRequestList) == []
     assert world.sent_of(ParamSet) == []
     assert {world.machine.table.params[name].trust for name in volatile} == {Trust.LIVE}
-    assert world.machine.refresh is None
+    assert world.machine.fetches.refresh is None
 
 
 def test_volatile_values_are_read_afresh_after_a_hit() -> None:
@@ -201,13 +202,13 @@ def test_a_second_hit_while_the_first_one_is_refreshed() -> None:
     world.fetch()
     go_on(world)
     world.fetch()
-    first = world.machine.refresh
+    first = world.machine.fetches.refresh
     world.fetch()
-    second = world.machine.refresh
+    second = world.machine.fetches.refresh
     assert first is not None
     assert second is not None
     world.until(lambda: first.done and second.done)
-    assert world.machine.refresh is None
+    assert world.machine.fetches.refresh is None
 
 
 def test_a_hit_without_anything_volatile_refreshes_nothing() -> None:
@@ -215,7 +216,7 @@ def test_a_hit_without_anything_volatile_refreshes_nothing() -> None:
     world.fetch()
     go_on(world)
     assert world.fetch().source == "cache"
-    assert world.machine.refresh is None
+    assert world.machine.fetches.refresh is None
 
 
 def test_a_hash_that_was_asked_for_ahead_costs_nothing_more() -> None:
@@ -375,7 +376,7 @@ def test_parameters_that_come_into_use_during_the_download() -> None:
 
 
 def test_a_group_that_comes_during_the_download() -> None:
-    vehicle = ArduPilotVehicle()
+    vehicle = listing_ardupilot()
     world = Simulation(vehicle)
     fetch = world.meet().begin_fetch(world.now)
     world.run(0.3)
@@ -402,9 +403,9 @@ def test_another_station_asks_for_the_list_meanwhile() -> None:
     assert result.elapsed < 2.5
 
 
-@pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
+@pytest.mark.parametrize("make", [PX4Vehicle, listing_ardupilot])
 def test_a_list_that_others_begin_again_and_again_is_left_to_them(
-    make: type[PX4Vehicle] | type[ArduPilotVehicle],
+    make: Callable[..., PX4Vehicle | ArduPilotVehicle],
 ) -> None:
     vehicle = make()
     world = Simulation(vehicle)
@@ -441,7 +442,7 @@ def test_after_a_hit_with_an_unproven_hash_everything_is_read_afresh() -> None:
     vehicle._entry("P03").store(77)  # no hash tells of it
     result = world.fetch()
     assert {param.trust for param in result.params.values()} == {Trust.CACHED}
-    refresh = world.machine.refresh
+    refresh = world.machine.fetches.refresh
     assert refresh is not None
     world.until(lambda: refresh.done)
     params = world.machine.table.params
@@ -600,7 +601,7 @@ def test_a_component_without_parameters_gives_no_reply() -> None:
     error = world.error_of(lambda: world.fetch())
     assert isinstance(error, NoReply)
     assert world.machine.fetch is None
-    assert world.machine.last_fetch is None
+    assert world.machine.fetches.last is None
 
 
 @pytest.mark.parametrize("is_cached", [False, True])
@@ -629,7 +630,7 @@ def test_two_who_fetch_share_one() -> None:
     second = machine.begin_fetch(world.now)
     assert first is second
     assert machine.state == "fetching"
-    machine.end_fetch(first)
+    machine.end_fetch(first, world.now)
     assert machine.fetch is first
     world.outcome(second)
     assert len(world.sent_of(ParamRequestList)) == 1
@@ -640,7 +641,7 @@ def test_the_last_one_who_waits_ends_it() -> None:
     machine = world.meet()
     fetch = machine.begin_fetch(world.now)
     world.run(0.5)
-    machine.end_fetch(fetch)
+    machine.end_fetch(fetch, world.now)
     assert machine.fetch is None
     assert not fetch.done
     assert len(machine.reads) == 0
@@ -656,7 +657,7 @@ def test_cancelling_while_the_hash_is_asked_for() -> None:
     go_on(world)
     fetch = world.machine.begin_fetch(world.now)
     assert HASH_CHECK in world.machine.reads
-    world.machine.end_fetch(fetch)
+    world.machine.end_fetch(fetch, world.now)
     assert HASH_CHECK not in world.machine.reads
     world.run(1.0)
     assert not fetch.done
@@ -666,9 +667,9 @@ def test_giving_one_back_twice_does_not_end_another() -> None:
     world = Simulation(PX4Vehicle(table=SMALL))
     machine = world.meet()
     first = machine.begin_fetch(world.now)
-    machine.end_fetch(first)
+    machine.end_fetch(first, world.now)
     second = machine.begin_fetch(world.now)
-    machine.end_fetch(first)
+    machine.end_fetch(first, world.now)
     assert machine.fetch is second
     assert world.outcome(second).complete
 
@@ -715,7 +716,7 @@ def test_progress_before_a_hit_and_before_a_count() -> None:
     progress = fetch.progress(world.now)
     assert (progress.received, progress.total, progress.rate, progress.seconds_left) == (0, None, 0.0, None)
     world.outcome(fetch)
-    machine.end_fetch(fetch)
+    machine.end_fetch(fetch, world.now)
     go_on(world)
     fetch = world.machine.begin_fetch(world.now)
     assert fetch.progress(world.now).total == 42
@@ -763,7 +764,7 @@ def test_the_link_goes_for_good_at_any_moment(seconds: float) -> None:
     error = LinkError("gone", link="x")
     fetch = world.machine.begin_fetch(world.now)
     world.run(seconds)
-    refresh = world.machine.refresh
+    refresh = world.machine.fetches.refresh
     world.station.fail_all(error, world.now)
     assert fetch.error is error or fetch.result is not None
     assert refresh is None or refresh.error is error or refresh.done
@@ -777,12 +778,12 @@ def test_the_link_goes_for_good_while_everything_is_read_afresh() -> None:
     world.fetch()
     go_on(world)
     world.fetch()
-    refresh = world.machine.refresh
+    refresh = world.machine.fetches.refresh
     assert refresh is not None
     error = LinkError("gone", link="x")
     world.station.fail_all(error, world.now)
     assert refresh.error is error
-    assert world.machine.refresh is None
+    assert world.machine.fetches.refresh is None
     assert len(world.machine.reads) == 0
 
 
@@ -793,7 +794,7 @@ def test_a_write_while_everything_is_read_afresh_leaves_the_question_open() -> N
     go_on(world)
     vehicle._entry("P03").store(77)
     world.fetch()
-    refresh = world.machine.refresh
+    refresh = world.machine.fetches.refresh
     assert refresh is not None
     world.until(lambda: refresh.done)
     world.machine.write("P20", 5, world.now)

@@ -12,9 +12,10 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, pr
 
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.protocol.download import MOST_ASKED
-from paramclient.protocol.fetch import Fetch, FetchResult
+from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.reads import Read
+from paramclient.protocol.result import FetchResult
 from paramclient.protocol.wire import HASH_CHECK
 from paramclient.protocol.writes import Write
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
@@ -218,7 +219,7 @@ class Sessions(RuleBasedStateMachine):
             self.open.remove(begun)
             self.check(begun)
             if isinstance(begun.operation, Fetch):
-                self.world.machine.end_fetch(begun.operation)
+                self.world.machine.end_fetch(begun.operation, self.world.now)
             elif isinstance(begun.operation, Read):
                 self.world.machine.reads.release(begun.operation)
 
@@ -285,7 +286,7 @@ class Sessions(RuleBasedStateMachine):
             machine.writes.cancel(operation, self.world.now)
             self.moved()
         elif isinstance(operation, Fetch):
-            machine.end_fetch(operation)
+            machine.end_fetch(operation, self.world.now)
         elif isinstance(operation, Read):
             machine.reads.release(operation)
 

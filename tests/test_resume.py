@@ -12,18 +12,18 @@ import pytest
 
 from paramclient import ParamCache, ParamClient, Trust
 from paramclient.errors import NoReply
-from paramclient.protocol.fetch import FetchResult
+from paramclient.protocol.result import FetchResult
 from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from tests.caches import start
 from tests.shell import bits, swiftly
-from tests.simulation import Simulation
+from tests.simulation import Simulation, listing_ardupilot
 
 SIZE = 200
 TABLE = {f"P{number:03d}": number for number in range(SIZE)}
 MAKES: dict[str, Callable[[], PX4Vehicle | ArduPilotVehicle]] = {
     "PX4": lambda: PX4Vehicle(table=TABLE, burst=1, period=0.01),
-    "ArduPilot": lambda: ArduPilotVehicle(table=TABLE, burst=1, period=0.01),
+    "ArduPilot": lambda: ArduPilotVehicle(ftp=False, table=TABLE, burst=1, period=0.01),
 }
 both = pytest.mark.parametrize("kind", MAKES)
 
@@ -34,7 +34,7 @@ def cancelled(vehicle: Vehicle, received: int = SIZE // 2, *, delay: float = 0.0
     machine = world.meet()
     fetch = machine.begin_fetch(world.now)
     world.until(lambda: len(machine.table.params) >= received)
-    machine.end_fetch(fetch)
+    machine.end_fetch(fetch, world.now)
     vehicle._position = None
     world.run(5.0)
     world.sent.clear()
@@ -82,7 +82,7 @@ def test_the_next_fetch_goes_on_with_what_is_there(kind: str) -> None:
 
 
 def test_with_little_there_the_list_is_measured_to_be_faster() -> None:
-    vehicle = ArduPilotVehicle(table=TABLE, burst=10, period=0.005)
+    vehicle = ArduPilotVehicle(ftp=False, table=TABLE, burst=10, period=0.005)
     world = cancelled(vehicle, 40)
     there = len(world.machine.table.params)
     result = world.fetch()
@@ -99,7 +99,7 @@ def test_a_list_that_still_runs_brings_the_rest(kind: str) -> None:
     machine = world.meet()
     fetch = machine.begin_fetch(world.now)
     world.until(lambda: len(machine.table.params) >= SIZE // 4)
-    machine.end_fetch(fetch)
+    machine.end_fetch(fetch, world.now)
     world.sent.clear()
     assert is_right(world.fetch(), vehicle)
     assert requests(world) == (0, 0)
@@ -113,7 +113,7 @@ def test_a_fetch_right_after_one_that_was_cancelled_near_its_end(kind: str, left
     machine = world.meet()
     fetch = machine.begin_fetch(world.now)
     world.until(lambda: len(machine.table.params) >= SIZE - 10)
-    machine.end_fetch(fetch)
+    machine.end_fetch(fetch, world.now)
     world.run(left * 0.01)
     assert is_right(world.fetch(), vehicle)
 
@@ -124,7 +124,7 @@ def test_a_list_that_was_expected_and_has_broken_off_is_not_the_vehicles_end() -
     machine = world.meet()
     fetch = machine.begin_fetch(world.now)
     world.until(lambda: len(machine.table.params) >= 150)
-    machine.end_fetch(fetch)
+    machine.end_fetch(fetch, world.now)
     vehicle._position = None
     result = world.fetch()
     assert is_right(result, vehicle)
@@ -135,7 +135,7 @@ def test_what_came_after_all_needs_only_to_be_asked_whether_it_is_still_so(kind:
     vehicle = MAKES[kind]()
     world = Simulation(vehicle)
     machine = world.meet()
-    machine.end_fetch(machine.begin_fetch(world.now))
+    machine.end_fetch(machine.begin_fetch(world.now), world.now)
     world.run(10.0)
     world.sent.clear()
     result = world.fetch()
@@ -179,7 +179,7 @@ def test_a_vehicle_that_is_gone_gives_no_reply_though_nothing_is_missing(kind: s
     vehicle = MAKES[kind]()
     world = Simulation(vehicle)
     machine = world.meet()
-    machine.end_fetch(machine.begin_fetch(world.now))
+    machine.end_fetch(machine.begin_fetch(world.now), world.now)
     world.run(10.0)
     world.air.uplink._loss = 1.0
     with pytest.raises(NoReply):
@@ -189,7 +189,7 @@ def test_a_vehicle_that_is_gone_gives_no_reply_though_nothing_is_missing(kind: s
 
 def test_when_the_count_has_moved_nothing_is_gone_on_with() -> None:
     vehicle = ArduPilotVehicle(
-        table=TABLE, groups={"P001": {"GROUP_A": 1, "GROUP_B": 2}}, burst=1, period=0.01
+        ftp=False, table=TABLE, groups={"P001": {"GROUP_A": 1, "GROUP_B": 2}}, burst=1, period=0.01
     )
     vehicle.set_param("P001", 0)
     world = cancelled(vehicle, 180)
@@ -205,7 +205,7 @@ def test_when_the_count_has_moved_nothing_is_gone_on_with() -> None:
 
 def test_when_a_moved_count_was_heard_indices_of_before_are_worth_nothing() -> None:
     vehicle = ArduPilotVehicle(
-        table=TABLE, groups={"P001": {"GROUP_A": 1, "GROUP_B": 2}}, burst=1, period=0.01
+        ftp=False, table=TABLE, groups={"P001": {"GROUP_A": 1, "GROUP_B": 2}}, burst=1, period=0.01
     )
     world = cancelled(vehicle, 180)
     assert world.set("P001", 0).actual == 0
@@ -220,11 +220,11 @@ def test_when_a_moved_count_was_heard_indices_of_before_are_worth_nothing() -> N
 
 
 def test_other_names_under_the_same_count_make_it_worthless() -> None:
-    vehicle = ArduPilotVehicle(table=TABLE, burst=1, period=0.01)
+    vehicle = ArduPilotVehicle(ftp=False, table=TABLE, burst=1, period=0.01)
     world = cancelled(vehicle, 180)
     names = dict(TABLE)
     del names["P010"]
-    other = ArduPilotVehicle(table={**names, "Q": 1}, burst=1, period=0.01)
+    other = ArduPilotVehicle(ftp=False, table={**names, "Q": 1}, burst=1, period=0.01)
     memory = world.memory()
     world = Simulation(other)
     world.meet().use_cached(now=world.now, **memory)
@@ -318,7 +318,7 @@ def test_another_count_by_now_leads_to_a_fresh_list(kind: str) -> None:
     grown_vehicle = (
         PX4Vehicle(table=grown, burst=1, period=0.01)
         if kind == "PX4"
-        else ArduPilotVehicle(table=grown, burst=1, period=0.01)
+        else ArduPilotVehicle(ftp=False, table=grown, burst=1, period=0.01)
     )
     world = Simulation(grown_vehicle)
     world.meet().use_cached(now=world.now, **memory)
@@ -339,10 +339,10 @@ def path(tmp_path: Path) -> Path:
 KILLED_SESSION = """
 import anyio, sys
 from paramclient import ParamClient
-from paramclient.sim import {make}
+from paramclient import sim
 
 async def main():
-    vehicle = {make}(burst=1, period=0.004)
+    vehicle = sim.{made}
     async with ParamClient(vehicle, cache=sys.argv[1]) as client:
         component = await client.component()
         changes = component.changes()
@@ -355,11 +355,17 @@ anyio.run(main)
 """
 
 
-@pytest.mark.parametrize(("make", "after"), [(PX4Vehicle, 520), (ArduPilotVehicle, 1250)])
+@pytest.mark.parametrize(
+    ("make", "made", "after"),
+    [
+        (PX4Vehicle, "PX4Vehicle(burst=1, period=0.004)", 520),
+        (listing_ardupilot, "ArduPilotVehicle(ftp=False, burst=1, period=0.004)", 1250),
+    ],
+)
 def test_after_a_killed_process_only_what_is_missing_is_fetched(
-    path: Path, make: type[PX4Vehicle] | type[ArduPilotVehicle], after: int
+    path: Path, make: Callable[..., Vehicle], made: str, after: int
 ) -> None:
-    process = start(KILLED_SESSION.format(make=make.__name__), path)
+    process = start(KILLED_SESSION.format(made=made), path)
     assert process.stdout is not None
     for line in process.stdout:
         if int(line) >= after:
@@ -425,13 +431,13 @@ async def test_a_download_begun_under_another_count_is_no_mixture(path: Path) ->
     """The first table is whole, the download of a grown one breaks off: old indices count for nothing."""
     await fetched(MAKES["ArduPilot"](), path)
     grown_table = {"AAA": 1, **TABLE}
-    grown = ArduPilotVehicle(table=grown_table, burst=1, period=0.01)
+    grown = ArduPilotVehicle(ftp=False, table=grown_table, burst=1, period=0.01)
     await left_unfinished(grown, path)
     with ParamCache(path) as cache:
         kept = cache.component()
         assert not kept.complete
         assert kept.count is None, "some indices are of before"
-    again = ArduPilotVehicle(table=grown_table, burst=1, period=0.01)
+    again = ArduPilotVehicle(ftp=False, table=grown_table, burst=1, period=0.01)
     result = await fetched(again, path)
     assert is_right(result, again)
     assert result.resumed == 0

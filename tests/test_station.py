@@ -11,7 +11,7 @@ from paramclient.protocol import station as room
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentHeard, ComponentIdentified
-from paramclient.protocol.fetch import FetchResult
+from paramclient.protocol.result import FetchResult
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_INVALID,
@@ -170,7 +170,7 @@ def test_what_is_waited_for() -> None:
     hear(station, AutopilotVersion(0, uid=2), 2, 1)
     fetch = station.components[2, 1].begin_fetch(0.0)
     assert is_so(station.is_waiting)
-    station.components[2, 1].end_fetch(fetch)
+    station.components[2, 1].end_fetch(fetch, 0.0)
     assert not station.is_waiting
 
 

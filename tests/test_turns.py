@@ -284,7 +284,9 @@ def test_deadlines_always_lie_ahead_or_something_happens() -> None:
 
 MAKES: dict[str, Callable[[int], Vehicle]] = {
     "PX4": lambda system: PX4Vehicle(system=system, table=table(150), burst=3, period=0.025),
-    "ArduPilot": lambda system: ArduPilotVehicle(system=system, table=table(150), burst=1, period=0.025),
+    "ArduPilot": lambda system: ArduPilotVehicle(
+        ftp=False, system=system, table=table(150), burst=1, period=0.025
+    ),
 }
 
 
@@ -373,8 +375,8 @@ def test_who_waits_for_its_turn_is_not_silent_and_gives_it_back() -> None:
         second.partial(world.now, "")
     assert caught.value.attempts == 0
     assert caught.value.waited == pytest.approx(0.3)
-    world.station.components[2, 1].end_fetch(second)
-    world.station.components[1, 1].end_fetch(first)
+    world.station.components[2, 1].end_fetch(second, world.now)
+    world.station.components[1, 1].end_fetch(first, world.now)
     world.run(0.0)
     assert [lists(world, system) for system in (1, 2, 3)] == [1, 0, 1]
     world.until(lambda: third.done)
@@ -420,7 +422,7 @@ def test_when_the_link_is_gone_nobody_waits_any_more() -> None:
 
 
 def test_a_starved_vehicle_is_not_given_up_while_the_lists_of_others_fill_the_link() -> None:
-    quick = ArduPilotVehicle(system=1, table=table(1400), burst=1, period=0.025)  # 35 s
+    quick = ArduPilotVehicle(ftp=False, system=1, table=table(1400), burst=1, period=0.025)  # 35 s
     starved = PX4Vehicle(system=2, table=table(40), burst=1, period=0.3)
     world = a_radio([quick, starved])
     first, second = begin_all(world, 2)

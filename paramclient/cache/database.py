@@ -97,7 +97,10 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
         )""",
         "CREATE INDEX history_of_component ON history (owner)",
     ),
-    ("ALTER TABLE param ADD COLUMN default_bits INTEGER",),
+    (
+        "ALTER TABLE param ADD COLUMN default_bits INTEGER",
+        "ALTER TABLE component ADD COLUMN file_works INTEGER",
+    ),
 )
 """The statements that lead from each schema version to the next; the version is the number of steps taken."""
 

@@ -63,6 +63,7 @@ class TableState:
         complete: every index was heard.
         volatile_known: which parameters are volatile was proven by computing the hash anew.
         synced_at: when the table was last proven to be the vehicle's.
+        file_works: whether the vehicle, with this firmware, gives the table as one file; None while unknown.
     """
 
     hash: int | None = None
@@ -70,6 +71,7 @@ class TableState:
     complete: bool = False
     volatile_known: bool = False
     synced_at: float | None = None
+    file_works: bool | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,7 +154,7 @@ class CachedSummary:
         component: component id.
         autopilot: MAV_AUTOPILOT of this component's heartbeat.
         size: parameters kept.
-        hash, count, complete, volatile_known, synced_at: as in `TableState`.
+        hash, count, complete, volatile_known, synced_at, file_works: as in `TableState`.
         updated_at: when anything of it was last written.
     """
 
@@ -167,6 +169,7 @@ class CachedSummary:
     volatile_known: bool
     synced_at: float | None
     updated_at: float
+    file_works: bool | None
 
     @property
     def system(self) -> int:

@@ -87,7 +87,7 @@ def summaries(
     """Tables with their ids in the database, without parameters; of one vehicle or component where given."""
     rows = connection.execute(
         "SELECT id, component, own_autopilot, (SELECT count(*) FROM param WHERE owner = c.id), hash, count,"
-        f" complete, volatile_known, synced_at, updated_at, key, {_IDENTITY}"
+        f" complete, volatile_known, synced_at, updated_at, file_works, key, {_IDENTITY}"
         " FROM component c JOIN vehicle ON key = vehicle"
         " WHERE key = ifnull(?, key) AND component = ifnull(?, component)"
         " ORDER BY last_seen DESC, key, component",
@@ -227,9 +227,10 @@ def _write_history(connection: sqlite3.Connection, owner: int, lines: Sequence[t
 def _write_state(connection: sqlite3.Connection, owner: int, state: TableState) -> None:
     synced = None if state.synced_at is None else time_cell(state.synced_at)
     connection.execute(
-        "UPDATE component SET hash = ?, count = ?, complete = ?, volatile_known = ?, synced_at = ?"
+        "UPDATE component"
+        " SET hash = ?, count = ?, complete = ?, volatile_known = ?, synced_at = ?, file_works = ?"
         " WHERE id = ?",
-        (state.hash, state.count, state.complete, state.volatile_known, synced, owner),
+        (state.hash, state.count, state.complete, state.volatile_known, synced, state.file_works, owner),
     )
 
 
@@ -249,11 +250,11 @@ def _rows(connection: sqlite3.Connection, owner: int) -> dict[str, Row]:
 
 
 def _summary(row: Sequence[object]) -> tuple[int, CachedSummary]:
-    owner, component, autopilot, size, *state, key = cells(row[:11], "iiiiIIiiFfs")
-    crc, count, complete, volatile_known, synced_at, updated_at = state
+    owner, component, autopilot, size, *state, key = cells(row[:12], "iiiiIIiiFfIs")
+    crc, count, complete, volatile_known, synced_at, updated_at, file_works = state
     return owner, CachedSummary(
         key=key,
-        identity=read_identity(row[11:]),
+        identity=read_identity(row[12:]),
         component=component,
         autopilot=autopilot,
         size=size,
@@ -263,6 +264,7 @@ def _summary(row: Sequence[object]) -> tuple[int, CachedSummary]:
         volatile_known=bool(volatile_known),
         synced_at=synced_at,
         updated_at=updated_at,
+        file_works=None if file_works is None else bool(file_works),
     )
 
 

@@ -14,7 +14,7 @@ from contextlib import ExitStack, contextmanager
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final
 
-from paramclient.protocol.fetch import Progress
+from paramclient.protocol.result import Progress
 from paramclient.values import Param, ParamType, Value, format_value, shortest_float, type_name
 
 if TYPE_CHECKING:

@@ -34,7 +34,7 @@ from paramclient.cli.output import (
 from paramclient.cli.session import Session, connect
 from paramclient.errors import NoReply, ParamClientError, UsageError, ValueNotApplied
 from paramclient.events import Changes
-from paramclient.protocol.fetch import FetchResult
+from paramclient.protocol.result import FetchResult
 from paramclient.protocol.table import Change
 from paramclient.values import Param, ParamType, Trust, Value, check_name, format_value, type_name
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Final
 
 from paramclient.errors import LinkError, NoReply
@@ -13,11 +12,13 @@ from paramclient.identity import Identity, autopilot_name
 from paramclient.protocol import events
 from paramclient.protocol.authors import Authors
 from paramclient.protocol.events import Event, ParamChanged
-from paramclient.protocol.fetch import Fetch, FetchResult, Policy
+from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.fetches import Fetches
+from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.identify import Identification
 from paramclient.protocol.presence import Presence
 from paramclient.protocol.reads import Key, Read, Reads
-from paramclient.protocol.refresh import Refresh
+from paramclient.protocol.result import Means, Policy, Sampled
 from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.timing import RoundTrip
@@ -29,6 +30,7 @@ from paramclient.protocol.wire import (
     NO_INDEX,
     AutopilotVersion,
     CommandAck,
+    FileTransfer,
     Heartbeat,
     HighLatency2,
     Message,
@@ -68,9 +70,8 @@ class ComponentMachine:
         round_trip: what its answers tell of the link.
         presence: whether it is there.
         sync: whether the table is still the vehicle's.
-        fetch: the fetch under way, or None.
-        last_fetch: the result of the last one that ended, or None.
-        refresh: the reading of volatile values under way after a hash hit, or None.
+        files: its files.
+        fetches: what was and is being fetched.
     """
 
     def __init__(
@@ -116,17 +117,34 @@ class ComponentMachine:
             is_writing=lambda: len(self.writes) > 0,
             is_fetching=lambda: self.fetch is not None,
             is_busy=is_link_busy,
+            file_is_cheap=lambda interval: self.fetches.file_is_cheap(interval),
             is_spared=lambda: self._is_spared,
             begin_fetch=lambda now, refresh: self.begin_fetch(now, refresh=refresh),
             end_fetch=self.end_fetch,
-            confirmed=self._refresh_unhashed,
+            confirmed=lambda confirmed, now: self.fetches.refresh_unhashed(confirmed, now),
             resynced=lambda changed, confirmed: emit(events.TableResynced(self, changed, confirmed)),
         )
-        self.fetch: Fetch | None = None
-        self.last_fetch: FetchResult | None = None
-        self.refresh: Refresh | None = None
+        self.files = FileTransfers(target, own, self.round_trip, send)
+        self.fetches = Fetches(
+            Means(
+                target,
+                self.round_trip,
+                send,
+                self.reads,
+                self.table,
+                self.turns,
+                self.files,
+                expects_hash=lambda: self.sync.expects_hash,
+                changed=self._report,
+                doubt=self._doubt_identity,
+            ),
+            self.sync,
+            upkeep.policy,
+            says_file=lambda: self.who.says_file,
+            is_writing=lambda: len(self.writes) > 0,
+            ended=lambda result: emit(events.Fetched(self, result)),
+        )
         self._own = own
-        self._send = send
         self._emit = emit
         self._policy = upkeep.policy
         self._another = another or self.become_another
@@ -168,6 +186,8 @@ class ComponentMachine:
         elif isinstance(message, SystemTime):
             if self.presence.system_time(message):
                 self._rebooted(now)
+        elif isinstance(message, FileTransfer):
+            self.files.heard(message, now)
         elif isinstance(message, HighLatency2):
             self.who.heartbeat(message)
             self.presence.high_latency()
@@ -248,54 +268,27 @@ class ComponentMachine:
         write.on_done.append(lambda: self.sync.write_ended(write.ended_at))
         return write
 
-    def begin_fetch(self, now: float, *, refresh: bool = False, listed: bool = False) -> Fetch:
+    def begin_fetch(
+        self, now: float, *, refresh: bool = False, listed: bool = False, sampled: Sampled | None = None
+    ) -> Fetch:
         """Begin a fetch, or join the one under way; give it back with `end_fetch`.
 
         Args:
             now: the time.
             refresh: download even if the vehicle's hash would confirm the cached table.
             listed: the list has been asked for already, of all components at once.
+            sampled: the sample that may settle it where there is no hash, or None.
 
         Raises:
             NoReply: the component is lost, and no fetch is under way. Nothing was sent.
         """
-        fetch = self.fetch
-        if fetch is None and self._policy is not Policy.CACHE_ONLY:
+        if self.fetch is None and self._policy is not Policy.CACHE_ONLY:
             self._check_present(f"the parameters of {self.system}/{self.component}", now)
-        if fetch is not None and refresh and (fetch.download is None or fetch.download.resumed):
-            fetch.restart(now)
-        if fetch is None:
-            fetch = self.fetch = Fetch(
-                (self.system, self.component),
-                self.round_trip,
-                self._send,
-                self.reads,
-                self.table,
-                self.turns,
-                now,
-                announced=self.sync.announced,
-                expects_hash=lambda: self.sync.expects_hash,
-                refresh=refresh,
-                listed=listed,
-                policy=self._policy,
-                changed=self._report,
-                doubt=self._doubt_identity,
-            )
-            if fetch.done:
-                self._fetch_ended(fetch)
-            else:
-                begun = fetch
-                fetch.on_done.append(lambda: self._fetch_ended(begun))
-        fetch.holders += 1
-        return fetch
+        return self.fetches.begin(now, refresh=refresh, listed=listed, sampled=sampled)
 
-    def end_fetch(self, fetch: Fetch) -> None:
+    def end_fetch(self, fetch: Fetch, now: float) -> None:
         """Wait for it no longer. The last one who waited cancels it."""
-        fetch.holders -= 1
-        if fetch.holders <= 0 and not fetch.done:
-            fetch.cancel()
-            if self.fetch is fetch:
-                self.fetch = None
+        self.fetches.end(fetch, now)
 
     def spelling(self, name: str) -> str:
         """The name as the vehicle has it. ArduPilot answers to any case; its own names have capitals only."""
@@ -309,6 +302,7 @@ class ComponentMachine:
             self._lose(now)
         self.reads.tick(now)
         self.writes.tick(now)
+        self.files.tick(now)
         if self.fetch is not None:
             self.fetch.tick(now)
         self.who.tick(now)
@@ -322,6 +316,7 @@ class ComponentMachine:
         return min(
             self.reads.next_deadline(),
             self.writes.next_deadline(),
+            self.files.next_deadline(),
             math.inf if self.fetch is None else self.fetch.next_deadline(),
             self.who.next_deadline(),
             self.sync.next_deadline(),
@@ -338,16 +333,18 @@ class ComponentMachine:
         self.presence.heard_at = self.round_trip.heard_at = now
         self.reads.resume(now)
         self.writes.resume(now)
+        self.files.resume(now)
         if self.fetch is not None:
             self.fetch.resume(now)
 
     def fail_all(self, error: LinkError, now: float) -> None:
         """The link is gone for good: everyone who waits gets its error."""
         if self.fetch is not None:
-            self.fetch.cancel()
+            self.fetch.cancel(now)
             self.fetch.fail(error, now)
-        if self.refresh is not None:
-            self.refresh.fail(error, now)
+        if self.fetches.refresh is not None:
+            self.fetches.refresh.fail(error, now)
+        self.files.fail_all(error, now)
         self.writes.fail_all(error, now)
         self.reads.fail_all(error, now)
         self.sync.stop()
@@ -362,6 +359,7 @@ class ComponentMachine:
         self.table.count = None
         self.table.complete = False
         self.sync.forget()
+        self.fetches.forget()
         self._known_as = None
         what = f"writes to {self.system}/{self.component}: another vehicle answers there now"
         self.writes.fail_all(NoReply(what, attempts=0, waited=0.0), now)
@@ -387,6 +385,11 @@ class ComponentMachine:
         if not self.table.params:
             return "new"
         return "cached" if self.table.complete else "partial"
+
+    @property
+    def fetch(self) -> Fetch | None:
+        """The fetch under way, or None."""
+        return self.fetches.current
 
     @property
     def sync_state(self) -> SyncState:
@@ -489,7 +492,7 @@ class ComponentMachine:
         self._authors.clear()
         self.sync.check(now)
         self.who.doubt(now)
-        if self.fetch is not None and self.fetch.download is not None and not self.fetch.download.done:
+        if self.fetch is not None and self.fetch.is_under_way:
             self.fetch.restart(now)
 
     def _is_known(self, key: Key) -> bool:
@@ -517,32 +520,6 @@ class ComponentMachine:
     def _report(self, changes: list[Change]) -> None:
         for change in changes:
             self._emit(ParamChanged(self, change))
-
-    def _fetch_ended(self, fetch: Fetch) -> None:
-        self.fetch = None
-        result = fetch.result
-        if result is None:
-            return
-        self.last_fetch = result
-        if result.source == "cache" and result.hash is None:
-            return  # the vehicle was not asked, or has not confirmed it
-        is_synced = result.complete and self.table.complete and result.is_confirmed
-        self.sync.fetched(is_synced, result.hash, fetch.ended_at)
-        self._emit(events.Fetched(self, result))
-        if result.hash is not None and (result.source == "cache" or result.resumed):
-            self._refresh_unhashed(result.hash, fetch.ended_at)
-
-    def _refresh_unhashed(self, confirmed: int, now: float) -> None:
-        """Read what the hash says nothing about."""
-        refresh = Refresh(self.reads, self.table, confirmed, lambda: len(self.writes) > 0, now)
-        if refresh.done:
-            return
-        self.refresh = refresh
-        refresh.on_done.append(partial(self._refresh_ended, refresh))
-
-    def _refresh_ended(self, refresh: Refresh) -> None:
-        if self.refresh is refresh:
-            self.refresh = None
 
 
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time

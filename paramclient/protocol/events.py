@@ -9,7 +9,7 @@ from paramclient.protocol.table import Change
 
 if TYPE_CHECKING:
     from paramclient.protocol.component import ComponentMachine
-    from paramclient.protocol.fetch import FetchResult
+    from paramclient.protocol.result import FetchResult
 
 __all__ = [
     "ComponentFound",

@@ -4,136 +4,53 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from enum import StrEnum
+from dataclasses import replace
 from functools import partial
 from typing import Final
 
-from paramclient.errors import CacheError, NoReply, UnknownParameter
+from paramclient.errors import CacheError, LinkError, NoReply, UnknownParameter
 from paramclient.protocol.download import Download
 from paramclient.protocol.hashing import find_volatile
+from paramclient.protocol.notes import (
+    FROM_MEMORY,
+    MOVED,
+    NO_FILE,
+    NOT_ASKED,
+    NOT_CONFIRMED,
+    NOT_RESUMED,
+    NOT_SAMPLED,
+    SAMPLED,
+    UNBRACKETED,
+    UNPROVEN,
+    UNSETTLED,
+)
 from paramclient.protocol.operation import Operation
+from paramclient.protocol.packfetch import PackFetch
 from paramclient.protocol.reads import Read, Reads
-from paramclient.protocol.table import Change, Table
-from paramclient.protocol.timing import RoundTrip
-from paramclient.protocol.turns import Turns
-from paramclient.protocol.wire import HASH_CHECK, Message, ParamValue
-from paramclient.values import Param, Trust
+from paramclient.protocol.result import Announcement, FetchResult, Means, Policy, Progress, Sampled
+from paramclient.protocol.sampling import Sampling
+from paramclient.protocol.table import Table
+from paramclient.protocol.wire import HASH_CHECK, ParamValue
+from paramclient.values import Trust
 
-__all__ = ["Announcement", "Fetch", "FetchResult", "Policy", "Progress", "present_of"]
+__all__ = ["Fetch", "present_of"]
 
 FRESH_HASH: Final = 1.0
 """Seconds for which an announced hash answers the question what the hash is. It is asked for when a component
 is found, so that a fetch right after that need not wait for another round trip."""
+ENOUGH_PRESENT: Final = 0.5
+"""The share of a table that must be there for its rest to be worth asking for one by one, where it is not
+known how fast the list comes."""
 MOST_RESTARTS: Final = 8
 """Times that a vehicle may start again, or turn out to be another one, before a fetch is given up."""
 
 
-class Policy(StrEnum):
-    """What may be asked of a vehicle to bring a table up to date.
-
-    Attributes:
-        AUTO: whatever is the cheapest sure way.
-        HASH_ONLY: its hash and nothing more, for a vehicle in flight or a link that costs: a table that the
-            hash does not confirm stays as it was cached.
-        CACHE_ONLY: nothing.
-    """
-
-    AUTO = "auto"
-    HASH_ONLY = "hash-only"
-    CACHE_ONLY = "cache-only"
-
-
-ENOUGH_PRESENT: Final = 0.5
-"""The share of a table that must be there for its rest to be worth asking for one by one, where it is not
-known how fast the list comes."""
-
-
-@dataclass(frozen=True, slots=True)
-class Announcement:
-    """A `_HASH_CHECK` that the vehicle has sent: its hash, the count with it, and when it came."""
-
-    hash: int
-    count: int
-    at: float
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """How far a fetch is.
-
-    Attributes:
-        received: parameters that have come.
-        total: parameters that the component has, or None before it said so.
-        rate: parameters a second since the first one came.
-        seconds_left: at that rate, or None while it cannot be told.
-    """
-
-    received: int
-    total: int | None
-    rate: float
-    seconds_left: float | None
-
-
-@dataclass(frozen=True, slots=True)
-class FetchResult:
-    """What `fetch_all` brought.
-
-    Attributes:
-        system, component: whose parameters.
-        params: all that are known, by name, as they were at the end of the fetch.
-        source: "cache" when the vehicle's hash confirmed the cached table, or when the policy allows no more
-            than the cache; "stream" when it was downloaded.
-        count: parameters that the component says it has.
-        received: how many of them are known.
-        missing: indices that did not come, rising. Empty when the fetch is complete.
-        hash: the PX4 hash under which the vehicle confirmed the table; None for a vehicle without one, when
-            the table moved during the download, and when the policy kept it from being asked.
-        elapsed: seconds from the call to the end.
-        resumed: how many were known already from an earlier download that did not come to its end.
-        notes: what else is worth knowing, in sentences.
-        lost: values that the list should have brought and did not, so that they had to be asked for one by
-            one or by listing again; 0 from the cache.
-        repeated: values that came although they had come before; 0 from the cache.
-        round_trip: the component's measured round trip in seconds, smoothed, or None.
-    """
-
-    system: int
-    component: int
-    params: Mapping[str, Param]
-    source: str
-    count: int
-    received: int
-    missing: tuple[int, ...]
-    hash: int | None
-    elapsed: float
-    notes: tuple[str, ...] = ()
-    resumed: int = 0
-    lost: int = 0
-    repeated: int = 0
-    round_trip: float | None = None
-
-    @property
-    def complete(self) -> bool:
-        return not self.missing
-
-    @property
-    def is_confirmed(self) -> bool:
-        """Whether every value was heard in this session, or the vehicle's hash stands for it."""
-        if not self.resumed or self.hash is not None:
-            return True
-        return all(param.trust is not Trust.CACHED or param.index is None for param in self.params.values())
-
-    def __repr__(self) -> str:
-        missing = f", {len(self.missing)} missing" if self.missing else ""
-        return (
-            f"<FetchResult {self.system}/{self.component} {self.received} params{missing} "
-            f"from {self.source} in {self.elapsed:.2f} s>"
-        )
-
-
 class Fetch(Operation[FetchResult]):
-    """One fetch: hash first where a cached table has one, else or on a difference the list.
+    """One fetch: hash first where a cached table has one, else or on a difference the file, or the list.
+
+    The file is asked for where the component serves it: it is exact, has the firmware's defaults, and comes
+    quicker. When that fails, the list follows, and `notes` says why. Where there is no hash, a sample of a
+    cached table may settle it, if that was asked for.
 
     The table that a download brought is confirmed when the hash that is computed from it is one that the
     vehicle announced in the course of it, or when the vehicle announced the same before and after: then
@@ -146,36 +63,32 @@ class Fetch(Operation[FetchResult]):
     Attributes:
         holders: how many wait for it; with none left it is cancelled.
         download: the download by list, once it is needed.
+        file: the download as a file, while that is tried.
+        file_failed: whether the file could not be had, once that is known: None before, and where the
+            component just did not answer.
     """
 
     def __init__(
         self,
-        target: tuple[int, int],
-        round_trip: RoundTrip,
-        send: Callable[[Message], None],
-        reads: Reads,
-        table: Table,
-        turns: Turns,
+        means: Means,
         now: float,
         *,
         announced: Announcement | None,
-        expects_hash: Callable[[], bool],
         refresh: bool,
         listed: bool,
         policy: Policy,
-        changed: Callable[[list[Change]], None],
-        doubt: Callable[[float], None],
+        may_use_file: bool,
+        sampled: Sampled | None,
     ) -> None:
         super().__init__(now)
-        self._target = target
-        self._round_trip = round_trip
-        self._send = send
-        self._reads = reads
-        self._table = table
-        self._turns = turns
-        self._changed = changed
-        self._doubt = doubt
-        self._expects_hash = expects_hash
+        self._means = means
+        self._target = means.target
+        self._round_trip = means.round_trip
+        self._reads = means.reads
+        table = self._table = means.table
+        self._expects_hash = means.expects_hash
+        self._may_use_file = may_use_file
+        self._sampling: Sampling | None = None
         self._hash_read: Read | None = None
         self._before: int | None = None  # the hash announced before any value counted
         self._meanwhile: int | None = None  # the hash announced in the course of the download
@@ -188,9 +101,13 @@ class Fetch(Operation[FetchResult]):
         self._restarts = 0
         self.holders = 0
         self.download: Download | None = None
+        self.file: PackFetch | None = None
+        self.file_failed: bool | None = None
         self._notes: tuple[str, ...] = ()
         if policy is Policy.CACHE_ONLY or refresh or listed:
             self._begin_download(now)
+        elif sampled is not None and table.complete and table.count and not self._expects_hash():
+            self._sample(sampled, table.count, now)
         elif table.hash is None or not table.complete:
             self._begin_or_resume(announced, now)
         elif announced is not None and now - announced.at <= FRESH_HASH:
@@ -207,6 +124,8 @@ class Fetch(Operation[FetchResult]):
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
+        if self.file is not None:
+            self.file.heard(message)
         download = self.download
         if download is not None and not download.done:
             if self._first_value_at > now:
@@ -231,10 +150,21 @@ class Fetch(Operation[FetchResult]):
         if self.download is not None:
             self.download.resume(now)
 
+    @property
+    def is_about_the_cache(self) -> bool:
+        """Whether it is still to be seen if what is known already will do."""
+        return self.file is None and (self.download is None or self.download.resumed > 0)
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether parameters are coming, which would be of the past if the vehicle started again."""
+        return self.file is not None or (self.download is not None and not self.download.done)
+
     def restart(self, now: float) -> None:
         """The vehicle is another one, or has started again: what came is not about it. Fetch it anew."""
-        self._drop()
         held_up = self.held_up(now)
+        self._drop(now)
+        self.download = None
         self._restarts += 1
         if self._restarts > MOST_RESTARTS:
             system, component = self._target
@@ -247,9 +177,9 @@ class Fetch(Operation[FetchResult]):
         self._listed = False
         self._begin_download(now)
 
-    def cancel(self) -> None:
+    def cancel(self, now: float) -> None:
         """Nobody waits any more. What is on its way still goes into the table."""
-        self._drop()
+        self._drop(now)
 
     def partial(self, now: float, note: str) -> FetchResult:
         """What has come so far, for someone whose time is up while it goes on.
@@ -258,6 +188,9 @@ class Fetch(Operation[FetchResult]):
             NoReply: nothing has come.
         """
         download = self.download
+        count = self._table.count
+        if self.file is not None and not self.file.is_awaited and count:
+            return self._result("ftp", count, tuple(range(count)), None, now, (note,))
         if download is None or download.count is None:
             system, component = self._target
             attempts = 1 if download is None else download.lists
@@ -268,6 +201,8 @@ class Fetch(Operation[FetchResult]):
     @property
     def is_silent(self) -> bool:
         """Whether nothing has come although it was asked for more than once."""
+        if self.file is not None:
+            return self.file.is_silent
         if self.download is not None:
             return self.download.count is None and self.download.lists > 1
         read = self._hash_read
@@ -275,16 +210,48 @@ class Fetch(Operation[FetchResult]):
 
     def held_up(self, now: float) -> float:
         """Seconds for which its list has waited for its turn: other lists of the same link ran."""
-        return self._held_before + (0.0 if self.download is None else self.download.held_for(now))
+        stream = self.download if self.file is None else self.file
+        return self._held_before + (0.0 if stream is None else stream.held_for(now))
 
     def progress(self, now: float) -> Progress:
         """How far it is."""
+        if self.file is not None:
+            return self._progress_of_file(self.file, now)
         received, total = (0, self._table.count) if self.download is None else self.download.progress
         running = now - self._first_value_at
         came = received - (0 if self.download is None else self.download.resumed)
         rate = came / running if came > 0 and running > 0 else 0.0
         left = (total - received) / rate if rate and total is not None else None
         return Progress(received, total, rate, left)
+
+    def _progress_of_file(self, file: PackFetch, now: float) -> Progress:
+        share, total, running = file.share, self._table.count, now - self.begun_at - self.held_up(now)
+        left = running * (1 - share) / share if share else None
+        received = int(share * (total or 0))
+        return Progress(received, total, received / running if running > 0 else 0.0, left)
+
+    def _sample(self, sampled: Sampled, count: int, now: float) -> None:
+        """Judge the cached table by some of its parameters."""
+        table = self._table
+        sampling = self._sampling = Sampling(
+            self._reads, table.params, table.encoding, count, now, size=sampled.size, seed=sampled.seed
+        )
+
+        def ended() -> None:
+            self._sampling = None
+            sample = sampling.result
+            if sample is not None and sample.agrees:
+                result = self._result("cache", count, (), None, sampling.ended_at, (SAMPLED,))
+                self.finish(replace(result, sample=sample), sampling.ended_at)
+            else:
+                why = str(sampling.error) if sample is None else sample.differing[0]
+                self._notes += (NOT_SAMPLED.format(why),)
+                self._begin_download(sampling.ended_at)
+
+        if sampling.done:
+            ended()
+        else:
+            sampling.on_done.append(ended)
 
     def _ask_hash(self, then: Callable[[Read], None], now: float) -> None:
         read = self._hash_read = self._reads.ask(HASH_CHECK, now)
@@ -320,7 +287,7 @@ class Fetch(Operation[FetchResult]):
             return
         table.count = announcement.count
         table.verify()
-        notes = () if table.volatile_known else (_UNPROVEN,)
+        notes = () if table.volatile_known else (UNPROVEN,)
         self.finish(self._result("cache", announcement.count, (), announcement.hash, now, notes), now)
 
     def _begin_or_resume(self, announced: Announcement | None, now: float) -> None:
@@ -359,13 +326,18 @@ class Fetch(Operation[FetchResult]):
         if self._policy is not Policy.AUTO:
             self._stay_with_cache(now)
             return
-        self._doubt(now)
+        means = self._means
+        means.doubt(now)
+        if self._may_use_file and not self._listed:
+            file = self.file = PackFetch(means.files, means.turns, means.table, means.changed, now)
+            file.on_done.append(partial(self._file_ended, file))
+            return
         download = self.download = Download(
-            self._target,
-            self._round_trip,
-            self._send,
-            self._reads,
-            self._turns,
+            means.target,
+            means.round_trip,
+            means.send,
+            means.reads,
+            means.turns,
             now,
             listed=self._listed,
             count=self._table.count,
@@ -375,6 +347,44 @@ class Fetch(Operation[FetchResult]):
         if download.done:
             self._download_ended(download)
         download.on_done.append(partial(self._download_ended, download))
+
+    def _file_ended(self, file: PackFetch) -> None:
+        if self.file is not file:
+            return
+        self.file = None
+        now = file.ended_at
+        self._held_before += file.held_up
+        if file.error is None:
+            self.file_failed = False
+            self._table.complete = True
+            if self._expects_hash() and not self._is_hash_unknown:
+                self._ask_hash(partial(self._hash_came_after_file, file), now)
+            else:
+                self._table.unconfirm()
+                self.finish(self._result("ftp", file.count, (), None, now, ()), now)
+            return
+        if isinstance(file.error, LinkError):
+            self.fail(file.error, now)
+            return
+        self._may_use_file = False
+        self.file_failed = None if isinstance(file.error, NoReply) else True
+        self._notes += (NO_FILE.format(file.error),)
+        self._begin_download(now)
+
+    def _hash_came_after_file(self, file: PackFetch, read: Read) -> None:
+        """The file is the vehicle's table at one moment; its hash may be of a later one."""
+        table, now = self._table, read.ended_at
+        notes: tuple[str, ...] = ()
+        table.unconfirm()
+        if read.result is not None:
+            after = int.from_bytes(read.result.raw, "little")
+            volatile, proven = find_volatile(table.listed(), after, believed=table.volatile)
+            if proven or after == self._before:
+                table.confirm(after, volatile, proven=proven)
+                notes = () if proven else (UNPROVEN,)
+            else:
+                notes = (MOVED,)
+        self.finish(self._result("ftp", file.count, (), table.hash, now, notes), now)
 
     def _stay_with_cache(self, now: float) -> None:
         """The policy allows no download: give what is known, and say so."""
@@ -389,7 +399,7 @@ class Fetch(Operation[FetchResult]):
         present = {param.index for param in table.listed()}
         count = len(present) if table.count is None else table.count
         missing = tuple(index for index in range(count) if index not in present)
-        note = _NOT_ASKED if self._policy is Policy.CACHE_ONLY else _NOT_CONFIRMED
+        note = NOT_ASKED if self._policy is Policy.CACHE_ONLY else NOT_CONFIRMED
         self.finish(self._result("cache", count, missing, None, now, (note,)), now)
 
     def _download_ended(self, download: Download) -> None:
@@ -430,7 +440,7 @@ class Fetch(Operation[FetchResult]):
             )
         )
         table.displaced.clear()
-        self._changed(gone)
+        self._means.changed(gone)
 
     def _hash_came_last(self, download: Download, read: Read) -> None:
         after = None if read.result is None else int.from_bytes(read.result.raw, "little")
@@ -443,13 +453,13 @@ class Fetch(Operation[FetchResult]):
         if not download.missing:
             self._remove_what_is_gone(download)
             if not download.is_settled:
-                notes = (_UNSETTLED,)
+                notes = (UNSETTLED,)
             table.unconfirm()
         if after is not None and not download.missing:
             volatile, proven = find_volatile(table.listed(), after, believed=table.volatile)
             if download.resumed and not proven:
                 # what was heard earlier is not what the vehicle has now, or cannot be told from it
-                self._notes = (_NOT_RESUMED,)
+                self._notes = (NOT_RESUMED,)
                 self._before = self._meanwhile = None
                 self._was_asked_meanwhile = False
                 self._begin_download(now)
@@ -457,9 +467,9 @@ class Fetch(Operation[FetchResult]):
             if proven or after == self._before:
                 table.confirm(after, volatile, proven=proven)
                 table.verify()
-                notes += () if proven else (_UNPROVEN,)
+                notes += () if proven else (UNPROVEN,)
             else:
-                notes += (_UNBRACKETED,) if self._before is None else (_MOVED,)
+                notes += (UNBRACKETED,) if self._before is None else (MOVED,)
         self._finish_download(download, now, notes)
 
     def _finish_download(self, download: Download, now: float, notes: tuple[str, ...]) -> None:
@@ -473,7 +483,7 @@ class Fetch(Operation[FetchResult]):
         table.count = count
         if download.resumed and table.hash is None:
             earlier = sum(param.trust is Trust.CACHED for param in table.listed())
-            notes += (_FROM_MEMORY.format(earlier),) if earlier else ()
+            notes += (FROM_MEMORY.format(earlier),) if earlier else ()
         self.finish(
             self._result("stream", count, missing, table.hash if not missing else None, now, notes), now
         )
@@ -507,10 +517,16 @@ class Fetch(Operation[FetchResult]):
             round_trip=self._round_trip.smoothed,
         )
 
-    def _drop(self) -> None:
+    def _drop(self, now: float) -> None:
         read, self._hash_read = self._hash_read, None
         if read is not None:
             self._reads.release(read)
+        sampling, self._sampling = self._sampling, None
+        if sampling is not None:
+            sampling.cancel()
+        file, self.file = self.file, None
+        if file is not None:
+            file.cancel(now)
         if self.download is not None:
             self.download.cancel()
 
@@ -523,28 +539,3 @@ def present_of(table: Table, reads: Reads) -> dict[int, str]:
     present = table.present()
     # with a list's pace measured, the download finds out itself whether another one is faster
     return present if reads.pace.gap or len(present) >= ENOUGH_PRESENT * count else {}
-
-
-_UNPROVEN = (
-    "Which parameters this firmware leaves out of its hash could not be proven, "
-    "so after a start from the cache every value is read afresh."
-)
-_MOVED = "The table moved during the download, so no hash stands for it; the next session downloads it again."
-_UNBRACKETED = (
-    "No hash was heard before the download, and what this firmware leaves out of it could not be proven, "
-    "so none stands for the table; the next session downloads it again."
-)
-_NOT_ASKED = "The vehicle was not asked, as the policy is cache-only: the values are those last known."
-_NOT_CONFIRMED = (
-    "The vehicle's hash did not confirm the cached table, and the policy hash-only allows no download: "
-    "the values are those last known."
-)
-_UNSETTLED = "The number of parameters kept changing during the download."
-_NOT_RESUMED = (
-    "What an earlier download had brought could not be confirmed by the vehicle's hash, "
-    "so all was downloaded anew."
-)
-_FROM_MEMORY = (
-    "{} values are those of an earlier session: this vehicle has no hash to confirm them. "
-    "A fetch with refresh=True reads them anew."
-)

@@ -11,6 +11,7 @@ from paramclient.identity import Identity
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
+    CAPABILITY_FTP,
     CAPABILITY_PARAM_ENCODE_BYTEWISE,
     CAPABILITY_PARAM_ENCODE_C_CAST,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -31,6 +32,8 @@ from paramclient.values import Encoding
 
 __all__ = ["Identification", "judge_encoding"]
 
+PX4_WITH_FILE: Final = 0x01120000
+"""flight_sw_version of the first PX4 that serves the packed parameter file: 1.18."""
 TRIES: Final = 4
 """AUTOPILOT_VERSION is asked for so often where nothing is known of the link, or where it was refused; many
 components (cameras, radios) never give one."""
@@ -105,6 +108,15 @@ class Identification:
     def has_parameters(self) -> bool:
         """Whether parameters can be expected of it: it is no ground station."""
         return self.vehicle_type != MAV_TYPE_GCS
+
+    @property
+    def says_file(self) -> bool:
+        """Whether it says that it serves files, and has the packed parameter file among them.
+
+        PX4 says so since long before it had that: 1.17 answers "file not found" (measured).
+        """
+        has_none = self.autopilot == MAV_AUTOPILOT_PX4 and self.identity.firmware < PX4_WITH_FILE
+        return bool((self.capabilities or 0) & CAPABILITY_FTP) and not has_none
 
     @property
     def encoding_is_certain(self) -> bool:

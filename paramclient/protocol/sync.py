@@ -9,8 +9,9 @@ from enum import StrEnum
 from typing import Final
 
 from paramclient.errors import UnknownParameter, UsageError
-from paramclient.protocol.fetch import FRESH_HASH, Announcement, Fetch, Policy
+from paramclient.protocol.fetch import FRESH_HASH, Fetch
 from paramclient.protocol.reads import Read, Reads
+from paramclient.protocol.result import Announcement, Policy
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.wire import HASH_CHECK, ParamValue
 
@@ -58,7 +59,8 @@ class Upkeep:
 
     Attributes:
         interval: seconds after which the vehicle is asked again whether it has moved; infinity for never.
-        without_hash: whether that goes for vehicles without a hash too; their whole list is then fetched.
+        without_hash: whether that goes for every vehicle without a hash too: its whole table is then fetched.
+            It goes anyway for those that give it as a file in no time.
         policy: what may be asked.
     """
 
@@ -99,6 +101,8 @@ class Sync:
         is_writing: whether a write of ours is under way.
         is_fetching: whether a fetch of the component is under way.
         is_busy: whether anything at all is, on the link.
+        file_is_cheap: whether a component without a hash gives its table as a file, which comes so quickly
+            that it can be read once in every interval.
         is_spared: whether the component is in a mode in which it is asked for nothing.
         begin_fetch: begins a fetch (with `refresh`, of everything), which `end_fetch` gives back.
         end_fetch: as it says.
@@ -120,9 +124,10 @@ class Sync:
         is_writing: Callable[[], bool],
         is_fetching: Callable[[], bool],
         is_busy: Callable[[], bool],
+        file_is_cheap: Callable[[float], bool],
         is_spared: Callable[[], bool],
         begin_fetch: Callable[[float, bool], Fetch],
-        end_fetch: Callable[[Fetch], None],
+        end_fetch: Callable[[Fetch, float], None],
         confirmed: Callable[[int, float], None],
         resynced: Callable[[tuple[str, ...], int | None], None],
     ) -> None:
@@ -133,6 +138,7 @@ class Sync:
         self._is_writing = is_writing
         self._is_fetching = is_fetching
         self._is_busy = is_busy
+        self._file_is_cheap = file_is_cheap
         self._is_spared = is_spared
         self._begin_fetch = begin_fetch
         self._end_fetch = end_fetch
@@ -295,7 +301,7 @@ class Sync:
             self._is_checking = False
         elif self.expects_hash:
             self.ask(now)
-        elif self._is_kept_up and self._upkeep.without_hash:
+        elif self._is_kept_up and (self._upkeep.without_hash or self._file_is_cheap(self._upkeep.interval)):
             self._begin_resync(now, refresh=True)
 
     def _hash_came(self, read: Read) -> None:
@@ -328,7 +334,7 @@ class Sync:
 
         def ended() -> None:
             self._resync = None
-            self._end_fetch(fetch)
+            self._end_fetch(fetch, fetch.ended_at)
 
         if fetch.done:
             ended()

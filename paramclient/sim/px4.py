@@ -46,7 +46,7 @@ class PX4Vehicle(BytewiseVehicle):
         autosave: seconds from a change until all that was unsaved is saved.
         burst, period: by default UDP and USB. A serial port has a burst of 3, the low-bandwidth mode 1
             every 0.125 s.
-        ftp: whether there is a param.pck; otherwise it is said not to be found.
+        ftp: whether there is a param.pck, as after 1.17; otherwise it is said not to be found.
         ftp_rate: bytes per second of a burst of MAVFTP.
         options: those of every `Vehicle`. A list that is asked for within its `boot_time` starts then.
 
@@ -109,7 +109,7 @@ class PX4Vehicle(BytewiseVehicle):
             ),
             version=wire.AutopilotVersion(
                 59647,
-                flight_sw_version=17891392,
+                flight_sw_version=_MAIN if ftp else _RELEASE,
                 git_hash=bytes.fromhex("0000009383550aa7"),
                 board_version=1,
                 uid=_UID + system - 1 if uid is None else uid,
@@ -230,6 +230,8 @@ class PX4Vehicle(BytewiseVehicle):
 
 
 _QUADROTOR = 2
+_RELEASE = 17891392  # 1.17.0
+_MAIN = 0x01120000  # 1.18
 _STANDBY = 3
 _UID = 5283920058631409231
 _PUSH_DELAY = 0.020

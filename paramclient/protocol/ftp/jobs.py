@@ -112,6 +112,11 @@ class Job(Operation[Result]):
         self._open_at = math.inf
         self._reopen: Callable[[float], None] | None = None
 
+    @property
+    def attempts(self) -> int:
+        """How often the present request was sent."""
+        return self._attempts
+
     @abstractmethod
     def begin(self, now: float) -> None:
         """The server is free: start."""

@@ -1,0 +1,145 @@
+"""The fetches of one component: one at a time, which everyone who wants one shares, and what follows each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.refresh import Refresh
+from paramclient.protocol.result import FetchResult, Means, Policy, Sampled
+from paramclient.protocol.sync import Sync
+
+__all__ = ["Fetches"]
+
+CHEAP_SHARE: Final = 0.05
+"""The share of the time between two looks at a vehicle without a hash that the fetch of its parameter file
+may take up: 1.5 s of 30 s, which it takes on cables and not on radios."""
+
+
+class Fetches:
+    """What was fetched, is being fetched, and can be.
+
+    Args:
+        means: what each of them works with.
+        sync: the component's.
+        policy: what may be asked.
+        says_file: whether the component says that it serves files.
+        is_writing: whether a write of ours is under way.
+        ended: is told of each result that stands for the vehicle's table of now.
+
+    Attributes:
+        current: the fetch under way, or None.
+        last: the result of the last one that ended, or None.
+        refresh: the reading of volatile values under way after a hash hit, or None.
+        file_works: whether this vehicle, with this firmware, gives its table as a file: None while unknown.
+        is_same_firmware: whether what the cache knows is of this very vehicle with this very firmware.
+    """
+
+    def __init__(
+        self,
+        means: Means,
+        sync: Sync,
+        policy: Policy,
+        *,
+        says_file: Callable[[], bool],
+        is_writing: Callable[[], bool],
+        ended: Callable[[FetchResult], None],
+    ) -> None:
+        self.current: Fetch | None = None
+        self.last: FetchResult | None = None
+        self.refresh: Refresh | None = None
+        self.file_works: bool | None = None
+        self.is_same_firmware = False
+        self._means = means
+        self._sync = sync
+        self._policy = policy
+        self._says_file = says_file
+        self._is_writing = is_writing
+        self._ended = ended
+        self._file_took: float | None = None
+
+    @property
+    def may_use_file(self) -> bool:
+        """Whether the table is worth asking for as a file: it has come as one, or the component says so."""
+        return self._says_file() if self.file_works is None else self.file_works
+
+    def file_is_cheap(self, interval: float) -> bool:
+        """Whether the file comes so quickly that it can be read once in every such interval."""
+        return self._file_took is not None and self._file_took <= CHEAP_SHARE * interval
+
+    def begin(
+        self, now: float, *, refresh: bool = False, listed: bool = False, sampled: Sampled | None = None
+    ) -> Fetch:
+        """Begin one, or join the one under way; give it back with `end`.
+
+        Args:
+            now: the time.
+            refresh: fetch even if the vehicle's hash would confirm the cached table.
+            listed: the list has been asked for already, of all components at once.
+            sampled: the sample that may settle it where there is no hash, or None.
+        """
+        fetch = self.current
+        if fetch is not None and refresh and fetch.is_about_the_cache:
+            fetch.restart(now)
+        if fetch is None:
+            fetch = self.current = Fetch(
+                self._means,
+                now,
+                announced=self._sync.announced,
+                refresh=refresh,
+                listed=listed,
+                policy=self._policy,
+                may_use_file=self.may_use_file,
+                sampled=sampled if self.is_same_firmware else None,
+            )
+            if fetch.done:
+                self._fetch_ended(fetch)
+            else:
+                fetch.on_done.append(partial(self._fetch_ended, fetch))
+        fetch.holders += 1
+        return fetch
+
+    def end(self, fetch: Fetch, now: float) -> None:
+        """Wait for it no longer. The last one who waited cancels it."""
+        fetch.holders -= 1
+        if fetch.holders <= 0 and not fetch.done:
+            fetch.cancel(now)
+            if self.current is fetch:
+                self.current = None
+
+    def refresh_unhashed(self, confirmed: int, now: float) -> None:
+        """A hash has confirmed the table: read what it says nothing about."""
+        refresh = Refresh(self._means.reads, self._means.table, confirmed, self._is_writing, now)
+        if not refresh.done:
+            self.refresh = refresh
+            refresh.on_done.append(partial(self._refresh_ended, refresh))
+
+    def forget(self) -> None:
+        """Another vehicle has taken the address."""
+        self.file_works = self._file_took = None
+        self.is_same_firmware = False
+
+    def _fetch_ended(self, fetch: Fetch) -> None:
+        self.current = None
+        if fetch.file_failed is not None:
+            self.file_works = not fetch.file_failed
+        result = fetch.result
+        if result is None:
+            return
+        self.last = result
+        if result.source == "ftp":
+            self._file_took = result.elapsed
+        if result.source == "cache" and result.hash is None:
+            return  # the vehicle was not asked, or not about all of it
+        table = self._means.table
+        is_synced = result.complete and table.complete and result.is_confirmed
+        self._sync.fetched(is_synced, result.hash, fetch.ended_at)
+        self._ended(result)
+        if result.hash is not None and (result.source == "cache" or result.resumed):
+            self.refresh_unhashed(result.hash, fetch.ended_at)
+
+    def _refresh_ended(self, refresh: Refresh) -> None:
+        if self.refresh is refresh:
+            self.refresh = None

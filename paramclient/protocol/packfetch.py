@@ -1,0 +1,178 @@
+"""Fetch every parameter of a component as one packed file over MAVFTP."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+from paramclient.errors import FileTransferError, PackError
+from paramclient.protocol.ftp import FileRead, FileTransfers
+from paramclient.protocol.ftp.packets import MOST_DATA
+from paramclient.protocol.operation import Operation
+from paramclient.protocol.pack import LARGEST_FILE, Pack, decode
+from paramclient.protocol.table import Change, Table
+from paramclient.protocol.turns import Seen, Turns
+from paramclient.protocol.wire import NO_INDEX, ParamValue
+
+__all__ = ["PARAMETER_FILE", "PackFetch"]
+
+PARAMETER_FILE: Final = "@PARAM/param.pck"
+"""The table of ArduPilot 4.1 and later, and of PX4 after 1.17."""
+WITH_DEFAULTS: Final = "?withdefaults=1"
+"""Understood since ArduPilot 4.3; what does not know it may say that there is no such file."""
+SILENCE: Final = 2.0
+"""Seconds without anything after which the file no longer keeps the lists of others waiting."""
+MOST_TRIES: Final = 2
+"""Times that a file is read which turns out to be none, or of the past: it is made anew for each reader, and
+a gap that is filled later may hold newer values of another length."""
+
+
+class PackFetch(Operation[None]):
+    """One fetch of the packed file into the table. It ends with the table filled, or with the reason why not.
+
+    While the file comes, PARAM_VALUEs go on: what was heard since it was asked for is newer than what stands
+    in it. A param_count that differs from the file's makes the file one of the past. It waits for its turn on
+    the link, as a list does.
+
+    Args:
+        files: the component's.
+        turns: those of the link.
+        table: where the parameters go.
+        changed: is told of the changes.
+        now: the time.
+
+    Attributes:
+        count: parameters in the table, once it is there.
+        held_up: seconds for which it waited for its turn.
+    """
+
+    def __init__(
+        self,
+        files: FileTransfers,
+        turns: Turns,
+        table: Table,
+        changed: Callable[[list[Change]], None],
+        now: float,
+    ) -> None:
+        super().__init__(now)
+        self._files = files
+        self._turns = turns
+        self._table = table
+        self._changed = changed
+        self._heard: set[str] = set()
+        self._heard_count: int | None = None
+        self._attempts = 0
+        self._query = WITH_DEFAULTS
+        self._job: FileRead | None = None
+        self._silent_at = math.inf
+        self.count = 0
+        self.held_up = 0.0
+        self._waits_since: float | None = now
+        turns.ask(self, now)
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether nothing of the file has come although it was asked for more than once."""
+        return self.is_awaited and self._job is not None and self._job.attempts > 1
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether nothing of the file has come."""
+        return self._job is None or not self._job.received
+
+    @property
+    def silent_at(self) -> float:
+        """While nothing has come: when that has lasted too long for others to wait."""
+        return self._silent_at if self.is_awaited else math.inf
+
+    def seen(self) -> Seen:
+        """What has come, in messages: a burst that is repaired on its own goes over nothing."""
+        came = 0 if self._job is None else self._job.received // MOST_DATA
+        return Seen(came, came, 0.0, False)
+
+    def begin(self, now: float) -> None:
+        """It is this file's turn."""
+        if self._waits_since is not None:
+            self.held_up += now - self._waits_since
+            self._waits_since = None
+        self._silent_at = now + SILENCE
+        self._read(now)
+
+    def held_for(self, now: float) -> float:
+        """Seconds for which it has waited for its turn so far."""
+        return self.held_up + (0.0 if self._waits_since is None else now - self._waits_since)
+
+    @property
+    def share(self) -> float:
+        """How much of the file has come, 0 to 1, as far as its size can be told."""
+        job = self._job
+        return min(job.received / job.size, 1.0) if job is not None and job.size else 0.0
+
+    def heard(self, message: ParamValue) -> None:
+        """Every PARAM_VALUE of the component passes here, after it went into the table."""
+        self._heard.add(message.param_id)
+        if message.param_count != NO_INDEX:
+            self._heard_count = message.param_count
+
+    def cancel(self, now: float) -> None:
+        """Nobody wants it any more; the file is closed on board."""
+        job, self._job = self._job, None
+        self._turns.give_back(self)
+        if job is not None:
+            self._files.release(job, now)
+
+    def _read(self, now: float) -> None:
+        self._attempts += 1
+        self._heard.clear()
+        self._heard_count = None
+        job = self._job = self._files.read(PARAMETER_FILE + self._query, now, limit=LARGEST_FILE)
+        job.on_done.append(partial(self._came, job))
+
+    def _came(self, job: FileRead) -> None:
+        if self._job is not job:
+            return
+        self._job = None
+        now = job.ended_at
+        if job.result is None:
+            may_be_the_query = isinstance(job.error, FileTransferError) and job.error.is_not_found
+            if may_be_the_query and self._query:
+                self._query = ""
+                self._attempts -= 1
+                self._read(now)
+            else:
+                assert job.error is not None
+                self._turns.give_back(self)
+                self.fail(job.error, now)
+            return
+        try:
+            pack = decode(job.result)
+            if len(pack.entries) < pack.total:
+                raise PackError(f"it has {len(pack.entries)} of {pack.total} parameters", offset=0)
+            if self._heard_count not in (None, pack.total):
+                raise PackError(f"the vehicle has {self._heard_count} parameters by now", offset=4)
+        except PackError as error:
+            if self._attempts < MOST_TRIES:
+                self._read(now)
+            else:
+                self._turns.give_back(self)
+                self.fail(error, now)
+            return
+        self._turns.give_back(self)
+        self._fill(pack)
+        self.finish(None, now)
+
+    def _fill(self, pack: Pack) -> None:
+        table = self._table
+        changes = []
+        for index, (name, number, bits, default) in enumerate(pack.entries):
+            if default is None and pack.with_defaults:
+                default = bits  # the vehicle gives those that differ
+            change = table.take(name, number, bits, index, default, is_older=name in self._heard)
+            if change is not None:
+                changes.append(change)
+        present = {entry.name for entry in pack.entries}
+        changes += table.remove(lambda param: param.index is not None and param.name not in present)
+        table.count = self.count = pack.total
+        self._changed(changes)

@@ -1,0 +1,157 @@
+"""What a fetch works with, what it is told, what it tells meanwhile, and what comes of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import StrEnum
+
+from paramclient.protocol.ftp import FileTransfers
+from paramclient.protocol.reads import Reads
+from paramclient.protocol.sampling import Sample
+from paramclient.protocol.table import Change, Table
+from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.turns import Turns
+from paramclient.protocol.wire import Message
+from paramclient.values import Param, Trust
+
+__all__ = ["Announcement", "FetchResult", "Means", "Policy", "Progress", "Sampled"]
+
+
+class Policy(StrEnum):
+    """What may be asked of a vehicle to bring a table up to date.
+
+    Attributes:
+        AUTO: whatever is the cheapest sure way.
+        HASH_ONLY: its hash and nothing more, for a vehicle in flight or a link that costs: a table that the
+            hash does not confirm stays as it was cached.
+        CACHE_ONLY: nothing.
+    """
+
+    AUTO = "auto"
+    HASH_ONLY = "hash-only"
+    CACHE_ONLY = "cache-only"
+
+
+@dataclass(frozen=True, slots=True)
+class Means:
+    """What a fetch works with; all of it is the component's.
+
+    Attributes:
+        target: system and component.
+        round_trip, send, reads, table, turns, files: as their names say.
+        expects_hash: whether it has a hash, as far as is known.
+        changed: is told of changes that no PARAM_VALUE brought.
+        doubt: is told that a table has turned out not to be what it was.
+    """
+
+    target: tuple[int, int]
+    round_trip: RoundTrip
+    send: Callable[[Message], None]
+    reads: Reads
+    table: Table
+    turns: Turns
+    files: FileTransfers
+    expects_hash: Callable[[], bool]
+    changed: Callable[[list[Change]], None]
+    doubt: Callable[[float], None]
+
+
+@dataclass(frozen=True, slots=True)
+class Sampled:
+    """What sample of a cached table may settle a fetch of a vehicle without a hash.
+
+    Attributes:
+        size: how many parameters.
+        seed: of the draw.
+    """
+
+    size: int
+    seed: int
+
+
+@dataclass(frozen=True, slots=True)
+class Announcement:
+    """A `_HASH_CHECK` that the vehicle has sent: its hash, the count with it, and when it came."""
+
+    hash: int
+    count: int
+    at: float
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a fetch is.
+
+    Attributes:
+        received: parameters that have come.
+        total: parameters that the component has, or None before it said so.
+        rate: parameters a second since the first one came.
+        seconds_left: at that rate, or None while it cannot be told.
+    """
+
+    received: int
+    total: int | None
+    rate: float
+    seconds_left: float | None
+
+
+@dataclass(frozen=True, slots=True)
+class FetchResult:
+    """What `fetch_all` brought.
+
+    Attributes:
+        system, component: whose parameters.
+        params: all that are known, by name, as they were at the end of the fetch.
+        source: "cache" when the vehicle's hash confirmed the cached table, when the policy allows no more
+            than the cache, or when a sample agreed with it; "ftp" when it came as one packed file, "stream"
+            when it came by list.
+        count: parameters that the component says it has.
+        received: how many of them are known.
+        missing: indices that did not come, rising. Empty when the fetch is complete.
+        hash: the PX4 hash under which the vehicle confirmed the table; None for a vehicle without one, when
+            the table moved during the download, and when the policy kept it from being asked.
+        elapsed: seconds from the call to the end.
+        resumed: how many were known already from an earlier download that did not come to its end.
+        notes: what else is worth knowing, in sentences.
+        lost: values that the list should have brought and did not, so that they had to be asked for one by
+            one or by listing again; 0 from the cache.
+        repeated: values that came although they had come before; 0 from the cache.
+        round_trip: the component's measured round trip in seconds, smoothed, or None.
+        sample: what a sample of the cached table has shown, where that settled the fetch: then nothing is
+            *verified*, and `sample.confidence` says how far it can be trusted. Else None.
+    """
+
+    system: int
+    component: int
+    params: Mapping[str, Param]
+    source: str
+    count: int
+    received: int
+    missing: tuple[int, ...]
+    hash: int | None
+    elapsed: float
+    notes: tuple[str, ...] = ()
+    resumed: int = 0
+    lost: int = 0
+    repeated: int = 0
+    round_trip: float | None = None
+    sample: Sample | None = None
+
+    @property
+    def complete(self) -> bool:
+        return not self.missing
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether every value was heard in this session, or the vehicle's hash stands for it."""
+        if not self.resumed or self.hash is not None:
+            return True
+        return all(param.trust is not Trust.CACHED or param.index is None for param in self.params.values())
+
+    def __repr__(self) -> str:
+        missing = f", {len(self.missing)} missing" if self.missing else ""
+        return (
+            f"<FetchResult {self.system}/{self.component} {self.received} params{missing} "
+            f"from {self.source} in {self.elapsed:.2f} s>"
+        )
