@@ -218,10 +218,13 @@ class Component:
             progress: called about ten times a second, from this task.
 
         Raises:
-            NoReply: nothing came at all.
+            UsageError: `refresh`, and the client's policy allows no download.
+            CacheError: nothing is cached, and the policy allows no download.
+            NoReply: nothing came at all, or it is lost.
             LinkError: the link failed, or the client was closed.
         """
         self._client._check_open()
+        self._client._station.check_refresh(refresh)
         began = anyio.current_time()
         if not refresh:
             with anyio.move_on_after(timeout):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import Final
 
 from paramclient.errors import LinkError, NoReply
@@ -65,6 +64,7 @@ class ComponentMachine:
         encoding: what the user said about its encoding, or None.
         upkeep: what is done for its table without being asked.
         is_link_busy: whether anything is being asked for on the link.
+        is_vehicle_doubted: whether it is open which vehicle its autopilot belongs to.
         another: is told that another vehicle has taken the system id; by default `become_another`.
 
     Attributes:
@@ -76,7 +76,6 @@ class ComponentMachine:
         sync: whether the table is still the vehicle's.
         fetch: the fetch under way, or None.
         last_fetch: the result of the last one that ended, or None.
-        refresh: the reading of volatile values under way after a hash hit, or None.
     """
 
     def __init__(
@@ -91,6 +90,7 @@ class ComponentMachine:
         encoding: Encoding | None = None,
         upkeep: Upkeep | None = None,
         is_link_busy: Callable[[], bool] = lambda: False,
+        is_vehicle_doubted: Callable[[], bool] = lambda: False,
         another: Callable[[float], None] | None = None,
     ) -> None:
         target = (system, component)
@@ -109,7 +109,7 @@ class ComponentMachine:
             self.reads,
             self.table.params,
             encoding=lambda: self.table.encoding,
-            is_certain=lambda: self.who.may_be_written,
+            is_certain=lambda: self.may_be_written,
         )
         self.presence = Presence()
         self.sync = Sync(
@@ -121,19 +121,19 @@ class ComponentMachine:
             is_fetching=lambda: self.fetch is not None,
             is_busy=is_link_busy,
             is_spared=lambda: self._is_spared,
+            is_doubted=lambda: self.who.is_doubted,
             begin_fetch=lambda now, refresh: self.begin_fetch(now, refresh=refresh),
             end_fetch=self.end_fetch,
-            confirmed=self._refresh_unhashed,
             resynced=lambda changed, confirmed: emit(TableResynced(self, changed, confirmed)),
         )
         self.fetch: Fetch | None = None
         self.last_fetch: FetchResult | None = None
-        self.refresh: Refresh | None = None
         self._own = own
         self._send = send
         self._emit = emit
         self._policy = upkeep.policy
         self._another = another or self.become_another
+        self._is_vehicle_doubted = is_vehicle_doubted
         self._known_as: str | None = None  # the key of the identity that was reported
         self._may_write = False
         self._authors = Authors()
@@ -144,8 +144,8 @@ class ComponentMachine:
         """Take a message that this component sent."""
         silence = self.presence.heard(now)
         self.round_trip.heard_at = now
-        if self.presence.is_lost:
-            self._find(silence, now)
+        if silence >= self.presence.gap or self.presence.is_lost:
+            self._was_silent(silence, now)
         if version > self.version:
             self.version = version
         if isinstance(message, ParamValue):
@@ -154,7 +154,6 @@ class ComponentMachine:
             self.who.heartbeat(message)
             if self.presence.heartbeat(message, now):
                 self._rebooted(now)
-            self.sync.silence(silence, now)
             self._authors.forget(now)
         elif isinstance(message, AutopilotVersion):
             if self.who.version(message, now):
@@ -170,15 +169,12 @@ class ComponentMachine:
             if denied:
                 self.writes.denied(denied.group(1), now)
         elif isinstance(message, SystemTime):
-            if self.presence.system_time(message):
+            if self.presence.system_time(message, now):
                 self._rebooted(now)
         elif isinstance(message, HighLatency2):
             self.who.heartbeat(message)
             self.presence.high_latency()
-        if self.presence.was_away(silence):
-            self.who.doubt(now)
-        else:
-            self.who.heard(now)
+        self.who.heard(now)
         if not isinstance(message, ParamValue):  # a value tells nothing of who it is
             self._follow_identity(now)
 
@@ -244,7 +240,7 @@ class ComponentMachine:
         self._check_present(f"PARAM_SET {name} to {self.system}/{self.component}", now)
         name = self.spelling(name)
         known = self.table.params.get(name)
-        if known is not None and known.trust is not Trust.CACHED and self.who.may_be_written:
+        if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
             encode(value, known.type, self.table.encoding)
         write = self.writes.set(name, value, now)
         write.on_done.append(lambda: self.sync.write_ended(write.ended_at))
@@ -316,7 +312,8 @@ class ComponentMachine:
         self._follow_identity(now)
         self.sync.tick(now)
         for name in self._authors.doubted(now):
-            self.reads.ask(name, now, urgent=False)
+            if self._policy is Policy.AUTO:
+                self.reads.ask(name, now, urgent=False)
 
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity."""
@@ -332,11 +329,13 @@ class ComponentMachine:
 
     def resume(self, now: float) -> None:
         """The link was away and is back: whatever waits for an answer is asked for again."""
-        # it could not be heard while the link was away
-        if now - self.presence.heard_at >= self.presence.patience and not self.presence.is_lost:
-            self._doubt()
-            self.sync.check(now)
-        self.presence.heard_at = self.round_trip.heard_at = now
+        self.round_trip.heard_at = now
+        if not self.presence.is_lost:
+            # it could not be heard meanwhile, nor be lost
+            if self.presence.was_away(silence := self.presence.heard(now)):
+                self._doubt()
+                self.sync.check(now)
+            self._was_silent(silence, now)
         self.reads.resume(now)
         self.writes.resume(now)
         if self.fetch is not None:
@@ -377,6 +376,11 @@ class ComponentMachine:
         return self.who.identity
 
     @property
+    def may_be_written(self) -> bool:
+        """Whether it is certain whom a write reaches, and what it makes of it."""
+        return self.who.may_be_written and not self._is_vehicle_doubted()
+
+    @property
     def state(self) -> str:
         """The table's state in a word: new, cached, fetching, synced, partial, lost."""
         if self.presence.is_lost:
@@ -393,6 +397,11 @@ class ComponentMachine:
     def sync_state(self) -> SyncState:
         """How the table stands to the vehicle's."""
         return SyncState.LOST if self.presence.is_lost else self.sync.state
+
+    @property
+    def refresh(self) -> Refresh | None:
+        """The reading of volatile values under way after a hash hit, or None."""
+        return self.sync.refresh
 
     @property
     def can_hit(self) -> bool:
@@ -464,7 +473,7 @@ class ComponentMachine:
 
     def _doubt(self) -> None:
         """What is known may be of the past: it counts again when the vehicle has confirmed it."""
-        self.table.doubt()
+        self.table.doubt(Trust.LIVE, Trust.VERIFIED)
         self.sync.doubt()
 
     def _lose(self, now: float) -> None:
@@ -472,16 +481,23 @@ class ComponentMachine:
         presence = self.presence
         presence.is_lost = True
         silence = now - presence.heard_at
-        self._doubt()
         self._emit(ComponentLost(self, silence))
         self.writes.lose(now)
         self.reads.lose(now)
+        self._doubt()
 
-    def _find(self, silence: float, now: float) -> None:
-        """It is heard again: who it is and its hash are asked for before anything counts."""
-        self.presence.is_lost = False
-        self._emit(ComponentFound(self, silence))
-        self.sync.check(now)
+    def _was_silent(self, silence: float, now: float) -> None:
+        """It is heard again. After a while, who it is and its hash are asked for before anything counts."""
+        presence = self.presence
+        if presence.is_lost:
+            presence.is_lost = False
+            self._emit(ComponentFound(self, silence))
+            self.sync.check(now)
+            self.who.doubt(now)
+        elif presence.was_away(silence) and silence < math.inf:
+            self.who.doubt(now)
+        if presence.has_beaten:  # else nothing says when it should have been heard
+            self.sync.silence(now)
 
     def _rebooted(self, now: float) -> None:
         """The vehicle has started again: what it had not saved is gone, and its list begins anew."""
@@ -490,7 +506,7 @@ class ComponentMachine:
         self._authors.clear()
         self.sync.check(now)
         self.who.doubt(now)
-        if self.fetch is not None and self.fetch.download is not None and not self.fetch.download.done:
+        if self.fetch is not None and self.fetch.download is not None:
             self.fetch.restart(now)
 
     def _is_known(self, key: Key) -> bool:
@@ -505,7 +521,7 @@ class ComponentMachine:
         if self.who.settled and self._known_as != self.identity.key:
             self._known_as = self.identity.key
             self._emit(ComponentIdentified(self))
-        may_write = self.who.may_be_written
+        may_write = self.may_be_written
         if may_write and not self._may_write:
             self.writes.proceed(now)
         self._may_write = may_write
@@ -525,24 +541,8 @@ class ComponentMachine:
         if result is None:
             return
         self.last_fetch = result
-        if result.source == "cache" and result.hash is None:
-            return  # the vehicle was not asked, or has not confirmed it
-        self.sync.fetched(result.complete and self.table.complete, result.hash, fetch.ended_at)
-        self._emit(Fetched(self, result))
-        if result.source == "cache" and result.hash is not None:
-            self._refresh_unhashed(result.hash, fetch.ended_at)
-
-    def _refresh_unhashed(self, confirmed: int, now: float) -> None:
-        """Read what the hash says nothing about."""
-        refresh = Refresh(self.reads, self.table, confirmed, lambda: len(self.writes) > 0, now)
-        if refresh.done:
-            return
-        self.refresh = refresh
-        refresh.on_done.append(partial(self._refresh_ended, refresh))
-
-    def _refresh_ended(self, refresh: Refresh) -> None:
-        if self.refresh is refresh:
-            self.refresh = None
+        if self.sync.fetched(result, fetch.ended_at):
+            self._emit(Fetched(self, result))
 
 
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time

@@ -289,6 +289,8 @@ class Fetch(Operation[FetchResult]):
         table.count = announcement.count
         table.verify()
         notes = () if table.volatile_known else (_UNPROVEN,)
+        if self._policy is Policy.HASH_ONLY:
+            notes = (_NOT_REFRESHED,) if table.unhashed() else ()
         self.finish(self._result("cache", announcement.count, (), announcement.hash, now, notes), now)
 
     def _begin_download(self, now: float) -> None:
@@ -378,6 +380,8 @@ class Fetch(Operation[FetchResult]):
         table = self._table
         if not missing:
             table.complete = download.is_settled
+            if table.hash is not None:
+                table.verify()  # what came before the component was lost for a while
         table.count = count
         self.finish(
             self._result("stream", count, missing, table.hash if not missing else None, now, notes), now
@@ -432,5 +436,8 @@ _NOT_ASKED = "The vehicle was not asked, as the policy is cache-only: the values
 _NOT_CONFIRMED = (
     "The vehicle's hash did not confirm the cached table, and the policy hash-only allows no download: "
     "the values are those last known."
+)
+_NOT_REFRESHED = (
+    "What the hash leaves out was not read afresh, as the policy is hash-only: those values stay cached."
 )
 _UNSETTLED = "The number of parameters kept changing during the download."

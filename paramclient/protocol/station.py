@@ -6,11 +6,11 @@ import math
 from collections.abc import Hashable, Sequence
 from typing import Final, TypeAlias
 
-from paramclient.errors import LinkError
+from paramclient.errors import LinkError, UsageError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentHeard, Event
-from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.fetch import Fetch, Policy
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.traffic import Traffic
 from paramclient.protocol.wire import (
@@ -68,6 +68,7 @@ class Station:
         components: every component heard, by (system, component).
         bytes_received, bytes_sent: on this link, by this station.
         traffic: the counts, or None where they are not wanted.
+        policy: what may be asked to bring tables up to date.
     """
 
     def __init__(
@@ -89,6 +90,7 @@ class Station:
         self.bytes_sent = 0
         self._is_stream = is_stream
         self._encoding = encoding
+        self.policy = Policy.AUTO if upkeep is None else upkeep.policy
         self._upkeep = upkeep
         self._framer = Framer(HEARD, stream=False)  # for datagrams, whoever they come from
         self._framers: dict[Peer, Framer] = {}  # for streams
@@ -182,6 +184,12 @@ class Station:
         autopilot = self.autopilot_of(machine.system) or machine
         return autopilot.identity if autopilot.who.settled else None
 
+    def is_doubted(self, machine: ComponentMachine) -> bool:
+        """Whether it is open which vehicle a component belongs to: its autopilot was away, or still is."""
+        autopilot = self.autopilot_of(machine.system) or machine
+        is_lost = autopilot is not machine and autopilot.presence.is_lost
+        return is_lost or autopilot.who.is_doubted
+
     def autopilot_of(self, system: int) -> ComponentMachine | None:
         """The component of a system that is its autopilot: the usual id first."""
         first = self.components.get((system, AUTOPILOT_COMPONENT))
@@ -192,6 +200,15 @@ class Station:
                 return machine
         return None
 
+    def check_refresh(self, refresh: bool) -> None:
+        """See whether a fetch may download what the cache has.
+
+        Raises:
+            UsageError: the policy says no.
+        """
+        if refresh and self.policy is not Policy.AUTO:
+            raise UsageError(f"the policy is {self.policy}: nothing may be downloaded, so not with refresh")
+
     def begin_fetches(
         self, machines: Sequence[ComponentMachine], now: float, *, refresh: bool = False
     ) -> list[Fetch]:
@@ -201,7 +218,9 @@ class Station:
         fetched, the list is asked for once, of all components.
         """
         is_new = all(machine.fetch is None for machine in machines)
-        if len(machines) > 1 and is_new and (refresh or not any(machine.can_hit for machine in machines)):
+        may_list = self.policy is Policy.AUTO
+        cannot_hit = refresh or not any(machine.can_hit for machine in machines)
+        if len(machines) > 1 and may_list and is_new and cannot_hit:
             system = machines[0].system
             known = [m for m in self.components.values() if m.system == system and m.who.has_parameters]
             if len(known) == len(machines):
@@ -256,6 +275,7 @@ class Station:
             encoding=self._encoding,
             upkeep=self._upkeep,
             is_link_busy=lambda: self.is_waiting,
+            is_vehicle_doubted=lambda: self._autopilot_is_doubted(system),
             another=lambda now: self._become_another(system, now),
         )
         self.components[sender] = machine
@@ -267,6 +287,10 @@ class Station:
         for machine in self.components.values():
             if machine.system == system:
                 machine.become_another(now)
+
+    def _autopilot_is_doubted(self, system: int) -> bool:
+        autopilot = self.autopilot_of(system)
+        return autopilot is not None and autopilot.who.is_doubted
 
     def _receive_foreign_set(self, message: ParamSet, sender: Address, now: float) -> None:
         station = f"station {sender[0]}/{sender[1]}"
