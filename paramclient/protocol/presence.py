@@ -120,15 +120,17 @@ class Presence:
         gone back and is further is an old message that took a longer way.
         """
         before, boot_ms = self._boot_ms, message.time_boot_ms
+        has_started_again = False
         if before is not None and boot_ms < before:
-            possible = 1000 * (now - self._boot_ms_at + DETOUR)
+            passed = 1000 * (now - self._boot_ms_at)
+            possible = passed + 1000 * DETOUR
             has_wrapped = boot_ms + WRAP - before <= possible
-            if not has_wrapped and (boot_ms > possible or before - boot_ms <= 1000 * OUT_OF_ORDER):
+            is_late = boot_ms > possible or before + passed - boot_ms <= 1000 * OUT_OF_ORDER
+            if is_late and not has_wrapped:
                 return False
-            self._boot_ms, self._boot_ms_at = boot_ms, now
-            return not has_wrapped
+            has_started_again = not has_wrapped
         self._boot_ms, self._boot_ms_at = boot_ms, now
-        return False
+        return has_started_again
 
     def lost_at(self) -> float:
         """When it will be lost if nothing comes; infinity while it is lost."""
