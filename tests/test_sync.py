@@ -350,7 +350,7 @@ def test_gaps_are_many_on_a_bad_link_and_checks_are_not() -> None:
     world.run(1800.0)
     apart = [after - before for before, after in pairwise(times)]
     assert len(times) > 1800.0 / INTERVAL, "there were gaps"
-    assert min(apart) >= GAPS_INTERVAL
+    assert min(apart) > GAPS_INTERVAL - 1e-6
     assert max(apart) <= INTERVAL + 5.0
     assert state(world) is SyncState.SYNCED
     assert len(world.told(TableResynced)) == len(world.told(ComponentLost))
@@ -363,7 +363,7 @@ def test_gaps_lead_to_one_check_in_five_seconds() -> None:
         world.away(2.6)
         world.run(1.9)
     assert len(times) >= 15
-    assert min(after - before for before, after in pairwise(times)) >= GAPS_INTERVAL
+    assert min(after - before for before, after in pairwise(times)) > GAPS_INTERVAL - 1e-6
 
 
 class Rare(Tap):

@@ -185,10 +185,13 @@ class Station:
         return autopilot.identity if autopilot.who.settled else None
 
     def is_doubted(self, machine: ComponentMachine) -> bool:
-        """Whether it is open which vehicle a component belongs to: its autopilot was away, or still is."""
+        """Whether it is open which vehicle a component belongs to.
+
+        Its autopilot is away, or was and has not said since who it is.
+        """
         autopilot = self.autopilot_of(machine.system) or machine
         is_lost = autopilot is not machine and autopilot.presence.is_lost
-        return is_lost or autopilot.who.is_doubted
+        return is_lost or autopilot.who.was_away
 
     def autopilot_of(self, system: int) -> ComponentMachine | None:
         """The component of a system that is its autopilot: the usual id first."""
