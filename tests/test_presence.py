@@ -65,10 +65,11 @@ def test_five_seconds_after_the_last_word_it_is_lost() -> None:
     assert presence.lost_at() == math.inf
 
 
-@pytest.mark.parametrize("interval", [0.1, 1.0, 1.6])
+@pytest.mark.parametrize("interval", [0.1, 0.6, 1.0, 1.6])
 def test_usual_heartbeats_change_nothing(interval: float) -> None:
     presence = beating(0.0, interval, 2 * interval, 3 * interval)
     assert presence.patience == LOST_AFTER
+    assert 2.5 <= presence.gap <= 4.0
 
 
 def test_one_that_beats_rarely_is_given_three_of_its_own_intervals() -> None:
