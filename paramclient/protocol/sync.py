@@ -261,8 +261,6 @@ class Sync:
         table, announced = self._table, self.announced
         if announced is None or now - announced.at > FRESH_HASH or announced.hash != table.hash:
             return False
-        if self._is_doubted():
-            return False
         if not table.complete or announced.count != len(table.listed()):
             return False
         table.verify()
