@@ -214,7 +214,7 @@ class Identification:
         if not self._is_asking:
             return math.inf
         pause = self._round_trip.timeout
-        if self._attempts >= self._tries:
+        if self._attempts >= self._tries and self._asked_at < self._asks_until:
             pause = max(pause, DOUBT_PACE)
         return min(self._denied_at, self._asked_at + pause)
 
