@@ -247,6 +247,18 @@ def test_a_vehicle_without_a_hash(upkeep: Upkeep) -> None:
     assert world.machine.table.params["P07"].value == 700
 
 
+def test_gaps_bring_about_no_lists() -> None:
+    world = World(ArduPilotVehicle(table=PLAIN), upkeep=Upkeep(INTERVAL, without_hash=True))
+    world.fetch()
+    world.sent.clear()
+    for _ in range(5):
+        world.away(3.0)
+        world.run(2.0)
+    assert world.requests() == 0
+    world.run(INTERVAL)
+    assert len(world.sent_of(ParamRequestList)) == 1
+
+
 def test_a_standard_vehicle_counts_as_one_without_a_hash() -> None:
     world = World(GenericVehicle(table=PLAIN))
     world.fetch()
@@ -421,7 +433,16 @@ def test_what_lies_between_the_answers_of_one_without_heartbeats_is_no_gap() -> 
     world.fetch()
     assert state(world) is SyncState.SYNCED
     world.sent.clear()
-    world.run(10 * INTERVAL)
+    for _ in range(3):
+        world.run(7.0)
+        world.station.receive(
+            wire.encode(wire.ParamValue("P00", bytes(4), 6, 42, 0), system=1, component=1, sequence=0),
+            "the only peer",
+            world.now,
+        )
+    world.run(7.0)
+    assert world.requests() == 0, "that it says something after a while is no gap either"
+    world.run(9 * INTERVAL)
     assert world.requests() <= 20, "each answer after a silence begs the question whose it is"
     assert state(world) is SyncState.SYNCED
 
@@ -561,10 +582,27 @@ def test_back_with_another_count_is_made_good_too() -> None:
         wire.ParamValue("P00", bytes(4), ParamType.INT32, 44, 65535), world.now
     )  # a count that is soon of the past
     assert not world.machine.table.complete
-    world.away(9.0)
+    world.away(60.0)
     world.run(3.0)
     assert state(world) is SyncState.SYNCED
     assert vehicle.values.items() <= {n: p.value for n, p in world.machine.table.params.items()}.items()
+
+
+def test_a_table_that_is_not_whole_any_more_is_checked_after_a_reboot_too() -> None:
+    vehicle, other = PX4Vehicle(table=TABLE), GenericVehicle(table=PLAIN, system=2)
+    world = World(vehicle, other)
+    world.fetch()
+    world.run(3.0)
+    world.taps[1].is_deaf = True
+    world.station.components[2, 1].read("P01", world.now)  # the link is busy, so a check has to wait
+    world.machine.receive(wire.ParamValue("P00", bytes(4), ParamType.INT32, 44, 65535), world.now)
+    vehicle.reboot(world.now, down=1.5)
+    world.run(2.1)
+    assert len(world.told(ComponentRebooted)) == 1
+    assert world.hashes() == []
+    world.taps[1].is_deaf = False
+    world.run(3.0)
+    assert state(world) is SyncState.SYNCED
 
 
 def test_back_without_a_hash_its_values_are_cached_until_they_are_fetched() -> None:

@@ -199,8 +199,11 @@ class Sync:
             self._check_at = min(self._check_at, now)
 
     def silence(self, now: float) -> None:
-        """The component is heard again after a silence in which something may have been missed."""
-        if self._is_kept_up:
+        """The component is heard again after a silence in which something may have been missed.
+
+        That is worth a question for the hash, but no list of one that has none: gaps are many on a bad link.
+        """
+        if self._is_kept_up and self.expects_hash:
             self._check_at = min(self._check_at, max(now, self._checked_at + GAPS_INTERVAL))
 
     def write_ended(self, now: float) -> None:
