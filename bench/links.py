@@ -3,6 +3,7 @@
 Run `python bench/links.py` for the table, `--seeds N` for more seeds, `--only TEXT` for the rows whose name
 holds a text, `--check` to fail when a row is beyond its bound. The protocol core runs against the simulated
 vehicles through the faulty link with no socket and no clock: the same seeds give the same figures anywhere.
+Where several vehicles share a link, the oracle's column holds the time of as many single downloads.
 """
 
 from __future__ import annotations
@@ -11,13 +12,14 @@ import argparse
 import math
 import statistics
 import sys
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
 from oracle import TellingLink, oracle_time
 
+from paramclient.protocol.fetch import Fetch, FetchResult
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
 
@@ -35,18 +37,20 @@ class Row:
         reads_per_second: what the oracle may count on: the vehicle's own pace, or the link's.
         faults: keywords of `FaultyLink`, for each direction.
         bound: the largest ratio to the oracle that is good enough.
+        vehicles: how many share the link. Several are measured against as many single downloads.
     """
 
     name: str
-    make: Callable[[], Vehicle]
+    make: Callable[..., Vehicle]
     reads_per_second: float
     faults: dict[str, Any] = field(default_factory=dict)
     bound: float = 1.25
+    vehicles: int = 1
 
 
 @dataclass(frozen=True)
 class Run:
-    """One download: when it ended, whether it was whole and right, and what it cost."""
+    """One download, or several at once: when it ended, whether all was whole and right, and what it cost."""
 
     seconds: float
     is_right: bool
@@ -86,25 +90,43 @@ def rows() -> Iterator[Row]:
             slow = partial(make, burst=1, period=1 / 30, telemetry=telemetry / 50)
             faults = {"delay": 0.075, "rate": 1200.0, "queue": 1024.0}
             yield Row(f"{kind} 1200 bytes/s{beside}", slow, min(served, 1200 / 37), faults)
+    for kind, make, served in kinds:
+        radio = partial(make, burst=3 if make is PX4Vehicle else 1, period=0.025)
+        for loss in (0.0, 0.05):
+            faults = {"loss": loss, "delay": 0.075, "rate": 5760.0, "queue": 1024.0}
+            yield Row(f"five {kind} on one radio 57600 {loss:.0%}", radio, served, faults, 1.1, vehicles=5)
 
 
 def download(row: Row, seed: int) -> Run:
-    """One download by this library, and the oracle's beside it."""
-    vehicle = row.make()
+    """What this library makes of a row, and what it is measured against."""
+    if row.vehicles == 1:
+        return fetch(row, seed, oracle(row, seed))
+    alone = replace(row, vehicles=1)
+    return fetch(row, seed, row.vehicles * fetch(alone, seed, math.nan).seconds)
+
+
+def fetch(row: Row, seed: int, measure: float) -> Run:
+    """The downloads of a row's vehicles, begun at once; `measure` is what their time is held against."""
+    vehicles = [row.make(system=system) for system in range(1, row.vehicles + 1)]
     uplink = FaultyLink(**row.faults, seed=2 * seed)
     downlink = FaultyLink(**row.faults, seed=2 * seed + 1)
-    air = Air([vehicle], uplink=uplink, downlink=downlink)
+    air = Air(vehicles, uplink=uplink, downlink=downlink)
     station = Station(link="bench", is_stream=False)
     now = began = 0.0
-    fetch = None
+    up = down = sent = 0
+    fetches: list[Fetch] = []
     air.tick(now)
-    while now < LIMIT and (fetch is None or not fetch.done):
+    while now < LIMIT and not (fetches and all(fetch.done for fetch in fetches)):
         station.tick(now)
-        machine = station.components.get((1, 1))
-        if fetch is None and machine is not None and machine.who.settled:
+        machines = list(station.components.values())
+        if (
+            not fetches
+            and len(machines) == len(vehicles)
+            and all(machine.who.settled for machine in machines)
+        ):
             began = now
-            up, down, sent = station.bytes_sent, station.bytes_received, vehicle.requests.total()
-            fetch = machine.begin_fetch(now)
+            up, down, sent = station.bytes_sent, station.bytes_received, requests(vehicles)
+            fetches = [station.components[vehicle.system, 1].begin_fetch(now) for vehicle in vehicles]
         for data, _ in station.data_to_send():
             air.receive(data, now)
         deadline = air.next_deadline()
@@ -112,22 +134,31 @@ def download(row: Row, seed: int) -> Run:
         air.tick(now)
         for data in air.data_to_send():
             station.receive(data, None, now)
-    result = None if fetch is None else fetch.result
-    if machine is None or result is None or fetch is None:
-        return Run(math.inf, False, 0, 0, 0, oracle(row, seed))
-    is_right = result.complete and all(
+    results = [fetch.result for fetch in fetches if fetch.result is not None]
+    if len(results) < len(vehicles):
+        return Run(math.inf, False, 0, 0, 0, measure)
+    return Run(
+        max(fetch.ended_at for fetch in fetches) - began,
+        all(is_right(result, vehicle) for result, vehicle in zip(results, vehicles, strict=True)),
+        station.bytes_sent - up,
+        station.bytes_received - down,
+        requests(vehicles) - sent,
+        measure,
+    )
+
+
+def is_right(result: FetchResult, vehicle: Vehicle) -> bool:
+    """Whether a result is whole, and every value is the vehicle's."""
+    return result.complete and all(
         result.params[name].same_value(param)
         for name, param in vehicle.params.items()
         if name not in ("STAT_RUNTIME", "BARO1_GND_PRESS")  # they move by themselves
     )
-    return Run(
-        fetch.ended_at - began,
-        is_right,
-        station.bytes_sent - up,
-        station.bytes_received - down,
-        vehicle.requests.total() - sent,
-        oracle(row, seed),
-    )
+
+
+def requests(vehicles: Sequence[Vehicle]) -> int:
+    """Messages that the vehicles have received."""
+    return sum(vehicle.requests.total() for vehicle in vehicles)
 
 
 def oracle(row: Row, seed: int) -> float:

@@ -325,6 +325,7 @@ class ParamClient:
             return together.outcome(now, waited=now - began)
         finally:
             together.end()
+            self._wake()  # they may have been in the way of others
 
     def traffic_report(self) -> TrafficReport:
         """What has gone over the link so far: who was heard, how fast, and what was lost on the way.
@@ -442,8 +443,10 @@ class ParamClient:
                 for component in self._components.values():
                     if component.system == machine.system:
                         self._read_cache(component)
-            elif isinstance(event, Fetched) and event.result.complete:
-                self._writer.synced(machine, is_whole=event.result.source != "cache")
+            elif isinstance(event, Fetched) and event.result.complete and event.result.is_confirmed:
+                self._writer.synced(
+                    machine, is_whole=event.result.source != "cache" and not event.result.resumed
+                )
                 self._something_to_write.set()
             elif isinstance(event, TableResynced):
                 self._writer.synced(machine, is_whole=False)

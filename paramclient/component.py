@@ -235,6 +235,7 @@ class Component:
             result = await self._wait_for_fetch(fetch, None if timeout is None else began + timeout, progress)
         finally:
             machine.end_fetch(fetch)
+            self._client._wake()  # it may have been in the way of others
         return replace(result, elapsed=anyio.current_time() - began)
 
     async def refreshed(self, *, timeout: float | None = None) -> None:

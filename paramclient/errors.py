@@ -8,10 +8,12 @@ The tree says who is to blame::
     │   ├── UnknownParameter          it has no parameter of that name or index
     │   ├── Refused                   it gave a reason: PARAM_ERROR, or ArduPilot's text
     │   ├── TypeMismatch              it holds the parameter in a type that the value cannot take
-    │   └── ValueNotApplied           it kept another value and gave no reason
+    │   ├── ValueNotApplied           it kept another value and gave no reason
+    │   └── FileTransferError         it did not do what was asked with a file
     ├── NoReply(TimeoutError)         nobody answered in time
     ├── LinkError(OSError)            the socket or the device
     │   └── ClientClosed              the client was closed while a call waited, or is not open
+    ├── PackError                     a packed parameter file that is none
     └── CacheError                    the cache on disk
 
 Each carries what is known as attributes, so that a program need not read its text.
@@ -24,8 +26,11 @@ from enum import IntEnum
 __all__ = [
     "CacheError",
     "ClientClosed",
+    "FileErrorCode",
+    "FileTransferError",
     "LinkError",
     "NoReply",
+    "PackError",
     "ParamClientError",
     "ParamErrorCode",
     "Refused",
@@ -55,6 +60,30 @@ class ParamErrorCode(IntEnum):
         """The code in words; a code that this version does not know is kept as its number."""
         try:
             return ParamErrorCode(code).name.lower().replace("_", " ")
+        except ValueError:
+            return f"error code {code}"
+
+
+class FileErrorCode(IntEnum):
+    """MAV_FTP_ERR: the reasons that a NAK of MAVFTP can give (MAVLink guide, "File Transfer Protocol")."""
+
+    NONE = 0
+    FAIL = 1
+    FAIL_ERRNO = 2
+    INVALID_DATA_SIZE = 3
+    INVALID_SESSION = 4
+    NO_SESSIONS_AVAILABLE = 5
+    EOF = 6
+    UNKNOWN_COMMAND = 7
+    FILE_EXISTS = 8
+    FILE_PROTECTED = 9
+    FILE_NOT_FOUND = 10
+
+    @staticmethod
+    def name_of(code: int) -> str:
+        """The code in words; a code that this version does not know is kept as its number."""
+        try:
+            return FileErrorCode(code).name.lower().replace("_", " ")
         except ValueError:
             return f"error code {code}"
 
@@ -141,6 +170,33 @@ class ValueNotApplied(VehicleError):
         self.actual = actual
 
 
+class FileTransferError(VehicleError):
+    """The vehicle did not do what was asked with a file.
+
+    Attributes:
+        path: the file or directory.
+        code: the number in its NAK, to compare with `FileErrorCode`.
+        errno: the error number of the vehicle's own system, where it gave one; else 0.
+        reason: the code in words.
+    """
+
+    def __init__(
+        self, message: str, *, system: int, component: int, path: str, code: int, errno: int = 0
+    ) -> None:
+        super().__init__(message, system=system, component=component)
+        self.path = path
+        self.code = code
+        self.errno = errno
+        self.reason = FileErrorCode.name_of(code)
+
+    @property
+    def is_not_found(self) -> bool:
+        """Whether there is no such file; servers say so in two ways (ENOENT is 2 on all of them)."""
+        return self.code == FileErrorCode.FILE_NOT_FOUND or (
+            self.code == FileErrorCode.FAIL_ERRNO and self.errno == 2
+        )
+
+
 class NoReply(ParamClientError, TimeoutError):
     """Nobody answered in time.
 
@@ -172,6 +228,18 @@ class LinkError(ParamClientError, OSError):
 
 class ClientClosed(LinkError):
     """The client was closed while the call waited, or had not been opened."""
+
+
+class PackError(ParamClientError):
+    """Bytes that should be a packed parameter file (param.pck) are none.
+
+    Attributes:
+        offset: the byte at which that showed.
+    """
+
+    def __init__(self, message: str, *, offset: int) -> None:
+        super().__init__(f"{message} (byte {offset})")
+        self.offset = offset
 
 
 class CacheError(ParamClientError):

@@ -35,6 +35,13 @@ class ParamMap(Mapping[str, Param]):
     def __len__(self) -> int:
         return len(self._params)
 
+    def changed(self) -> dict[str, Param]:
+        """Those whose value differs from the firmware's default, by name: a copy.
+
+        None where the vehicle has not said what its defaults are (see `Param.default`).
+        """
+        return {name: param for name, param in self._params.items() if param.is_changed}
+
     def __repr__(self) -> str:
         count = len(self._params)
         return f"<ParamMap {count} {'param' if count == 1 else 'params'}>"

@@ -95,7 +95,7 @@ class FetchTogether:
         is_anyone_done = any(fetch.result is not None for fetch in self._fetches.values())
         patience = SILENT_PATIENCE if is_anyone_done else math.inf
         return any(
-            not fetch.done and (not fetch.is_silent or now - fetch.begun_at < patience)
+            not fetch.done and (not fetch.is_silent or now - fetch.begun_at - fetch.held_up(now) < patience)
             for fetch in self._fetches.values()
         )
 

@@ -24,6 +24,8 @@ __all__ = [
     "ParamType",
     "Trust",
     "Value",
+    "as_sent",
+    "bits_of",
     "check_name",
     "check_value",
     "crc32_px4",
@@ -113,6 +115,8 @@ class Param:
         bits: the value's own bytes in its type, read as a little-endian unsigned number. Two values are
             the same parameter value when `same_bits` says so; `value` does not take part in equality.
         trust: where the value comes from.
+        default: the value that the firmware gives it, where the vehicle has said so (only a packed
+            parameter file does), else None. It takes no part in equality.
     """
 
     name: str
@@ -121,6 +125,7 @@ class Param:
     index: int | None
     bits: int
     trust: Trust = Trust.LIVE
+    default: Value | None = field(default=None, compare=False)
 
     def __init__(
         self,
@@ -130,6 +135,7 @@ class Param:
         index: int | None,
         bits: int,
         trust: Trust = Trust.LIVE,
+        default: Value | None = None,
     ) -> None:
         # A generated one takes twice as long, and each value that comes makes a Param.
         _set_name(self, name)
@@ -138,11 +144,20 @@ class Param:
         _set_index(self, index)
         _set_bits(self, bits)
         _set_trust(self, trust)
+        _set_default(self, default)
 
     @property
     def is_raw(self) -> bool:
         """Whether `value` holds the undecoded wire bytes."""
         return isinstance(self.value, bytes)
+
+    @property
+    def is_changed(self) -> bool | None:
+        """Whether the value differs from the firmware's default; None where that is not known."""
+        if self.default is None:
+            return None
+        # NaN is not equal to itself, and a vehicle may well have it for a default
+        return self.value != self.default and not (self.value != self.value and self.default != self.default)
 
     def with_trust(self, trust: Trust) -> Param:
         """The same parameter, trusted differently."""
@@ -160,7 +175,7 @@ class Param:
         return f"{self.name} = {format_value(self.value, self.type)}"
 
 
-_set_name, _set_value, _set_type, _set_index, _set_bits, _set_trust = (
+_set_name, _set_value, _set_type, _set_index, _set_bits, _set_trust, _set_default = (
     vars(Param)[each.name].__set__ for each in fields(Param)
 )
 
@@ -290,6 +305,17 @@ def encode(value: Value, number: int, encoding: Encoding) -> bytes:
     return raw
 
 
+def as_sent(bits: int, number: int, encoding: Encoding) -> bytes:
+    """The four bytes of a message in which a vehicle gives a value of these `bits` and this type.
+
+    The other way round from `decode`, and not its inverse: a vehicle that casts rounds integers beyond 24
+    bits to the next float32, and of a type with eight bytes a message holds the first four.
+    """
+    if encoding is Encoding.C_CAST and number in _BOUNDS:
+        return struct.pack("<f", from_bits(bits, number))
+    return (bits & 0xFFFFFFFF).to_bytes(4, "little")
+
+
 def from_bits(bits: int, number: int, *, is_raw: bool = False) -> Value:
     """The value whose own bits these are: the inverse of `Param.bits`, for what was kept on disk.
 
@@ -303,6 +329,25 @@ def from_bits(bits: int, number: int, *, is_raw: bool = False) -> Value:
     kind = ParamType(number)
     value: int | float = _LAYOUT[kind].unpack(bits.to_bytes(kind.size, "little"))[0]
     return value
+
+
+def bits_of(value: Value, number: int) -> int:
+    """The value's own bytes in its type, read as a little-endian unsigned number.
+
+    Raises:
+        UsageError: the value does not fit the type.
+    """
+    value = check_value(value)
+    if number in (ParamType.UINT64, ParamType.INT64) and isinstance(value, int):
+        kind = ParamType(number)
+        low, high = kind.bounds
+        if not low <= value <= high:
+            raise UsageError(f"{value} does not fit {kind.name}, which holds {low} to {high}")
+        return value & 0xFFFFFFFF_FFFFFFFF
+    if number == ParamType.REAL64 and not isinstance(value, bytes):
+        return int.from_bytes(struct.pack("<d", value), "little")
+    size = ParamType(number).size if 1 <= number <= ParamType.REAL64 else 4
+    return int.from_bytes(encode(value, number, Encoding.BYTEWISE)[:size], "little")
 
 
 def same_bits(number: int, a: int, b: int) -> bool:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from queue import SimpleQueue
 from typing import Final, TypeVar
@@ -21,6 +21,7 @@ from paramclient.cache import CachedComponent, ParamCache, StoredParam, TableSta
 from paramclient.errors import CacheError, UsageError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentMachine
+from paramclient.values import Param
 
 __all__ = ["WriteThrough"]
 
@@ -164,17 +165,20 @@ class WriteThrough:
         for name in table.params:
             table.dirty.setdefault(name, "vehicle")
         if cached is not None:
+            # the indices of an unfinished table are gone on with: they must be this firmware's on this board
+            is_same = identity.uid is not None and _firmware(cached.identity) == _firmware(identity)
             machine.use_cached(
-                cached.params,
+                _of_firmware(cached, identity),
                 anyio.current_time(),
                 count=cached.count,
                 confirmed=cached.hash,
                 complete=cached.complete,
                 volatile=cached.volatile,
                 volatile_known=cached.volatile_known,
+                placed=cached.complete or (is_same and cached.count is not None),
             )
             kept.synced_at = cached.synced_at
-            kept.state = self._state(machine, kept)
+            kept.state = None if table.is_displaced else self._state(machine, kept)
         if machine.sync.synced:
             kept.synced_at = time.time()
 
@@ -216,7 +220,7 @@ class WriteThrough:
         table = machine.table
         return TableState(
             hash=table.hash if table.complete else None,
-            count=table.count,
+            count=None if table.is_displaced else table.count,  # the cache keeps the indices of before
             complete=table.complete,
             volatile_known=table.volatile_known,
             synced_at=kept.synced_at,
@@ -306,9 +310,20 @@ class _Worker:
             call()
 
 
+def _firmware(identity: Identity) -> tuple[int, str]:
+    return identity.firmware, identity.git_hash
+
+
 def _save(cache: ParamCache, updates: list[TableUpdate]) -> bool:
     cache.save(updates)
     return True
+
+
+def _of_firmware(cached: CachedComponent, identity: Identity) -> Mapping[str, Param]:
+    """The cached parameters, without the defaults of another firmware than the present one."""
+    if _firmware(cached.identity) == _firmware(identity):
+        return cached.params
+    return {name: replace(param, default=None) for name, param in cached.params.items()}
 
 
 def _nothing() -> None:

@@ -29,7 +29,7 @@ from paramclient.cache import (
 )
 from paramclient.errors import CacheError, UsageError
 from paramclient.identity import Identity
-from paramclient.values import ParamType, Trust, same_bits
+from paramclient.values import Param, ParamType, Trust, same_bits
 from tests.caches import CACHE_ALONE, NOW, PX4, set_aside, start, stored, update, values, whole_table
 
 PLAIN = Identity(system=1, link="udpin:0.0.0.0:14550", autopilot=3)
@@ -666,3 +666,26 @@ class CacheMachine(RuleBasedStateMachine):
 
 TestCacheMachine = CacheMachine.TestCase
 TestCacheMachine.settings = settings(max_examples=40, stateful_step_count=15, deadline=None)
+
+
+def test_defaults_are_kept_beside_the_values(path: Path) -> None:
+    kept = {
+        "INT": Param("INT", -5, ParamType.INT16, 0, 0xFFFB, default=-1),
+        "FLOAT": Param("FLOAT", 0.5, ParamType.REAL32, 1, 0x3F000000, default=-0.25),
+        "NONE": Param("NONE", 1, ParamType.INT8, 2, 1),
+    }
+    with ParamCache(path) as cache:
+        cache.save(update(*(StoredParam(param, NOW) for param in kept.values())))
+        table = cache.load(PX4.key, 1)
+        assert table is not None
+        assert {name: param.default for name, param in table.params.items()} == {
+            "INT": -1,
+            "FLOAT": -0.25,
+            "NONE": None,
+        }
+        assert table.params.changed().keys() == {"INT", "FLOAT"}
+        cache.save(update(StoredParam(replace(kept["INT"], default=-5), NOW)))
+        table = cache.load(PX4.key, 1)
+        assert table is not None
+        assert table.params.changed().keys() == {"FLOAT"}
+        assert not table.history(), "a default is no change of the value"

@@ -297,7 +297,7 @@ def test_the_memory_of_other_stations_is_bounded() -> None:
     desk = Desk()
     for number in range(3 * MOST_FOREIGN_SETS):
         desk.machine.foreign_set(f"N{number}", "station 2/2", desk.now)
-    assert len(desk.machine._authors._foreign_sets) == MOST_FOREIGN_SETS
+    assert len(desk.machine._authors.foreign_sets) == MOST_FOREIGN_SETS
     desk.hear("N0")
     desk.hear(f"N{3 * MOST_FOREIGN_SETS - 1}")
     assert [change.by for change in desk.changes] == ["vehicle", "station 2/2"]
@@ -743,7 +743,7 @@ def test_a_pause_does_not_count_as_the_vehicles_silence() -> None:
     assert not read.done
     desk.now += 100.0
     desk.machine.resume(desk.now)
-    desk.pass_time(4.0)
+    desk.pass_time(4.0)  # several time-outs
     assert not read.done
 
 

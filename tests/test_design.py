@@ -24,9 +24,13 @@ MAY_IMPORT = {
     "params": {"errors", "values"},
     "identity": {"errors", "values"},
     "protocol.wire": {"errors", "values", "protocol.wire"},
+    "protocol.ftp.packets": {"errors", "values"},
     "protocol.pack": {"errors", "values"},
-    "protocol": {"errors", "values", "identity", "params", "protocol", "protocol.wire", "protocol.pack"},
-    "sim": {"errors", "values", "protocol.wire", "protocol.pack", "sim"},
+    "protocol": {
+        *("errors", "values", "identity", "params"),
+        *("protocol", "protocol.wire", "protocol.ftp.packets", "protocol.pack"),
+    },
+    "sim": {"errors", "values", "protocol.wire", "protocol.ftp.packets", "protocol.pack", "sim"},
     "links": {"errors", "values", "sim", "links"},
     "cache": {"errors", "values", "identity", "params", "cache"},
 }

@@ -10,19 +10,22 @@ import pytest
 from paramclient.errors import LinkError, NoReply
 from paramclient.protocol import download as room
 from paramclient.protocol.download import (
+    EVEN_LISTS,
     FEW,
     LIST_PATIENCE,
-    LONGEST_JUMP,
+    LIST_TRIES,
     LONGEST_LIST_WAIT,
     MOST_ASKED,
+    MOST_LISTS_AT_ONCE,
     MOST_MOVES,
     MOST_VAIN_PASSES,
-    REORDER_DEPTH,
     Download,
 )
 from paramclient.protocol.pacing import REQUEST_SIZE, UPSTREAM_SHARE, VALUE_SIZE
 from paramclient.protocol.reads import CONTROL, Reads
+from paramclient.protocol.stream import LONGEST_JUMP, REORDER_DEPTH
 from paramclient.protocol.timing import INITIAL_TIMEOUT, RoundTrip
+from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import (
     NO_INDEX,
     Message,
@@ -47,7 +50,10 @@ class Desk:
         for _ in range(100 if round_trip is not None else 0):
             self.trip.answered(0.0, round_trip or 0.0, 1)
         self.reads = Reads((1, 1), self.trip, self.sent.append, lambda key: True)
-        self.download = Download((1, 1), self.trip, self.sent.append, self.reads, 0.0, listed=listed)
+        self.turns = Turns()
+        self.download = Download(
+            (1, 1), self.trip, self.sent.append, self.reads, self.turns, 0.0, listed=listed
+        )
 
     def hear(self, index: int, *, count: int = 100, name: str | None = None) -> None:
         message = param_value(f"P{index}" if name is None else name, index=index, count=count)
@@ -119,8 +125,13 @@ def test_the_list_is_asked_for_again_as_long_as_nothing_comes() -> None:
     assert desk.take() == ["list"]
     desk.pass_time(0.02)
     assert desk.take() == ["list"]
-    desk.pass_time(2 * INITIAL_TIMEOUT)
+    for _ in range(EVEN_LISTS - 2):
+        desk.pass_time(INITIAL_TIMEOUT)
+        assert desk.take() == ["list"]
+    desk.pass_time(INITIAL_TIMEOUT)
     assert desk.take() == ["list"]
+    desk.pass_time(1.9 * INITIAL_TIMEOUT)  # from now on less often: it may not want to answer yet
+    assert desk.take() == []
     desk.stream(range(40))
     desk.pass_time(0.05)
     assert desk.take() == []
@@ -153,10 +164,38 @@ def test_silence_ends_with_no_reply() -> None:
     desk.pass_time()
     assert isinstance(desk.download.error, NoReply)
     assert LIST_PATIENCE <= desk.now <= LIST_PATIENCE + LONGEST_LIST_WAIT
-    assert desk.download.error.attempts == desk.download.lists == desk.take().count("list") < 12
+    assert desk.download.error.attempts == desk.download.lists == desk.take().count("list")
+    assert LIST_TRIES <= desk.download.lists < LIST_TRIES + 4
     assert "list of 1/1" in str(desk.download.error)
     assert desk.download.missing == ()
     assert desk.reads.is_idle
+
+
+def test_a_list_that_is_lost_often_is_asked_for_often_enough() -> None:
+    desk = Desk(round_trip=3.0)
+    desk.pass_time(LIST_PATIENCE + 5.0)
+    assert not desk.download.done, "not before it was asked for often enough"
+    desk.pass_time()
+    assert desk.download.lists == LIST_TRIES
+
+
+def test_a_component_that_is_not_heard_either_is_given_up_sooner() -> None:
+    desk = Desk(round_trip=3.0)
+    desk.trip.heard_at = 0.0
+    desk.pass_time()
+    assert isinstance(desk.download.error, NoReply)
+    assert desk.now < LIST_PATIENCE + 5.0
+
+
+def test_another_pass_is_asked_for_twice_at_once_on_a_link_that_loses() -> None:
+    desk = Desk()
+    for _ in range(100):
+        desk.trip.timed_out(1)
+        desk.trip.answered(0.0, 0.02, 1)
+    desk.stream(range(50), count=1000)
+    assert desk.take() == ["list"]
+    desk.pass_time(0.3)
+    assert desk.take().count("list") == MOST_LISTS_AT_ONCE
 
 
 def test_on_a_slow_link_the_list_is_not_asked_for_while_the_answer_is_on_its_way() -> None:
@@ -481,13 +520,37 @@ def test_gaps_that_stay_silent_do_not_end_a_stream_that_runs() -> None:
     desk = Desk()
     desk.stream([0, 1, *range(5, 60)], count=4000)
     at = 60
-    while desk.reads.answered_at == -math.inf and not desk.download.given_up and at < 4000:
+    while at < 1000:
         desk.stream([at], count=4000)
         desk.pass_time(0.05)
         at += 1
-    assert desk.download.given_up == {2, 3, 4}
+    assert desk.download.given_up == set()  # nothing tells whether it is the link that is to blame
     desk.stream(range(at, 4000), count=4000)
+    assert is_so(not desk.download.done)
+    desk.answer(count=4000, silent=(2, 3, 4))
     assert desk.download.missing == (2, 3, 4)
+
+
+def test_a_vehicle_that_answers_hardly_anything_is_not_given_up() -> None:
+    desk = Desk()
+    desk.stream(range(80))
+    asked = 0
+    while not desk.download.done and desk.now < 1000.0:
+        desk.pass_time(0.05)
+        for each in desk.take():
+            asked += 1
+            if isinstance(each, int) and asked % 40 == 0:
+                desk.hear(each)
+    assert desk.download.missing == ()
+
+
+@pytest.mark.parametrize("silent", [(0,), (0, 1, 2), (7, 99)])
+def test_dead_indices_are_given_up_soon_even_the_usual_control(silent: tuple[int, ...]) -> None:
+    desk = Desk()
+    desk.stream(index for index in range(100) if index not in silent)
+    desk.answer(silent=silent)
+    assert desk.download.missing == silent
+    assert desk.now < 3.0
 
 
 # the count moves

@@ -9,8 +9,11 @@ from paramclient import errors
 from paramclient.errors import (
     CacheError,
     ClientClosed,
+    FileErrorCode,
+    FileTransferError,
     LinkError,
     NoReply,
+    PackError,
     ParamClientError,
     ParamErrorCode,
     Refused,
@@ -30,9 +33,11 @@ from paramclient.errors import (
         (Refused, VehicleError),
         (TypeMismatch, VehicleError),
         (ValueNotApplied, VehicleError),
+        (FileTransferError, VehicleError),
         (NoReply, TimeoutError),
         (LinkError, OSError),
         (ClientClosed, LinkError),
+        (PackError, ParamClientError),
         (CacheError, ParamClientError),
     ],
 )
@@ -73,6 +78,39 @@ def test_codes_in_words(code: int, words: str) -> None:
     assert (refused.code, refused.reason) == (code, words)
     assert (refused.system, refused.component, refused.name, refused.index) == (1, 2, "A", 3)
     assert str(refused) == "no"
+
+
+def test_codes_of_files_are_mavlinks() -> None:
+    names = {
+        name.removeprefix("MAV_FTP_ERR_"): value
+        for name, value in vars(dialect).items()
+        if name.startswith("MAV_FTP_ERR_") and not name.endswith("ENUM_END")
+    }
+    spelled = {name.replace("_", ""): value for name, value in names.items()}
+    assert spelled == {code.name.replace("_", ""): code.value for code in FileErrorCode}
+
+
+@pytest.mark.parametrize(
+    ("code", "errno", "words", "not_found"),
+    [
+        (10, 0, "file not found", True),
+        (2, 2, "fail errno", True),
+        (2, 13, "fail errno", False),
+        (1, 2, "fail", False),
+        (99, 0, "error code 99", False),
+    ],
+)
+def test_what_a_vehicle_says_of_a_file(code: int, errno: int, words: str, not_found: bool) -> None:
+    error = FileTransferError("no", system=1, component=2, path="a.txt", code=code, errno=errno)
+    assert (error.system, error.component, error.name, error.path) == (1, 2, None, "a.txt")
+    assert (error.code, error.errno, error.reason) == (code, errno, words)
+    assert error.is_not_found is not_found
+
+
+def test_a_file_that_is_none_says_where_that_showed() -> None:
+    error = PackError("it is cut off", offset=7)
+    assert str(error) == "it is cut off (byte 7)"
+    assert error.offset == 7
 
 
 def test_a_value_that_was_not_applied_carries_both_values() -> None:

@@ -12,6 +12,7 @@ from paramclient.protocol.pacing import (
     SMALLEST_RATE,
     UPSTREAM_SHARE,
     Pace,
+    Share,
 )
 from paramclient.protocol.timing import RoundTrip
 
@@ -144,3 +145,75 @@ def test_something_may_always_be_asked_even_on_the_slowest_link(gap: float) -> N
         assert pace.may_send(now)
         pace.sent(now)
     assert now < 5 / SMALLEST_RATE + 1.0
+
+
+def test_what_the_component_drops_does_not_pass_for_a_bad_link() -> None:
+    trip = RoundTrip()
+    pace = Pace(trip)
+    pace.stream_seen(0.0001)  # the list lost nothing
+    for _ in range(200):
+        trip.timed_out(1)
+        trip.timed_out(1)
+        trip.answered(0.0, 0.02, 1)
+    now = 0.0
+    answers: list[float] = []
+    while now < 2.0:  # it answers one of three, at once
+        while pace.may_send(now):
+            pace.sent(now)
+            pace.sent(now)
+            pace.sent(now)
+            answers.append(now + 0.02)
+        while answers and answers[0] <= now:
+            pace.answered(now - answers.pop(0) + 0.02, now)
+        now += 0.01
+    assert pace.rate <= FIRST_RATE
+
+
+def test_answers_that_were_not_counted_slow_nothing_down() -> None:
+    pace = Pace(RoundTrip())
+    now = serve(pace, 0.5, 0.02)
+    before = pace.rate
+    while now < 3.0:  # a list answers, and what is asked for meanwhile is not counted
+        while pace.may_send(now):
+            pace.sent(now)
+        now += 0.01
+    pace.rest()
+    serve(pace, 0.5, 0.02, since=now)
+    assert pace.rate >= before
+
+
+def test_components_share_what_reads_may_take_of_the_link() -> None:
+    share = Share()
+    one, two = Pace(RoundTrip(), share), Pace(RoundTrip(), share)
+    one.stream_seen(0.1)
+    total = 37 * 10 * UPSTREAM_SHARE / 16
+    assert one.rate == two.rate == pytest.approx(total)
+    one.sent(0.0)
+    two.sent(0.0)
+    assert one.rate == two.rate == pytest.approx(total / 2)
+    two.idle()
+    assert one.rate == pytest.approx(total)
+
+
+def test_lists_that_run_beside_each_other_show_the_link_by_what_came_of_them() -> None:
+    share = Share()
+    one, two = Pace(RoundTrip(), share), Pace(RoundTrip(), share)
+    one.stream_seen(0.1, 0.5)
+    assert one.rate == pytest.approx(37 * 10 * UPSTREAM_SHARE / 16), (
+        "alone: what was lost was lost on the way"
+    )
+    two.stream_seen(0.1, 0.5)
+    assert one.rate == pytest.approx(37 * 10 * UPSTREAM_SHARE / 16)
+    two.stream_seen(0.1, 0.0)
+    assert one.rate == pytest.approx(37 * 15 * UPSTREAM_SHARE / 16)
+    one.stream_ended()
+    two.stream_ended()
+    assert one.rate == pytest.approx(37 * 15 * UPSTREAM_SHARE / 16), "that still holds"
+    one.stream_seen(0.2)
+    assert one.rate < 37 * 10 * UPSTREAM_SHARE / 16, "until one of them comes anew"
+
+
+def test_a_stream_of_bursts_shows_a_faster_link() -> None:
+    pace = Pace(RoundTrip())
+    pace.stream_seen(0.1, 0.0, 3.0)
+    assert pace.rate == pytest.approx(3 * 37 * 10 * UPSTREAM_SHARE / 16)

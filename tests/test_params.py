@@ -27,3 +27,28 @@ def test_it_shows_the_table_as_it_is_now_and_cannot_be_written_to() -> None:
         params["C"] = table["A"]  # type: ignore[index]  # that it is refused is the point
     with pytest.raises(AttributeError):
         params.anything = 1  # type: ignore[attr-defined]  # as above
+
+
+def test_what_differs_from_the_firmwares_defaults() -> None:
+    nan = float("nan")
+    table = {
+        name: Param(name, value, ParamType.REAL32, 0, 0, default=default)
+        for name, value, default in (
+            ("SAME", 1.5, 1.5),
+            ("OTHER", 1.5, 2.5),
+            ("UNKNOWN", 1.5, None),
+            ("ZERO", 0.0, -0.0),
+            ("NAN", nan, nan),
+            ("NOW_NAN", nan, 1.0),
+        )
+    }
+    assert {name: param.is_changed for name, param in table.items()} == {
+        "SAME": False,
+        "OTHER": True,
+        "UNKNOWN": None,
+        "ZERO": False,
+        "NAN": False,
+        "NOW_NAN": True,
+    }
+    params = ParamMap(table)
+    assert params.changed() == {"OTHER": table["OTHER"], "NOW_NAN": table["NOW_NAN"]}

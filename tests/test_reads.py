@@ -358,6 +358,34 @@ def test_of_what_is_known_silence_is_silence(key: Key) -> None:
     assert desk.sent.count(CONTROL) > 0
 
 
+def test_where_much_is_silent_the_controls_tell_how_good_the_link_is() -> None:
+    desk = Desk()
+    desk.measure()
+    for _ in range(60):  # other reads in vain have made the link look bad
+        for _ in range(3):
+            desk.round_trip.timed_out(1)
+        desk.round_trip.answered(desk.now, desk.now + 0.02, 1)
+    assert desk.round_trip.tries > 30
+    read = desk.ask(7)
+    for _ in range(100):
+        desk.pass_time(0.05)
+        if CONTROL in desk.take():
+            desk.hear("P0", index=CONTROL)
+    assert read.done
+    assert read.attempts < 15
+
+
+def test_what_a_list_may_have_brought_is_no_answered_control() -> None:
+    desk = Desk()
+    desk.measure()
+    desk.reads.list_runs_again = True
+    read = desk.ask(7)
+    for _ in range(10):
+        desk.pass_time(0.05)
+        desk.hear("P0", index=CONTROL)
+    assert read.controls == 0
+
+
 def test_without_answered_controls_nothing_is_called_unknown() -> None:
     desk = Desk()
     read = desk.ask("NOWHERE")

@@ -62,7 +62,8 @@ class TestDecoding:
     @pytest.mark.parametrize("name", NAMES)
     def test_encoding_what_was_decoded_gives_the_bytes_of_the_log(self, name: str) -> None:
         """For the messages of the protocol itself, which `wire` holds in full."""
-        kinds = wire.ParamValue | wire.ParamSet | wire.ParamRequestRead | wire.ParamRequestList
+        values = wire.ParamValue | wire.ParamSet | wire.ParamRequestRead | wire.ParamRequestList
+        kinds = values | wire.FileTransfer
         for record in read(name):
             message = record.message
             if isinstance(message, kinds):
@@ -209,6 +210,18 @@ class TestReplay:
         assert len(events) == 2
         sent = replay(ArduPilotVehicle(live_period=0.0), "ardupilot_get_set", events)
         assert param_values(sent) == param_values(recorded)
+
+    def test_ardupilot_ftp_download(self) -> None:
+        """Both files, every block of them, and the end of each."""
+
+        def answers(messages: list[tuple[float, wire.Message]]) -> list[tuple[float, wire.FileTransfer]]:
+            return [(time, message) for time, message in messages if isinstance(message, wire.FileTransfer)]
+
+        recorded = answers(from_vehicle("ardupilot_ftp_download"))
+        sent = answers(replay(ArduPilotVehicle(live_period=0.0), "ardupilot_ftp_download"))
+        assert [message for _, message in sent] == [message for _, message in recorded]
+        assert len(sent) == 2 * (2 + 64 + 1 + 1)
+        assert sent[66][0] - sent[2][0] == pytest.approx(recorded[66][0] - recorded[2][0], rel=0.1)
 
     @pytest.mark.parametrize(
         ("kind", "name"), [(PX4Vehicle, "px4_full_download"), (ArduPilotVehicle, "ardupilot_full_download")]

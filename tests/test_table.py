@@ -246,3 +246,76 @@ def test_it_is_computed_again_on_request() -> None:
     assert table.hash == 0x12345678
     table.rehash()
     assert table.hash == right
+
+
+# entries of a packed parameter file
+
+
+BIG = (1 << 24) + 1
+"""An integer that no float32 can hold."""
+
+
+def test_an_entry_of_a_file_is_exact_and_brings_its_default() -> None:
+    table = Table(Encoding.C_CAST)
+    change = table.take("A", ParamType.INT32, BIG, 3, 7, is_older=False)
+    param = table.params["A"]
+    assert change == Change("A", None, param)
+    assert (param.value, param.type, param.index, param.default) == (BIG, ParamType.INT32, 3, 7)
+    assert param.trust is Trust.LIVE
+    assert table.take_dirty() == {"A": "vehicle"}
+    assert table.take("A", ParamType.INT32, BIG, 3, 7, is_older=False) is None
+    assert table.take_dirty() == {}
+    assert table.take("A", ParamType.INT32, BIG, 3, 8, is_older=False) is None
+    assert table.take_dirty() == {"A": "vehicle"}, "another default is worth keeping"
+
+
+@pytest.mark.parametrize("is_doubted", [False, True])
+def test_a_message_that_rounds_an_exact_integer_changes_nothing(is_doubted: bool) -> None:
+    table = Table(Encoding.C_CAST)
+    table.take("A", ParamType.INT32, BIG, 3, 7, is_older=False)
+    if is_doubted:
+        table.doubt()
+    rounded = param_value("A", BIG - 1, index=3, kind=ParamType.INT32, encoding=Encoding.C_CAST)
+    assert table.hear(rounded, "vehicle") is None
+    param = table.params["A"]
+    assert (param.value, param.default, param.trust) == (BIG, 7, Trust.LIVE)
+    other = param_value("A", BIG - 3, index=3, kind=ParamType.INT32, encoding=Encoding.C_CAST)
+    change = table.hear(other, "vehicle")
+    assert change is not None
+    assert table.params["A"].value == BIG - 3
+    assert table.params["A"].default == 7
+
+
+def test_a_byte_wise_integer_is_what_the_message_says() -> None:
+    table = Table()
+    table.take("A", ParamType.INT32, BIG, 3, None, is_older=False)
+    change = table.hear(param_value("A", BIG - 1, index=3, kind=ParamType.INT32), "vehicle")
+    assert change is not None
+    assert table.params["A"].value == BIG - 1
+
+
+def test_what_was_heard_while_the_file_came_counts_and_not_the_file() -> None:
+    table = Table(Encoding.C_CAST)
+    table.hear(param_value("A", 5, index=65535, kind=ParamType.INT32, encoding=Encoding.C_CAST), "vehicle")
+    assert table.take("A", ParamType.INT32, 4, 9, 1, is_older=True) is None
+    param = table.params["A"]
+    assert (param.value, param.index, param.default) == (5, 9, 1)
+    rounded = param_value("B", BIG - 1, index=65535, kind=ParamType.INT32, encoding=Encoding.C_CAST)
+    table.hear(rounded, "vehicle")
+    assert table.take("B", ParamType.INT32, BIG, 10, None, is_older=True) is not None
+    assert table.params["B"].value == BIG, "the message may have rounded it"
+
+
+def test_a_file_moves_the_hash() -> None:
+    table = Table()
+    table.take("A", ParamType.INT32, 1, 0, None, is_older=False)
+    table.confirm(5, frozenset(), proven=False)
+    table.take("A", ParamType.INT32, 2, 0, None, is_older=False)
+    assert table.hash is None
+
+
+def test_a_default_goes_with_the_type() -> None:
+    table = Table()
+    table.take("A", ParamType.INT32, 1, 0, 7, is_older=False)
+    table.hear(param_value("A", 1.0, index=0), "vehicle")
+    assert table.params["A"].default is None

@@ -5,13 +5,15 @@ from __future__ import annotations
 import pytest
 
 from paramclient.protocol.timing import (
+    FEWEST_SILENCES,
     FEWEST_TRIES,
     INITIAL_TIMEOUT,
     LONGEST_SILENCE,
     LONGEST_TIMEOUT,
+    MOST_SILENCES,
     MOST_TRIES,
+    SERVING_TIME,
     SHORTEST_TIMEOUT,
-    SILENCES_TO_BACK_OFF,
     RoundTrip,
 )
 
@@ -59,12 +61,12 @@ def test_what_was_asked_for_twice_is_no_sample() -> None:
 def test_silences_in_a_row_back_off_and_a_sample_ends_that() -> None:
     trip = measured(0.1, 50)
     before = trip.timeout
-    for _ in range(SILENCES_TO_BACK_OFF - 1):
+    for _ in range(FEWEST_SILENCES - 1):
         trip.timed_out(1)
     assert trip.timeout == before
     trip.timed_out(1)
     assert trip.timeout == 2 * before
-    for _ in range(20 * SILENCES_TO_BACK_OFF):
+    for _ in range(20 * FEWEST_SILENCES):
         trip.timed_out(3)
     assert trip.timeout == LONGEST_TIMEOUT
     trip.answered(0.0, 0.1, 1)
@@ -74,15 +76,52 @@ def test_silences_in_a_row_back_off_and_a_sample_ends_that() -> None:
 def test_an_answer_that_fits_the_last_request_ends_the_silences() -> None:
     trip = measured(0.1, 50)
     for _ in range(4):
-        for _ in range(SILENCES_TO_BACK_OFF - 1):
+        for _ in range(FEWEST_SILENCES - 1):
             trip.timed_out(1)
         trip.answered(0.0, 0.09, 2)
     assert trip.timeout < 0.2
-    for _ in range(SILENCES_TO_BACK_OFF - 1):
+    for _ in range(MOST_SILENCES):
         trip.timed_out(1)
-    trip.answered(0.0, 0.01, 2)  # too soon to be the answer to the last request
-    trip.timed_out(1)
+        trip.answered(0.0, 0.01, 2)  # too soon to be the answer to the last request
     assert trip.timeout > 0.2
+    for _ in range(4):
+        trip.answered(0.0, 0.09, 2)
+    assert trip.timeout < 0.2
+
+
+def test_the_worse_the_link_the_more_silences_are_no_surprise() -> None:
+    good, bad = measured(0.1, 50), measured(0.1, 50)
+    for _ in range(100):
+        for _ in range(2):
+            bad.timed_out(1)
+        bad.answered(0.0, 0.1, 1)
+    before = bad.timeout
+    for _ in range(FEWEST_SILENCES):
+        good.timed_out(3)
+        bad.timed_out(3)
+    assert good.timeout > 1.9 * 0.12
+    assert bad.timeout == before
+    for _ in range(MOST_SILENCES):
+        bad.timed_out(3)
+    assert bad.timeout > 1.9 * before
+
+
+def test_before_reads_are_known_they_get_longer_than_what_is_answered_at_once() -> None:
+    trip = measured(0.02, 2)
+    assert trip.prompt_timeout == SHORTEST_TIMEOUT
+    assert trip.timeout == pytest.approx(0.02 + SERVING_TIME)
+    known = measured(0.02, 50)
+    assert known.timeout == known.prompt_timeout
+
+
+def test_how_many_requests_at_once_a_risk_is_worth() -> None:
+    trip = measured(0.1, 50)
+    assert trip.copies(0.05, 3) == 1
+    for _ in range(200):
+        trip.timed_out(1)
+        trip.answered(0.0, 0.1, 1)
+    assert trip.copies(0.3, 9) == 2
+    assert trip.copies(0.05, 3) == 3
 
 
 def test_a_slow_link_gets_what_it_needs() -> None:

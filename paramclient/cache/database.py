@@ -97,6 +97,7 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
         )""",
         "CREATE INDEX history_of_component ON history (owner)",
     ),
+    ("ALTER TABLE param ADD COLUMN default_bits INTEGER",),
 )
 """The statements that lead from each schema version to the next; the version is the number of steps taken."""
 

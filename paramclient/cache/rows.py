@@ -10,7 +10,7 @@ from typing import Any, Final, NamedTuple
 from paramclient.cache.database import Damaged
 from paramclient.errors import UsageError
 from paramclient.identity import Identity
-from paramclient.values import Param, Trust, from_bits, known_type, same_bits
+from paramclient.values import Param, Trust, Value, bits_of, from_bits, known_type, same_bits
 
 __all__ = [
     "Row",
@@ -74,12 +74,15 @@ class Row(NamedTuple):
     param_index: int | None
     volatile: int
     heard_at: float
+    default_bits: int | None = None
 
     @classmethod
     def of(cls, param: Param, index: int | None, volatile: bool, heard_at: float) -> Row:
         """The cells of a parameter."""
         bits = _signed(param.bits)
-        return cls(int(param.type), bits, int(param.is_raw), index, int(volatile), time_cell(heard_at))
+        number = int(param.type)
+        default = None if param.default is None else _signed(bits_of(param.default, number))
+        return cls(number, bits, int(param.is_raw), index, int(volatile), time_cell(heard_at), default)
 
     @property
     def value(self) -> tuple[int, int, int]:
@@ -99,20 +102,36 @@ class Row(NamedTuple):
 
 
 def checksum(rows: Mapping[str, Row]) -> int:
-    """A CRC-32 of all that is kept of a table's parameters, whatever their order."""
-    return zlib.crc32(repr(sorted((name, *row) for name, row in rows.items())).encode())
+    """A CRC-32 of all that is kept of a table's parameters, whatever their order.
+
+    A row without a default counts as it did before there were any.
+    """
+    kept = ((name, *(row[:-1] if row.default_bits is None else row)) for name, row in rows.items())
+    return zlib.crc32(repr(sorted(kept)).encode())
 
 
-def read_param(name: str, number: int, bits: int, is_raw: int, index: int | None = None) -> Param:
+def read_param(
+    name: str,
+    number: int,
+    bits: int,
+    is_raw: int,
+    index: int | None = None,
+    default_bits: int | None = None,
+) -> Param:
     """The parameter of a row's `value`; its trust is CACHED."""
-    bits &= _MASK_64
-    try:
-        value = from_bits(bits, number, is_raw=bool(is_raw))
-    except OverflowError:
-        raise Damaged(f"{bits} is not a value of type {number}") from None
+    value = _value(number, bits, bool(is_raw))
+    default = None if default_bits is None else _value(number, default_bits, False)
     if not 0 <= number <= 255:
         raise Damaged(f"{number} is not a type")
-    return Param(name, value, known_type(number), index, bits, Trust.CACHED)
+    return Param(name, value, known_type(number), index, bits & _MASK_64, Trust.CACHED, default)
+
+
+def _value(number: int, bits: int, is_raw: bool) -> Value:
+    bits &= _MASK_64
+    try:
+        return from_bits(bits, number, is_raw=is_raw)
+    except OverflowError:
+        raise Damaged(f"{bits} is not a value of type {number}") from None
 
 
 def _signed(number: int) -> int:

@@ -109,7 +109,10 @@ def component(
         return CachedComponent(
             **{field.name: getattr(summary, field.name) for field in fields(summary)},
             params=ParamMap(
-                {name: read_param(name, *row.value, row.param_index) for name, row in rows.items()}
+                {
+                    name: read_param(name, *row.value, row.param_index, row.default_bits)
+                    for name, row in rows.items()
+                }
             ),
             volatile=frozenset(name for name, row in rows.items() if row.volatile),
             heard_at=MappingProxyType({name: row.heard_at for name, row in rows.items()}),
@@ -198,8 +201,8 @@ def _write_rows(
         [(owner, name) for name in before.keys() - after.keys()],
     )
     connection.executemany(
-        "REPLACE INTO param (owner, name, type, bits, is_raw, param_index, volatile, heard_at)"
-        " VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
+        "REPLACE INTO param (owner, name, type, bits, is_raw, param_index, volatile, heard_at, default_bits)"
+        " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [(owner, name, *row) for name, row in after.items() if before.get(name) != row],
     )
     connection.execute("UPDATE component SET checksum = ? WHERE id = ?", (checksum(after), owner))
@@ -233,11 +236,12 @@ def _write_state(connection: sqlite3.Connection, owner: int, state: TableState) 
 def _rows(connection: sqlite3.Connection, owner: int) -> dict[str, Row]:
     """A table's parameters by index, then name, those without an index last; `Damaged` where one changed."""
     found = connection.execute(
-        "SELECT name, type, bits, is_raw, param_index, volatile, heard_at FROM param WHERE owner = ?"
+        "SELECT name, type, bits, is_raw, param_index, volatile, heard_at, default_bits"
+        " FROM param WHERE owner = ?"
         " ORDER BY param_index IS NULL, param_index, name",
         (owner,),
     )
-    rows = {name: Row(*row) for name, *row in (cells(row, "siiiIif") for row in found)}
+    rows = {name: Row(*row) for name, *row in (cells(row, "siiiIifI") for row in found)}
     [(expected,)] = connection.execute("SELECT checksum FROM component WHERE id = ?", (owner,))
     if checksum(rows) != expected:
         raise Damaged("a table is not what was written")

@@ -7,8 +7,10 @@ from typing import Final
 
 from paramclient.errors import (
     CacheError,
+    FileTransferError,
     LinkError,
     NoReply,
+    PackError,
     ParamClientError,
     Refused,
     TypeMismatch,
@@ -47,6 +49,7 @@ def status_of(error: ParamClientError) -> str:
 
 _CODES: Final = {
     VehicleError: ExitCode.INCOMPLETE,
+    PackError: ExitCode.INCOMPLETE,
     UsageError: ExitCode.USAGE,
     NoReply: ExitCode.NO_ANSWER,
     LinkError: ExitCode.LINK,
@@ -54,6 +57,7 @@ _CODES: Final = {
 }
 _STATUSES: Final = {
     Refused: "refused",
+    FileTransferError: "refused",
     UnknownParameter: "unknown",
     TypeMismatch: "mismatch",
     ValueNotApplied: "not-applied",

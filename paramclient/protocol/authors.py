@@ -17,31 +17,32 @@ values for a batch of answers up to 100 ms before it sends them, and what was se
 
 
 class Authors:
-    """What is remembered for a few seconds of the changes of one component's values."""
+    """What is remembered for a few seconds of the changes of one component's values.
 
-    __slots__ = ("_changed_at", "_doubts", "_foreign_sets")
+    Attributes:
+        foreign_sets: by name, the station that was heard setting it last, and when.
+    """
+
+    __slots__ = ("_changed_at", "_doubts", "foreign_sets")
 
     def __init__(self) -> None:
-        self._foreign_sets: dict[str, tuple[str, float]] = {}
+        self.foreign_sets: dict[str, tuple[str, float]] = {}
         self._changed_at: dict[str, float] = {}
         self._doubts: dict[str, float] = {}  # what changed again: when to ask for it
 
     def foreign_set(self, name: str, station: str, now: float) -> None:
         """Another station was heard setting a parameter."""
-        self._foreign_sets.pop(name, None)
-        self._foreign_sets[name] = (station, now)
-        if len(self._foreign_sets) > MOST_FOREIGN_SETS:
-            del self._foreign_sets[next(iter(self._foreign_sets))]
+        self.foreign_sets.pop(name, None)
+        self.foreign_sets[name] = (station, now)
+        if len(self.foreign_sets) > MOST_FOREIGN_SETS:
+            del self.foreign_sets[next(iter(self.foreign_sets))]
 
     def of(self, name: str, now: float) -> str:
         """Who has changed a parameter that no write of ours is about."""
-        if self._foreign_sets:
-            station, at = self._foreign_sets.get(name, ("", -math.inf))
-            if now - at <= FOREIGN_SET_MEMORY:
-                return station
-        return "vehicle"
+        station, at = self.foreign_sets.get(name, ("", -math.inf))
+        return station if now - at <= FOREIGN_SET_MEMORY else "vehicle"
 
-    def changed(self, name: str, now: float, *, is_written: bool) -> None:
+    def changed(self, name: str, now: float, is_written: bool) -> None:
         """A value changed: the second time in a short while, the one that came last may be the older one."""
         before = self._changed_at.pop(name, -math.inf)
         if now - before <= DOUBT and not is_written:

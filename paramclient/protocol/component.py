@@ -9,17 +9,9 @@ from typing import Final
 
 from paramclient.errors import LinkError, NoReply
 from paramclient.identity import Identity, autopilot_name
+from paramclient.protocol import events
 from paramclient.protocol.authors import Authors
-from paramclient.protocol.events import (
-    ComponentFound,
-    ComponentIdentified,
-    ComponentLost,
-    ComponentRebooted,
-    Event,
-    Fetched,
-    ParamChanged,
-    TableResynced,
-)
+from paramclient.protocol.events import Event, ParamChanged
 from paramclient.protocol.fetch import Fetch, FetchResult, Policy
 from paramclient.protocol.identify import Identification
 from paramclient.protocol.presence import Presence
@@ -28,6 +20,7 @@ from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -66,6 +59,7 @@ class ComponentMachine:
         is_link_busy: whether anything is being asked for on the link.
         is_vehicle_doubted: whether it is open which vehicle its autopilot belongs to.
         another: is told that another vehicle has taken the system id; by default `become_another`.
+        turns: those of the lists on the link; None for a link that it has for itself.
 
     Attributes:
         version: the MAVLink version that it speaks, as far as heard.
@@ -92,6 +86,7 @@ class ComponentMachine:
         is_link_busy: Callable[[], bool] = lambda: False,
         is_vehicle_doubted: Callable[[], bool] = lambda: False,
         another: Callable[[float], None] | None = None,
+        turns: Turns | None = None,
     ) -> None:
         target = (system, component)
         upkeep = upkeep or Upkeep()
@@ -101,7 +96,8 @@ class ComponentMachine:
         self.round_trip = RoundTrip()
         self.who = Identification(target, link, self.round_trip, send, encoding)
         self.table = Table(self.who.encoding)
-        self.reads = Reads(target, self.round_trip, send, self._is_known)
+        self.turns = Turns() if turns is None else turns
+        self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share)
         self.writes = Writes(
             target,
             self.round_trip,
@@ -124,7 +120,7 @@ class ComponentMachine:
             is_doubted=lambda: self.who.is_doubted,
             begin_fetch=lambda now, refresh: self.begin_fetch(now, refresh=refresh),
             end_fetch=self.end_fetch,
-            resynced=lambda changed, confirmed: emit(TableResynced(self, changed, confirmed)),
+            resynced=lambda changed, confirmed: emit(events.TableResynced(self, changed, confirmed)),
         )
         self.fetch: Fetch | None = None
         self.last_fetch: FetchResult | None = None
@@ -192,6 +188,7 @@ class ComponentMachine:
         complete: bool,
         volatile: frozenset[str],
         volatile_known: bool,
+        placed: bool = True,
     ) -> None:
         """Take what the cache knows of this component. What was heard on this link stays as it is.
 
@@ -200,7 +197,7 @@ class ComponentMachine:
             now: the time.
             count: the param_count with it.
             confirmed: the hash under which the vehicle would confirm it, or None.
-            complete: whether it held every index below the count.
+            complete, placed: whether it held every index below the count, and whether these still hold.
             volatile, volatile_known: as in `Table`.
         """
         if self.table.complete:
@@ -210,6 +207,7 @@ class ComponentMachine:
             count=count,
             confirmed=confirmed,
             complete=complete,
+            placed=placed,
             volatile=volatile,
             volatile_known=volatile_known,
         )
@@ -260,7 +258,7 @@ class ComponentMachine:
         fetch = self.fetch
         if fetch is None and self._policy is not Policy.CACHE_ONLY:
             self._check_present(f"the parameters of {self.system}/{self.component}", now)
-        if fetch is not None and refresh and fetch.download is None:
+        if fetch is not None and refresh and (fetch.download is None or fetch.download.resumed):
             fetch.restart(now)
         if fetch is None:
             fetch = self.fetch = Fetch(
@@ -269,6 +267,7 @@ class ComponentMachine:
                 self._send,
                 self.reads,
                 self.table,
+                self.turns,
                 now,
                 announced=self.sync.announced,
                 expects_hash=lambda: self.sync.expects_hash,
@@ -440,31 +439,31 @@ class ComponentMachine:
         table = self.table
         if count != table.count and count != NO_INDEX:
             self._count_moved(count, now)
-        is_writing = len(self.writes) > 0
-        is_ours = is_writing and name in self.writes
-        change = table.hear(message, "us" if is_ours else self._authors.of(name, now))
+        authors = self._authors
+        is_ours = bool(self.writes.queues) and name in self.writes
+        by = "us" if is_ours else authors.of(name, now) if authors.foreign_sets else "vehicle"
+        change = table.hear(message, by)
         if change is not None:
-            self._authors.changed(name, now, is_written=is_ours)
+            authors.changed(name, now, is_ours)
             self.sync.changed(change)
             self._emit(_new(ParamChanged, (self, change)))
         elif name not in table.params:
             return  # more names than there can be
         if self.fetch is not None:
             self.fetch.heard(message, now)
-        if is_writing:
+        if self.writes.queues:
             self.writes.heard(message, now)
         self.reads.heard(message, now)
 
     def _count_moved(self, count: int, now: float) -> None:
         if self.table.count is not None:
-            self.table.complete = False
             self.sync.count_moved(now)
-        self.table.count = count
+        self.table.move(count)
 
     @property
     def _is_spared(self) -> bool:
         """Whether it is in a mode in which nothing is asked of it unasked."""
-        return self.presence.is_high_latency or self.reads.pace.stream_gap >= LOW_BANDWIDTH_GAP
+        return self.presence.is_high_latency or self.reads.pace.gap >= LOW_BANDWIDTH_GAP
 
     def _check_present(self, what: str, now: float) -> None:
         if self.presence.is_lost:
@@ -481,7 +480,7 @@ class ComponentMachine:
         presence = self.presence
         presence.is_lost = True
         silence = now - presence.heard_at
-        self._emit(ComponentLost(self, silence))
+        self._emit(events.ComponentLost(self, silence))
         self.writes.lose(now)
         self.reads.lose(now)
         self._doubt()
@@ -491,7 +490,7 @@ class ComponentMachine:
         presence = self.presence
         if presence.is_lost:
             presence.is_lost = False
-            self._emit(ComponentFound(self, silence))
+            self._emit(events.ComponentFound(self, silence))
             self.sync.check(now)
             self.who.doubt(now)
         elif presence.was_away(silence) and silence < math.inf:
@@ -501,7 +500,7 @@ class ComponentMachine:
 
     def _rebooted(self, now: float) -> None:
         """The vehicle has started again: what it had not saved is gone, and its list begins anew."""
-        self._emit(ComponentRebooted(self))
+        self._emit(events.ComponentRebooted(self))
         self._doubt()
         self._authors.clear()
         self.sync.check(now)
@@ -520,7 +519,7 @@ class ComponentMachine:
         self._report(self.table.use_encoding(self.who.encoding))
         if self.who.settled and self._known_as != self.identity.key:
             self._known_as = self.identity.key
-            self._emit(ComponentIdentified(self))
+            self._emit(events.ComponentIdentified(self))
         may_write = self.may_be_written
         if may_write and not self._may_write:
             self.writes.proceed(now)
@@ -542,7 +541,7 @@ class ComponentMachine:
             return
         self.last_fetch = result
         if self.sync.fetched(result, fetch.ended_at):
-            self._emit(Fetched(self, result))
+            self._emit(events.Fetched(self, result))
 
 
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Final
 
 from paramclient.errors import NoReply
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.reads import Read, Reads
-from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.stream import SHORTEST_QUIET, ListStream
+from paramclient.protocol.timing import LONGEST_SILENCE, RoundTrip
+from paramclient.protocol.turns import Seen, Turns
 from paramclient.protocol.wire import NO_INDEX, Message, ParamRequestList, ParamValue
 
 __all__ = ["Download"]
@@ -17,8 +19,19 @@ __all__ = ["Download"]
 LIST_PATIENCE: Final = 20.0
 """Seconds of silence after which PARAM_REQUEST_LIST counts as not answered: longer than ArduPilot leaves it
 unanswered after a boot."""
-LONGEST_LIST_WAIT: Final = 5.0
+LIST_VARIATION: Final = 3.0
+"""How many times longer than the first list another one may take to begin: reads, which wait for each other,
+say less of that."""
+LIST_RISK: Final = 0.05
+MOST_LISTS_AT_ONCE: Final = 3
+"""The chance of no answer to go below, where the list is asked for another time, by asking twice at once. The
+first time PX4 would take the second for a restart, and leave out its hash."""
+LIST_TRIES: Final = 12
+"""Times that it is asked for, at the least, when the component is heard: enough where many are lost."""
+LONGEST_LIST_WAIT: Final = 2.5
 """Seconds between two of them, at the most, on a link that answers sooner than that."""
+EVEN_LISTS: Final = 3
+"""Of these the first follow each other without a longer wait: they were lost rather than left unanswered."""
 MOST_PASSES: Final = 20
 """Times that the list may be asked for: anew when the count has moved, or when too much is missing to be read
 one by one."""
@@ -26,25 +39,19 @@ MOST_VAIN_PASSES: Final = 3
 """Passes in a row that bring nothing, after which only single reads are tried."""
 MOST_MOVES: Final = 8
 """Times that a moved count makes everything count again. A table that still moves is taken as it comes."""
-SHORTEST_QUIET: Final = 0.25
-"""Seconds without a value after which a stream may be over, at the least: PX4 sends every 20 ms, ArduPilot
-every 10."""
-REORDER_DEPTH: Final = 3
-"""Later values that must have come before a missing one counts as lost, as in TCP's fast retransmit."""
-ENOUGH_ADVANCES: Final = 20
-"""Values after which the stream's own pace is known."""
-QUIET_GAPS: Final = 3.0
-"""A stream that pauses for so many of its longest gaps is over; a radio's pauses count among its gaps."""
-SHORTEST_QUIET_AT_PACE: Final = 0.06
-LONGEST_JUMP: Final = 40
-"""Indices that the stream may pass over at once. A longer jump is believed when the next value goes on from
-there: PX4 pushes changed parameters, with their index, into a running stream."""
 FEW: Final = 24
 """Missing values that are never worth another pass of the list."""
 MOST_ASKED: Final = 256
 """Indices asked for at a time; the pace of the reads says how many of them are in flight."""
 RELIST_GAIN: Final = 1.5
 """How many times faster another pass of the list must be than single reads, by the rates measured so far."""
+ASSUMED_LIST: Final = 5.0
+"""Seconds that a list is taken to last before its pace was measured: on a cable one, on a radio thirty."""
+DEAD: Final = 1e-3
+"""The chance of bad luck below which an index counts as dead, by what was answered while it kept silent."""
+BURST_GAIN: Final = 3.0
+"""How many times faster than such a stream the link is taken to be: within a burst of PX4 it is a lot more,
+but a program that was busy sees bursts on any link."""
 
 
 class Download(Operation[None]):
@@ -59,12 +66,22 @@ class Download(Operation[None]):
     reads tell the count of now while a running stream of ArduPilot goes by that of its beginning; so a
     different count in an answer is noted, and settled by another pass when the stream is over.
 
+    The list waits for its turn where others of the same link run. It does not end before its time while the
+    component answers, however slowly: an index is given up when others are answered that are asked for
+    together with it, and all of them when nothing at all is for `LONGEST_SILENCE`.
+
+    With what is there already only the rest is asked for. Should that turn out to be of another count, or to
+    have other names, it counts as nothing.
+
     Attributes:
         count: parameters that the vehicle said it has; None before the first value.
         names: what came under that count, by index.
         given_up: indices that stayed silent too often, or were answered with what cannot be true.
         repeated: values that came although they had come before.
+        resumed: how many of them were there already.
         lists: how often the list was asked for.
+        held_up: seconds for which it waited for its turn; with `held_since` while it waits.
+        held_since: since when it waits, or None.
     """
 
     def __init__(
@@ -73,48 +90,57 @@ class Download(Operation[None]):
         round_trip: RoundTrip,
         send: Callable[[Message], None],
         reads: Reads,
+        turns: Turns,
         now: float,
         *,
         listed: bool = False,
+        count: int | None = None,
+        present: Mapping[int, str] | None = None,
     ) -> None:
         super().__init__(now)
         self._target = target
         self._round_trip = round_trip
         self._send = send
         self._reads = reads
-        self.count: int | None = None
-        self.names: dict[int, str] = {}
+        self._turns = turns
+        self.count = count if present else None
+        self.names = dict(present or {})
+        self.resumed = len(self.names)
         self.given_up: set[int] = set()
         self.repeated = 0
         self._lost: set[int] = set()
         self.lists = 0
+        self.held_up = 0.0
+        self.held_since: float | None = None
         self._passes = 1
         self._vain_passes = 0
         self._moves = 0
-        self._front = -1  # the highest index that the stream has reached
-        self._front_at = now  # when that was
-        self._jump = -1  # an index too far ahead to be believed at once
-        self._advances = 0  # how often the stream went forward
-        self._holes: dict[int, int] = {}  # what it passed over: index -> advances when that happened
+        self._stream = ListStream(now)
         self._asked: dict[int, Read] = {}
         self._next = 0  # below it, whatever is missing was asked for since the stream was over
         self._vain = 0  # values in a row that had come before
         self._is_streaming = True
         self._other_count: int | None = None
-        self._heard_at = now  # the last value of the stream
-        self._began = (0, now)  # where and when the stream began
-        self._gap = 0.0  # the mean time between two values of it
-        self._longest = 0.0  # the longest of late
-        self._is_awaited = True  # the list was asked for, and no value of it has come
+        self._silent_at = math.inf  # when an unanswered list no longer takes anything of the link
+        self._tries: dict[int, tuple[int, int]] = {}  # what reads in vain have shown: requests, controls
+        self._places = {name: index for index, name in self.names.items()}  # of what was there already
+        self._is_heard = self._is_checked = False  # whether anything has come, and was asked for to see that
+        self._list_patience = math.inf  # how long another pass may let its first value be waited for
         self._is_answered = False  # the first answer to it tells the round trip
         self._list_wait = 0.0
+        self._list_asked = 0  # times since the turn began
         self._list_at = now
         self._patient_since = now
         if listed:
             self.lists = 1
-            self._list_wait = round_trip.timeout
+            self._list_wait = round_trip.prompt_timeout
+            self._list_asked = 1
+            self._silent_at = now + self._list_wait
+            turns.has_begun(self)
+        elif present:
+            self._go_on(now)
         else:
-            self._ask_for_list(now)
+            self._ask_for_turn(now)
 
     @property
     def received(self) -> int:
@@ -144,14 +170,52 @@ class Download(Operation[None]):
         """Received, and total where it is known."""
         return self.received, self.count
 
+    @property
+    def is_awaited(self) -> bool:
+        """Whether nothing has come of the list since it was asked for."""
+        return self._stream.is_awaited
+
+    @property
+    def silent_at(self) -> float:
+        """While nothing has come of the list: when that has lasted too long."""
+        return self._silent_at if self._stream.is_awaited else math.inf
+
+    def seen(self) -> Seen:
+        """What the list has shown since it was asked for."""
+        return self._stream.seen()
+
+    def begin(self, now: float) -> None:
+        """It is this list's turn."""
+        if self.held_since is not None:
+            self.held_up += now - self.held_since
+            self.held_since = None
+        self._patient_since = now
+        is_running = self._stream.is_at_pace and now < self._quiet_at
+        if self.lists == 0 and is_running:
+            return  # somebody else has asked for it meanwhile
+        self._stream.rewind()
+        self._stream.heard_at = now
+        self._list_wait = 0.0
+        self._list_asked = 0
+        self._ask_for_list(now)
+        self._silent_at = now + self._list_wait
+
+    def held_for(self, now: float) -> float:
+        """Seconds for which it has waited for its turn so far."""
+        return self.held_up + (0.0 if self.held_since is None else now - self.held_since)
+
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
         name, _, _, count, index = message
         if index == NO_INDEX or count == NO_INDEX or index >= count or self.done:
             return
+        self._is_heard = True
         if self.count is None:
             self._note_answer(now)
             self.count = count
+        elif self.resumed and self._contradicts(index, name) and count == self.count:
+            self._start_over(count)
+            self._ask_for_another_pass(now)
         elif count != self.count and self._moves < MOST_MOVES:
             if index in self._asked or not self._is_streaming:
                 self._other_count = count
@@ -163,7 +227,7 @@ class Download(Operation[None]):
             self._take(index, name)
         else:
             self._follow(index, name, now)
-        if self._holes or self._asked or not self._is_streaming:
+        if (self._stream.holes and self.held_since is None) or self._asked or not self._is_streaming:
             self._ask_for_gaps(now)
             self._finish_if_complete(now)
 
@@ -173,28 +237,31 @@ class Download(Operation[None]):
             self._note_answer(now)
             self._list_at = now
             self._list_wait = max(self._list_wait, SHORTEST_QUIET)
+            self._silent_at = now + self._list_wait
 
     def tick(self, now: float) -> None:
         """Ask for the list again, or see that the stream is over."""
-        if self.done:
+        if self.done or self.held_since is not None:
             return
         if self.count is None:
             if self._list_at + self._list_wait <= now:
-                if now - self._patient_since >= LIST_PATIENCE:
-                    system, component = self._target
-                    what = f"the parameter list of {system}/{component}"
-                    self._end_with_error(NoReply(what, attempts=self.lists, waited=now - self.begun_at), now)
+                if self._turns.is_beside_others(self):
+                    self._patient_since = now  # it may have no room to answer
+                is_gone = now - self._round_trip.heard_at >= LONGEST_SILENCE
+                is_enough = is_gone or self._list_asked >= LIST_TRIES
+                if is_enough and now - self._patient_since >= LIST_PATIENCE:
+                    self._end_in_vain(now)
                 else:
                     self._ask_for_list(now)
             return
         if self._is_streaming and self._quiet_at <= now:
-            self._stream_ends()
+            self._stream_ends(is_cut=True)
         self._ask_for_gaps(now)
         self._finish_if_complete(now)
 
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity. The reads have deadlines of their own."""
-        if self.done:
+        if self.done or self.held_since is not None:
             return math.inf
         if self.count is None:
             return self._list_at + self._list_wait
@@ -203,44 +270,74 @@ class Download(Operation[None]):
     def resume(self, now: float) -> None:
         """The link is back: what was not sent while it was away is worth asking for now."""
         self._list_at = now - self._list_wait
-        self._patient_since = self._heard_at = now
+        self._patient_since = self._stream.heard_at = now
+        self._silent_at = now + self._round_trip.timeout
 
     def cancel(self) -> None:
         """Nobody waits for it any more; a stream that runs goes on and still fills the table."""
+        stream = self._stream
+        if self._is_streaming and not stream.is_awaited and self.count is not None:
+            self._learn_pace()
+            self._reads.list_until = self._quiet_at + (self.count - stream.front) * stream.gap
         self._stream_ends()
         self._forget_reads()
 
     @property
     def _quiet_at(self) -> float:
         """When a stream from which nothing more has come is taken to be over."""
-        if self._advances < ENOUGH_ADVANCES or self._is_awaited:
-            return self._heard_at + max(SHORTEST_QUIET, self._round_trip.timeout)
-        return self._heard_at + max(QUIET_GAPS * self._longest, SHORTEST_QUIET_AT_PACE)
+        timeout = self._round_trip.timeout
+        if self._stream.is_awaited and self._passes > 1:
+            timeout = min(timeout, self._list_patience)
+        return self._stream.quiet_at(timeout)
 
     def _note_answer(self, now: float) -> None:
-        if not self._is_answered:
+        if not self._is_answered and self.lists:
             self._is_answered = True
             self._round_trip.answered(self._list_at, now, self.lists)
+            if self.lists == 1:
+                self._list_patience = LIST_VARIATION * (now - self._list_at)
+
+    def _go_on(self, now: float) -> None:
+        """Ask for what is missing, unless a list still comes that will bring it."""
+        assert self.count is not None
+        self._stream.gap = self._reads.pace.gap or ASSUMED_LIST / self.count
+        self._is_streaming = now < self._reads.list_until and len(self.names) < self.count
+        self._reads.is_idle = not self._is_streaming
+        if not self._is_streaming:
+            self._check(now)
+            self._ask_for_gaps(now)
+
+    def _check(self, now: float) -> None:
+        """Ask for one value that is there: its answer tells whether count and indices are still the same."""
+        self._is_checked = True
+        self._ask(max(self.names), now)
+
+    def _contradicts(self, index: int, name: str) -> bool:
+        """Whether a value shows that what was there already is not of the vehicle as it is now."""
+        return self.names.get(index, name) != name or self._places.get(name, index) != index
+
+    def _ask_for_turn(self, now: float) -> None:
+        self.held_since = now
+        self._turns.ask(self, now)
 
     def _ask_for_list(self, now: float) -> None:
         self.lists += 1
         self._list_at = now
-        timeout = self._round_trip.timeout
-        self._list_wait = max(min(self._list_wait * 2, LONGEST_LIST_WAIT), timeout)
-        self._is_awaited = True
+        timeout = self._round_trip.prompt_timeout
+        self._list_asked += 1
+        growth = 2 if self._list_asked > EVEN_LISTS else 1
+        self._list_wait = max(min(self._list_wait * growth, LONGEST_LIST_WAIT), timeout)
+        self._stream.is_awaited = True
         self._reads.is_idle = False
-        self._send(ParamRequestList(*self._target))
+        for _ in range(1 if self._passes == 1 else self._round_trip.copies(LIST_RISK, MOST_LISTS_AT_ONCE)):
+            self._send(ParamRequestList(*self._target))
 
     def _ask_for_another_pass(self, now: float) -> None:
         self._passes += 1
         self._vain_passes += 1
-        self._list_wait = 0.0
-        self._front = self._jump = -1
         self._vain = 0
-        self._holes.clear()
         self._is_streaming = self._reads.list_runs_again = True
-        self._heard_at = now
-        self._ask_for_list(now)
+        self._ask_for_turn(now)
 
     def _follow(self, index: int, name: str, now: float) -> None:
         """The stream has brought an index, or the vehicle has pushed a change into it."""
@@ -248,27 +345,16 @@ class Download(Operation[None]):
             self._vain += 1
         else:
             self._vain = self._vain_passes = 0
-        if self._is_streaming and index > self._front:
-            if index - self._front > LONGEST_JUMP and not 0 < index - self._jump <= LONGEST_JUMP:
-                self._jump = index
+        stream = self._stream
+        if self._is_streaming and index > stream.front:
+            behind = stream.front + 1
+            if not stream.takes(index, now):
                 return
-            if self._is_awaited:
-                self._is_awaited = False
-                self._began = (index, now)
-            else:
-                self._longest *= 0.99
-                if now - self._heard_at > self._longest:
-                    self._longest = now - self._heard_at
-            self._advances += 1
-            if index - self._front > 1:
-                for hole in range(self._front + 1, index):
-                    if hole not in self.names:
-                        self._holes[hole] = self._advances
-            self._front = index
-            self._front_at = now
-        self._heard_at = now
+            if index > behind:
+                stream.pass_over(hole for hole in range(behind, index) if hole not in self.names)
+        stream.heard_at = now
         count = self.count or 0
-        if self._front == count - 1 or len(self.names) >= count:
+        if stream.front == count - 1 or len(self.names) >= count:
             self._stream_ends()
         elif self._vain > count:
             # others begin the list anew again and again: leave it to them, and read what is missing
@@ -281,38 +367,47 @@ class Download(Operation[None]):
         if is_repeated:
             self.repeated += 1
         self.names[index] = name
-        if self._holes:
-            self._holes.pop(index, None)
+        if self._stream.holes:
+            self._stream.holes.pop(index, None)
         if self.given_up:
             self.given_up.discard(index)
         return is_repeated
 
     def _learn_pace(self) -> None:
         """What the stream has told of the link so far: worked out when it is needed, not for each value."""
-        first, since = self._began
-        if self._front > first:
-            self._gap = (self._front_at - since) / (self._front - first)
-        if self._advances >= ENOUGH_ADVANCES:
-            self._reads.pace.stream_seen(self._gap)
+        stream = self._stream
+        stream.measure()
+        if stream.is_at_pace:
+            came, passed, _, is_bursty = stream.seen()
+            loss = 1 - came / passed if passed else 0.0
+            self._reads.pace.stream_seen(stream.gap, loss, BURST_GAIN if is_bursty else 1.0)
 
-    def _stream_ends(self) -> None:
+    def _stream_ends(self, *, is_cut: bool = False) -> None:
         self._learn_pace()
+        if self._reads.list_runs_again:
+            self._reads.pace.rest()  # answers that the list may have given were not counted
         self._is_streaming = self._reads.list_runs_again = False
         self._reads.is_idle = True
+        self.held_since = None
+        self._reads.pace.stream_ended()
+        self._turns.give_back(self, is_cut=is_cut)
 
     def _start_over(self, count: int | None) -> None:
         """The count has moved: indices heard before may mean other parameters now."""
-        self._learn_pace()
+        if self._is_streaming:
+            self._learn_pace()
         self._forget_reads()
         self._moves += 1
         self.count = count
         self.names.clear()
         self._lost.clear()
+        self._places.clear()
+        self.resumed = 0
         self.given_up.clear()
-        self._holes.clear()
-        self._front = self._jump = -1
+        self._tries.clear()
+        self._stream.rewind()
+        self._stream.is_awaited = True
         self._next = self._vain = 0
-        self._is_awaited = True
         self._other_count = None
 
     def _ask_for_gaps(self, now: float) -> None:
@@ -321,10 +416,10 @@ class Download(Operation[None]):
             return
         if self._is_streaming:
             self._learn_pace()
-            for index, seen in list(self._holes.items()):
-                if len(self._asked) >= MOST_ASKED or self._advances - seen < REORDER_DEPTH - 1:
+            for index in self._stream.lost():
+                if len(self._asked) >= MOST_ASKED:
                     break
-                del self._holes[index]
+                del self._stream.holes[index]
                 if index not in self._asked and index not in self.given_up:
                     self._ask(index, now)
         elif self._another_pass_is_faster(count - len(self.names) - len(self.given_up)):
@@ -340,14 +435,16 @@ class Download(Operation[None]):
     def _another_pass_is_faster(self, missing: int) -> bool:
         if self.count is None or self._passes >= MOST_PASSES or missing <= FEW:
             return False
-        if self._vain_passes >= MOST_VAIN_PASSES:
+        if self._vain_passes >= MOST_VAIN_PASSES or not self._turns.is_free:
             return False
         trip = self._round_trip
         by_reads = missing / (self._reads.pace.prospect * (1 - trip.loss))
-        return by_reads > RELIST_GAIN * (self.count * self._gap + (trip.smoothed or trip.timeout))
+        return by_reads > RELIST_GAIN * (self.count * self._stream.gap + (trip.smoothed or trip.timeout))
 
     def _ask(self, index: int, now: float) -> None:
         self._lost.add(index)
+        if self._stream.front in self.names:
+            self._reads.control = self._stream.front
         read = self._asked[index] = self._reads.ask(index, now, urgent=False)
 
         def ended() -> None:
@@ -355,13 +452,31 @@ class Download(Operation[None]):
                 return
             del self._asked[index]
             if index not in self.names and self._other_count is None:
-                self.given_up.add(index)
-                if isinstance(read.error, NoReply) and self._reads.answered_at <= read.begun_at:
-                    self._give_up_the_rest()
+                self._unanswered(index, read)
             self._ask_for_gaps(read.ended_at)
             self._finish_if_complete(read.ended_at)
 
         read.on_done.append(ended)
+
+    def _unanswered(self, index: int, read: Read) -> None:
+        """A read has ended without its value: for good, or is it worth asking again?"""
+        now = read.ended_at
+        if isinstance(read.error, NoReply) and read.begun_at <= self._turns.beside_others_at(self):
+            self._reads.forgive()  # there may have been no room for an answer
+        elif not isinstance(read.error, NoReply) or self._seems_dead(index, read):
+            self.given_up.add(index)
+            return
+        elif now - self._round_trip.heard_at >= LONGEST_SILENCE or self._reads.is_silent(now):
+            self._give_up_the_rest()
+        self._next = min(self._next, index)
+
+    def _seems_dead(self, index: int, read: Read) -> bool:
+        """Whether what was asked for together with it was answered too often for this to be bad luck."""
+        attempts, controls = self._tries.get(index, (0, 0))
+        attempts, controls = attempts + read.attempts, controls + read.controls
+        self._tries[index] = attempts, controls
+        answered = min(controls / max(attempts - 2, 1), 1.0)
+        return (1.0 - answered) ** attempts < DEAD
 
     def _finish_if_complete(self, now: float) -> None:
         if self.done or self.count is None or self._is_streaming or self._asked:
@@ -373,6 +488,8 @@ class Download(Operation[None]):
                 self._ask_for_another_pass(now)
             else:
                 self._ask_for_gaps(now)
+        elif self.resumed and not self._is_heard:
+            (self._end_in_vain if self._is_checked else self._check)(now)
         else:
             self.finish(None, now)  # whatever has not come was asked for and given up
 
@@ -387,6 +504,10 @@ class Download(Operation[None]):
         for read in asked.values():
             self._reads.release(read)
 
-    def _end_with_error(self, error: Exception, now: float) -> None:
+    def _end_in_vain(self, now: float) -> None:
+        """Nothing has come."""
         self._stream_ends()
-        self.fail(error, now)
+        system, component = self._target
+        what = f"the parameter list of {system}/{component}"
+        waited = now - self.begun_at - self.held_up
+        self.fail(NoReply(what, attempts=self.lists, waited=waited), now)

@@ -16,10 +16,11 @@ from paramclient.protocol.operation import Operation
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import HASH_CHECK, Message, ParamValue
-from paramclient.values import Param
+from paramclient.values import Param, Trust
 
-__all__ = ["Announcement", "Fetch", "FetchResult", "Policy", "Progress"]
+__all__ = ["Announcement", "Fetch", "FetchResult", "Policy", "Progress", "present_of"]
 
 FRESH_HASH: Final = 1.0
 """Seconds for which an announced hash answers the question what the hash is. It is asked for when a component
@@ -41,6 +42,11 @@ class Policy(StrEnum):
     AUTO = "auto"
     HASH_ONLY = "hash-only"
     CACHE_ONLY = "cache-only"
+
+
+ENOUGH_PRESENT: Final = 0.5
+"""The share of a table that must be there for its rest to be worth asking for one by one, where it is not
+known how fast the list comes."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,6 +90,7 @@ class FetchResult:
         hash: the PX4 hash under which the vehicle confirmed the table; None for a vehicle without one, when
             the table moved during the download, and when the policy kept it from being asked.
         elapsed: seconds from the call to the end.
+        resumed: how many were known already from an earlier download that did not come to its end.
         notes: what else is worth knowing, in sentences.
         lost: values that the list should have brought and did not, so that they had to be asked for one by
             one or by listing again; 0 from the cache.
@@ -101,6 +108,7 @@ class FetchResult:
     hash: int | None
     elapsed: float
     notes: tuple[str, ...] = ()
+    resumed: int = 0
     lost: int = 0
     repeated: int = 0
     round_trip: float | None = None
@@ -108,6 +116,13 @@ class FetchResult:
     @property
     def complete(self) -> bool:
         return not self.missing
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether every value was heard in this session, or the vehicle's hash stands for it."""
+        if not self.resumed or self.hash is not None:
+            return True
+        return all(param.trust is not Trust.CACHED or param.index is None for param in self.params.values())
 
     def __repr__(self) -> str:
         missing = f", {len(self.missing)} missing" if self.missing else ""
@@ -124,6 +139,10 @@ class Fetch(Operation[FetchResult]):
     vehicle announced in the course of it, or when the vehicle announced the same before and after: then
     nothing moved between. For the latter it is asked for once more after the download.
 
+    What an earlier download has left unfinished is gone on with, when the count is still the same. With a
+    hash it must be proven in the end, or all is downloaded after all; without one what the cache knows stays
+    *cached*.
+
     Attributes:
         holders: how many wait for it; with none left it is cancelled.
         download: the download by list, once it is needed.
@@ -136,6 +155,7 @@ class Fetch(Operation[FetchResult]):
         send: Callable[[Message], None],
         reads: Reads,
         table: Table,
+        turns: Turns,
         now: float,
         *,
         announced: Announcement | None,
@@ -152,6 +172,7 @@ class Fetch(Operation[FetchResult]):
         self._send = send
         self._reads = reads
         self._table = table
+        self._turns = turns
         self._changed = changed
         self._doubt = doubt
         self._expects_hash = expects_hash
@@ -161,13 +182,17 @@ class Fetch(Operation[FetchResult]):
         self._was_asked_meanwhile = False
         self._is_hash_unknown = False  # the vehicle answers, but not to that
         self._first_value_at = math.inf
+        self._held_before = 0.0  # by a download that was begun anew
         self._listed = listed
         self._policy = policy
         self._restarts = 0
         self.holders = 0
         self.download: Download | None = None
-        if policy is Policy.CACHE_ONLY or refresh or listed or table.hash is None or not table.complete:
+        self._notes: tuple[str, ...] = ()
+        if policy is Policy.CACHE_ONLY or refresh or listed:
             self._begin_download(now)
+        elif table.hash is None or not table.complete:
+            self._begin_or_resume(announced, now)
         elif announced is not None and now - announced.at <= FRESH_HASH:
             self._compare(announced, now)
         else:
@@ -209,12 +234,14 @@ class Fetch(Operation[FetchResult]):
     def restart(self, now: float) -> None:
         """The vehicle is another one, or has started again: what came is not about it. Fetch it anew."""
         self._drop()
+        held_up = self.held_up(now)
         self._restarts += 1
         if self._restarts > MOST_RESTARTS:
             system, component = self._target
             what = f"the parameters of {system}/{component}, which has started again {self._restarts} times"
             self.fail(NoReply(what, attempts=self._restarts, waited=now - self.begun_at), now)
             return
+        self._held_before = held_up
         self._before = self._meanwhile = None
         self._was_asked_meanwhile = False
         self._listed = False
@@ -246,11 +273,16 @@ class Fetch(Operation[FetchResult]):
         read = self._hash_read
         return read is not None and read.attempts > 1 and not read.controls
 
+    def held_up(self, now: float) -> float:
+        """Seconds for which its list has waited for its turn: other lists of the same link ran."""
+        return self._held_before + (0.0 if self.download is None else self.download.held_for(now))
+
     def progress(self, now: float) -> Progress:
         """How far it is."""
         received, total = (0, self._table.count) if self.download is None else self.download.progress
         running = now - self._first_value_at
-        rate = received / running if received and running > 0 else 0.0
+        came = received - (0 if self.download is None else self.download.resumed)
+        rate = came / running if came > 0 and running > 0 else 0.0
         left = (total - received) / rate if rate and total is not None else None
         return Progress(received, total, rate, left)
 
@@ -293,15 +325,56 @@ class Fetch(Operation[FetchResult]):
             notes = (_NOT_REFRESHED,) if table.unhashed() else ()
         self.finish(self._result("cache", announcement.count, (), announcement.hash, now, notes), now)
 
-    def _begin_download(self, now: float) -> None:
+    def _begin_or_resume(self, announced: Announcement | None, now: float) -> None:
+        """Go on with what is there, if that is enough and the vehicle's count is still the same."""
+        if not present_of(self._table, self._reads):
+            self._begin_download(now)
+        elif not self._expects_hash():
+            self._resume(now)
+        elif announced is not None and now - announced.at <= FRESH_HASH:
+            self._resume_under(announced, now)
+        else:
+            self._ask_hash(self._hash_came_to_resume, now)
+
+    def _hash_came_to_resume(self, read: Read) -> None:
+        if read.result is not None:
+            message = read.result
+            announced = int.from_bytes(message.raw, "little")
+            self._resume_under(Announcement(announced, message.param_count, read.ended_at), read.ended_at)
+        elif isinstance(read.error, UnknownParameter):
+            self._is_hash_unknown = True
+            self._resume(read.ended_at)
+        else:
+            self._begin_download(read.ended_at)
+
+    def _resume_under(self, announcement: Announcement, now: float) -> None:
+        self._before = announcement.hash
+        if announcement.count == self._table.count:
+            self._resume(now)
+        else:
+            self._begin_download(now)
+
+    def _resume(self, now: float) -> None:
+        self._begin_download(now, present=present_of(self._table, self._reads))
+
+    def _begin_download(self, now: float, present: Mapping[int, str] | None = None) -> None:
         if self._policy is not Policy.AUTO:
             self._stay_with_cache(now)
             return
         self._doubt(now)
         download = self.download = Download(
-            self._target, self._round_trip, self._send, self._reads, now, listed=self._listed
+            self._target,
+            self._round_trip,
+            self._send,
+            self._reads,
+            self._turns,
+            now,
+            listed=self._listed,
+            count=self._table.count,
+            present=present,
         )
-
+        if download.done:
+            self._download_ended(download)
         download.on_done.append(partial(self._download_ended, download))
 
     def _stay_with_cache(self, now: float) -> None:
@@ -309,9 +382,7 @@ class Fetch(Operation[FetchResult]):
         table = self._table
         if not table.params:
             system, component = self._target
-            what = (
-                f"nothing is cached of {system}/{component}, and the policy {self._policy} allows no download"
-            )
+            what = f"nothing is cached of {system}/{component}, and the policy is {self._policy}"
             self.fail(CacheError(what), now)
             return
         present = {param.index for param in table.listed()}
@@ -345,11 +416,19 @@ class Fetch(Operation[FetchResult]):
         volatile, is_proven = find_volatile(table.listed(), announced, believed=table.volatile)
         if is_proven:
             table.confirm(announced, volatile, proven=True)
+            table.verify()
         return is_proven
 
     def _remove_what_is_gone(self, download: Download) -> None:
+        table = self._table
+        table.place(download.names)
         present = frozenset(download.names.values())
-        gone = self._table.remove(lambda param: param.index is not None and param.name not in present)
+        gone = table.remove(
+            lambda param: (
+                param.name not in present and (param.index is not None or param.name in table.displaced)
+            )
+        )
+        table.displaced.clear()
         self._changed(gone)
 
     def _hash_came_last(self, download: Download, read: Read) -> None:
@@ -367,8 +446,16 @@ class Fetch(Operation[FetchResult]):
             table.unconfirm()
         if after is not None and not download.missing:
             volatile, proven = find_volatile(table.listed(), after, believed=table.volatile)
+            if download.resumed and not proven:
+                # what was heard earlier is not what the vehicle has now, or cannot be told from it
+                self._notes = (_NOT_RESUMED,)
+                self._before = self._meanwhile = None
+                self._was_asked_meanwhile = False
+                self._begin_download(now)
+                return
             if proven or after == self._before:
                 table.confirm(after, volatile, proven=proven)
+                table.verify()
                 notes += () if proven else (_UNPROVEN,)
             else:
                 notes += (_UNBRACKETED,) if self._before is None else (_MOVED,)
@@ -380,9 +467,12 @@ class Fetch(Operation[FetchResult]):
         table = self._table
         if not missing:
             table.complete = download.is_settled
-            if table.hash is not None:
-                table.verify()  # what came before the component was lost for a while
+        else:
+            table.place(download.names)
         table.count = count
+        if download.resumed and table.hash is None:
+            earlier = sum(param.trust is Trust.CACHED for param in table.listed())
+            notes += (_FROM_MEMORY.format(earlier),) if earlier else ()
         self.finish(
             self._result("stream", count, missing, table.hash if not missing else None, now, notes), now
         )
@@ -409,7 +499,8 @@ class Fetch(Operation[FetchResult]):
             missing,
             confirmed,
             elapsed,
-            notes,
+            self._notes + notes,
+            resumed=0 if download is None else download.resumed,
             lost=0 if download is None else download.lost,
             repeated=0 if download is None else download.repeated,
             round_trip=self._round_trip.smoothed,
@@ -421,6 +512,16 @@ class Fetch(Operation[FetchResult]):
             self._reads.release(read)
         if self.download is not None:
             self.download.cancel()
+
+
+def present_of(table: Table, reads: Reads) -> dict[int, str]:
+    """What is there of an unfinished table, by index; nothing where that is too little to go on with."""
+    count = table.count
+    if table.complete or not count:
+        return {}
+    present = table.present()
+    # with a list's pace measured, the download finds out itself whether another one is faster
+    return present if reads.pace.gap or len(present) >= ENOUGH_PRESENT * count else {}
 
 
 _UNPROVEN = (
@@ -437,7 +538,13 @@ _NOT_CONFIRMED = (
     "The vehicle's hash did not confirm the cached table, and the policy hash-only allows no download: "
     "the values are those last known."
 )
-_NOT_REFRESHED = (
-    "What the hash leaves out was not read afresh, as the policy is hash-only: those values stay cached."
-)
+_NOT_REFRESHED = "What the hash leaves out was not read afresh, as the policy is hash-only."
 _UNSETTLED = "The number of parameters kept changing during the download."
+_NOT_RESUMED = (
+    "What an earlier download had brought could not be confirmed by the vehicle's hash, "
+    "so all was downloaded anew."
+)
+_FROM_MEMORY = (
+    "{} values are those of an earlier session: this vehicle has no hash to confirm them. "
+    "A fetch with refresh=True reads them anew."
+)

@@ -7,7 +7,7 @@ from typing import Final
 
 from paramclient.protocol.timing import RoundTrip
 
-__all__ = ["Pace"]
+__all__ = ["Pace", "Share"]
 
 FIRST_RATE: Final = 50.0
 """Requests a second before anything is known: what ArduPilot serves, the slowest autopilot there is."""
@@ -25,6 +25,9 @@ QUEUEING: Final = 0.12
 answers once in 100 ms."""
 ENOUGH_SERVED: Final = 0.5
 """The share of the requests that must be answered for a rate to count as served."""
+LOSS_MARGIN: Final = 0.1
+"""By how much more exchanges may fail than the list's losses explain before that is the component's doing:
+one that is asked too fast drops requests, and that must not pass for a bad link."""
 ROUNDING: Final = 1e-9
 """Of a token: without it, what `next_at` promises could be missed by the last bit of a float, for ever."""
 ENOUGH_SERVED_LATE: Final = 0.8
@@ -36,43 +39,107 @@ VALUE_SIZE: Final = 37
 """Bytes of a PARAM_REQUEST_READ by index and of a PARAM_VALUE, in MAVLink 2."""
 
 
+class Share:
+    """What the reads of all components of one link may take of it together: a third of its rate.
+
+    That is the rate at which their lists were seen to come, of those that ran beside each other the sum. It
+    is divided evenly among the components that are asked for something.
+
+    Attributes:
+        each: requests a second that every one of them may send.
+    """
+
+    __slots__ = ("_askers", "_best", "_streams", "each")
+
+    def __init__(self) -> None:
+        self._askers: set[Pace] = set()
+        self._streams: dict[Pace, tuple[float, float]] = {}
+        self._best: dict[Pace, float] = {}
+        self.each = LARGEST_RATE
+
+    def join(self, pace: Pace) -> None:
+        """A component is asked for something."""
+        self._askers.add(pace)
+        self._divide()
+
+    def leave(self, pace: Pace) -> None:
+        """Nothing is asked of it any more."""
+        self._askers.discard(pace)
+        self._divide()
+
+    def stream_seen(self, pace: Pace, rate: float, loss: float) -> None:
+        """A component sends its list with so many values a second, of which a share is lost."""
+        if pace in self._best:
+            self._best = {}  # of an earlier list of it
+        self._streams[pace] = rate, rate * (1.0 - loss)
+        self._divide()
+
+    def stream_ended(self, pace: Pace) -> None:
+        """Its list is over. What it has shown of the link counts on until it sends another."""
+        if pace in self._streams:
+            rates = self._rates()
+            if sum(rates.values()) > sum(self._best.values()):
+                self._best = rates
+            del self._streams[pace]
+            self._divide()
+
+    def _rates(self) -> dict[Pace, float]:
+        """Values a second of the lists that run: beside another one, lost values show no room on the link."""
+        is_alone = len(self._streams) == 1
+        return {pace: sent if is_alone else came for pace, (sent, came) in self._streams.items()}
+
+    def _divide(self) -> None:
+        values = max(sum(self._best.values()), sum(self._rates().values()))
+        if values:
+            requests = values * VALUE_SIZE * UPSTREAM_SHARE / REQUEST_SIZE
+            self.each = max(requests, SMALLEST_RATE) / max(len(self._askers), 1)
+
+
 class Pace:
     """A token bucket whose rate follows what the component serves.
 
     As long as requests wait for their turn and answers come no later than before, the rate doubles with the
     first look and grows fourfold with each further one. When answers begin to queue up, or fewer come than
     should, it falls to what was answered, and from there on only creeps.
-    It never takes more than a third of the rate at which the list's stream was seen to come.
+    It never takes more than the component's share of the link.
+
+    Args:
+        round_trip: the component's.
+        share: the link's; None for a component that has the link for itself.
 
     Attributes:
-        stream_gap: seconds from one value of the list to the next, as last seen; 0 before one was.
+        gap: seconds between two values of its list, as far as it was measured; 0 before.
     """
 
     __slots__ = (
         "_answers",
-        "_cap",
         "_epoch_at",
         "_is_found",
         "_late",
+        "_likely_loss",
         "_quickest",
         "_rate",
         "_round_trip",
+        "_sent",
+        "_share",
         "_timed",
         "_tokens",
         "_tokens_at",
         "_was_short",
-        "stream_gap",
+        "gap",
     )
 
-    def __init__(self, round_trip: RoundTrip) -> None:
+    def __init__(self, round_trip: RoundTrip, share: Share | None = None) -> None:
         self._round_trip = round_trip
-        self.stream_gap = 0.0
+        self._share = Share() if share is None else share
+        self.gap = 0.0
+        self._likely_loss = 1.0  # of exchanges, by what the list has lost
         self._rate = FIRST_RATE
-        self._cap = LARGEST_RATE
         self._tokens = SMALLEST_BURST
         self._tokens_at = -math.inf
         self._epoch_at = math.inf
         self._answers = 0
+        self._sent = 0
         self._timed = 0
         self._late = 0.0
         self._quickest = math.inf
@@ -82,12 +149,12 @@ class Pace:
     @property
     def rate(self) -> float:
         """Requests a second."""
-        return max(min(self._rate, self._cap), SMALLEST_RATE)
+        return min(self._rate, self._share.each)
 
     @property
     def prospect(self) -> float:
         """Requests a second that the next look may allow: what is served is not found yet."""
-        return self.rate if self._is_found else min(self.rate * self._growth, self._cap)
+        return self.rate if self._is_found else min(self.rate * self._growth, self._share.each)
 
     @property
     def _growth(self) -> float:
@@ -98,7 +165,7 @@ class Pace:
 
     @property
     def _burst(self) -> float:
-        return max(self.rate * BURST_TIME, min(SMALLEST_BURST, self._cap * BURST_TIME * 2), 1.0)
+        return max(self.rate * BURST_TIME, min(SMALLEST_BURST, self._share.each * BURST_TIME * 2), 1.0)
 
     def may_send(self, now: float, reserve: float = 0.0) -> bool:
         """Whether a request may go out now; with a reserve, whether that many more still could."""
@@ -117,7 +184,9 @@ class Pace:
         """A request went out."""
         self._fill(now)
         self._tokens -= 1.0
+        self._sent += 1
         if self._epoch_at == math.inf:
+            self._share.join(self)
             self._epoch_at = now + (self._round_trip.smoothed or 0.0)
 
     def answered(self, delay: float | None, now: float) -> None:
@@ -133,35 +202,52 @@ class Pace:
         if self._answers >= EPOCH_ANSWERS and now - self._epoch_at >= EPOCH:
             self._look(now)
 
-    def stream_seen(self, gap: float) -> None:
-        """The list's stream brings a value every `gap` seconds."""
-        self.stream_gap = gap
+    def stream_seen(self, gap: float, loss: float = 0.0, gain: float = 1.0) -> None:
+        """The list's stream brings a value every `gap` seconds, but for the share of them that is lost.
+
+        The link is known to be so many times faster.
+        """
         if gap > 0:
-            self._cap = VALUE_SIZE / gap * UPSTREAM_SHARE / REQUEST_SIZE
+            self.gap = gap
+            self._likely_loss = 1.0 - (1.0 - loss) ** 2 + LOSS_MARGIN
+            self._share.stream_seen(self, gain / gap, loss)
+
+    def stream_ended(self) -> None:
+        """It brings no more."""
+        self._share.stream_ended(self)
+
+    def rest(self) -> None:
+        """What was answered of late tells nothing: what is measured next begins anew."""
+        self._begin_epoch(math.inf)
 
     def idle(self) -> None:
         """Nothing is asked for any more: what is measured next begins anew."""
-        self._epoch_at = math.inf
+        self._share.leave(self)
+        self._begin_epoch(math.inf)
+
+    def _begin_epoch(self, at: float) -> None:
+        self._epoch_at = at
         self._answers = 0
+        self._sent = 0
         self._timed = 0
         self._late = 0.0
         self._was_short = False
 
     def _look(self, now: float) -> None:
         elapsed = now - self._epoch_at
-        served = self._answers / elapsed / (1.0 - min(self._round_trip.loss, 0.9))
+        served = self._answers / elapsed / (1.0 - min(self._round_trip.loss, self._likely_loss, 0.9))
         late = self._late / self._timed if self._timed else 0.0
         is_queueing = late > 1.25 * self._quickest + QUEUEING
         # few answers say little; that those which came were late as well says more
         enough = ENOUGH_SERVED_LATE if late > LATE * self._quickest else ENOUGH_SERVED
-        if is_queueing or (self._was_short and served < enough * self._rate):
+        expected = min(self._rate, self._sent / elapsed)  # it may have been asked for less
+        if is_queueing or (self._was_short and served < enough * expected):
             self._rate = max(min(served, self._rate), FIRST_RATE)
             self._is_found = True
         elif self._was_short:
             self._rate = min(self._rate * self._growth, LARGEST_RATE)
-        self.idle()
         # what comes within the next round trip answers to the rate before
-        self._epoch_at = now + self._quickest
+        self._begin_epoch(now + self._quickest)
 
     def _fill(self, now: float) -> None:
         if now > self._tokens_at:

@@ -9,8 +9,8 @@ from typing import Final, TypeAlias
 
 from paramclient.errors import NoReply, ParamErrorCode, Refused, TypeMismatch, UnknownParameter, VehicleError
 from paramclient.protocol.operation import Operation
-from paramclient.protocol.pacing import Pace
-from paramclient.protocol.timing import FEWEST_TRIES, LONGEST_SILENCE, MOST_TRIES, RoundTrip
+from paramclient.protocol.pacing import Pace, Share
+from paramclient.protocol.timing import FEWEST_TRIES, LONGEST_SILENCE, MEMORY, MOST_TRIES, RoundTrip
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
 
 __all__ = ["Key", "Read", "Reads"]
@@ -19,7 +19,7 @@ Key: TypeAlias = str | int
 """What a read asks for: a name, or an index."""
 
 CONTROL: Final = 0
-"""The index that is asked for to learn whether the component answers at all."""
+"""The index that every component with parameters has, and that is asked for where none is known to answer."""
 COPY_RESERVE: Final = 2.0
 """Requests that must remain possible when one is sent again early."""
 COPY_RISK: Final = 0.01
@@ -28,8 +28,12 @@ MOST_COPIES: Final = 6
 SILENCES_TO_SPARE: Final = 24
 """Time-outs in a row, with no answer at all between them, after which asking twice cannot be of help."""
 SILENCES_TO_GIVE_UP: Final = 16
-"""Time-outs in a row, within `LONGEST_SILENCE` at the least, after which the component is one that does not
-answer reads at all: where two exchanges of three are lost, it comes to that once in 650 times."""
+"""Time-outs in a row, in twice `LONGEST_SILENCE` at the least, after which a component that is heard is one
+that answers no reads at all: where two exchanges of three are lost, it comes to that once in 650 times."""
+FEWEST_CONTROLS: Final = 3
+BAD_LUCK: Final = 1e-6
+"""Answered controls, at the least, and the chance of bad luck below which a silence is the component's doing,
+by the share of the controls that were answered. Where much is silent, no other share tells of the link."""
 ENOUGH_CONTROLS: Final = 4
 """Answered controls, at the least, after which a silence is the component's and not the link's."""
 
@@ -61,7 +65,7 @@ class Reads:
     """Every read of one component: as fast as it serves them, single ones before a download's.
 
     Silence is not an answer: PX4 up to 1.17 and ArduPilot say nothing to what they do not have. What stays
-    silent is therefore asked for together with index 0, which every component with parameters has. When that
+    silent is therefore asked for together with an index that it has. When that
     keeps being answered, and a name that nobody has heard of or an index that is not below the count does
     not, the link is not the reason: the parameter is unknown.
 
@@ -71,6 +75,9 @@ class Reads:
         list_runs_again: set while a list comes for another time: then it may answer reads by index, and that
             tells nothing of the round trip.
         is_idle: false while a list comes: then nothing is asked for twice to save time.
+        list_until: until when a list may still come that nobody follows any more.
+        control: the index that is asked for to learn whether the component answers at all: one that is known
+            to be there.
     """
 
     def __init__(
@@ -79,12 +86,13 @@ class Reads:
         round_trip: RoundTrip,
         send: Callable[[Message], None],
         is_known: Callable[[Key], bool],
+        share: Share | None = None,
     ) -> None:
         self._target = target
         self._round_trip = round_trip
         self._send = send
         self._is_known = is_known
-        self.pace = Pace(round_trip)
+        self.pace = Pace(round_trip, share)
         self._open: dict[Key, Read] = {}
         self._flying: dict[Key, Read] = {}
         self._again: deque[Read] = deque()
@@ -95,8 +103,13 @@ class Reads:
         self.is_idle = True
         self._silences = 0  # time-outs since anything was answered
         self._silent_since = math.inf  # the first request since then
+        self.list_until = -math.inf
+        self.control = CONTROL
         self._control_at = math.inf
+        self._control_index = CONTROL  # of the one under way
         self._control_attempts = 0
+        self._controls_sent = 0.0  # the last fifty or so count
+        self._controls_answered = 0.0
 
     def __len__(self) -> int:
         return len(self._open)
@@ -127,8 +140,7 @@ class Reads:
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here after it went into the table."""
         wanted = self._open
-        found = (wanted.get(message.param_id), wanted.get(message.param_index)) if wanted else ()
-        for read in found:
+        for read in (wanted.get(message.param_id), wanted.get(message.param_index)) if wanted else ():
             if read is None or wanted.get(read.key) is not read:
                 continue
             if read.attempts:
@@ -136,14 +148,16 @@ class Reads:
             self._drop(read)
             read.finish(message, now)
             self._send_waiting(now)
-        if message.param_index == CONTROL and self._control_at < math.inf:
+        if message.param_index == self._control_index and self._control_at < math.inf:
             # one that was lost may have nobody left to ask again; then this is not its answer
             is_late = now - self._control_at > 2 * self._round_trip.timeout
             self._round_trip.answered(self._control_at, now, self._control_attempts + is_late)
             self._control_at = math.inf
             self._not_silent(now)
-            for read in self._flying.values():
-                read.controls += read.attempts > 1
+            if not self.list_runs_again:  # else it may have brought the value
+                self._controls_answered += 1
+                for read in self._flying.values():
+                    read.controls += read.attempts > 1
 
     def refused(self, message: ParamError, now: float) -> None:
         """A PARAM_ERROR that may be about a read."""
@@ -203,6 +217,16 @@ class Reads:
                 self._again.append(read)
         self._send_waiting(now)
 
+    def is_silent(self, now: float) -> bool:
+        """Whether nothing at all was answered for so long, and so often, that it leads nowhere."""
+        tries = min(self._round_trip.tries, MOST_TRIES)
+        return self._silences >= tries and now - self._silent_since >= LONGEST_SILENCE
+
+    def forgive(self) -> None:
+        """The silence so far has another reason."""
+        self._silences = 0
+        self._silent_since = math.inf
+
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity."""
         earliest = math.inf
@@ -240,11 +264,16 @@ class Reads:
                 read.fail(error, now)
 
     def _is_hopeless(self, read: Read, now: float) -> bool:
-        if now - self._silent_since >= LONGEST_SILENCE and (
-            self._silences >= MOST_TRIES
-            or (self._silences >= SILENCES_TO_GIVE_UP and read.attempts >= FEWEST_TRIES)
+        silent_for = now - self._silent_since
+        is_mute = read.attempts >= FEWEST_TRIES and silent_for >= 2 * LONGEST_SILENCE
+        if (self._silences >= MOST_TRIES and silent_for >= LONGEST_SILENCE) or (
+            self._silences >= SILENCES_TO_GIVE_UP and is_mute
         ):
             return True  # not one of all these was answered
+        if read.controls >= FEWEST_CONTROLS and read.attempts >= FEWEST_TRIES:
+            lost = 1 - (self._controls_answered + 0.5) / (self._controls_sent + 1)
+            if lost**read.attempts < BAD_LUCK:
+                return True
         # half as often will do where nothing speaks for it and the link is good enough for others
         weight = 2 if self._seems_unknown(read) else 1
         return self._round_trip.is_hopeless(weight * read.attempts, now)
@@ -262,8 +291,7 @@ class Reads:
 
     def _not_silent(self, now: float) -> None:
         self.answered_at = now
-        self._silences = 0
-        self._silent_since = math.inf
+        self.forgive()
 
     def _silence(self, read: Read, now: float) -> Exception:
         system, component = self._target
@@ -290,7 +318,7 @@ class Reads:
         self._silent_since = min(self._silent_since, now)
         self.pace.sent(now)
         self._request(read)
-        if read.key != CONTROL and read.attempts > (2 if self._is_known(read.key) else 1):
+        if read.key != self.control and read.attempts > (2 if self._is_known(read.key) else 1):
             self._send_control(now)
 
     def _request(self, read: Read) -> None:
@@ -309,8 +337,11 @@ class Reads:
         else:
             self._control_attempts = 1
         self._control_at = now
+        self._control_index = self.control
+        self._controls_sent = self._controls_sent * MEMORY + 1
+        self._controls_answered *= MEMORY
         self.pace.sent(now)
-        self._send(ParamRequestRead(*self._target, "", CONTROL))
+        self._send(ParamRequestRead(*self._target, "", self.control))
 
     def _send_waiting(self, now: float) -> None:
         """Send what waits, as far as the pace allows; on an idle link ask twice rather than wait."""
@@ -333,10 +364,9 @@ class Reads:
         """A read that is worth asking for once more while its answer may be on the way."""
         if not self.is_idle or not self._flying or self._silences >= SILENCES_TO_SPARE:
             return None
-        loss = self._round_trip.seen_loss
-        if loss < COPY_RISK:
+        most = self._round_trip.copies(COPY_RISK, MOST_COPIES + 1) - 1
+        if not most:
             return None
-        most = min(math.ceil(math.log(COPY_RISK) / math.log(loss)) - 1, MOST_COPIES)
         fewest = min(self._flying.values(), key=lambda read: read.copies)
         return fewest if fewest.copies < most and fewest.sent_at < math.inf else None
 

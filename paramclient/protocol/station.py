@@ -10,9 +10,10 @@ from paramclient.errors import LinkError, UsageError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentHeard, Event
-from paramclient.protocol.fetch import Fetch, Policy
+from paramclient.protocol.fetch import Fetch, Policy, present_of
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.traffic import Traffic
+from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import (
     AUTOPILOT_COMPONENT,
     COMP_ID_ALL,
@@ -100,6 +101,7 @@ class Station:
         self._sequence = 0
         self._heartbeat_at = -math.inf
         self._is_paused = False
+        self._turns = Turns()
 
     def receive(self, data: bytes, peer: Peer, now: float) -> bool:
         """Take a datagram, or a chunk of a stream. An empty chunk says that the peer's stream has ended.
@@ -133,6 +135,7 @@ class Station:
         for machine in list(self.components.values()):
             if machine.next_deadline() <= now:
                 machine.tick(now)
+        self._turns.tick(now)
         if self.traffic is not None:
             self.traffic.sent(self.bytes_sent, now)
 
@@ -140,7 +143,10 @@ class Station:
         """When `tick` has something to do, or infinity while the link is away."""
         if self._is_paused:
             return math.inf
-        return min([self._heartbeat_at, *(machine.next_deadline() for machine in self.components.values())])
+        turns_at = self._turns.next_deadline()
+        return min(
+            [self._heartbeat_at, turns_at, *(machine.next_deadline() for machine in self.components.values())]
+        )
 
     def data_to_send(self) -> list[tuple[bytes, Peer | None]]:
         """Frames to send, in order, each with the peer it is for; None is for all."""
@@ -166,6 +172,7 @@ class Station:
         """The link is back: our heartbeat goes out, and whatever waits is asked for again."""
         self._is_paused = False
         self._heartbeat_at = now
+        self._turns.resume(now)
         for machine in self.components.values():
             machine.resume(now)
 
@@ -217,13 +224,13 @@ class Station:
     ) -> list[Fetch]:
         """Begin a fetch of several components of one system.
 
-        When they are all that is known of it, none of them can be confirmed by its hash, and none is being
-        fetched, the list is asked for once, of all components.
+        When they are all that is known of it, none of them has a table worth going on with, none is being
+        fetched, and no other list runs, the list is asked for once, of all components.
         """
-        is_new = all(machine.fetch is None for machine in machines)
+        is_new = self._turns.is_free and all(machine.fetch is None for machine in machines)
         may_list = self.policy is Policy.AUTO
-        cannot_hit = refresh or not any(machine.can_hit for machine in machines)
-        if len(machines) > 1 and may_list and is_new and cannot_hit:
+        is_fresh = refresh or not any(m.can_hit or present_of(m.table, m.reads) for m in machines)
+        if len(machines) > 1 and may_list and is_new and is_fresh:
             system = machines[0].system
             known = [m for m in self.components.values() if m.system == system and m.who.has_parameters]
             if len(known) == len(machines):
@@ -280,6 +287,7 @@ class Station:
             is_link_busy=lambda: self.is_waiting,
             is_vehicle_doubted=lambda: self._autopilot_is_doubted(system),
             another=lambda now: self._become_another(system, now),
+            turns=self._turns,
         )
         self.components[sender] = machine
         self._events.append(ComponentHeard(machine))

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 from paramclient.protocol.wire import NO_INDEX, ParamValue
-from paramclient.values import Encoding, Param, Trust, decode, known_type, px4_hash
+from paramclient.values import Encoding, Param, Trust, Value, as_sent, decode, from_bits, known_type, px4_hash
 
 __all__ = ["Change", "Table"]
 
 MOST_NAMES: Final = 65_535
 """Names that one table may hold. No more can have an index; a component that invents further ones is ill."""
 
+_EXACT = 1 << 24  # up to here every integer is a float32
 _LIVE = Trust.LIVE  # each look into an enumeration takes a tenth of what a value takes here
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
 
@@ -38,11 +40,14 @@ class Table:
 
     Attributes:
         params: by name, in the order in which they were first heard. Shared with readers; never replaced.
-        count: the param_count heard last, or None.
+        count: the param_count heard last, or None. Indices are those under this count: when it moves, none is
+            known any more.
         volatile: names that the vehicle leaves out of its hash, as far as known.
         volatile_known: whether a recomputed hash has proven that set.
         complete: whether every index below `count` has its parameter here.
         hash: the PX4 hash under which the vehicle would confirm exactly this table, or None while unknown.
+        displaced: names whose index was of an earlier count, and that the vehicle may no longer have; some of
+            them may have come again since.
         dirty: names whose value, type or index changed since `take_dirty` was called last.
     """
 
@@ -52,6 +57,7 @@ class Table:
         self.volatile: frozenset[str] = frozenset()
         self.volatile_known = False
         self.complete = False
+        self.displaced: set[str] = set()
         self.dirty: dict[str, str] = {}
         self._hash: int | None = None
         self._hash_is_stale = False
@@ -107,11 +113,16 @@ class Table:
                 return None
         elif old.type == number and self._wire.get(name) == raw:
             if old.index != index:
-                self.params[name] = Param(name, old.value, old.type, index, old.bits, Trust.LIVE)
+                self.params[name] = Param(name, old.value, old.type, index, old.bits, Trust.LIVE, old.default)
                 self.dirty.setdefault(name, by)
             return None
         value, bits = decode(raw, number, self._encoding)
-        new = Param(name, value, known_type(number), index, bits, _LIVE)
+        default: Value | None = None
+        if old is not None and old.type == number:
+            default = old.default
+            if self._rounds(old, raw):
+                value, bits = old.value, old.bits
+        new = Param(name, value, known_type(number), index, bits, _LIVE, default)
         self.params[name] = new
         self._wire[name] = raw
         if old is not None and old.same_value(new):
@@ -123,6 +134,38 @@ class Table:
             self._moved(name)
         return _new(Change, (name, old, new, by))
 
+    def take(
+        self, name: str, number: int, bits: int, index: int, default: int | None, *, is_older: bool
+    ) -> Change | None:
+        """Take one entry of a packed parameter file; give the change if it brought one.
+
+        Its integers are exact, also where a PARAM_VALUE rounds them.
+
+        Args:
+            name, number: param_id and type.
+            bits, default: the value and the firmware's default, as in `Param.bits`.
+            index: its place in the list.
+            is_older: whether a PARAM_VALUE of it was heard since the file was asked for: then that counts,
+                unless it rounds what the file says.
+        """
+        kind = known_type(number)
+        initial = None if default is None else from_bits(default, number)
+        old = self.params.get(name)
+        raw = as_sent(bits, number, self._encoding)
+        if is_older and old is not None and (old.type != number or self._wire.get(name) != raw):
+            self.params[name] = replace(old, index=index, default=initial)
+            self.dirty.setdefault(name, "vehicle")
+            return None
+        new = self.params[name] = Param(name, from_bits(bits, number), kind, index, bits, _LIVE, initial)
+        self._wire[name] = raw
+        if old is None or old.index != index or old.default != initial:
+            self.dirty.setdefault(name, "vehicle")
+        if old is not None and old.same_value(new):
+            return None
+        self.dirty[name] = "vehicle"
+        self._moved(name)
+        return Change(name, old, new)
+
     def use_encoding(self, encoding: Encoding) -> list[Change]:
         """Read everything that was heard in another encoding; give what looks different now."""
         if encoding is self._encoding:
@@ -132,7 +175,7 @@ class Table:
         for name, raw in self._wire.items():
             old = self.params[name]
             value, bits = decode(raw, old.type, encoding)
-            new = Param(name, value, old.type, old.index, bits, old.trust)
+            new = Param(name, value, old.type, old.index, bits, old.trust, old.default)
             self.params[name] = new
             if not old.same_value(new):
                 self.dirty.setdefault(name, "vehicle")
@@ -146,6 +189,7 @@ class Table:
         count: int | None,
         confirmed: int | None,
         complete: bool,
+        placed: bool,
         volatile: frozenset[str],
         volatile_known: bool,
     ) -> list[Change]:
@@ -155,9 +199,10 @@ class Table:
             params: the cached table.
             count: the param_count with it; with another one than was heard, nothing below counts.
             confirmed: the hash under which the vehicle would confirm it, or None.
+            placed: whether its indices still hold.
             complete, volatile, volatile_known: as the attributes.
         """
-        changes = self.fill(params)
+        changes = self.fill(params, placed=placed and self.count in (None, count))
         if self.count not in (None, count):
             return changes
         self.count = count
@@ -174,15 +219,56 @@ class Table:
                 self.unconfirm()
         return changes
 
-    def fill(self, params: Mapping[str, Param]) -> list[Change]:
-        """Put in what the cache knows, as *cached*; what was heard on this link stays."""
+    def fill(self, params: Mapping[str, Param], *, placed: bool = True) -> list[Change]:
+        """Put in what the cache knows, as *cached*; what was heard on this link stays.
+
+        Args:
+            params: the cached table.
+            placed: whether its indices are still worth anything.
+        """
         changes = []
         for name, param in params.items():
             if name not in self.params:
                 new = param.with_trust(Trust.CACHED)
+                if not placed and new.index is not None:
+                    new = self._displaced(new)
                 self.params[name] = new
                 changes.append(Change(name, None, new))
         return changes
+
+    def move(self, count: int) -> None:
+        """Another count was heard: which parameter has which index is open again."""
+        if self.count is not None:
+            self.complete = False
+            for param in self.listed():
+                self.params[param.name] = self._displaced(param)
+        self.count = count
+
+    @property
+    def is_displaced(self) -> bool:
+        """Whether there are names whose index is open since the count moved."""
+        params = self.params
+        self.displaced = {name for name in self.displaced if name in params and params[name].index is None}
+        return bool(self.displaced)
+
+    def place(self, names: Mapping[int, str]) -> None:
+        """A download has settled which parameter has which index."""
+        for index, name in names.items():
+            param = self.params.get(name)
+            if param is not None and param.index != index:
+                self.params[name] = Param(name, param.value, param.type, index, param.bits, param.trust)
+                self.dirty.setdefault(name, "vehicle")
+
+    def present(self) -> dict[int, str]:
+        """Names by index, as far as they are known under the count of now; none where two claim one index."""
+        names: dict[int, str] = {}
+        twice = set()
+        for param in self.listed():
+            assert param.index is not None
+            if names.setdefault(param.index, param.name) != param.name:
+                twice.add(param.index)
+        count = self.count or 0
+        return {index: name for index, name in names.items() if index < count and index not in twice}
 
     def verify(self) -> None:
         """The vehicle's hash has confirmed it: what is cached and counts into it becomes *verified*."""
@@ -221,6 +307,19 @@ class Table:
         """Names that changed since the last call, each with who did it; gone names too."""
         dirty, self.dirty = self.dirty, {}
         return dirty
+
+    def _rounds(self, known: Param, raw: bytes) -> bool:
+        """Whether a message rounds what is known exactly: an integer beyond the 24 bits of a float32."""
+        return (
+            self._encoding is Encoding.C_CAST
+            and isinstance(known.value, int)
+            and abs(known.value) > _EXACT
+            and as_sent(known.bits, known.type, self._encoding) == raw
+        )
+
+    def _displaced(self, param: Param) -> Param:
+        self.displaced.add(param.name)
+        return replace(param, index=None)
 
     def _moved(self, name: str) -> None:
         if name in self.volatile:

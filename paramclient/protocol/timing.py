@@ -11,10 +11,15 @@ INITIAL_TIMEOUT: Final = 1.0
 """Seconds before anything was measured (RFC 6298, 2.1)."""
 SHORTEST_TIMEOUT: Final = 0.1
 """ArduPilot answers reads in batches every 100 ms, PX4 once in its loop: asking sooner gains nothing."""
+SERVING_TIME: Final = 0.22
+"""Seconds that the first reads get beyond the first samples, which may be of what is answered at once:
+ArduPilot answers ten reads in two batches."""
 LONGEST_TIMEOUT: Final = 4.0
 """To which backing off leads; a link that is measured to be slower than that gets what it needs."""
-SILENCES_TO_BACK_OFF: Final = 6
-"""Time-outs in a row that loss alone hardly explains."""
+FEWEST_SILENCES: Final = 6
+MOST_SILENCES: Final = 30
+UNEXPLAINED: Final = 1e-3
+"""Time-outs in a row that lead to backing off: as many as loss alone explains with this chance."""
 FEW_SAMPLES: Final = 8
 """Samples below which the variation is a guess: the time-out is then at most two round trips."""
 GRANULARITY: Final = 0.02
@@ -28,7 +33,8 @@ LONGEST_SILENCE: Final = 20.0
 """Seconds without a word, not even one of the heartbeats that come every second, after which a component that
 was asked `FEWEST_TRIES` times counts as gone."""
 _CHANCE_OF_BAD_LUCK = 1e-6
-_MEMORY = 0.98  # weight that older answers keep with each new one: about the last 50 count
+MEMORY: Final = 0.98
+"""Weight that older answers keep with each new one: about the last fifty count."""
 
 
 class RoundTrip:
@@ -68,11 +74,19 @@ class RoundTrip:
     @property
     def timeout(self) -> float:
         """Seconds to wait for an answer before asking again."""
+        return self._wait(0.0 if self.smoothed is None else self.smoothed + SERVING_TIME)
+
+    @property
+    def prompt_timeout(self) -> float:
+        """The same for what is answered at once, or as soon as the vehicle looks at it."""
+        return self._wait(0.0)
+
+    def _wait(self, least_at_first: float) -> float:
         base = (
             INITIAL_TIMEOUT if self.smoothed is None else self.smoothed + max(4 * self.variation, GRANULARITY)
         )
         if self._samples < FEW_SAMPLES and self.smoothed is not None:
-            base = min(base, 2 * self.smoothed)
+            base = max(min(base, 2 * self.smoothed), least_at_first)
         base = max(base, SHORTEST_TIMEOUT)
         return min(base * self._backoff, max(LONGEST_TIMEOUT, base))
 
@@ -85,6 +99,11 @@ class RoundTrip:
     def seen_loss(self) -> float:
         """The same as far as it was seen: 0 as long as everything was answered."""
         return self._unanswered / (self._unanswered + self._answered + 1.0)
+
+    def copies(self, risk: float, most: int) -> int:
+        """How many requests at once bring the chance of no answer below a risk; one without loss."""
+        loss = self.seen_loss
+        return 1 if loss < risk else min(math.ceil(math.log(risk) / math.log(loss)), most)
 
     @property
     def tries(self) -> int:
@@ -104,12 +123,14 @@ class RoundTrip:
     def answered(self, sent_at: float, now: float, attempts: int) -> None:
         """A request got its answer; it had been sent `attempts` times, the last time at `sent_at`."""
         if attempts <= 2:
-            self._answered = self._answered * _MEMORY + 1
-            self._unanswered *= _MEMORY
+            self._answered = self._answered * MEMORY + 1
+            self._unanswered *= MEMORY
         sample = now - sent_at
         if attempts != 1:
             if sample >= LIKELY * (self.smoothed or math.inf):
-                self._silences = 0  # it may well be the answer to the last of them
+                # it may well be the answer to the last of them
+                self._silences = 0
+                self._backoff = max(self._backoff / 2, 1.0)
             return
         if self.smoothed is None:
             self.smoothed = sample
@@ -128,8 +149,10 @@ class RoundTrip:
         have no answer at all.
         """
         if attempts <= 2:
-            self._unanswered = self._unanswered * _MEMORY + 1
-            self._answered *= _MEMORY
+            self._unanswered = self._unanswered * MEMORY + 1
+            self._answered *= MEMORY
         self._silences += 1
-        if self._silences % SILENCES_TO_BACK_OFF == 0:
+        likely = math.log(UNEXPLAINED) / math.log(self.loss)
+        if self._silences >= min(max(likely, FEWEST_SILENCES), MOST_SILENCES):
+            self._silences = 0
             self._backoff = min(self._backoff * 2, LONGEST_TIMEOUT / SHORTEST_TIMEOUT)

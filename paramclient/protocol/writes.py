@@ -90,6 +90,9 @@ class Writes:
 
     Nothing is sent before it is certain how the component writes values: an integer in the wrong encoding
     would be taken as another number.
+
+    Attributes:
+        queues: by name, those that are open, the one under way first; no name has an empty one.
     """
 
     def __init__(
@@ -109,10 +112,10 @@ class Writes:
         self._params = params
         self._encoding = encoding
         self._is_certain = is_certain
-        self._queues: dict[str, deque[Write]] = {}
+        self.queues: dict[str, deque[Write]] = {}
 
     def __len__(self) -> int:
-        return len(self._queues)
+        return len(self.queues)
 
     def __contains__(self, name: str) -> bool:
         """Whether a PARAM_SET to this name is under way."""
@@ -121,7 +124,7 @@ class Writes:
     def set(self, name: str, value: Value, now: float) -> Write:
         """Begin a write, behind those to the same name that are open."""
         write = Write(name, value, now)
-        queue = self._queues.setdefault(name, deque())
+        queue = self.queues.setdefault(name, deque())
         queue.append(write)
         if len(queue) == 1:
             self._start(write, now)
@@ -129,7 +132,7 @@ class Writes:
 
     def cancel(self, write: Write, now: float) -> None:
         """Forget a write. What was sent cannot be taken back: the vehicle may have applied it."""
-        queue = self._queues.get(write.name)
+        queue = self.queues.get(write.name)
         if queue is None or write not in queue:
             return
         if queue[0] is write:
@@ -139,13 +142,13 @@ class Writes:
 
     def proceed(self, now: float) -> None:
         """It is certain now how the component writes values: begin what had to wait for that."""
-        for queue in list(self._queues.values()):
+        for queue in list(self.queues.values()):
             if queue and not queue[0].attempts and queue[0].read is None:
                 self._start(queue[0], now)
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here after it went into the table."""
-        queue = self._queues.get(message.param_id)
+        queue = self.queues.get(message.param_id)
         if queue is None or not queue[0].attempts:
             return
         write = queue[0]
@@ -187,7 +190,7 @@ class Writes:
         if not self._is_certain():
             return
         timeout = self._round_trip.timeout
-        for queue in list(self._queues.values()):
+        for queue in list(self.queues.values()):
             if not queue:
                 continue
             write = queue[0]
@@ -214,7 +217,7 @@ class Writes:
         """When `tick` has something to do, or infinity."""
         timeout = self._round_trip.timeout
         earliest = math.inf
-        for queue in self._queues.values() if self._is_certain() else ():
+        for queue in self.queues.values() if self._is_certain() else ():
             write = queue[0]
             earliest = min(earliest, write.verify_at)
             if write.attempts and write.read is None and not write.is_answered:
@@ -223,7 +226,7 @@ class Writes:
 
     def resume(self, now: float) -> None:
         """The link is back: what was under way goes on at once."""
-        for queue in list(self._queues.values()):
+        for queue in list(self.queues.values()):
             if queue and queue[0].attempts and queue[0].read is None:
                 if self._is_certain():
                     queue[0].attempts -= 1
@@ -238,7 +241,7 @@ class Writes:
         self._end_all(lambda write: error, now)
 
     def _end_all(self, error_of: Callable[[Write], Exception], now: float) -> None:
-        queues, self._queues = self._queues, {}
+        queues, self.queues = self.queues, {}
         for queue in queues.values():
             for write in queue:
                 if write.read is not None:
@@ -252,7 +255,7 @@ class Writes:
         return max(self._round_trip.timeout / 2, 0.05)
 
     def _active(self, name: str) -> Write | None:
-        queue = self._queues.get(name)
+        queue = self.queues.get(name)
         return queue[0] if queue and queue[0].attempts else None
 
     def _start(self, write: Write, now: float) -> None:
@@ -341,12 +344,12 @@ class Writes:
         if write.read is not None:
             self._reads.release(write.read)
             write.read = None
-        queue = self._queues[write.name]
+        queue = self.queues[write.name]
         queue.remove(write)
         if queue:
             self._start(queue[0], now)
         else:
-            del self._queues[write.name]
+            del self.queues[write.name]
 
     def _no_reply(self, write: Write, now: float, why: str = "") -> Exception:
         what = f"PARAM_SET {write.name} to {self._target[0]}/{self._target[1]}{why}"

@@ -11,9 +11,11 @@ from typing import Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.protocol import wire
-from paramclient.sim.table import Entry, Table, ardupilot_table, as_table, bits_of, ek2_group
+from paramclient.protocol.pack import PackedParam
+from paramclient.sim.ftp import FileServer
+from paramclient.sim.table import Entry, Table, ardupilot_table, as_table, ek2_group
 from paramclient.sim.vehicle import Vehicle, VehicleOptions
-from paramclient.values import Encoding, ParamType
+from paramclient.values import Encoding, ParamType, bits_of, from_bits
 
 __all__ = ["ArduPilotVehicle"]
 
@@ -33,6 +35,8 @@ class ArduPilotVehicle(Vehicle):
       is sent, and a STATUSTEXT.
     - A parameter that switches a group shows it while it is not 0 and hides it at 0: count and indices move.
       Hidden parameters can be read and set by name.
+    - MAVFTP serves `@PARAM/param.pck` and `files`: one session, 5 requests waiting, bursts paced to a third
+      of the link (see `FileServer`). A param.pck that is written sets parameters, and nothing tells of it.
     - Some values change by themselves and are sent unasked, index 65535.
 
     Args:
@@ -47,6 +51,9 @@ class ArduPilotVehicle(Vehicle):
             their last bit. Names that are not in the table are passed over.
         live_period: seconds between two such changes; 0 for none.
         burst, period: by default UDP. On 57600 baud it is 1 every 0.025 s.
+        ftp: whether MAVFTP is on.
+        ftp_rate: bytes per second of a burst: a third of the link. By default UDP as measured; on 57600 baud
+            it is 1920.
         options: those of every `Vehicle`. Within its `boot_time`, PARAM_REQUEST_LIST is ignored.
 
     Raises:
@@ -69,6 +76,8 @@ class ArduPilotVehicle(Vehicle):
         live_period: float = 30.0,
         burst: int = 10,
         period: float = 0.0059,
+        ftp: bool = True,
+        ftp_rate: float = 48_500.0,
         **options: Unpack[VehicleOptions],
     ) -> None:
         if groups is None:
@@ -83,6 +92,8 @@ class ArduPilotVehicle(Vehicle):
             raise UsageError(f"uid2 has up to 18 bytes, not {len(uid2)}")
         if not 0.0 <= live_period < math.inf:
             raise UsageError(f"live_period is a number of seconds from 0 up, not {live_period}")
+        if ftp:
+            self._ftp = FileServer(self._packed_params, self._apply_packed, ftp_rate)
         self._switch_of = {row.name: switch for switch, group in members.items() for row in group}
         self._switches = members.keys()
         self._read_only = frozenset(read_only)
@@ -97,7 +108,10 @@ class ArduPilotVehicle(Vehicle):
                 _QUADROTOR, wire.MAV_AUTOPILOT_ARDUPILOTMEGA, base_mode=81, system_status=_STANDBY
             ),
             version=wire.AutopilotVersion(
-                64495, flight_sw_version=67502080, git_hash=b"fbb78585", uid2=uid2.ljust(18, b"\0")
+                64495 if ftp else 64495 & ~wire.CAPABILITY_FTP,
+                flight_sw_version=67502080,
+                git_hash=b"fbb78585",
+                uid2=uid2.ljust(18, b"\0"),
             ),
             burst=burst,
             period=period,
@@ -157,6 +171,14 @@ class ArduPilotVehicle(Vehicle):
 
     def _count_in_list(self) -> int:
         return self._list_count
+
+    def _set_from_file(self, entry: Entry, param: PackedParam) -> None:
+        value = from_bits(param.bits, param.type)
+        if entry.name in self._read_only or isinstance(value, bytes) or not math.isfinite(value):
+            return
+        entry.store(param.bits if param.type == entry.type else _converted(value, entry.type))
+        if entry.name in self._switches:
+            self._relist()
 
     def _switch_on(self, at: float) -> None:
         self._waiting: deque[tuple[wire.ParamRequestRead, wire.Frame]] = deque()

@@ -8,6 +8,7 @@ from typing import Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.protocol import wire
+from paramclient.sim.ftp import FileServer
 from paramclient.sim.generic import BytewiseVehicle
 from paramclient.sim.table import Entry, SimParam, Table, as_table, px4_table
 from paramclient.sim.vehicle import VehicleOptions
@@ -29,6 +30,7 @@ class PX4Vehicle(BytewiseVehicle):
     - A wrong type, an unknown name and an unknown index are met with silence.
     - A parameter that is not in use can be read and set by name (index 65535) and is neither in the list
       nor in the hash.
+    - MAVFTP serves `files` and, if `ftp` is on as in the newest ones, `@PARAM/param.pck` (see `FileServer`).
     - It answers to its own system only, and to component 0.
 
     Args:
@@ -44,6 +46,8 @@ class PX4Vehicle(BytewiseVehicle):
         autosave: seconds from a change until all that was unsaved is saved.
         burst, period: by default UDP and USB. A serial port has a burst of 3, the low-bandwidth mode 1
             every 0.125 s.
+        ftp: whether there is a param.pck; otherwise it is said not to be found.
+        ftp_rate: bytes per second of a burst of MAVFTP.
         options: those of every `Vehicle`. A list that is asked for within its `boot_time` starts then.
 
     Raises:
@@ -68,6 +72,8 @@ class PX4Vehicle(BytewiseVehicle):
         autosave: float = 0.3,
         burst: int = 20,
         period: float = 0.020,
+        ftp: bool = False,
+        ftp_rate: float = 48_500.0,
         **options: Unpack[VehicleOptions],
     ) -> None:
         rows = px4_table() if table is None else as_table(table)
@@ -83,6 +89,13 @@ class PX4Vehicle(BytewiseVehicle):
             raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
         if not autosave >= 0.0:
             raise UsageError(f"autosave is a number of seconds from 0 up, not {autosave}")
+        self._ftp = FileServer(
+            self._packed_params if ftp else lambda: None,
+            self._apply_packed,
+            ftp_rate,
+            numbers_sessions=True,
+            burst_blocks=_BURST_BLOCKS,
+        )
         self._hash: int | None = None
         self._hash_check = hash_check
         self._autosave = autosave
@@ -220,6 +233,7 @@ _QUADROTOR = 2
 _STANDBY = 3
 _UID = 5283920058631409231
 _PUSH_DELAY = 0.020
+_BURST_BLOCKS = 146  # a burst of MAVFTP ends after 35 kB
 
 
 def _third_compass(rows: tuple[SimParam, ...]) -> tuple[SimParam, ...]:

@@ -11,20 +11,23 @@ from functools import cache
 from importlib import resources
 from typing import TypeAlias
 
-from paramclient.errors import UsageError
+from paramclient.protocol.pack import PACKABLE, PackedParam
 from paramclient.values import (
     Encoding,
     Param,
     ParamType,
     Value,
+    bits_of,
     check_name,
     check_value,
-    encode,
     from_bits,
     known_type,
 )
 
-__all__ = ["Entry", "SimParam", "Table", "ardupilot_table", "as_table", "bits_of", "ek2_group", "px4_table"]
+__all__ = ["Entry", "SimParam", "Table", "ardupilot_table", "as_table", "ek2_group", "px4_table"]
+
+FLT_EPSILON = 2.0**-23
+"""By how much ArduPilot lets a value differ from its default before it tells the default."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,6 +39,7 @@ class SimParam:
         type: any MAV_PARAM_TYPE, or the number of one that MAVLink does not define.
         value: within the type; four raw bytes for a type that MAVLink does not define.
         volatile: whether PX4 leaves it out of the hash.
+        default: the firmware's default as the number in its source, or None where it is not known.
         bits: the value's own bytes, as in `paramclient.Param.bits`.
 
     Raises:
@@ -46,6 +50,7 @@ class SimParam:
     type: ParamType | int
     value: Value = field(compare=False)
     volatile: bool = False
+    default: float | None = None
     bits: int = field(init=False)
 
     def __post_init__(self) -> None:
@@ -63,21 +68,26 @@ class Entry:
     """A parameter as the vehicle holds it now.
 
     Attributes:
-        name, type, volatile: as in `SimParam`.
+        name, type, volatile, default: as in `SimParam`.
         bits: the value, as in `SimParam.bits`.
         order: its place among all that the vehicle has, listed or not.
         index: its place in the list, or None while it is not listed.
         raw: the four bytes that stand for it in a message.
     """
 
-    __slots__ = ("_encoding", "bits", "index", "name", "order", "raw", "type", "volatile")
+    __slots__ = (
+        *("_encoding", "_packed"),
+        *("bits", "default", "index", "name", "order", "raw", "type", "volatile"),
+    )
 
     def __init__(self, row: SimParam, order: int, encoding: Encoding) -> None:
         self._encoding = encoding
         self.name = row.name
         self.type = row.type
         self.volatile = row.volatile
+        self.default = row.default
         self.order = order
+        self._packed: PackedParam | None = None
         self.index: int | None = None
         self.store(row.bits)
 
@@ -89,14 +99,37 @@ class Entry:
     def param(self) -> Param:
         return Param(self.name, self.value, self.type, self.index, self.bits)
 
+    @property
+    def packed(self) -> PackedParam | None:
+        """How it stands in param.pck, with its default if that differs; None for a type it does not have."""
+        if self._packed is None and isinstance(self.type, ParamType) and self.type in PACKABLE:
+            default = None
+            if self.default is not None and self._differs_from(self.default):
+                is_float = self.type is ParamType.REAL32
+                raw = (
+                    _cast(self.default) if is_float else int(self.default).to_bytes(8, "little", signed=True)
+                )
+                default = int.from_bytes(raw[: self.type.size], "little")
+            self._packed = PackedParam(self.name, self.type, self.bits, default)
+        return self._packed
+
     def store(self, bits: int) -> None:
         """Hold another value."""
         self.bits = bits
+        self._packed = None
         value = self.value
         if self._encoding is Encoding.BYTEWISE or self.type == ParamType.REAL32 or isinstance(value, bytes):
             self.raw = (bits & 0xFFFFFFFF).to_bytes(4, "little")
         else:
             self.raw = _cast(value)
+
+    def _differs_from(self, default: float) -> bool:
+        """As ArduPilot compares them: as float32, and by more than FLT_EPSILON."""
+        value = self.value
+        if isinstance(value, bytes):
+            return True
+        difference = struct.unpack("<f", _cast(value))[0] - struct.unpack("<f", _cast(default))[0]
+        return not abs(difference) < FLT_EPSILON
 
 
 def as_table(table: Table) -> tuple[SimParam, ...]:
@@ -108,25 +141,6 @@ def as_table(table: Table) -> tuple[SimParam, ...]:
     if isinstance(table, Mapping):
         return tuple(_row(name, entry) for name, entry in table.items())
     return tuple(table)
-
-
-def bits_of(value: Value, number: int) -> int:
-    """The value's own bytes in its type, read as a little-endian unsigned number.
-
-    Raises:
-        UsageError: the value does not fit the type.
-    """
-    value = check_value(value)
-    if number in (ParamType.UINT64, ParamType.INT64) and isinstance(value, int):
-        kind = ParamType(number)
-        low, high = kind.bounds
-        if not low <= value <= high:
-            raise UsageError(f"{value} does not fit {kind.name}, which holds {low} to {high}")
-        return value & 0xFFFFFFFF_FFFFFFFF
-    if number == ParamType.REAL64 and not isinstance(value, bytes):
-        return int.from_bytes(struct.pack("<d", value), "little")
-    size = ParamType(number).size if 1 <= number <= ParamType.REAL64 else 4
-    return int.from_bytes(encode(value, number, Encoding.BYTEWISE)[:size], "little")
 
 
 @cache
@@ -162,7 +176,9 @@ def _row(name: str, entry: Value | tuple[ParamType | int, Value]) -> SimParam:
 
 def _plain(row: dict[str, str]) -> SimParam:
     kind = ParamType[row["type"]]
-    return SimParam(row["name"], kind, int(row["value"]) if kind.is_integer else float(row["value"]))
+    value = int(row["value"]) if kind.is_integer else float(row["value"])
+    default = float(row["default"]) if "default" in row else None
+    return SimParam(row["name"], kind, value, default=default)
 
 
 def _read(name: str) -> Iterable[dict[str, str]]:

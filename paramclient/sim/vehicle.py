@@ -6,15 +6,17 @@ import math
 import struct
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from typing import TypedDict
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.protocol import wire
+from paramclient.protocol.pack import PackedParam
 from paramclient.sim.air import OUT_LIMIT
-from paramclient.sim.table import Entry, SimParam, bits_of
-from paramclient.values import Encoding, Param, Value
+from paramclient.sim.ftp import FileServer
+from paramclient.sim.table import Entry, SimParam
+from paramclient.values import Encoding, Param, Value, bits_of
 
 __all__ = ["Vehicle", "VehicleOptions"]
 
@@ -64,6 +66,7 @@ class Vehicle(ABC):
         high_latency: see the attribute.
     """
 
+    _ftp: FileServer | None = None
     _ack_first = True  # whether COMMAND_ACK comes before what the command asked for
     _position: int | None  # where the list stands, None while it is not being sent
     _last_listed: Entry | None  # what it sent last
@@ -207,6 +210,22 @@ class Vehicle(ABC):
             raise UsageError(f"count is a number of values from 1 up, not {count}")
         self._when_listed.setdefault(count, []).append(do)
 
+    @property
+    def files(self) -> dict[str, bytes]:
+        """The files that it has besides param.pck, by path; they can be changed at any time.
+
+        Raises:
+            UsageError: this vehicle does not speak MAVFTP.
+        """
+        if self._ftp is None:
+            raise UsageError("this vehicle does not speak MAVFTP")
+        return self._ftp.files
+
+    @property
+    def open_files(self) -> list[str]:
+        """The paths of the files that are open in a session of MAVFTP."""
+        return [] if self._ftp is None else self._ftp.open_files
+
     def set_param(self, name: str, value: Value) -> None:
         """Change a value as if on board or by another station; the vehicle tells of it if its kind does.
 
@@ -252,6 +271,8 @@ class Vehicle(ABC):
         if self._now < self._on_at:
             return None if self._on_at == math.inf else self._on_at
         due = [self._next_heartbeat, *self._timers()]
+        if self._ftp is not None:
+            due.append(self._ftp.next_deadline())
         return min(due) if self._high_latency else min(self._next_telemetry, self._next_burst, *due)
 
     def data_to_send(self) -> list[bytes]:
@@ -276,6 +297,11 @@ class Vehicle(ABC):
     @abstractmethod
     def _write(self, entry: Entry, bits: int) -> None:
         """Hold another value, by whomever, and see to what follows from that."""
+
+    def _set_from_file(self, entry: Entry, param: PackedParam) -> None:
+        """A parameter has come in a file."""
+        if param.type == entry.type:
+            self._write(entry, param.bits)
 
     def _answers_system(self, target: int) -> bool:
         return target in (0, self.system)
@@ -337,6 +363,8 @@ class Vehicle(ABC):
         self._position = None
         self._last_listed = None
         self._list_sent = 0
+        if self._ftp is not None:
+            self._ftp.reset()
         self._relist()
 
     def _work(self, now: float) -> None:
@@ -362,8 +390,22 @@ class Vehicle(ABC):
                 if not self._send_next():
                     self._next_burst = math.inf
                     break
+        if self._ftp is not None:
+            for answer, sender in self._ftp.work(now):
+                self._send(wire.FileTransfer(0, *sender, answer.pack()))
 
     # Tools for the kinds
+
+    def _packed_params(self) -> list[PackedParam] | None:
+        """The list for param.pck; None where a type in it has no place there."""
+        packed = [each for entry in self._listed if (each := entry.packed) is not None]
+        return packed if len(packed) == len(self._listed) else None
+
+    def _apply_packed(self, params: Sequence[PackedParam]) -> None:
+        for param in params:
+            entry = self._find(param.name)
+            if entry is not None:
+                self._set_from_file(entry, param)
 
     def _start_list(self, at: float) -> None:
         """Send the list from its start, from `at` on, and not before the vehicle has booted."""
@@ -458,7 +500,12 @@ class Vehicle(ABC):
             self.requests["HEARTBEAT"] += 1
             return
         if not isinstance(
-            message, wire.ParamRequestRead | wire.ParamRequestList | wire.ParamSet | wire.CommandLong
+            message,
+            wire.ParamRequestRead
+            | wire.ParamRequestList
+            | wire.ParamSet
+            | wire.CommandLong
+            | wire.FileTransfer,
         ):
             return
         if not self._answers_system(message.target_system):
@@ -472,6 +519,9 @@ class Vehicle(ABC):
             self._on_list()
         elif isinstance(message, wire.ParamSet):
             self._on_set(message, frame)
+        elif isinstance(message, wire.FileTransfer):
+            if self._ftp is not None:
+                self._ftp.receive(message.payload, (frame.system, frame.component), self._now)
         else:
             self._on_command(message, frame)
 
@@ -491,6 +541,7 @@ _NAMES = {
     wire.ParamRequestList: "PARAM_REQUEST_LIST",
     wire.ParamSet: "PARAM_SET",
     wire.CommandLong: "COMMAND_LONG",
+    wire.FileTransfer: "FILE_TRANSFER_PROTOCOL",
 }
 _AUTOPILOT_VERSION = 148
 _ATTITUDE = 30

@@ -16,6 +16,7 @@ from paramclient.protocol.wire.messages import (
     AutopilotVersion,
     CommandAck,
     CommandLong,
+    FileTransfer,
     Heartbeat,
     HighLatency2,
     Message,
@@ -86,6 +87,7 @@ _PARAM_VALUE = struct.Struct("<4sHH16sB")
 _PARAM_SET = struct.Struct("<4sBB16sB")
 _STATUSTEXT = struct.Struct("<B50s")  # its extension fields, for long texts in pieces, are not read
 _PARAM_ERROR = struct.Struct("<hBB16sB")
+_FILE_TRANSFER = struct.Struct("<BBB251s")
 _SYSTEM_TIME = struct.Struct("<QI")
 _HIGH_LATENCY2 = struct.Struct("<24xBB16x")
 _V1_LENGTHS = {77: 3, 148: 60}  # extension fields exist in MAVLink 2 only
@@ -143,6 +145,10 @@ def _decode_param_error(payload: bytes) -> ParamError:
     return ParamError(system, component, text_of(name), index, error)
 
 
+def _decode_file_transfer(payload: bytes) -> FileTransfer:
+    return FileTransfer(*_fields(_FILE_TRANSFER, payload))
+
+
 def _decode_system_time(payload: bytes) -> SystemTime:
     return SystemTime(*_fields(_SYSTEM_TIME, payload))
 
@@ -160,6 +166,7 @@ _DECODERS: dict[int, Callable[[bytes], Message]] = {
     23: _decode_param_set,
     76: _decode_command_long,
     77: _decode_command_ack,
+    110: _decode_file_transfer,
     148: _decode_autopilot_version,
     235: _decode_high_latency2,
     253: _decode_statustext,
@@ -199,6 +206,10 @@ _ENCODERS: dict[type, Callable[..., tuple[int, bytes]]] = {
     CommandAck: lambda m: (
         77,
         _COMMAND_ACK.pack(m.command, m.result, 0, 0, m.target_system, m.target_component),
+    ),
+    FileTransfer: lambda m: (
+        110,
+        _FILE_TRANSFER.pack(m.target_network, m.target_system, m.target_component, m.payload),
     ),
     AutopilotVersion: lambda m: (
         148,

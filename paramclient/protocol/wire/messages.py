@@ -9,11 +9,13 @@ __all__ = [
     "AUTOPILOT_COMPONENT",
     "AUTOPILOT_VERSION_ID",
     "AutopilotVersion",
+    "CAPABILITY_FTP",
     "CAPABILITY_PARAM_ENCODE_BYTEWISE",
     "CAPABILITY_PARAM_ENCODE_C_CAST",
     "COMP_ID_ALL",
     "CommandAck",
     "CommandLong",
+    "FileTransfer",
     "HASH_CHECK",
     "Heartbeat",
     "HighLatency2",
@@ -62,6 +64,7 @@ MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: Final = 520
 MAV_RESULT_ACCEPTED: Final = 0
 MAV_RESULT_UNSUPPORTED: Final = 3
 CAPABILITY_PARAM_ENCODE_BYTEWISE: Final = 16
+CAPABILITY_FTP: Final = 32
 CAPABILITY_PARAM_ENCODE_C_CAST: Final = 131072
 
 
@@ -161,6 +164,16 @@ class StatusText:
 
 
 @dataclass(frozen=True, slots=True)
+class FileTransfer:
+    """FILE_TRANSFER_PROTOCOL; `payload` has 251 bytes when decoded, see `paramclient.protocol.ftp`."""
+
+    target_network: int
+    target_system: int
+    target_component: int
+    payload: bytes
+
+
+@dataclass(frozen=True, slots=True)
 class SystemTime:
     """SYSTEM_TIME; `time_unix_usec` is 0 where the vehicle does not know it."""
 
@@ -187,6 +200,7 @@ Message: TypeAlias = (
     | ParamSet
     | ParamError
     | StatusText
+    | FileTransfer
     | SystemTime
     | HighLatency2
 )

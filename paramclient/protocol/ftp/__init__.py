@@ -1,0 +1,22 @@
+"""The files of a component over MAVFTP, without input and output."""
+
+from __future__ import annotations
+
+from paramclient.protocol.ftp.reading import LARGEST_FILE, FileRead
+from paramclient.protocol.ftp.transfers import (
+    DirectoryEntry,
+    FileChecksum,
+    FileList,
+    FileTransfers,
+    FileWrite,
+)
+
+__all__ = [
+    "LARGEST_FILE",
+    "DirectoryEntry",
+    "FileChecksum",
+    "FileList",
+    "FileRead",
+    "FileTransfers",
+    "FileWrite",
+]

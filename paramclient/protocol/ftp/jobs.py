@@ -1,0 +1,260 @@
+"""One piece of work with the files of a component: requests one at a time, each until it is answered."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Final, TypeVar
+
+from paramclient.errors import FileErrorCode, FileTransferError, NoReply, UsageError
+from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.operation import Operation
+from paramclient.protocol.timing import LONGEST_SILENCE, RoundTrip
+from paramclient.protocol.wire import FileTransfer, Message
+
+__all__ = ["Close", "Job", "Line", "path_bytes"]
+
+Result = TypeVar("Result")
+
+COPY_RISK: Final = 0.01
+"""The share of requests without an answer from which on each is sent twice: servers give the same answer to
+the same request, so that costs its few bytes."""
+BUSY_PAUSE: Final = 0.5
+BUSY_PATIENCE: Final = 4.0
+"""Seconds between two attempts to open a file while the server has no session left, and for how long:
+ArduPilot gives one up that was idle for 3 s."""
+MOST_FAILURES: Final = 4
+"""How often an open may fail without a reason. ArduPilot says no more when the session is open already, as
+after an open whose answer was lost; it is then closed and opened again at once."""
+BUSY = frozenset((FileErrorCode.FAIL, FileErrorCode.INVALID_SESSION, FileErrorCode.NO_SESSIONS_AVAILABLE))
+"""What servers say of an open while another file is open."""
+
+
+def path_bytes(path: str) -> bytes:
+    """A path as it stands in a request.
+
+    Raises:
+        UsageError: it is empty, longer than a request can hold, or has a NUL in it.
+    """
+    data = path.encode("utf-8", "surrogateescape")
+    if not data or b"\0" in data:
+        raise UsageError(f"the path of a file has at least one character, and no NUL: {path!r}")
+    if len(data) > MOST_DATA:
+        raise UsageError(f"the path of a file has at most {MOST_DATA} bytes, not {len(data)}")
+    return data
+
+
+class Line:
+    """The way to the files of one component, which all work there shares.
+
+    Attributes:
+        target: system and component.
+        round_trip: the component's; requests feed it, and it says when to repeat them.
+        heard_at: when the server sent us anything last.
+    """
+
+    def __init__(
+        self, target: tuple[int, int], round_trip: RoundTrip, send: Callable[[Message], None], now: float
+    ) -> None:
+        self.target = target
+        self.round_trip = round_trip
+        self.heard_at = -math.inf
+        self._send = send
+        # Where the numbers begin differs from one program to the next: a server gives its last answer once
+        # more to a request that has the number of the one before.
+        self._sequence = int(now * 1000) & 0xFFFF
+        self._session = self._sequence % 255
+
+    def send(self, packet: Packet) -> None:
+        self._send(FileTransfer(0, *self.target, packet.pack()))
+
+    def reset_sessions(self, session: int) -> None:
+        """Ask for all our sessions to be closed, and do not wait for it; twice, as one may get lost."""
+        packet = Packet(self.next_sequence(), session, Opcode.RESET_SESSIONS)
+        self.send(packet)
+        self.send(packet)
+
+    def next_sequence(self, *, answers: int = 1) -> int:
+        """A number for a request that may get so many answers, each with a number of its own."""
+        number = self._sequence
+        self._sequence = (number + 1 + answers) & 0xFFFF
+        return number
+
+    def next_session(self) -> int:
+        """The number of a session that we ask for; never 0, in whose place a server may put another."""
+        self._session = self._session % 255 + 1
+        return self._session
+
+
+class Job(Operation[Result]):
+    """Something that is done with one file. Its owner gives it the answers and the time.
+
+    Attributes:
+        path: of the file or directory.
+        session: the number of the session that is open for it, or None.
+        asked_session: the one that was asked for when it is not known whether that is open, or None.
+    """
+
+    def __init__(self, line: Line, path: str, now: float) -> None:
+        super().__init__(now)
+        self._line = line
+        self.path = path
+        self.session: int | None = None
+        self.asked_session: int | None = None
+        self._path_data = path_bytes(path)
+        self._request: Packet | None = None
+        self._then: Callable[[Packet, float], None] | None = None
+        self._attempts = 0
+        self._sent_at = math.inf
+        self._failures = 0
+        self._busy_since = math.inf
+        self._open_at = math.inf
+        self._reopen: Callable[[float], None] | None = None
+
+    @abstractmethod
+    def begin(self, now: float) -> None:
+        """The server is free: start."""
+
+    def take(self, packet: Packet, now: float) -> None:
+        """Something came from the server."""
+        request = self._request
+        if request is None or self._then is None:
+            return
+        is_answer = packet.sequence == (request.sequence + 1) & 0xFFFF and packet.requested == request.opcode
+        if is_answer and packet.opcode in (Opcode.ACK, Opcode.NAK):
+            then = self._then
+            # what takes long on board says nothing of the link
+            attempts = 2 if request.opcode == Opcode.CALC_FILE_CRC32 else self._attempts
+            self._line.round_trip.answered(self._sent_at, now, attempts)
+            self._request = self._then = None
+            then(packet, now)
+
+    def tick(self, now: float) -> None:
+        """Do what is due."""
+        if self._open_at <= now and self._reopen is not None:
+            self._open_at = math.inf
+            self._reopen(now)
+        if self._request is not None and self._deadline() <= now:
+            self._line.round_trip.timed_out(self._attempts)
+            if self._line.round_trip.is_hopeless(self._attempts, now):
+                self._request = None
+                self.fail(self._no_reply(self._attempts, now), now)
+            else:
+                self._transmit(self._request, now)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do, or infinity."""
+        return min(self._open_at, self._deadline() if self._request is not None else math.inf)
+
+    def resume(self, now: float) -> None:
+        """The link is back: ask again."""
+        if self._request is not None:
+            self._attempts = 0
+            self._transmit(self._request, now)
+
+    def _ask(
+        self,
+        opcode: Opcode,
+        then: Callable[[Packet, float], None],
+        now: float,
+        *,
+        data: bytes = b"",
+        session: int = 0,
+        offset: int = 0,
+        copies: int = 1,
+    ) -> None:
+        """Send a request, again and again until its answer comes, which goes to `then`."""
+        sequence = self._line.next_sequence()
+        self._request = Packet(sequence, session, opcode, data, offset=offset)
+        self._then = then
+        self._attempts = 0
+        self._transmit(self._request, now, copies=copies)
+
+    def _open_file(
+        self, opcode: Opcode, then: Callable[[Packet, float], None], now: float, *, copies: int = 1
+    ) -> None:
+        """Open the file in a session of its own, which `session` names when `then` is called.
+
+        Where an open is on its way already, its number is used again.
+        """
+
+        def opened(packet: Packet, now: float) -> None:
+            code = self._code(packet)
+            if packet.opcode == Opcode.ACK:
+                self.session, self.asked_session = packet.session, None
+                then(packet, now)
+            elif code not in BUSY or self._is_patience_over(code, now):
+                self.asked_session = None
+                self._refused(packet, "does not open", now)
+            elif code == FileErrorCode.FAIL or self._busy_since == math.inf:
+                # what is open may be what we ourselves, or a program before us, could not close
+                self._busy_since = min(self._busy_since, now)
+                self._line.reset_sessions(number)
+                again(now)
+            else:
+                self._open_at = now + BUSY_PAUSE
+                self._reopen = again
+
+        def again(now: float) -> None:
+            self._ask(opcode, opened, now, data=self._path_data, session=number)
+
+        number = self._line.next_session() if self.asked_session is None else self.asked_session
+        self.asked_session = number
+        self._ask(opcode, opened, now, data=self._path_data, session=number, copies=copies)
+
+    def _is_patience_over(self, code: int, now: float) -> bool:
+        if code == FileErrorCode.FAIL:
+            self._failures += 1
+        return self._failures > MOST_FAILURES or now - self._busy_since >= BUSY_PATIENCE
+
+    def _refused(self, packet: Packet, what: str, now: float) -> None:
+        """End with the error that a NAK names."""
+        system, component = self._line.target
+        code = self._code(packet)
+        errno = packet.data[1] if code == FileErrorCode.FAIL_ERRNO and len(packet.data) > 1 else 0
+        words = FileErrorCode.name_of(code) + (f" {errno}" if errno else "")
+        self.fail(
+            FileTransferError(
+                f"{system}/{component} {what} {self.path}: {words}",
+                system=system,
+                component=component,
+                path=self.path,
+                code=code,
+                errno=errno,
+            ),
+            now,
+        )
+
+    def _no_reply(self, attempts: int, now: float) -> NoReply:
+        system, component = self._line.target
+        return NoReply(f"{self.path} of {system}/{component}", attempts=attempts, waited=now - self.begun_at)
+
+    @staticmethod
+    def _code(packet: Packet) -> int:
+        return packet.data[0] if packet.data else FileErrorCode.FAIL
+
+    def _transmit(self, request: Packet, now: float, *, copies: int = 1) -> None:
+        self._attempts += 1
+        self._sent_at = now
+        for _ in range(2 if self._line.round_trip.seen_loss >= COPY_RISK else copies):
+            self._line.send(request)
+
+    def _deadline(self) -> float:
+        # while a burst comes the server does nothing else
+        since = min(max(self._sent_at, self._line.heard_at), self._sent_at + LONGEST_SILENCE)
+        return since + self._line.round_trip.timeout
+
+
+class Close(Job[None]):
+    """Closes the session of another job, as well as can be: its end is never an error that matters."""
+
+    def __init__(self, line: Line, job: Job[Result], now: float) -> None:
+        super().__init__(line, job.path, now)
+        if job.session is not None:
+            self._opcode, self._number = Opcode.TERMINATE_SESSION, job.session
+        else:  # the server may have opened one, with a number that it did not get through to us
+            self._opcode, self._number = Opcode.RESET_SESSIONS, job.asked_session or 0
+
+    def begin(self, now: float) -> None:
+        self._ask(self._opcode, lambda _, now: self.finish(None, now), now, session=self._number)

@@ -1,0 +1,482 @@
+"""Reading a file: one burst from its beginning to its end, and single reads for what got lost of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Final, NamedTuple
+
+from paramclient.errors import FileErrorCode, FileTransferError, UsageError
+from paramclient.protocol.ftp.blocks import Blocks
+from paramclient.protocol.ftp.jobs import Job, Line
+from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+
+__all__ = ["FileRead"]
+
+LARGEST_FILE: Final = 64 * 1024 * 1024
+"""Bytes that a file may have unless it is said otherwise: more than any log of a flight, less than memory."""
+BURST_ANSWERS: Final = 4096
+"""Numbers that the answers to one burst may take; ArduPilot ends one after 2000 (GCS_FTP.cpp)."""
+MOST_DOUBLINGS: Final = 1
+"""How often the time to wait for a burst doubles."""
+BURSTS_KEPT: Final = 4
+"""Bursts whose late answers are still taken."""
+FIRST_BLOCK: Final = 0.4
+FIRST_BLOCK_TRIPS: Final = 2.5
+"""Seconds, and round trips, by which the first block of a burst may come later than a short answer: on 1,200
+bytes a second it takes 0.22 s alone. Asking too early lets the vehicle send everything twice. The messages
+that measured the round trip are almost half as long, so a short one tells that the link is not slow."""
+SLOWEST_GAP: Final = 2.0
+"""Seconds to wait for the second block of a burst, when nothing is known of its pace."""
+QUIET_BLOCKS: Final = 6
+SHORTEST_QUIET: Final = 0.05
+"""A burst in which nothing came for so many times the usual gap, and for so many seconds, is over, or what is
+left of it was lost."""
+HELD: Final = 4
+"""Reads that may wait in the vehicle for the end of its burst: ArduPilot queues 5."""
+SMALLEST_WINDOW: Final = 3
+LARGEST_WINDOW: Final = 64
+"""Reads in flight at once; in between it is what one round trip can hold."""
+SEND_BURST: Final = 3.0
+"""Reads that may go out at one time, so that they do not overflow ArduPilot's queue."""
+UNKNOWN_GAP: Final = 0.01
+"""Seconds from one block to the next before any was seen."""
+OVERTAKEN: Final = 2
+"""Later reads that must be answered for one to count as lost."""
+COPY_RISK: Final = 0.01
+MOST_COPIES: Final = 6
+"""The chance of no answer to go below by asking again early, and how often that may be done."""
+TAIL_BLOCKS: Final = 4
+TAIL_SHARE: Final = 0.15
+"""What may be left of a file, in blocks and as a share of its size, for reads to be better than a new burst.
+ArduPilot's estimate for param.pck is a tenth too large."""
+LATE_KEPT: Final = 256
+"""Reads that count as lost and whose answers are taken all the same, should they still come."""
+MOST_OPENINGS: Final = 3
+MOST_RESTARTS: Final = 2
+"""How often a file is opened when its session is lost on board, and how often it is opened anew when nobody
+can tell whether it is open."""
+SESSION_LOST = frozenset((FileErrorCode.INVALID_SESSION, FileErrorCode.FILE_NOT_FOUND))
+"""What servers say to a read in a session that is not open."""
+ROUNDING: Final = 1e-9
+
+
+class _Flight(NamedTuple):
+    offset: int
+    number: int
+    sent_at: float
+    ahead: int
+    is_only: bool
+    """Whether it tells of the round trip: nothing of this offset was asked for before, and no burst runs."""
+
+
+class FileRead(Job[bytes]):
+    """The content of a file. See `FileTransfers.read`.
+
+    Attributes:
+        size: what the server says the file has; an estimate for ArduPilot's param.pck. None at first.
+    """
+
+    def __init__(self, line: Line, path: str, now: float, *, read_size: int, limit: int) -> None:
+        if not 1 <= read_size <= MOST_DATA:
+            raise UsageError(f"a file is read by 1 to {MOST_DATA} bytes, not {read_size}")
+        super().__init__(line, path, now)
+        self.size: int | None = None
+        self._read_size = read_size
+        self._limit = limit
+        self._openings = 1
+        self._restarts = 0
+        self._has_bursts = True
+        self._start_anew()
+        self._gap = UNKNOWN_GAP
+        self._came = 0
+        self._lost = 0
+        self._number = 0
+        self._tokens = SEND_BURST
+        self._tokens_at = -math.inf
+
+    def _start_anew(self) -> None:
+        """Nothing has come, and nothing is asked for."""
+        self._blocks = Blocks()
+        self._bursts: list[int] = []
+        self._burst_runs = False
+        self._burst_attempts = 0
+        self._burst_session = 0
+        self._has_early_burst = False
+        self._may_burst = False
+        self._burst_sent_at = math.inf
+        self._opened_at = math.inf
+        self._block_at = math.inf  # the last block of the burst that runs
+        self._first_block: tuple[float, int] | None = None
+        self._flights: dict[int, _Flight] = {}  # by the number of the request
+        self._late: dict[int, _Flight] = {}
+        self._unheard = 0  # blocks that came before the answer to the open
+        self._is_silent = False  # nothing came since what timed out last was sent
+        self._asked: dict[int, tuple[int, float]] = {}  # how often each offset was so in vain, and when last
+
+    @property
+    def received(self) -> int:
+        """Bytes that have come."""
+        return self._blocks.received
+
+    def begin(self, now: float) -> None:
+        round_trip = self._line.round_trip
+        if round_trip.smoothed is not None and round_trip.seen_loss < COPY_RISK:
+            self._begin_early(now)
+        else:
+            self._open_file(Opcode.OPEN_FILE_RO, self._opened, now)
+
+    def _begin_early(self, now: float) -> None:
+        """Ask for the burst together with the open: a server that keeps to our number of the session begins.
+
+        What it sends counts when it has said so, which therefore is asked for twice.
+        """
+        self._open_file(Opcode.OPEN_FILE_RO, self._opened, now, copies=2)
+        self._burst(now)
+
+    def _is_unheard(self, packet: Packet) -> bool:
+        """Whether this shows that the answer to our open got lost: it comes of the burst behind it."""
+        if packet.session != self.asked_session or packet.requested != Opcode.BURST_READ_FILE:
+            return False
+        self._unheard += packet.opcode == Opcode.ACK and self._is_of_a_burst(packet)
+        return self._unheard == OVERTAKEN and self._restarts < MOST_RESTARTS
+
+    def take(self, packet: Packet, now: float) -> None:
+        super().take(packet, now)
+        if not self.done and self.session is None and self._is_unheard(packet):
+            # whether the file is ours nobody can tell any more: close it, and begin anew when the burst ends
+            self._restarts += 1
+            self._line.reset_sessions(packet.session)
+            self._start_anew()
+            self._begin_early(now)
+        if self.done or self.session is None or packet.session != self.session:
+            return
+        self._is_silent = False
+        if packet.requested == Opcode.BURST_READ_FILE and self._is_of_a_burst(packet):
+            self._take_burst(packet, now)
+        elif packet.requested == Opcode.READ_FILE:
+            sequence = (packet.sequence - 1) & 0xFFFF
+            flight = self._flights.pop(sequence, None) or self._late.pop(sequence, None)
+            if flight is not None:
+                self._take_read(packet, flight, now)
+        self._go_on(now)
+
+    def tick(self, now: float) -> None:
+        super().tick(now)
+        if self.done or self.session is None:
+            return
+        if self._burst_runs and self._quiet_at() <= now:
+            self._burst_is_silent(now)
+        if not self._burst_runs:
+            for sequence, flight in list(self._flights.items()):
+                if self._flight_deadline(flight) <= now:
+                    self._give_up(sequence)
+                    self._in_vain(flight, now)
+        self._go_on(now)
+
+    def next_deadline(self) -> float:
+        earliest = super().next_deadline()
+        if self.done or self.session is None:
+            return earliest
+        if self._burst_runs:
+            earliest = min(earliest, self._quiet_at())
+        elif self._flights:
+            earliest = min(earliest, *map(self._flight_deadline, self._flights.values()))
+        if self._next_wanted() is not None:
+            earliest = min(earliest, self._tokens_at + max(1.0 - self._tokens, 0.0) * self._interval)
+        return earliest
+
+    def resume(self, now: float) -> None:
+        super().resume(now)
+        if self.session is not None:
+            self._flights.clear()
+            self._asked.clear()
+            self._burst_attempts = 0
+            self._burst_runs = False
+            self._go_on(now)
+
+    def _opened(self, packet: Packet, now: float) -> None:
+        if len(packet.data) >= 4:
+            self.size = int.from_bytes(packet.data[:4], "little")
+        self._opened_at = now
+        self._has_early_burst = (
+            self._burst_runs and packet.session == self._burst_session and self._attempts == 1
+        )
+        if not self._has_early_burst:
+            self._burst_attempts = 0
+            self._burst(now)
+
+    # The burst
+
+    def _burst(self, now: float) -> None:
+        """Let everything come from where we stand."""
+        if self._line.round_trip.is_hopeless(self._burst_attempts, now):
+            self.fail(self._no_reply(self._burst_attempts, now), now)
+            return
+        sequence = self._line.next_sequence(answers=BURST_ANSWERS)
+        self._bursts = [*self._bursts[1 - BURSTS_KEPT :], sequence]
+        self._burst_runs = True
+        self._has_early_burst = False
+        self._may_burst = False
+        self._burst_attempts += 1
+        self._burst_sent_at = now
+        self._block_at = math.inf
+        self._first_block = None
+        session = self.asked_session if self.session is None else self.session
+        self._burst_session = session or 0
+        self._line.send(
+            Packet(
+                sequence,
+                self._burst_session,
+                Opcode.BURST_READ_FILE,
+                size=self._read_size,
+                offset=self._blocks.reached,
+            )
+        )
+        if self.session is not None:
+            # the first answer to this, and no block before it, tells that the burst was not heard
+            for _ in range(min(self._most_copies, 2)):
+                self._read(self._blocks.reached, now)
+
+    def _is_of_a_burst(self, packet: Packet) -> bool:
+        return any(0 < (packet.sequence - first) & 0xFFFF <= BURST_ANSWERS for first in self._bursts)
+
+    def _take_burst(self, packet: Packet, now: float) -> None:
+        if self._block_at == math.inf and self._burst_runs:
+            first_answer = (self._bursts[-1] + 1) & 0xFFFF
+            if packet.sequence == first_answer and self._burst_attempts == 1:
+                self._line.round_trip.answered(self._burst_sent_at, now, 1)
+        is_latest = 0 < (packet.sequence - self._bursts[-1]) & 0xFFFF <= BURST_ANSWERS
+        if packet.opcode == Opcode.NAK:
+            self._end_of_burst(packet, is_latest, now)
+            return
+        skipped = packet.offset - self._blocks.reached
+        if skipped > 0:
+            self._lost += -(-skipped // self._read_size)
+        self._came += 1
+        self._measure(packet, now)
+        if self._keep(packet, packet.offset, now):
+            self._burst_attempts = 0
+        if not packet.burst_complete:
+            self._burst_runs = True  # also when it was taken for over
+        elif is_latest:
+            self._may_burst = True
+            self._stop_burst(now)
+
+    def _measure(self, packet: Packet, now: float) -> None:
+        """How long one block takes."""
+        self._block_at = now
+        if self._first_block is None:
+            self._first_block = (now, packet.offset)
+            return
+        began_at, offset = self._first_block
+        blocks = (packet.offset - offset) / self._read_size
+        if blocks > 0 and now > began_at:
+            self._gap = (now - began_at) / blocks
+
+    def _end_of_burst(self, packet: Packet, is_latest: bool, now: float) -> None:
+        code = self._code(packet)
+        if code == FileErrorCode.EOF:
+            if packet.offset >= self._blocks.reached:  # else the server does not say where, and a read will
+                self._ends_at(packet.offset)
+        elif not is_latest:
+            return
+        elif code == FileErrorCode.UNKNOWN_COMMAND:
+            self._has_bursts = False
+        elif self._has_early_burst and self._blocks.reached == 0:
+            self._burst(now)  # the first one came there before the open
+            return
+        else:
+            self._does_not_read(packet, now)
+        if is_latest:
+            self._stop_burst(now)
+
+    def _stop_burst(self, now: float) -> None:
+        """It is over: what was asked for meanwhile is answered only now."""
+        self._burst_runs = False
+        for sequence, flight in self._flights.items():
+            self._flights[sequence] = flight._replace(sent_at=now, is_only=False)
+
+    def _quiet_at(self) -> float:
+        if self._block_at == math.inf:
+            round_trip = self._line.round_trip
+            longer = min(FIRST_BLOCK, FIRST_BLOCK_TRIPS * (round_trip.smoothed or FIRST_BLOCK))
+            if self._has_early_burst:
+                return self._opened_at + longer
+            backoff = 2.0 ** min(max(self._burst_attempts - 2, 0), MOST_DOUBLINGS)
+            return self._burst_sent_at + (round_trip.timeout + longer) * backoff
+        if self._gap == UNKNOWN_GAP:
+            return self._block_at + SLOWEST_GAP
+        return self._block_at + max(QUIET_BLOCKS * self._gap, SHORTEST_QUIET)
+
+    def _burst_is_silent(self, now: float) -> None:
+        if self._block_at == math.inf:
+            self._line.round_trip.timed_out(self._burst_attempts)
+            self._burst(now)
+        else:
+            self._stop_burst(now)
+
+    # Single reads
+
+    def _take_read(self, packet: Packet, flight: _Flight, now: float) -> None:
+        for sequence, other in list(self._flights.items()):
+            if other.number <= flight.number - OVERTAKEN:
+                self._give_up(sequence)
+                self._line.round_trip.timed_out(1)
+        self._line.round_trip.answered(flight.sent_at, now, 1 if flight.is_only else 2)
+        self._asked.pop(flight.offset, None)
+        if packet.opcode == Opcode.ACK and packet.data:
+            is_ahead = flight.offset >= self._blocks.reached
+            self._keep(packet, flight.offset, now)
+            if is_ahead and self._burst_runs and self._block_at == math.inf:
+                self._stop_burst(now)
+            self._may_burst = self._may_burst or (is_ahead and not self._burst_runs)
+        elif packet.opcode == Opcode.ACK or self._code(packet) == FileErrorCode.EOF:
+            self._ends_at(flight.offset)
+        else:
+            self._does_not_read(packet, now)
+
+    def _give_up(self, sequence: int) -> None:
+        """Count a read as lost."""
+        self._late[sequence] = self._flights.pop(sequence)._replace(is_only=False)
+        if len(self._late) > LATE_KEPT:
+            del self._late[next(iter(self._late))]
+
+    def _in_vain(self, flight: _Flight, now: float) -> None:
+        """A read stayed without an answer; those of one offset that went out meanwhile count as one."""
+        attempts, counted_at = self._asked.get(flight.offset, (0, -math.inf))
+        if not self._is_wanted(flight.offset) or flight.sent_at < counted_at:
+            return
+        attempts += 1
+        self._asked[flight.offset] = attempts, now
+        is_silence = self._line.heard_at < flight.sent_at
+        if not (is_silence and self._is_silent):  # of a silence that all share one tells enough
+            self._line.round_trip.timed_out(attempts)
+        self._is_silent = is_silence
+        if self._line.round_trip.is_hopeless(attempts, now):
+            self.fail(self._no_reply(attempts, now), now)
+
+    def _flight_deadline(self, flight: _Flight) -> float:
+        return flight.sent_at + self._line.round_trip.timeout + flight.ahead * self._gap
+
+    def _is_wanted(self, offset: int) -> bool:
+        is_behind = self._blocks.end is None and offset >= self._blocks.reached
+        return is_behind or self._blocks.is_missing(offset)
+
+    def _is_asked_for(self, offset: int) -> bool:
+        return any(flight.offset == offset for flight in self._flights.values())
+
+    @property
+    def _window(self) -> int:
+        if self._burst_runs:
+            return HELD
+        if self._is_silent:
+            return SMALLEST_WINDOW
+        round_trip = self._line.round_trip.smoothed or self._line.round_trip.timeout
+        return min(max(math.ceil(round_trip / self._gap) + 2, SMALLEST_WINDOW), LARGEST_WINDOW)
+
+    @property
+    def _interval(self) -> float:
+        """Seconds from one request to the next: the burst takes a third of the link, reads may take more."""
+        return self._gap / 2
+
+    def _wanted(self) -> Iterator[int]:
+        """What to read singly, the most useful first."""
+        yield from self._blocks.missing(self._read_size)
+        if self._blocks.end is None and not self._burst_runs:
+            reached = self._blocks.reached
+            ahead = TAIL_BLOCKS if self._has_bursts else LARGEST_WINDOW
+            if self.size is not None:
+                left = (self.size - reached) // self._read_size
+                ahead = 1 if self._has_bursts and self._is_worth_a_burst() else max(min(ahead, left + 1), 1)
+            yield from range(reached, reached + ahead * self._read_size, self._read_size)
+
+    def _next_wanted(self) -> int | None:
+        """What to read now: what is not asked for yet, else once more what is, if that is worth it."""
+        if len(self._flights) >= self._window:
+            return None
+        copies: dict[int, int] = {}
+        for flight in self._flights.values():
+            copies[flight.offset] = copies.get(flight.offset, 0) + 1
+        wanted = []
+        for offset in self._wanted():
+            if offset not in copies:
+                return offset
+            wanted.append(offset)
+        if not wanted or self._burst_runs:
+            return None
+        fewest = min(wanted, key=copies.__getitem__)
+        return fewest if copies[fewest] <= self._most_copies else None
+
+    @property
+    def _most_copies(self) -> int:
+        passed = self._came / (self._came + self._lost) if self._came else 1.0
+        loss = max(self._line.round_trip.seen_loss, 1.0 - passed * passed)
+        if loss < COPY_RISK:
+            return 0
+        return min(math.ceil(math.log(COPY_RISK) / math.log(loss)) - 1, MOST_COPIES)
+
+    def _read(self, offset: int, now: float) -> None:
+        sequence = self._line.next_sequence()
+        is_only = not (self._burst_runs or offset in self._asked or self._is_asked_for(offset))
+        self._number += 1
+        self._flights[sequence] = _Flight(offset, self._number, now, len(self._flights), is_only)
+        self._tokens -= 1.0
+        self._line.send(
+            Packet(sequence, self.session or 0, Opcode.READ_FILE, size=self._read_size, offset=offset)
+        )
+
+    # Both
+
+    def _keep(self, packet: Packet, offset: int, now: float) -> bool:
+        """Take what has come; whether anything in it is new."""
+        if offset + len(packet.data) > self._limit:
+            system, component = self._line.target
+            self.fail(
+                FileTransferError(
+                    f"{self.path} of {system}/{component} is longer than {self._limit} bytes",
+                    system=system,
+                    component=component,
+                    path=self.path,
+                    code=FileErrorCode.INVALID_DATA_SIZE,
+                ),
+                now,
+            )
+            return False
+        return self._blocks.take(offset, packet.data)
+
+    def _does_not_read(self, packet: Packet, now: float) -> None:
+        """The server refuses; where the session is lost, as when another station resets all, begin anew."""
+        self._openings += 1
+        if self._code(packet) not in SESSION_LOST or self._openings > MOST_OPENINGS:
+            self._refused(packet, "does not read", now)
+            return
+        self.session = None
+        self._start_anew()
+        self._open_file(Opcode.OPEN_FILE_RO, self._opened, now)
+
+    def _ends_at(self, offset: int) -> None:
+        self._blocks.ends_at(min(offset, self._limit))
+
+    def _go_on(self, now: float) -> None:
+        """Ask for what is wanted, as far as the pace allows; end when all is there."""
+        if self.done or self.session is None:
+            return
+        if self._blocks.is_complete:
+            self.finish(self._blocks.content, now)
+            return
+        if self._may_burst and self._has_bursts and not self._burst_runs and self._is_worth_a_burst():
+            self._burst(now)
+        if now > self._tokens_at:
+            elapsed = now - self._tokens_at
+            self._tokens = min(self._tokens + elapsed / self._interval, SEND_BURST)
+            self._tokens_at = now
+        while self._tokens >= 1.0 - ROUNDING and (offset := self._next_wanted()) is not None:
+            self._read(offset, now)
+
+    def _is_worth_a_burst(self) -> bool:
+        """Whether so much is left behind what has come that reads would take longer."""
+        if self._blocks.end is not None or self.size is None:
+            return False
+        left = self.size - self._blocks.reached
+        return left > max(TAIL_BLOCKS * self._read_size, TAIL_SHARE * self.size)

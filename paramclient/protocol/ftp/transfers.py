@@ -1,0 +1,279 @@
+"""The files of one component over MAVFTP: reads, writes, lists and checksums, one after the other.
+
+Servers have few sessions, ArduPilot 4.6 and PX4 one, so whatever is asked for waits until what came before it
+has ended and its session is closed.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Any, Final, NamedTuple, TypeVar
+
+from paramclient.errors import FileErrorCode, NoReply, UsageError
+from paramclient.protocol.ftp.jobs import Close, Job, Line
+from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.reading import LARGEST_FILE, FileRead
+from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.wire import FileTransfer, Message
+
+__all__ = ["DirectoryEntry", "FileChecksum", "FileList", "FileRead", "FileTransfers", "FileWrite"]
+
+AnyJob = TypeVar("AnyJob", bound=Job[Any])
+
+MOST_ENTRIES: Final = 65_536
+"""Entries of a directory that are taken: more than a card of FAT can hold in one."""
+
+
+class DirectoryEntry(NamedTuple):
+    """One entry of a directory; `size` is None for a directory."""
+
+    name: str
+    size: int | None
+
+    @property
+    def is_directory(self) -> bool:
+        return self.size is None
+
+
+class FileWrite(Job[None]):
+    """Writes a file; done when the server has closed it. See `FileTransfers.write`.
+
+    Attributes:
+        written: bytes that the server has acknowledged.
+    """
+
+    def __init__(self, line: Line, path: str, data: bytes, now: float, *, write_size: int) -> None:
+        if not 1 <= write_size <= MOST_DATA:
+            raise UsageError(f"a file is written by 1 to {MOST_DATA} bytes, not {write_size}")
+        super().__init__(line, path, now)
+        self.written = 0
+        self._data = data
+        self._write_size = write_size
+
+    def begin(self, now: float) -> None:
+        self._open_file(Opcode.CREATE_FILE, lambda _, now: self._write(now), now)
+
+    def _write(self, now: float) -> None:
+        """The next piece, or the end. One at a time: PX4 takes a param.pck in its order only."""
+        session = self.session or 0
+        piece = self._data[self.written : self.written + self._write_size]
+        if not piece:
+            self._ask(Opcode.TERMINATE_SESSION, self._closed, now, session=session)
+            return
+
+        def answered(packet: Packet, now: float) -> None:
+            if packet.opcode == Opcode.NAK:
+                self._refused(packet, "does not write", now)
+            else:
+                self.written += len(piece)
+                self._write(now)
+
+        self._ask(Opcode.WRITE_FILE, answered, now, data=piece, session=session, offset=self.written)
+
+    def _closed(self, packet: Packet, now: float) -> None:
+        was_closed_before = self._code(packet) == FileErrorCode.INVALID_SESSION and self._attempts > 1
+        self.session = None
+        if packet.opcode == Opcode.NAK and not was_closed_before:
+            self._refused(packet, "does not take", now)
+        else:
+            self.finish(None, now)
+
+
+class FileList(Job[tuple[DirectoryEntry, ...]]):
+    """The entries of a directory. See `FileTransfers.list`."""
+
+    def __init__(self, line: Line, path: str, now: float) -> None:
+        super().__init__(line, path, now)
+        self._entries: list[DirectoryEntry] = []
+        self._passed = 0
+
+    def begin(self, now: float) -> None:
+        self._ask(Opcode.LIST_DIRECTORY, self._answered, now, data=self._path_data, offset=self._passed)
+
+    def _answered(self, packet: Packet, now: float) -> None:
+        is_end = packet.opcode == Opcode.NAK and self._code(packet) == FileErrorCode.EOF
+        if packet.opcode == Opcode.NAK and not is_end:
+            self._refused(packet, "does not list", now)
+            return
+        items = [] if is_end else [item for item in packet.data.split(b"\0") if item]
+        for item in items:
+            kind, text = item[:1], item[1:].decode("utf-8", "surrogateescape")
+            if kind == b"F":
+                name, _, size = text.rpartition("\t")
+                is_number = size.isascii() and size.isdigit()
+                self._entries.append(
+                    DirectoryEntry(name, int(size)) if is_number else DirectoryEntry(text, 0)
+                )
+            elif kind == b"D":
+                self._entries.append(DirectoryEntry(text, None))
+        self._passed += len(items)
+        if items and self._passed < MOST_ENTRIES:
+            self.begin(now)
+        else:
+            self.finish(tuple(self._entries), now)
+
+
+class FileChecksum(Job[int]):
+    """The checksum of a file. See `FileTransfers.checksum`."""
+
+    def begin(self, now: float) -> None:
+        self._ask(Opcode.CALC_FILE_CRC32, self._answered, now, data=self._path_data)
+
+    def _answered(self, packet: Packet, now: float) -> None:
+        if packet.opcode == Opcode.NAK:
+            self._refused(packet, "gives no checksum of", now)
+        else:
+            self.finish(int.from_bytes(packet.data[:4], "little"), now)
+
+
+class FileTransfers:
+    """All work with the files of one component, in the order in which it was asked for.
+
+    Every call gives an `Operation` at once; it begins when what is before it has ended, ends with its result,
+    with a `FileTransferError` that carries the server's reason, or with `NoReply`. Whoever wants it no longer
+    gives it back with `release`. However it ends, its session on board is closed.
+
+    Args:
+        target: system and component of the server.
+        own: ours; what the server sends to others is passed over.
+        round_trip: the component's.
+        send: takes what is to be sent.
+    """
+
+    def __init__(
+        self,
+        target: tuple[int, int],
+        own: tuple[int, int],
+        round_trip: RoundTrip,
+        send: Callable[[Message], None],
+    ) -> None:
+        self._target = target
+        self._own = own
+        self._round_trip = round_trip
+        self._send = send
+        self._line: Line | None = None
+        self._job: Job[Any] | None = None
+        self._waiting: deque[Job[Any]] = deque()
+
+    @property
+    def is_idle(self) -> bool:
+        """Whether nothing is under way, not even the closing of a session."""
+        return self._job is None
+
+    def read(
+        self, path: str, now: float, *, read_size: int = MOST_DATA, limit: int = LARGEST_FILE
+    ) -> FileRead:
+        """Read a whole file; `size` and `received` of what this gives tell how far it is.
+
+        Args:
+            path: as the server names it, with a query where it takes one.
+            now: seconds.
+            read_size: bytes of one read, 1 to 239: one size for all, as ArduPilot asks for param.pck. Less
+                than 239 is better on a radio that loses long frames.
+            limit: bytes above which the file is not taken.
+
+        Raises:
+            UsageError: the path or a size cannot be.
+        """
+        return self._begin(FileRead(self._line_at(now), path, now, read_size=read_size, limit=limit), now)
+
+    def write(self, path: str, data: bytes, now: float, *, write_size: int = MOST_DATA) -> FileWrite:
+        """Write a whole file in the place of one that may be there.
+
+        When it fails or is released half-way, what was written until then stays on board. ArduPilot and PX4
+        then refuse a param.pck as a whole.
+
+        Raises:
+            UsageError: the path or the size of one piece cannot be.
+        """
+        return self._begin(FileWrite(self._line_at(now), path, data, now, write_size=write_size), now)
+
+    def list(self, path: str, now: float) -> FileList:
+        """List a directory.
+
+        Raises:
+            UsageError: the path cannot be.
+        """
+        return self._begin(FileList(self._line_at(now), path, now), now)
+
+    def checksum(self, path: str, now: float) -> FileChecksum:
+        """Let the server compute the CRC-32 of a file, which is that of `paramclient.values.crc32_px4`.
+
+        Raises:
+            UsageError: the path cannot be.
+        """
+        return self._begin(FileChecksum(self._line_at(now), path, now), now)
+
+    def release(self, job: Job[Any], now: float) -> None:
+        """Want it no longer: it does not end any more, and what it has open is closed."""
+        if job in self._waiting:
+            self._waiting.remove(job)
+        elif job is self._job and not job.done:
+            self._end(job, now)
+
+    def heard(self, message: FileTransfer, now: float) -> None:
+        """Every FILE_TRANSFER_PROTOCOL of the component passes here."""
+        system, component = self._own
+        if message.target_system not in (0, system) or message.target_component not in (0, component):
+            return
+        if self._job is not None and self._line is not None:
+            self._line.heard_at = now
+            self._job.take(Packet.unpack(message.payload), now)
+            self._go_on(now)
+
+    def tick(self, now: float) -> None:
+        """Repeat what stayed unanswered, give up what stayed so too often."""
+        if self._job is not None:
+            self._job.tick(now)
+            self._go_on(now)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do, or infinity."""
+        return math.inf if self._job is None else self._job.next_deadline()
+
+    def resume(self, now: float) -> None:
+        """The link is back: what is under way is asked for again."""
+        if self._job is not None:
+            self._job.resume(now)
+            self._go_on(now)
+
+    def fail_all(self, error: Exception, now: float) -> None:
+        """Nothing can be answered any more. What is asked for from now on stands."""
+        jobs = [*([] if self._job is None else [self._job]), *self._waiting]
+        self._job = None
+        self._waiting.clear()
+        for job in jobs:
+            job.fail(error, now)
+
+    def _line_at(self, now: float) -> Line:
+        if self._line is None:
+            self._line = Line(self._target, self._round_trip, self._send, now)
+        return self._line
+
+    def _begin(self, job: AnyJob, now: float) -> AnyJob:
+        self._waiting.append(job)
+        if self._job is None:
+            self._next(now)
+        return job
+
+    def _go_on(self, now: float) -> None:
+        """Close what has ended, and begin the next."""
+        if self._job is not None and self._job.done:
+            self._end(self._job, now)
+
+    def _end(self, job: Job[Any], now: float) -> None:
+        is_open = job.session is not None or job.asked_session is not None
+        if is_open and not isinstance(job, Close):
+            self._job = Close(self._line_at(now), job, now)
+            self._job.begin(now)
+        if not is_open or isinstance(job, Close) or isinstance(job.error, NoReply):
+            # of one who has fallen silent nothing more is awaited
+            self._job = None
+            self._next(now)
+
+    def _next(self, now: float) -> None:
+        while self._job is None and self._waiting:
+            self._job = self._waiting.popleft()
+            self._job.begin(now)
