@@ -136,7 +136,10 @@ class ParamClient:
             counts_traffic=traffic,
         )
         self._writer = WriteThrough(
-            self.cache, owned=self.cache is not cache, identity_of=self._station.identity_of
+            self.cache,
+            owned=self.cache is not cache,
+            identity_of=self._station.identity_of,
+            is_doubted=self._station.is_doubted,
         )
         self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self._components: dict[Address, Component] = {}
@@ -300,9 +303,12 @@ class ParamClient:
             progress: called about ten times a second with the progress of each, from this task.
 
         Raises:
+            UsageError: `refresh`, and the policy allows no download.
+            CacheError: nothing is cached of anybody, and the policy allows no download.
             NoReply: nobody was heard, or nobody answered.
             LinkError: the link failed, or the client was closed.
         """
+        self._station.check_refresh(refresh)
         began = anyio.current_time()
         deadline = math.inf if timeout is None else began + timeout
         hear_until = began + HEARING_PATIENCE if timeout is None else deadline
@@ -321,15 +327,10 @@ class ParamClient:
                 await together.news(min(PROGRESS_INTERVAL, deadline - now))
                 if progress is not None:
                     progress(together.progress(anyio.current_time()))
-            fetched = together.outcome(now)
+            return together.outcome(now, waited=now - began)
         finally:
             together.end(anyio.current_time())
             self._wake()  # they may have been in the way of others
-        if not fetched.results:
-            whose = "any component" if system is None else f"any component of system {system}"
-            attempts = max((error.attempts for error in fetched.silent.values()), default=0)
-            raise NoReply(f"the parameters of {whose}", attempts=attempts, waited=now - began)
-        return fetched
 
     def traffic_report(self) -> TrafficReport:
         """What has gone over the link so far: who was heard, how fast, and what was lost on the way.
@@ -521,8 +522,6 @@ class ParamClient:
                 for machine in self._station.components.values()
             ):
                 await self._news.wait()
-
-    # helpers
 
     def _may_be_cached(self, component: Component) -> bool:
         return self._writer.may_have(component.system, component.component)

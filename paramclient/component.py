@@ -234,11 +234,14 @@ class Component:
             progress: called about ten times a second, from this task.
 
         Raises:
-            UsageError: there is no such `accept`, or the sample is empty.
-            NoReply: nothing came at all.
+            UsageError: there is no such `accept`, the sample is empty, or `refresh` is given where the policy
+                of the client allows no download.
+            CacheError: nothing is cached, and the policy allows no download.
+            NoReply: nothing came at all, or it is lost.
             LinkError: the link failed, or the client was closed.
         """
         self._client._check_open()
+        self._client._station.check_refresh(refresh)
         if accept not in ("verified", "sampled"):
             raise UsageError(f'accept is "verified" or "sampled", not {accept!r}')
         if sample < 1:
@@ -269,7 +272,7 @@ class Component:
             LinkError: the link failed, or the client was closed.
         """
         self._client._check_open()
-        refresh = self._machine.fetches.refresh
+        refresh = self._machine.refresh
         if refresh is not None:
             await self._wait(refresh, timeout, lambda: ("the values that no hash covers", 0))
 

@@ -11,7 +11,7 @@ from typing import Final
 import anyio
 
 from paramclient.component import TIME_IS_OVER, Component
-from paramclient.errors import NoReply
+from paramclient.errors import CacheError, NoReply
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.result import FetchResult, Progress
@@ -29,11 +29,12 @@ class FetchedAll:
 
     Attributes:
         results: by (system, component), for those that answered.
-        silent: those that have not, each with its error.
+        silent: those that have not, each with its error: a CacheError where the policy allows no download and
+            nothing is cached.
     """
 
     results: Mapping[Address, FetchResult]
-    silent: Mapping[Address, NoReply]
+    silent: Mapping[Address, NoReply | CacheError]
 
     @property
     def complete(self) -> bool:
@@ -117,26 +118,35 @@ class FetchTogether:
         """How far each is."""
         return {address: fetch.progress(now) for address, fetch in self._fetches.items()}
 
-    def outcome(self, now: float) -> FetchedAll:
-        """What came, also of those that are not over.
+    def outcome(self, now: float, *, waited: float) -> FetchedAll:
+        """What came in so many seconds, also of those that are not over.
 
         Raises:
+            NoReply, CacheError: nothing came.
             LinkError: the link failed, or the client was closed.
         """
         results: dict[Address, FetchResult] = {}
-        silent: dict[Address, NoReply] = {}
+        silent: dict[Address, NoReply | CacheError] = {}
         for address, fetch in self._fetches.items():
             try:
                 if fetch.error is not None:
                     raise fetch.error
                 results[address] = fetch.result or fetch.partial(now, TIME_IS_OVER)
-            except NoReply as error:
+            except (NoReply, CacheError) as error:
                 silent[address] = error
         for address, component in self._components.items():
             is_wanted = self._system in (None, address[0])
             if is_wanted and address not in self._fetches and component._machine.presence.is_lost:
                 what = f"the parameters of {address[0]}/{address[1]} (lost)"
                 silent[address] = NoReply(what, attempts=0, waited=component.silence)
+        if not results:
+            attempts = 0
+            for failure in silent.values():
+                if isinstance(failure, CacheError):
+                    raise failure
+                attempts = max(attempts, failure.attempts)
+            whose = "any component" if self._system is None else f"any component of system {self._system}"
+            raise NoReply(f"the parameters of {whose}", attempts=attempts, waited=waited)
         return FetchedAll(results, silent)
 
     def end(self, now: float) -> None:

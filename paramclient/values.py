@@ -94,11 +94,11 @@ class Trust(StrEnum):
     """How far a value in a table can be relied upon."""
 
     LIVE = "live"
-    """Heard from the vehicle on this link."""
+    """Heard from the vehicle on this link, and it has not been away since."""
     VERIFIED = "verified"
-    """From the cache, and the vehicle's hash has confirmed it in this session."""
+    """Last known, and the vehicle's hash has confirmed it in this session."""
     CACHED = "cached"
-    """From the cache: the last value known."""
+    """Last known: from the cache, or from before the vehicle was away."""
 
 
 @dataclass(frozen=True, slots=True, init=False)

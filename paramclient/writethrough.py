@@ -44,6 +44,7 @@ class WriteThrough:
         cache: where to, or None for nowhere.
         owned: whether `close` closes it.
         identity_of: says who the vehicle is that a component belongs to; None while that is open.
+        is_doubted: says whether another vehicle may have taken its place by now.
     """
 
     def __init__(
@@ -52,9 +53,11 @@ class WriteThrough:
         *,
         owned: bool,
         identity_of: Callable[[ComponentMachine], Identity | None],
+        is_doubted: Callable[[ComponentMachine], bool],
     ) -> None:
         self._cache = cache
         self._identity_of = identity_of
+        self._is_doubted = is_doubted
         self._owned = owned
         self._worker = _Worker()
         self._kept: dict[ComponentMachine, _Kept] = {}
@@ -132,7 +135,7 @@ class WriteThrough:
     @property
     def is_held_back(self) -> bool:
         """Whether there is news of a component of which it is open who it is: it may be another vehicle."""
-        return any(machine.who.is_doubted and machine.table.dirty for machine in self._kept)
+        return any(machine.table.dirty and self._is_doubted(machine) for machine in self._kept)
 
     async def flush(self) -> bool:
         """Write what is new; false when the cache could not take it. Cancelled, it loses nothing."""
@@ -185,7 +188,7 @@ class WriteThrough:
     def _news_of(self, kept: _Kept) -> list[_News]:
         """What the cache does not know of a table yet; it counts as written from now on."""
         machine, table = kept.machine, kept.machine.table
-        if machine.who.is_doubted:
+        if self._is_doubted(machine):
             return []
         state = self._state(machine, kept)
         if not (table.dirty or kept.is_whole or state != kept.state):

@@ -256,7 +256,7 @@ def residue(component: Component) -> list[object]:
     left: list[object] = [f"{len(machine.reads)} reads"] if len(machine.reads) else []
     left += [f"{len(machine.writes)} writes"] if len(machine.writes) else []
     left += [machine.fetch] if machine.fetch is not None else []
-    left += [machine.fetches.refresh] if machine.fetches.refresh is not None else []
+    left += [machine.refresh] if machine.refresh is not None else []
     return left
 
 

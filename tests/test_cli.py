@@ -16,7 +16,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NoReturn, Self
@@ -24,15 +24,18 @@ from typing import Any, NoReturn, Self
 import pytest
 
 import paramclient
-from paramclient import LinkError, ParamCache, ParamClient, ParamErrorCode, ParamType
+from paramclient import LinkError, ParamCache, ParamClient, ParamErrorCode, ParamType, Policy
 from paramclient.cli import run, session
+from paramclient.cli import vehicle as vehicle_commands
+from paramclient.cli.options import LinkOptions
 from paramclient.cli.outcome import ExitCode, code_of, status_of
 from paramclient.cli.output import hash_text, printable
 from paramclient.errors import CacheError, ClientClosed, PackError, ParamClientError
 from paramclient.links import Peer, SimLink
 from paramclient.protocol import wire
-from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.sim.table import Entry
+from tests.shell import swiftly
 
 ROOT = Path(__file__).parent.parent
 PATIENCE = 60.0  # seconds after which a test gives up; nothing waits that long when all is well
@@ -40,7 +43,7 @@ ESCAPE = "\x1b"
 
 FETCH_KEYS = [
     *("system", "component", "autopilot", "uid", "count", "received", "source", "hash", "missing"),
-    *("lost", "repeated", "round_trip_s"),
+    *("cached", "lost", "repeated", "round_trip_s"),
     *("elapsed_s", "bytes_received", "bytes_sent", "params"),
 ]
 PARAM_KEYS = ["value", "type", "index", "bits"]
@@ -507,6 +510,53 @@ def test_what_is_no_number_is_not_sent(command: Command, put: Callable[[Endpoint
     assert not vehicle.requests
 
 
+# fetch under a policy
+
+
+@pytest.mark.parametrize("policy", ["cache-only", "hash-only"])
+def test_fetch_may_ask_for_little(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path, policy: str
+) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    rows = [SimParam("A", ParamType.INT32, 1), SimParam("CAL_ACC0_XOFF", ParamType.INT32, 2, volatile=True)]
+    vehicle = PX4Vehicle(table=rows)
+    url = put(vehicle)
+    nothing = command("fetch", url, "--cache", cache, "--policy", policy)
+    assert nothing.code == 5
+    assert "nothing is cached of 1/1" in nothing.err
+    assert command("fetch", url, "--cache", cache, "--json").json["cached"] == []
+    vehicle.requests.clear()
+    fetched = command("fetch", url, "--cache", cache, "--policy", policy, "--json")
+    assert fetched.code == 0
+    assert policy in fetched.err
+    found = fetched.json
+    assert list(found) == FETCH_KEYS
+    assert {name: param["value"] for name, param in found["params"].items()} == {"A": 1, "CAL_ACC0_XOFF": 2}
+    assert (found["source"], found["missing"], found["received"]) == ("cache", [], 2)
+    if policy == "hash-only":
+        assert found["cached"] == ["CAL_ACC0_XOFF"]
+        assert found["hash"] is not None
+        assert vehicle.requests["PARAM_REQUEST_READ"] == 1
+    else:
+        assert found["cached"] == ["A", "CAL_ACC0_XOFF"]
+        assert found["hash"] is None
+        assert vehicle.requests["PARAM_REQUEST_READ"] == 0
+    assert vehicle.requests["PARAM_REQUEST_LIST"] == 0
+    shown = command("fetch", url, "--cache", cache, "--policy", policy)
+    assert [row[-1] for row in shown.rows[1:]] == [
+        "verified" if policy == "hash-only" else "cached",
+        "cached",
+    ]
+
+
+def test_a_policy_and_refresh_exclude_each_other(command: Command) -> None:
+    refused = command("fetch", "sim:px4", "--refresh", "--policy", "cache-only", "--no-cache")
+    assert (refused.code, refused.out) == (2, "")
+    assert "cache-only" in refused.err
+    unknown = command("fetch", "sim:px4", "--policy", "never", "--no-cache")
+    assert unknown.code == 2
+
+
 # watch
 
 
@@ -562,6 +612,102 @@ def test_watch_tells_what_has_changed_since_the_cache_was_written(
     assert watched.code == 0
     change = watched.json
     assert (change["name"], change["old"], change["new"]) == ("B", 2, 3)
+
+
+def goings_and_comings() -> PX4Vehicle:
+    """A vehicle that is away from 2 s on for 8 s, and comes back with another value of B."""
+
+    class Restless(PX4Vehicle):
+        begun_at: float | None = None
+
+        def tick(self, now: float) -> None:
+            if self.begun_at is None:
+                self.begun_at = now
+            elif now > self.begun_at + 1.5 and self._heartbeat.base_mode:
+                self._heartbeat = replace(self._heartbeat, base_mode=0)
+                self.set_param("B", 3)
+                self.reboot(now, down=8.0)
+            super().tick(now)
+
+    return Restless(table={"A": 1, "B": 2})
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+@swiftly
+async def test_watch_tells_what_becomes_of_the_vehicle(
+    put: Callable[[Endpoint], str], capsys: pytest.CaptureFixture[str], as_json: bool
+) -> None:
+    url = put(goings_and_comings())
+    options = LinkOptions(json=as_json, no_cache=True, timeout=20.0)
+    assert await vehicle_commands.watch(url, options=options) == 0
+    printed = capsys.readouterr()
+    assert printed.err == "watching 2 parameters of 1/1 px4\n"
+    lines = printed.out.splitlines()
+    if not as_json:
+        told = [line.partition("Z  ")[2] for line in lines]
+        assert told[0] == "1/1 lost: not heard for 5.0 s"
+        assert re.fullmatch(r"1/1 found after \d\d?\.\d s", told[1])
+        assert told[2:] == [
+            "1/1 has started again",
+            "B  2 -> 3  (vehicle)",
+            "1/1 resynced: 1 had moved",
+        ]
+        return
+    lost, found, rebooted, change, resynced = (strict(line) for line in lines)
+    where = {"system": 1, "component": 1}
+    assert list(lost) == ["time", "event", "system", "component", "silence_s"]
+    for each in (lost, found, rebooted, change, resynced):
+        datetime.fromisoformat(each.pop("time"))
+    assert lost == {"event": "lost", **where, "silence_s": pytest.approx(5.0, abs=0.1)}
+    assert found == {"event": "found", **where, "silence_s": pytest.approx(9.0, abs=1.5)}
+    assert rebooted == {"event": "rebooted", **where}
+    assert change == {"name": "B", "old": 2, "new": 3, "by": "vehicle"}
+    assert resynced == {"event": "resynced", **where, "changed": ["B"], "hash": resynced["hash"]}
+    assert re.fullmatch("[0-9a-f]{8}", resynced["hash"])
+
+
+@swiftly
+async def test_watch_tells_of_its_own_vehicle_alone(
+    put: Callable[[Endpoint], str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = goings_and_comings()
+    other.system = 2
+    url = put(Air([PX4Vehicle(table={"A": 1}), other]))
+    assert await vehicle_commands.watch(url, options=LinkOptions(no_cache=True, timeout=20.0)) == 0
+    assert capsys.readouterr().out == ""
+
+
+@swiftly
+async def test_watch_may_only_listen(
+    put: Callable[[Endpoint], str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    vehicle = goings_and_comings()
+    url = put(vehicle)
+    options = LinkOptions(cache=tmp_path / "cache.sqlite3", timeout=20.0)
+    assert await vehicle_commands.watch(url, policy=Policy.CACHE_ONLY, options=options) == 0
+    printed = capsys.readouterr()
+    assert printed.err == "watching 0 parameters of 1/1 px4\n"
+    assert len(printed.out.splitlines()) == 3, "lost, found, has started again"
+    assert vehicle.requests.keys() == {"HEARTBEAT", "COMMAND_LONG"}
+
+
+@pytest.mark.parametrize("is_json", [True, False])
+def test_a_link_that_fails_under_watch_is_told_once(
+    command: Command, put: Callable[[Endpoint | SimLink], str], is_json: bool
+) -> None:
+    class Failing(SimLink):
+        received = 0
+
+        async def receive(self) -> list[tuple[Peer, bytes]]:
+            self.received += 1
+            if self.received > 6:
+                raise LinkError("it is gone", link=self.name)
+            return await super().receive()
+
+    url = put(Failing(PX4Vehicle(table={"A": 1}), "sim:custom"))
+    watched = command("watch", url, "A", "--no-cache", *(["--json"] if is_json else []))
+    assert (watched.code, watched.out) == (4, "")
+    assert watched.err == "watching A of 1/1 px4\nparamclient: it is gone\n"
 
 
 # link

@@ -727,12 +727,12 @@ def test_a_refresh_of_volatile_values_fails_with_the_link() -> None:
     world.next_session()
     world.meet().use_cached(now=world.now, **memory)
     world.fetch()
-    refresh = world.machine.fetches.refresh
+    refresh = world.machine.refresh
     assert refresh is not None
     error = LinkError("gone", link="x")
     world.station.fail_all(error, world.now)
     assert refresh.error is error
-    assert world.machine.fetches.refresh is None
+    assert world.machine.refresh is None
 
 
 def test_a_pause_does_not_count_as_the_vehicles_silence() -> None:

@@ -173,14 +173,14 @@ def test_a_hit_costs_one_request_and_the_volatile_values() -> None:
     assert {result.params[name].trust for name in volatile} == {Trust.CACHED}
     assert {param.trust for name, param in result.params.items() if name not in volatile} == {Trust.VERIFIED}
     assert names_read(world)[0] == HASH_CHECK
-    refresh = world.machine.fetches.refresh
+    refresh = world.machine.refresh
     assert refresh is not None
     world.until(lambda: refresh.done)
     assert sorted(names_read(world)) == sorted([HASH_CHECK, *volatile])
     assert world.sent_of(ParamRequestList) == []
     assert world.sent_of(ParamSet) == []
     assert {world.machine.table.params[name].trust for name in volatile} == {Trust.LIVE}
-    assert world.machine.fetches.refresh is None
+    assert world.machine.refresh is None
 
 
 def test_volatile_values_are_read_afresh_after_a_hit() -> None:
@@ -202,13 +202,13 @@ def test_a_second_hit_while_the_first_one_is_refreshed() -> None:
     world.fetch()
     go_on(world)
     world.fetch()
-    first = world.machine.fetches.refresh
+    first = world.machine.refresh
     world.fetch()
-    second = world.machine.fetches.refresh
+    second = world.machine.refresh
     assert first is not None
     assert second is not None
     world.until(lambda: first.done and second.done)
-    assert world.machine.fetches.refresh is None
+    assert world.machine.refresh is None
 
 
 def test_a_hit_without_anything_volatile_refreshes_nothing() -> None:
@@ -216,7 +216,7 @@ def test_a_hit_without_anything_volatile_refreshes_nothing() -> None:
     world.fetch()
     go_on(world)
     assert world.fetch().source == "cache"
-    assert world.machine.fetches.refresh is None
+    assert world.machine.refresh is None
 
 
 def test_a_hash_that_was_asked_for_ahead_costs_nothing_more() -> None:
@@ -442,7 +442,7 @@ def test_after_a_hit_with_an_unproven_hash_everything_is_read_afresh() -> None:
     vehicle._entry("P03").store(77)  # no hash tells of it
     result = world.fetch()
     assert {param.trust for param in result.params.values()} == {Trust.CACHED}
-    refresh = world.machine.fetches.refresh
+    refresh = world.machine.refresh
     assert refresh is not None
     world.until(lambda: refresh.done)
     params = world.machine.table.params
@@ -764,7 +764,7 @@ def test_the_link_goes_for_good_at_any_moment(seconds: float) -> None:
     error = LinkError("gone", link="x")
     fetch = world.machine.begin_fetch(world.now)
     world.run(seconds)
-    refresh = world.machine.fetches.refresh
+    refresh = world.machine.refresh
     world.station.fail_all(error, world.now)
     assert fetch.error is error or fetch.result is not None
     assert refresh is None or refresh.error is error or refresh.done
@@ -778,12 +778,12 @@ def test_the_link_goes_for_good_while_everything_is_read_afresh() -> None:
     world.fetch()
     go_on(world)
     world.fetch()
-    refresh = world.machine.fetches.refresh
+    refresh = world.machine.refresh
     assert refresh is not None
     error = LinkError("gone", link="x")
     world.station.fail_all(error, world.now)
     assert refresh.error is error
-    assert world.machine.fetches.refresh is None
+    assert world.machine.refresh is None
     assert len(world.machine.reads) == 0
 
 
@@ -794,7 +794,7 @@ def test_a_write_while_everything_is_read_afresh_leaves_the_question_open() -> N
     go_on(world)
     vehicle._entry("P03").store(77)
     world.fetch()
-    refresh = world.machine.fetches.refresh
+    refresh = world.machine.refresh
     assert refresh is not None
     world.until(lambda: refresh.done)
     world.machine.write("P20", 5, world.now)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import pytest
 
-from paramclient.protocol.identify import TRIES, Identification, judge_encoding
+from paramclient.protocol.identify import DOUBT_PACE, DOUBT_PATIENCE, TRIES, Identification, judge_encoding
 from paramclient.protocol.timing import INITIAL_TIMEOUT, RoundTrip
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
@@ -259,3 +260,24 @@ def test_an_answer_that_never_comes_again_leaves_what_is_known() -> None:
     assert not desk.who.is_doubted
     assert desk.who.identity.uid == "0000000000000007"
     assert desk.who.settled
+
+
+def test_one_that_was_away_is_asked_for_five_seconds_and_not_more_than_once_a_second_in_the_end() -> None:
+    desk = settled(7)
+    for _ in range(50):
+        desk.trip.answered(0.0, 0.02, 1)  # a quick link, on which five tries take half a second
+    desk.who.doubt(30.0)
+    times = [30.0]
+    while (deadline := desk.who.next_deadline()) < math.inf:
+        assert is_so(desk.who.is_doubted)
+        assert not desk.who.may_be_written
+        times.append(deadline)
+        desk.who.tick(deadline)
+    usual = desk.trip.tries
+    assert times[-1] >= 30.0 + DOUBT_PATIENCE
+    assert all(after - before >= DOUBT_PACE for before, after in pairwise(times[usual - 1 : -1]))
+    assert len(times) <= usual + DOUBT_PATIENCE / DOUBT_PACE + 2
+    assert desk.who.may_be_written, "nothing waits for ever"
+    assert desk.who.was_away, "but it has not said that it is the same"
+    desk.who.version(AutopilotVersion(0, uid=7), 60.0)
+    assert not is_so(desk.who.was_away)

@@ -12,6 +12,7 @@ import anyio
 from paramclient.cli.options import LinkOptions
 from paramclient.client import ParamClient
 from paramclient.component import Component
+from paramclient.protocol.result import Policy
 
 __all__ = ["Deadline", "Session", "connect", "listen"]
 
@@ -53,7 +54,7 @@ class Session:
 
 
 @asynccontextmanager
-async def connect(url: str, options: LinkOptions) -> AsyncIterator[Session]:
+async def connect(url: str, options: LinkOptions, *, policy: Policy = Policy.AUTO) -> AsyncIterator[Session]:
     """Open a link and wait for the component that the options name.
 
     Raises:
@@ -62,7 +63,7 @@ async def connect(url: str, options: LinkOptions) -> AsyncIterator[Session]:
         LinkError: the link cannot be opened, or failed.
     """
     deadline = Deadline(options.timeout)
-    async with ParamClient(url, cache=options.place, encoding=options.encoding) as client:
+    async with ParamClient(url, cache=options.place, encoding=options.encoding, policy=policy) as client:
         patience = HEARING_PATIENCE if options.timeout is None else deadline.left()
         component = await client.component(options.system, options.component, timeout=patience)
         yield Session(client, component, deadline)

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import re
 import time
-from collections.abc import Iterable, Sequence
-from contextlib import suppress
+from collections.abc import AsyncGenerator, Iterable, Sequence
+from contextlib import aclosing, suppress
 from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
@@ -32,9 +33,9 @@ from paramclient.cli.output import (
     value_json,
 )
 from paramclient.cli.session import Session, connect
-from paramclient.errors import NoReply, ParamClientError, UsageError, ValueNotApplied
-from paramclient.events import Changes
-from paramclient.protocol.result import FetchResult
+from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError, ValueNotApplied
+from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
+from paramclient.protocol.result import FetchResult, Policy
 from paramclient.protocol.table import Change
 from paramclient.values import Param, ParamType, Trust, Value, check_name, format_value, type_name
 
@@ -48,7 +49,14 @@ MOST_INDICES: Final = 20
 _DEFAULTS: Final = LinkOptions()
 
 
-async def fetch(url: str, /, *, refresh: bool = False, options: LinkOptions = _DEFAULTS) -> int:
+async def fetch(
+    url: str,
+    /,
+    *,
+    refresh: bool = False,
+    policy: Policy = Policy.AUTO,
+    options: LinkOptions = _DEFAULTS,
+) -> int:
     """Bring every parameter: from the cache where the vehicle's hash confirms it, else by download.
 
     Exit code 1 says that some are missing.
@@ -56,12 +64,13 @@ async def fetch(url: str, /, *, refresh: bool = False, options: LinkOptions = _D
     Args:
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
         refresh: Download even what the cache has.
+        policy: What the vehicle may be asked: whatever is needed, only for its hash, or nothing.
     """
-    async with connect(url, options) as session:
+    async with connect(url, options, policy=policy) as session:
         result = await _fetch_all(session, refresh=refresh)
         with suppress(NoReply):
             await session.component.refreshed(timeout=session.deadline.left(REFRESH_PATIENCE))
-        fetched = _Fetched.of(session, result)
+        fetched = _Fetched.of(session, result, policy)
     for note in result.notes:
         report(note)
     if options.json:
@@ -134,30 +143,37 @@ async def set_(
     return max(outcome.code for outcome in outcomes)
 
 
-async def watch(url: str, /, *names: str, options: LinkOptions = _DEFAULTS) -> int:
+async def watch(
+    url: str, /, *names: str, policy: Policy = Policy.AUTO, options: LinkOptions = _DEFAULTS
+) -> int:
     """Print every change of a value as it happens, whoever caused it, until Ctrl-C.
 
-    What is known is brought up to date first; what has changed since the cache was written is printed too.
+    What is known is brought up to date first; what has changed since the cache was written is printed too,
+    and so is when the vehicle is lost, found, has started again, or its table agrees with the one here again.
     With --timeout it ends by itself.
 
     Args:
         url: The link.
         names: The parameters to watch; without any, all of them.
+        policy: What the vehicle may be asked beside NAMES: whatever is needed, only for its hash, or nothing.
     """
     wanted = [check_name(each) for each in dict.fromkeys(names)]
-    async with connect(url, options) as session:
-        changes = session.component.changes()
+    async with connect(url, options, policy=policy) as session:
+        changes, events = session.component.changes(), session.client.events()
         if wanted:
             _, errors = await _get_all(session, wanted)
             if errors:
                 return _report_all(errors.values())
         else:
-            await _fetch_all(session, refresh=False)
+            with suppress(CacheError):  # there may be nothing in it: then all that is heard is new
+                await _fetch_all(session, refresh=False)
         known = set(session.component.params)
         what = ", ".join(wanted) if wanted else f"{len(known)} parameters"
         say(printable(f"watching {what} of {session.who}"))
         with anyio.move_on_after(session.deadline.left()):
-            await _print_changes(changes, known, frozenset(wanted), as_lines_of_json=options.json)
+            await _print_news(
+                session, changes, events, known, frozenset(wanted), as_lines_of_json=options.json
+            )
     return ExitCode.DONE
 
 
@@ -168,25 +184,34 @@ async def watch(url: str, /, *names: str, options: LinkOptions = _DEFAULTS) -> i
 class _Fetched:
     """What the vehicle has given or confirmed in this session.
 
-    A value that only the cache knows is left out, and its index is missing like one that did not come.
+    A value that only the cache knows is left out, and its index is missing like one that did not come; but
+    where the policy keeps it from being asked for, it is among the others, and named in `cached`.
     """
 
     session: Session
     result: FetchResult
     params: list[Param]
     missing: list[int]
+    cached: list[str]
     bytes_received: int
     bytes_sent: int
 
     @classmethod
-    def of(cls, session: Session, result: FetchResult) -> _Fetched:
-        known = by_index(session.component.params.values())
-        stale = {param.index for param in known if param.trust is Trust.CACHED and param.index is not None}
+    def of(cls, session: Session, result: FetchResult, policy: Policy) -> _Fetched:
+        params = by_index(session.component.params.values())
+        cached = [param for param in params if param.trust is Trust.CACHED]
+        missing = set(result.missing)
+        if policy is Policy.AUTO:
+            if result.source == "cache":
+                missing = {param.index for param in cached if param.index is not None}
+            params = [param for param in params if param.trust is not Trust.CACHED]
+            cached = []
         return cls(
             session,
             result,
-            params=[param for param in known if param.trust is not Trust.CACHED],
-            missing=sorted(stale if result.source == "cache" else result.missing),
+            params=params,
+            missing=sorted(missing),
+            cached=[param.name for param in cached],
             bytes_received=session.client.bytes_received,
             bytes_sent=session.client.bytes_sent,
         )
@@ -220,6 +245,7 @@ class _Fetched:
             "source": self.result.source,
             "hash": hash_text(self.result.hash),
             "missing": self.missing,
+            "cached": self.cached,
             "lost": self.result.lost,
             "repeated": self.result.repeated,
             "round_trip_s": rounded(self.result.round_trip),
@@ -362,28 +388,98 @@ _REAL: Final = re.compile(
 # watch
 
 
-async def _print_changes(
-    changes: Changes, known: set[str], wanted: frozenset[str], *, as_lines_of_json: bool
+async def _print_news(
+    session: Session,
+    changes: Changes,
+    events: Events,
+    known: set[str],
+    wanted: frozenset[str],
+    *,
+    as_lines_of_json: bool,
 ) -> None:
-    """Print changes until cancelled; a parameter that has just been heard for the first time is none."""
-    async for change in changes:
-        if change.old is None and change.name in known:
-            known.discard(change.name)
-        elif not wanted or change.name in wanted:
-            at = time.time()
-            if as_lines_of_json:
-                print_json(_change_json(change, at))
+    """Print changes, and what becomes of the component, until cancelled.
+
+    A parameter that has just been heard for the first time is no change.
+    """
+    async with aclosing(_merged(changes, events)) as news:
+        async for each in news:
+            if isinstance(each, Change):
+                if each.old is None and each.name in known:
+                    known.discard(each.name)
+                    continue
+                if wanted and each.name not in wanted:
+                    continue
+                text, json = _change_text(each), _change_json(each)
+            elif isinstance(each, Heard) or each.component is not session.component:
+                continue
             else:
-                old, new = (_change_text(param) for param in (change.old, change.new))
-                print_line(f"{time_text(at)}  {change.name}  {old} -> {new}  ({change.by})")
+                text, json = _event_text(each), _event_json(each)
+            at = time_text(time.time())
+            if as_lines_of_json:
+                print_json({"time": at, **json})
+            else:
+                print_line(f"{at}  {text}")
 
 
-def _change_json(change: Change, at: float) -> dict[str, Any]:
+async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | Event]:
+    """What comes from either of them, as it comes."""
+    waiting: dict[asyncio.Future[Change | Event], Changes | Events] = {}
+
+    def wait(feed: Changes | Events) -> None:
+        waiting[asyncio.ensure_future(anext(feed))] = feed
+
+    try:
+        wait(changes)
+        wait(events)
+        while True:
+            done, _ = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+            for each in [each for each in waiting if each in done]:
+                wait(waiting.pop(each))
+                yield each.result()
+    finally:
+        for each in waiting:
+            if not each.cancel():
+                each.exception()  # both end with the link; one of them is told
+
+
+def _change_json(change: Change) -> dict[str, Any]:
     old, new = (
         None if param is None else value_json(param.value, param.type) for param in (change.old, change.new)
     )
-    return {"time": time_text(at), "name": change.name, "old": old, "new": new, "by": change.by}
+    return {"name": change.name, "old": old, "new": new, "by": change.by}
 
 
-def _change_text(param: Param | None) -> str:
-    return "none" if param is None else format_value(param.value, param.type)
+def _change_text(change: Change) -> str:
+    old, new = (
+        "none" if param is None else format_value(param.value, param.type)
+        for param in (change.old, change.new)
+    )
+    return f"{change.name}  {old} -> {new}  ({change.by})"
+
+
+def _event_json(event: Lost | Found | Rebooted | Resynced) -> dict[str, Any]:
+    component = event.component
+    told: dict[str, Any] = {
+        "event": type(event).__name__.lower(),
+        "system": component.system,
+        "component": component.component,
+    }
+    if isinstance(event, Lost | Found):
+        told["silence_s"] = rounded(event.silence)
+    elif isinstance(event, Resynced):
+        told |= {"changed": list(event.changed), "hash": hash_text(event.hash)}
+    return told
+
+
+def _event_text(event: Lost | Found | Rebooted | Resynced) -> str:
+    match event:
+        case Lost():
+            what = f"lost: not heard for {event.silence:.1f} s"
+        case Found():
+            what = f"found after {event.silence:.1f} s"
+        case Rebooted():
+            what = "has started again"
+        case Resynced():
+            number = len(event.changed)
+            what = f"resynced: {number or 'nothing'} had moved"
+    return f"{event.component.system}/{event.component.component} {what}"

@@ -18,6 +18,7 @@ from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.identify import Identification
 from paramclient.protocol.presence import Presence
 from paramclient.protocol.reads import Key, Read, Reads
+from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.result import Means, Policy, Sampled
 from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
 from paramclient.protocol.table import Change, Table
@@ -60,6 +61,7 @@ class ComponentMachine:
         encoding: what the user said about its encoding, or None.
         upkeep: what is done for its table without being asked.
         is_link_busy: whether anything is being asked for on the link.
+        is_vehicle_doubted: whether it is open which vehicle its autopilot belongs to.
         another: is told that another vehicle has taken the system id; by default `become_another`.
         turns: those of the lists on the link; None for a link that it has for itself.
 
@@ -86,6 +88,7 @@ class ComponentMachine:
         encoding: Encoding | None = None,
         upkeep: Upkeep | None = None,
         is_link_busy: Callable[[], bool] = lambda: False,
+        is_vehicle_doubted: Callable[[], bool] = lambda: False,
         another: Callable[[float], None] | None = None,
         turns: Turns | None = None,
     ) -> None:
@@ -106,7 +109,7 @@ class ComponentMachine:
             self.reads,
             self.table.params,
             encoding=lambda: self.table.encoding,
-            is_certain=lambda: self.who.may_be_written,
+            is_certain=lambda: self.may_be_written,
         )
         self.presence = Presence()
         self.sync = Sync(
@@ -119,9 +122,9 @@ class ComponentMachine:
             is_busy=is_link_busy,
             file_is_cheap=lambda interval: self.fetches.file_is_cheap(interval),
             is_spared=lambda: self._is_spared,
+            is_doubted=lambda: self.who.is_doubted,
             begin_fetch=lambda now, refresh: self.begin_fetch(now, refresh=refresh),
             end_fetch=self.end_fetch,
-            confirmed=lambda confirmed, now: self.fetches.refresh_unhashed(confirmed, now),
             resynced=lambda changed, confirmed: emit(events.TableResynced(self, changed, confirmed)),
         )
         self.files = FileTransfers(target, own, self.round_trip, send)
@@ -135,19 +138,19 @@ class ComponentMachine:
                 self.turns,
                 self.files,
                 expects_hash=lambda: self.sync.expects_hash,
-                changed=self._report,
+                changed=self._moved,
                 doubt=self._doubt_identity,
             ),
             self.sync,
             upkeep.policy,
             says_file=lambda: self.who.says_file,
-            is_writing=lambda: len(self.writes) > 0,
             ended=lambda result: emit(events.Fetched(self, result)),
         )
         self._own = own
         self._emit = emit
         self._policy = upkeep.policy
         self._another = another or self.become_another
+        self._is_vehicle_doubted = is_vehicle_doubted
         self._known_as: str | None = None  # the key of the identity that was reported
         self._may_write = False
         self._authors = Authors()
@@ -158,8 +161,8 @@ class ComponentMachine:
         """Take a message that this component sent."""
         silence = self.presence.heard(now)
         self.round_trip.heard_at = now
-        if self.presence.is_lost:
-            self._find(silence, now)
+        if silence >= self.presence.gap or self.presence.is_lost:
+            self._was_silent(silence, now)
         if version > self.version:
             self.version = version
         if isinstance(message, ParamValue):
@@ -168,7 +171,6 @@ class ComponentMachine:
             self.who.heartbeat(message)
             if self.presence.heartbeat(message, now):
                 self._rebooted(now)
-            self.sync.silence(silence, now)
             self._authors.forget(now)
         elif isinstance(message, AutopilotVersion):
             if self.who.version(message, now):
@@ -184,17 +186,14 @@ class ComponentMachine:
             if denied:
                 self.writes.denied(denied.group(1), now)
         elif isinstance(message, SystemTime):
-            if self.presence.system_time(message):
+            if self.presence.system_time(message, now):
                 self._rebooted(now)
         elif isinstance(message, FileTransfer):
             self.files.heard(message, now)
         elif isinstance(message, HighLatency2):
             self.who.heartbeat(message)
             self.presence.high_latency()
-        if self.presence.was_away(silence):
-            self.who.doubt(now)
-        else:
-            self.who.heard(now)
+        self.who.heard(now)
         if not isinstance(message, ParamValue):  # a value tells nothing of who it is
             self._follow_identity(now)
 
@@ -262,7 +261,7 @@ class ComponentMachine:
         self._check_present(f"PARAM_SET {name} to {self.system}/{self.component}", now)
         name = self.spelling(name)
         known = self.table.params.get(name)
-        if known is not None and known.trust is not Trust.CACHED and self.who.may_be_written:
+        if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
             encode(value, known.type, self.table.encoding)
         write = self.writes.set(name, value, now)
         write.on_done.append(lambda: self.sync.write_ended(write.ended_at))
@@ -309,7 +308,8 @@ class ComponentMachine:
         self._follow_identity(now)
         self.sync.tick(now)
         for name in self._authors.doubted(now):
-            self.reads.ask(name, now, urgent=False)
+            if self._policy is Policy.AUTO:
+                self.reads.ask(name, now, urgent=False)
 
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity."""
@@ -326,11 +326,13 @@ class ComponentMachine:
 
     def resume(self, now: float) -> None:
         """The link was away and is back: whatever waits for an answer is asked for again."""
-        # it could not be heard while the link was away
-        if now - self.presence.heard_at >= self.presence.patience and not self.presence.is_lost:
-            self._doubt()
-            self.sync.check(now)
-        self.presence.heard_at = self.round_trip.heard_at = now
+        self.round_trip.heard_at = now
+        if not self.presence.is_lost:
+            # it could not be heard meanwhile, nor be lost
+            if self.presence.was_away(silence := self.presence.heard(now)):
+                self._doubt()
+                self.sync.check(now)
+            self._was_silent(silence, now)
         self.reads.resume(now)
         self.writes.resume(now)
         self.files.resume(now)
@@ -342,8 +344,8 @@ class ComponentMachine:
         if self.fetch is not None:
             self.fetch.cancel(now)
             self.fetch.fail(error, now)
-        if self.fetches.refresh is not None:
-            self.fetches.refresh.fail(error, now)
+        if self.sync.refresh is not None:
+            self.sync.refresh.fail(error, now)
         self.files.fail_all(error, now)
         self.writes.fail_all(error, now)
         self.reads.fail_all(error, now)
@@ -374,6 +376,11 @@ class ComponentMachine:
         return self.who.identity
 
     @property
+    def may_be_written(self) -> bool:
+        """Whether it is certain whom a write reaches, and what it makes of it."""
+        return self.who.may_be_written and not self._is_vehicle_doubted()
+
+    @property
     def state(self) -> str:
         """The table's state in a word: new, cached, fetching, synced, partial, lost."""
         if self.presence.is_lost:
@@ -397,6 +404,11 @@ class ComponentMachine:
         return SyncState.LOST if self.presence.is_lost else self.sync.state
 
     @property
+    def refresh(self) -> Refresh | None:
+        """The reading of volatile values under way after a hash hit, or None."""
+        return self.sync.refresh
+
+    @property
     def can_hit(self) -> bool:
         """Whether the vehicle's hash may confirm the table as it stands."""
         return self.table.complete and self.table.hash is not None
@@ -414,8 +426,6 @@ class ComponentMachine:
     def __repr__(self) -> str:
         kind = "unknown" if self.who.autopilot is None else autopilot_name(self.who.autopilot)
         return f"<ComponentMachine {self.system}/{self.component} {kind} {self.state}>"
-
-    # private
 
     def _receive_value(self, message: ParamValue, now: float) -> None:
         name, _, _, count, _ = message
@@ -466,7 +476,7 @@ class ComponentMachine:
 
     def _doubt(self) -> None:
         """What is known may be of the past: it counts again when the vehicle has confirmed it."""
-        self.table.doubt()
+        self.table.doubt(Trust.LIVE, Trust.VERIFIED)
         self.sync.doubt()
 
     def _lose(self, now: float) -> None:
@@ -474,16 +484,23 @@ class ComponentMachine:
         presence = self.presence
         presence.is_lost = True
         silence = now - presence.heard_at
-        self._doubt()
         self._emit(events.ComponentLost(self, silence))
         self.writes.lose(now)
         self.reads.lose(now)
+        self._doubt()
 
-    def _find(self, silence: float, now: float) -> None:
-        """It is heard again: who it is and its hash are asked for before anything counts."""
-        self.presence.is_lost = False
-        self._emit(events.ComponentFound(self, silence))
-        self.sync.check(now)
+    def _was_silent(self, silence: float, now: float) -> None:
+        """It is heard again. After a while, who it is and its hash are asked for before anything counts."""
+        presence = self.presence
+        if presence.is_lost:
+            presence.is_lost = False
+            self._emit(events.ComponentFound(self, silence))
+            self.sync.check(now)
+            self.who.doubt(now)
+        elif presence.was_away(silence) and silence < math.inf:
+            self.who.doubt(now)
+        if presence.has_beaten:  # else nothing says when it should have been heard
+            self.sync.silence(now)
 
     def _rebooted(self, now: float) -> None:
         """The vehicle has started again: what it had not saved is gone, and its list begins anew."""
@@ -507,7 +524,7 @@ class ComponentMachine:
         if self.who.settled and self._known_as != self.identity.key:
             self._known_as = self.identity.key
             self._emit(events.ComponentIdentified(self))
-        may_write = self.who.may_be_written
+        may_write = self.may_be_written
         if may_write and not self._may_write:
             self.writes.proceed(now)
         self._may_write = may_write
@@ -516,6 +533,12 @@ class ComponentMachine:
         """The table is not what it was: it may be another vehicle that answers by now."""
         if self.who.settled and now - self.who.known_at > FRESH_IDENTITY:
             self.who.ask_again(now)
+
+    def _moved(self, changes: list[Change]) -> None:
+        """What a fetch has found out otherwise than by a PARAM_VALUE."""
+        for change in changes:
+            self.sync.changed(change)
+        self._report(changes)
 
     def _report(self, changes: list[Change]) -> None:
         for change in changes:

@@ -17,6 +17,7 @@ from paramclient.protocol.notes import (
     NO_FILE,
     NOT_ASKED,
     NOT_CONFIRMED,
+    NOT_REFRESHED,
     NOT_RESUMED,
     NOT_SAMPLED,
     SAMPLED,
@@ -88,6 +89,7 @@ class Fetch(Operation[FetchResult]):
         table = self._table = means.table
         self._expects_hash = means.expects_hash
         self._may_use_file = may_use_file
+        self._has_begun = False
         self._sampling: Sampling | None = None
         self._hash_read: Read | None = None
         self._before: int | None = None  # the hash announced before any value counted
@@ -157,8 +159,8 @@ class Fetch(Operation[FetchResult]):
 
     @property
     def is_under_way(self) -> bool:
-        """Whether parameters are coming, which would be of the past if the vehicle started again."""
-        return self.file is not None or (self.download is not None and not self.download.done)
+        """Whether parameters have come, which are of the past if the vehicle starts again."""
+        return self._has_begun
 
     def restart(self, now: float) -> None:
         """The vehicle is another one, or has started again: what came is not about it. Fetch it anew."""
@@ -288,6 +290,8 @@ class Fetch(Operation[FetchResult]):
         table.count = announcement.count
         table.verify()
         notes = () if table.volatile_known else (UNPROVEN,)
+        if self._policy is Policy.HASH_ONLY:
+            notes = (NOT_REFRESHED,) if table.unhashed() else ()
         self.finish(self._result("cache", announcement.count, (), announcement.hash, now, notes), now)
 
     def _begin_or_resume(self, announced: Announcement | None, now: float) -> None:
@@ -327,6 +331,7 @@ class Fetch(Operation[FetchResult]):
             self._stay_with_cache(now)
             return
         means = self._means
+        self._has_begun = True
         means.doubt(now)
         if self._may_use_file and not self._listed:
             file = self.file = PackFetch(means.files, means.turns, means.table, means.changed, now)
@@ -343,7 +348,6 @@ class Fetch(Operation[FetchResult]):
             count=self._table.count,
             present=present,
         )
-
         if download.done:
             self._download_ended(download)
         download.on_done.append(partial(self._download_ended, download))
@@ -381,6 +385,7 @@ class Fetch(Operation[FetchResult]):
             volatile, proven = find_volatile(table.listed(), after, believed=table.volatile)
             if proven or after == self._before:
                 table.confirm(after, volatile, proven=proven)
+                table.verify()
                 notes = () if proven else (UNPROVEN,)
             else:
                 notes = (MOVED,)
@@ -391,9 +396,7 @@ class Fetch(Operation[FetchResult]):
         table = self._table
         if not table.params:
             system, component = self._target
-            what = (
-                f"nothing is cached of {system}/{component}, and the policy {self._policy} allows no download"
-            )
+            what = f"nothing is cached of {system}/{component}, and the policy is {self._policy}"
             self.fail(CacheError(what), now)
             return
         present = {param.index for param in table.listed()}

@@ -7,7 +7,6 @@ from functools import partial
 from typing import Final
 
 from paramclient.protocol.fetch import Fetch
-from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.result import FetchResult, Means, Policy, Sampled
 from paramclient.protocol.sync import Sync
 
@@ -26,13 +25,11 @@ class Fetches:
         sync: the component's.
         policy: what may be asked.
         says_file: whether the component says that it serves files.
-        is_writing: whether a write of ours is under way.
-        ended: is told of each result that stands for the vehicle's table of now.
+        ended: is told of each result in which the vehicle has said something of its table.
 
     Attributes:
         current: the fetch under way, or None.
         last: the result of the last one that ended, or None.
-        refresh: the reading of volatile values under way after a hash hit, or None.
         file_works: whether this vehicle, with this firmware, gives its table as a file: None while unknown.
         is_same_firmware: whether what the cache knows is of this very vehicle with this very firmware.
     """
@@ -44,19 +41,16 @@ class Fetches:
         policy: Policy,
         *,
         says_file: Callable[[], bool],
-        is_writing: Callable[[], bool],
         ended: Callable[[FetchResult], None],
     ) -> None:
         self.current: Fetch | None = None
         self.last: FetchResult | None = None
-        self.refresh: Refresh | None = None
         self.file_works: bool | None = None
         self.is_same_firmware = False
         self._means = means
         self._sync = sync
         self._policy = policy
         self._says_file = says_file
-        self._is_writing = is_writing
         self._ended = ended
         self._file_took: float | None = None
 
@@ -109,13 +103,6 @@ class Fetches:
             if self.current is fetch:
                 self.current = None
 
-    def refresh_unhashed(self, confirmed: int, now: float) -> None:
-        """A hash has confirmed the table: read what it says nothing about."""
-        refresh = Refresh(self._means.reads, self._means.table, confirmed, self._is_writing, now)
-        if not refresh.done:
-            self.refresh = refresh
-            refresh.on_done.append(partial(self._refresh_ended, refresh))
-
     def forget(self) -> None:
         """Another vehicle has taken the address."""
         self.file_works = self._file_took = None
@@ -131,15 +118,5 @@ class Fetches:
         self.last = result
         if result.source == "ftp":
             self._file_took = result.elapsed
-        if result.source == "cache" and result.hash is None:
-            return  # the vehicle was not asked, or not about all of it
-        table = self._means.table
-        is_synced = result.complete and table.complete and result.is_confirmed
-        self._sync.fetched(is_synced, result.hash, fetch.ended_at)
-        self._ended(result)
-        if result.hash is not None and (result.source == "cache" or result.resumed):
-            self.refresh_unhashed(result.hash, fetch.ended_at)
-
-    def _refresh_ended(self, refresh: Refresh) -> None:
-        if self.refresh is refresh:
-            self.refresh = None
+        if self._sync.fetched(result, fetch.ended_at):
+            self._ended(result)

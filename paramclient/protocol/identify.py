@@ -37,6 +37,10 @@ PX4_WITH_FILE: Final = 0x01120000
 TRIES: Final = 4
 """AUTOPILOT_VERSION is asked for so often where nothing is known of the link, or where it was refused; many
 components (cameras, radios) never give one."""
+DOUBT_PATIENCE: Final = 5.0
+"""Seconds for which one that has said it before is asked at the least: it may only be starting."""
+DOUBT_PACE: Final = 1.0
+"""Seconds between two questions when the usual number of them has not helped."""
 
 
 def judge_encoding(
@@ -75,7 +79,7 @@ class Identification:
         known_at: when the version came; minus infinity before that.
         settled: whether `identity` is as good as it gets: the version came, or it never will.
         autopilot, vehicle_type: of the heartbeat; None before one came.
-        is_doubted: whether another vehicle may have taken its place, and the answer is awaited.
+        was_away: whether another vehicle may have taken its place since it said who it is.
         encoding, encoding_reason: how it writes values, and why that is believed.
     """
 
@@ -93,7 +97,7 @@ class Identification:
         self._chosen = chosen
         self.identity = Identity(target[0], link)
         self.settled = False
-        self.is_doubted = False
+        self.was_away = False
         self.known_at = -math.inf
         self.autopilot: int | None = None
         self.vehicle_type: int | None = None
@@ -102,6 +106,7 @@ class Identification:
         self._attempts = 0
         self._asked_at = -math.inf
         self._is_asking = False
+        self._asks_until = -math.inf  # however often that is
         self._denied_at = math.inf  # when the last way of asking was refused
 
     @property
@@ -123,6 +128,11 @@ class Identification:
         """Whether nothing that is still to come can tell otherwise."""
         has_said = self.autopilot in (MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4)
         return self._chosen is not None or has_said or self.settled or not self.has_parameters
+
+    @property
+    def is_doubted(self) -> bool:
+        """Whether another vehicle may have taken its place, and the answer is awaited."""
+        return self.was_away and self._is_asking
 
     @property
     def may_be_written(self) -> bool:
@@ -160,15 +170,17 @@ class Identification:
     def doubt(self, now: float) -> None:
         """It was away, or has started again: ask who it is now."""
         if self.has_parameters:
-            self.is_doubted = self.identity.uid is not None
+            self.was_away = self.identity.uid is not None
             self._attempts = 0
+            if self.was_away:
+                self._asks_until = now + DOUBT_PATIENCE
             self._ask(now)
 
     def version(self, message: AutopilotVersion, now: float) -> bool:
         """Take an AUTOPILOT_VERSION; true when it shows another vehicle than the one known so far."""
         if self._is_asking:
             self._round_trip.answered(self._asked_at, now, self._attempts)
-        self._is_asking = self.is_doubted = False
+        self._is_asking = self.was_away = False
         system, _ = self._target
         before = self.identity
         self.identity = Identity.from_version(
@@ -213,13 +225,19 @@ class Identification:
         """When `tick` has something to do, or infinity; it follows what other answers tell of the link."""
         if not self._is_asking:
             return math.inf
-        return min(self._denied_at, self._asked_at + self._round_trip.timeout)
+        pause = self._round_trip.timeout
+        if self._attempts >= self._tries and self._asked_at < self._asks_until:
+            pause = max(pause, DOUBT_PACE)
+        return min(self._denied_at, self._asked_at + pause)
+
+    @property
+    def _tries(self) -> int:
+        is_blind = self._round_trip.smoothed is None or self._denied_at < math.inf
+        return TRIES if is_blind else self._round_trip.tries
 
     def _ask(self, now: float) -> None:
-        is_blind = self._round_trip.smoothed is None or self._denied_at < math.inf
-        tries = TRIES if is_blind else self._round_trip.tries
-        if self._attempts >= tries:
-            self._is_asking = self.is_doubted = False
+        if self._attempts >= self._tries and now >= self._asks_until:
+            self._is_asking = False
             self.settled = True
             return
         self._attempts += 1

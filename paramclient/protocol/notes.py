@@ -7,6 +7,7 @@ __all__ = [
     "MOVED",
     "NOT_ASKED",
     "NOT_CONFIRMED",
+    "NOT_REFRESHED",
     "NOT_RESUMED",
     "NOT_SAMPLED",
     "NO_FILE",
@@ -33,6 +34,7 @@ NOT_CONFIRMED = (
 NO_FILE = "The parameters did not come as a file, so they were listed: {}."
 SAMPLED = "A sample of the cached table agreed with the vehicle; nothing else was asked."
 NOT_SAMPLED = "The sample did not confirm the cached table: {}."
+NOT_REFRESHED = "What the hash leaves out was not read afresh, as the policy is hash-only."
 UNSETTLED = "The number of parameters kept changing during the download."
 NOT_RESUMED = (
     "What an earlier download had brought could not be confirmed by the vehicle's hash, "

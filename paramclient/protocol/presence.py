@@ -13,12 +13,21 @@ LOST_AFTER: Final = 5.0
 """Seconds without a word after which a component that sent heartbeats counts as lost: five in a row."""
 BEATS_TO_MISS: Final = 3.0
 """For one that is known to send fewer heartbeats than one a second: so many of its own intervals."""
-ENOUGH_BEATS: Final = 4
-"""Heartbeats after which that interval is known."""
+LONGEST_PATIENCE: Final = 60.0
+"""The most that comes to: two heartbeats far apart may as well be those of one that was away between them."""
+USUAL_INTERVAL: Final = 1.0
+"""Seconds from one heartbeat to the next, by the standard."""
+BEATS_IN_A_GAP: Final = 2.5
+"""Intervals of silence in which an update may have been lost as well: two heartbeats were."""
+COPY: Final = 0.5
+"""Seconds within which a second heartbeat is one that came twice, or late."""
 LOST_AFTER_HIGH_LATENCY: Final = 20.0
 """The same in high-latency mode, where PX4 sends one HIGH_LATENCY2 every 5 seconds and nothing else."""
-OUT_OF_ORDER: Final = 2_000
-"""Milliseconds by which SYSTEM_TIME may go back because a link brought two of them in the wrong order."""
+OUT_OF_ORDER: Final = 2.0
+"""Seconds by which one message may be late because a link brought two of them in the wrong order."""
+DETOUR: Final = 5.0
+"""Seconds by which a message may be late that took another way: vehicles are heard over radio and satellite
+at once."""
 WRAP: Final = 1 << 32
 """Where time_boot_ms begins anew, after 49 days."""
 
@@ -29,6 +38,7 @@ class Presence:
     A component that never sent a heartbeat is never lost: nothing says when it should have been heard.
 
     Attributes:
+        gap: seconds of silence from which on something may have been missed.
         heard_at: when anything came from it last.
         is_lost: whether it has been silent for too long since.
         is_high_latency: whether it said so: HIGH_LATENCY2 came, and no heartbeat since.
@@ -36,10 +46,12 @@ class Presence:
 
     __slots__ = (
         "_beat_at",
-        "_beats",
+        "_boot_beat_at",
         "_boot_ms",
+        "_boot_ms_at",
         "_interval",
         "_state",
+        "gap",
         "heard_at",
         "is_high_latency",
         "is_lost",
@@ -49,22 +61,29 @@ class Presence:
         self.heard_at = -math.inf
         self.is_lost = False
         self.is_high_latency = False
+        self.gap = BEATS_IN_A_GAP * USUAL_INTERVAL
         self._beat_at = -math.inf
-        self._beats = 0
         self._interval = math.inf  # the shortest time between two heartbeats: the others were lost
         self._state: int | None = None
+        self._boot_beat_at = -math.inf  # the last heartbeat that said it was booting
         self._boot_ms: int | None = None
+        self._boot_ms_at = -math.inf
 
     @property
     def patience(self) -> float:
         """Seconds of silence after which it is lost; infinity as long as nothing can be expected of it."""
         if self.is_high_latency:
             return LOST_AFTER_HIGH_LATENCY
-        if not self._beats:
+        if not self.has_beaten:
             return math.inf
-        if self._beats < ENOUGH_BEATS:
+        if self._interval == math.inf:
             return LOST_AFTER
-        return max(LOST_AFTER, BEATS_TO_MISS * self._interval)
+        return min(max(LOST_AFTER, BEATS_TO_MISS * self._interval), LONGEST_PATIENCE)
+
+    @property
+    def has_beaten(self) -> bool:
+        """Whether it ever sent a heartbeat."""
+        return self._beat_at > -math.inf
 
     def heard(self, now: float) -> float:
         """Anything has come. Gives the seconds of silence before it: infinity for the first word."""
@@ -74,13 +93,18 @@ class Presence:
 
     def heartbeat(self, message: Heartbeat, now: float) -> bool:
         """Take a heartbeat; true when it shows that the component has started again."""
-        if self._beat_at < now:
-            self._interval = min(self._interval, now - self._beat_at)
+        interval = now - self._beat_at
+        if COPY <= interval < self._interval:
+            self._interval = interval
+            self.gap = BEATS_IN_A_GAP * max(interval, USUAL_INTERVAL)
         self._beat_at = now
-        self._beats += 1
         self.is_high_latency = False
         before, self._state = self._state, message.system_status
-        if message.system_status != MAV_STATE_BOOT or before in (None, MAV_STATE_BOOT):
+        if message.system_status != MAV_STATE_BOOT:
+            return False
+        is_late = now - self._boot_beat_at <= OUT_OF_ORDER
+        self._boot_beat_at = now
+        if before in (None, MAV_STATE_BOOT) or is_late:
             return False
         self._boot_ms = None  # its clock need not tell it again
         return True
@@ -89,16 +113,24 @@ class Presence:
         """HIGH_LATENCY2 has come: what it sends from now on is one of those every few seconds."""
         self.is_high_latency = True
 
-    def system_time(self, message: SystemTime) -> bool:
-        """Take a SYSTEM_TIME; true when it shows that the component has started again."""
-        before, now = self._boot_ms, message.time_boot_ms
-        if before is None or now >= before:
-            self._boot_ms = now
-            return False
-        if before - now <= OUT_OF_ORDER:
-            return False
-        self._boot_ms = now
-        return before - now < WRAP // 2
+    def system_time(self, message: SystemTime, now: float) -> bool:
+        """Take a SYSTEM_TIME; true when it shows that the component has started again.
+
+        Then its clock has gone back, and is no further than the time since it was heard before. One that has
+        gone back and is further is an old message that took a longer way.
+        """
+        before, boot_ms = self._boot_ms, message.time_boot_ms
+        has_started_again = False
+        if before is not None and boot_ms < before:
+            passed = 1000 * (now - self._boot_ms_at)
+            possible = passed + 1000 * DETOUR
+            has_wrapped = boot_ms + WRAP - before <= possible
+            is_late = boot_ms > possible or before + passed - boot_ms <= 1000 * OUT_OF_ORDER
+            if is_late and not has_wrapped:
+                return False
+            has_started_again = not has_wrapped
+        self._boot_ms, self._boot_ms_at = boot_ms, now
+        return has_started_again
 
     def lost_at(self) -> float:
         """When it will be lost if nothing comes; infinity while it is lost."""

@@ -6,11 +6,12 @@ import math
 from collections.abc import Hashable, Sequence
 from typing import Final, TypeAlias
 
-from paramclient.errors import LinkError
+from paramclient.errors import LinkError, UsageError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentHeard, Event
 from paramclient.protocol.fetch import Fetch, present_of
+from paramclient.protocol.result import Policy
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.traffic import Traffic
 from paramclient.protocol.turns import Turns
@@ -69,6 +70,7 @@ class Station:
         components: every component heard, by (system, component).
         bytes_received, bytes_sent: on this link, by this station.
         traffic: the counts, or None where they are not wanted.
+        policy: what may be asked to bring tables up to date.
     """
 
     def __init__(
@@ -90,6 +92,7 @@ class Station:
         self.bytes_sent = 0
         self._is_stream = is_stream
         self._encoding = encoding
+        self.policy = Policy.AUTO if upkeep is None else upkeep.policy
         self._upkeep = upkeep
         self._framer = Framer(HEARD, stream=False)  # for datagrams, whoever they come from
         self._framers: dict[Peer, Framer] = {}  # for streams
@@ -189,6 +192,15 @@ class Station:
         autopilot = self.autopilot_of(machine.system) or machine
         return autopilot.identity if autopilot.who.settled else None
 
+    def is_doubted(self, machine: ComponentMachine) -> bool:
+        """Whether it is open which vehicle a component belongs to.
+
+        Its autopilot is away, or was and has not said since who it is.
+        """
+        autopilot = self.autopilot_of(machine.system) or machine
+        is_lost = autopilot is not machine and autopilot.presence.is_lost
+        return is_lost or autopilot.who.was_away
+
     def autopilot_of(self, system: int) -> ComponentMachine | None:
         """The component of a system that is its autopilot: the usual id first."""
         first = self.components.get((system, AUTOPILOT_COMPONENT))
@@ -199,6 +211,15 @@ class Station:
                 return machine
         return None
 
+    def check_refresh(self, refresh: bool) -> None:
+        """See whether a fetch may download what the cache has.
+
+        Raises:
+            UsageError: the policy says no.
+        """
+        if refresh and self.policy is not Policy.AUTO:
+            raise UsageError(f"the policy is {self.policy}: nothing may be downloaded, so not with refresh")
+
     def begin_fetches(
         self, machines: Sequence[ComponentMachine], now: float, *, refresh: bool = False
     ) -> list[Fetch]:
@@ -208,11 +229,9 @@ class Station:
         fetched, and no other list runs, the list is asked for once, of all components.
         """
         is_new = self._turns.is_free and all(machine.fetch is None for machine in machines)
-        if (
-            len(machines) > 1
-            and is_new
-            and (refresh or not any(m.can_hit or present_of(m.table, m.reads) for m in machines))
-        ):
+        may_list = self.policy is Policy.AUTO
+        is_fresh = refresh or not any(m.can_hit or present_of(m.table, m.reads) for m in machines)
+        if len(machines) > 1 and may_list and is_new and is_fresh:
             system = machines[0].system
             known = [m for m in self.components.values() if m.system == system and m.who.has_parameters]
             if len(known) == len(machines):
@@ -267,6 +286,7 @@ class Station:
             encoding=self._encoding,
             upkeep=self._upkeep,
             is_link_busy=lambda: self.is_waiting,
+            is_vehicle_doubted=lambda: self._autopilot_is_doubted(system),
             another=lambda now: self._become_another(system, now),
             turns=self._turns,
         )
@@ -279,6 +299,10 @@ class Station:
         for machine in self.components.values():
             if machine.system == system:
                 machine.become_another(now)
+
+    def _autopilot_is_doubted(self, system: int) -> bool:
+        autopilot = self.autopilot_of(system)
+        return autopilot is not None and autopilot.who.is_doubted
 
     def _receive_foreign_set(self, message: ParamSet, sender: Address, now: float) -> None:
         station = f"station {sender[0]}/{sender[1]}"

@@ -6,14 +6,17 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from functools import partial
 from typing import Final
 
 from paramclient.errors import UnknownParameter, UsageError
 from paramclient.protocol.fetch import FRESH_HASH, Fetch
 from paramclient.protocol.reads import Read, Reads
-from paramclient.protocol.result import Announcement, Policy
+from paramclient.protocol.refresh import Refresh
+from paramclient.protocol.result import Announcement, FetchResult, Policy
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.wire import HASH_CHECK, ParamValue
+from paramclient.values import Trust
 
 __all__ = ["Sync", "SyncState", "Upkeep"]
 
@@ -24,8 +27,6 @@ SHORTEST_INTERVAL: Final = 1.0
 SETTLING_TIME: Final = 0.06
 """Seconds from the last of our writes until the hash is asked for: what PX4 changed with it, it pushes 10 to
 24 ms later."""
-HEARTBEAT_GAP: Final = 2.5
-"""Seconds of silence in which an update may have been lost as well: two heartbeats."""
 BUSY_WAIT: Final = 0.1
 """Seconds until it is looked again whether the link is idle."""
 GAPS_INTERVAL: Final = 5.0
@@ -104,14 +105,15 @@ class Sync:
         file_is_cheap: whether a component without a hash gives its table as a file, which comes so quickly
             that it can be read once in every interval.
         is_spared: whether the component is in a mode in which it is asked for nothing.
+        is_doubted: whether it is open who it is.
         begin_fetch: begins a fetch (with `refresh`, of everything), which `end_fetch` gives back.
         end_fetch: as it says.
-        confirmed: is told of the hash that confirms a table which was in doubt, and when.
         resynced: is told when the table agrees with the vehicle's again, of what had moved, and its hash.
 
     Attributes:
         announced: the last hash that was heard, or None.
         synced: whether the table was brought up to date on this link and no sign came since that it moved.
+        refresh: the reading of what a hash that confirmed the table does not cover, or None.
     """
 
     def __init__(
@@ -126,9 +128,9 @@ class Sync:
         is_busy: Callable[[], bool],
         file_is_cheap: Callable[[float], bool],
         is_spared: Callable[[], bool],
+        is_doubted: Callable[[], bool],
         begin_fetch: Callable[[float, bool], Fetch],
         end_fetch: Callable[[Fetch, float], None],
-        confirmed: Callable[[int, float], None],
         resynced: Callable[[tuple[str, ...], int | None], None],
     ) -> None:
         self._reads = reads
@@ -140,12 +142,13 @@ class Sync:
         self._is_busy = is_busy
         self._file_is_cheap = file_is_cheap
         self._is_spared = is_spared
+        self._is_doubted = is_doubted
         self._begin_fetch = begin_fetch
         self._end_fetch = end_fetch
-        self._confirmed = confirmed
         self._resynced = resynced
         self.announced: Announcement | None = None
         self.synced = False
+        self.refresh: Refresh | None = None
         self._was_synced = False  # at any time on this link: only then is there something to keep up
         self._has_no_hash = False
         self._moved_by_us_alone = False
@@ -160,10 +163,10 @@ class Sync:
     @property
     def state(self) -> SyncState:
         """How the table stands to the vehicle's, of a component that is heard."""
-        if self._resync is not None:
-            return SyncState.RESYNCING
         if self.synced:
             return SyncState.SYNCED
+        if self._resync is not None:
+            return SyncState.RESYNCING
         return SyncState.CHECKING if self._is_checking else SyncState.UNSYNCED
 
     @property
@@ -192,7 +195,7 @@ class Sync:
             self._moved_by_us_alone &= change.by == "us"
             if self.announced is not None and self.announced.at != -math.inf:
                 self.announced = replace(self.announced, at=-math.inf)
-        if self._has_fallen:
+        if self._has_fallen or self._resync is not None:
             self._moved[name] = None
 
     def count_moved(self, now: float) -> None:
@@ -201,9 +204,12 @@ class Sync:
         if self._is_kept_up:
             self._check_at = min(self._check_at, now)
 
-    def silence(self, seconds: float, now: float) -> None:
-        """The component is heard again after so many seconds."""
-        if seconds >= HEARTBEAT_GAP and self._is_kept_up:
+    def silence(self, now: float) -> None:
+        """The component is heard again after a silence in which something may have been missed.
+
+        That is worth a question for the hash, but no list of one that has none: gaps are many on a bad link.
+        """
+        if self._is_kept_up and self.expects_hash:
             self._check_at = min(self._check_at, max(now, self._checked_at + GAPS_INTERVAL))
 
     def write_ended(self, now: float) -> None:
@@ -220,18 +226,29 @@ class Sync:
 
     def check(self, now: float) -> None:
         """It is there again: see whether the table still holds, as soon as the link is idle."""
-        if self._table.complete and self._upkeep.policy is not Policy.CACHE_ONLY:
+        may_ask = self._upkeep.policy is not Policy.CACHE_ONLY
+        if may_ask and (self._table.complete or self._is_kept_up):
             self._is_checking = self.expects_hash
             self._check_at = now
 
-    def fetched(self, complete: bool, confirmed: int | None, now: float) -> None:
-        """A fetch has ended with a result, not only one of ours."""
+    def fetched(self, result: FetchResult, now: float) -> bool:
+        """A fetch has ended, not only one of ours. False when the vehicle has said nothing of its table."""
+        if result.source == "cache" and result.hash is None:
+            self._not_confirmed()
+            return False
+        table = self._table
+        complete = result.complete and table.complete
+        if result.hash is None:  # what came before it was lost may have moved since
+            complete = complete and all(param.trust is not Trust.CACHED for param in table.listed())
         if not complete:
             self._fall()
         self.synced = complete
         self._was_synced |= complete
-        self._moved_by_us_alone = confirmed is not None
+        self._moved_by_us_alone = result.hash is not None
         self._settled(now)
+        if result.hash is not None:
+            self._read_unhashed(result.hash, now)
+        return True
 
     def forget(self) -> None:
         """Another vehicle has taken the address: nothing that is known is about it."""
@@ -290,6 +307,24 @@ class Sync:
             self._has_fallen = True
             self._moved.clear()
 
+    def _not_confirmed(self) -> None:
+        """The table was to be confirmed, and is not: what a hash has confirmed before is in doubt."""
+        self._fall()
+        self._table.doubt(Trust.VERIFIED)
+
+    def _read_unhashed(self, confirmed: int, now: float) -> None:
+        """Read what the hash says nothing about."""
+        if self._upkeep.policy is not Policy.AUTO:
+            return
+        refresh = Refresh(self._reads, self._table, confirmed, self._is_writing, now)
+        if not refresh.done:
+            self.refresh = refresh
+            refresh.on_done.append(partial(self._refresh_ended, refresh))
+
+    def _refresh_ended(self, refresh: Refresh) -> None:
+        if self.refresh is refresh:
+            self.refresh = None
+
     def _check(self, now: float) -> None:
         """See whether the table still is the vehicle's, if there is room for that on the link."""
         if self._is_busy():
@@ -311,11 +346,14 @@ class Sync:
             self._has_no_hash = isinstance(read.error, UnknownParameter) and self.announced is None
             self._is_checking = False
             return
+        if self._is_doubted():
+            self._check_at = now  # again, when it is known whose it is
+            return
         announced = int.from_bytes(read.result.raw, "little")
         if self.compare(now):
             if self._has_fallen:
                 self.synced = True
-                self._confirmed(announced, now)
+                self._read_unhashed(announced, now)
             self._settled(now)
         elif self._is_writing() or self._is_fetching():
             return
@@ -323,13 +361,12 @@ class Sync:
             # it cannot be computed here, and all that was heard to move it since was our own doing
             table.confirm(announced, table.volatile, proven=False)
         else:
-            self._fall()
+            self._not_confirmed()
             self._is_checking = False
             if self._is_kept_up and not self._is_spared():
                 self._begin_resync(now, refresh=False)
 
     def _begin_resync(self, now: float, *, refresh: bool) -> None:
-        self._fall()
         fetch = self._resync = self._begin_fetch(now, refresh)
 
         def ended() -> None:
@@ -346,7 +383,9 @@ class Sync:
         self._is_checking = False
         self._check_at = now + self._upkeep.interval if self._is_kept_up else math.inf
         self._checked_at = now
-        if self.synced and self._has_fallen:
-            self._has_fallen = False
+        if not self.synced:
+            return
+        if self._has_fallen or self._moved:
             self._resynced(tuple(self._moved), self._table.hash)
-            self._moved.clear()
+        self._has_fallen = False
+        self._moved.clear()

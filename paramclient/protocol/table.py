@@ -277,11 +277,11 @@ class Table:
             if param.trust is Trust.CACHED and param.name not in unhashed:
                 self.params[param.name] = param.with_trust(Trust.VERIFIED)
 
-    def doubt(self) -> None:
-        """It may have moved unheard: what was live or verified is no more than *cached*."""
-        self._wire.clear()  # the next value counts, also if it is the same
+    def doubt(self, *trusts: Trust) -> None:
+        """It may have moved unheard: what was trusted like this is no more than *cached*."""
         for name, param in self.params.items():
-            if param.trust is not Trust.CACHED:
+            if param.trust in trusts:
+                self._wire.pop(name, None)  # the next value counts, also if it is the same
                 self.params[name] = param.with_trust(Trust.CACHED)
 
     def remove(self, condition: Callable[[Param], bool]) -> list[Change]:

@@ -186,7 +186,9 @@ class Writes:
             self._fail(write, self._reads.error_of(message, name), now)
 
     def tick(self, now: float) -> None:
-        """Verify, send again, give up."""
+        """Verify, send again, give up; but nothing while it is open who would get it."""
+        if not self._is_certain():
+            return
         timeout = self._round_trip.timeout
         for queue in list(self.queues.values()):
             if not queue:
@@ -215,7 +217,7 @@ class Writes:
         """When `tick` has something to do, or infinity."""
         timeout = self._round_trip.timeout
         earliest = math.inf
-        for queue in self.queues.values():
+        for queue in self.queues.values() if self._is_certain() else ():
             write = queue[0]
             earliest = min(earliest, write.verify_at)
             if write.attempts and write.read is None and not write.is_answered:
@@ -226,23 +228,26 @@ class Writes:
         """The link is back: what was under way goes on at once."""
         for queue in list(self.queues.values()):
             if queue and queue[0].attempts and queue[0].read is None:
-                queue[0].attempts -= 1
+                if self._is_certain():
+                    queue[0].attempts -= 1
                 self._transmit(queue[0], now)
 
     def lose(self, now: float) -> None:
         """The component is lost: nobody waits any longer. What it has taken is not known."""
-        for queue in list(self.queues.values()):
-            for write in reversed(queue.copy()):
-                self._fail(write, self._no_reply(write, now, " (lost)"), now)
+        self._end_all(lambda write: self._no_reply(write, now, " (lost)"), now)
 
     def fail_all(self, error: Exception, now: float) -> None:
         """Nothing can be acknowledged any more."""
+        self._end_all(lambda write: error, now)
+
+    def _end_all(self, error_of: Callable[[Write], Exception], now: float) -> None:
         queues, self.queues = self.queues, {}
         for queue in queues.values():
             for write in queue:
                 if write.read is not None:
                     self._reads.release(write.read)
-                write.fail(error, now)
+                    write.read = None
+                write.fail(error_of(write), now)
 
     @property
     def _grace(self) -> float:
@@ -268,6 +273,12 @@ class Writes:
         self._transmit(write, now)
 
     def _transmit(self, write: Write, now: float) -> None:
+        if not self._is_certain():
+            # whoever may be there now is not meant: as soon as it is known, it is begun, or overdue
+            write.sent_at = -math.inf
+            write.is_answered = False
+            write.verify_at = math.inf
+            return
         encoding = self._encoding()
         try:
             raw = encode(write.value, write.number, encoding)
