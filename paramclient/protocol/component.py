@@ -368,8 +368,6 @@ class ComponentMachine:
         if self.fetch is not None:
             self.fetch.restart(now)
 
-    # how it stands
-
     @property
     def identity(self) -> Identity:
         """Who the vehicle is, as far as this component has said."""
@@ -521,6 +519,8 @@ class ComponentMachine:
     def _follow_identity(self, now: float) -> None:
         """What the identification has come to know takes effect."""
         self._report(self.table.use_encoding(self.who.encoding))
+        if self.fetch is not None:
+            self.fetch.identified(now)
         if self.who.settled and self._known_as != self.identity.key:
             self._known_as = self.identity.key
             self._emit(events.ComponentIdentified(self))

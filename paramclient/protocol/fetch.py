@@ -42,6 +42,8 @@ is found, so that a fetch right after that need not wait for another round trip.
 ENOUGH_PRESENT: Final = 0.5
 """The share of a table that must be there for its rest to be worth asking for one by one, where it is not
 known how fast the list comes."""
+IDENTITY_PATIENCE: Final = 1.0
+"""Seconds for which a component may say whether it serves the file before its list is asked for."""
 MOST_RESTARTS: Final = 8
 """Times that a vehicle may start again, or turn out to be another one, before a fetch is given up."""
 
@@ -78,7 +80,7 @@ class Fetch(Operation[FetchResult]):
         refresh: bool,
         listed: bool,
         policy: Policy,
-        may_use_file: bool,
+        may_use_file: Callable[[], bool | None],
         sampled: Sampled | None,
     ) -> None:
         super().__init__(now)
@@ -89,7 +91,9 @@ class Fetch(Operation[FetchResult]):
         table = self._table = means.table
         self._expects_hash = means.expects_hash
         self._may_use_file = may_use_file
-        self._has_begun = False
+        self._undecided_until = math.inf  # whether to ask for the file or for the list
+        self._present: Mapping[int, str] | None = None  # with what the latter would go on
+        self._has_begun = self._had_no_file = False
         self._sampling: Sampling | None = None
         self._hash_read: Read | None = None
         self._before: int | None = None  # the hash announced before any value counted
@@ -141,11 +145,17 @@ class Fetch(Operation[FetchResult]):
                 self._ask_hash(self._hash_came_meanwhile, now)
 
     def tick(self, now: float) -> None:
+        self.identified(now)
         if self.download is not None:
             self.download.tick(now)
 
     def next_deadline(self) -> float:
-        return math.inf if self.download is None else self.download.next_deadline()
+        return self._undecided_until if self.download is None else self.download.next_deadline()
+
+    def identified(self, now: float) -> None:
+        """It may be known by now whether the component serves the file."""
+        if self._undecided_until < math.inf:
+            self._begin_download(now, self._present)
 
     def resume(self, now: float) -> None:
         """The link is back."""
@@ -218,19 +228,13 @@ class Fetch(Operation[FetchResult]):
     def progress(self, now: float) -> Progress:
         """How far it is."""
         if self.file is not None:
-            return self._progress_of_file(self.file, now)
+            return self.file.progress(now)
         received, total = (0, self._table.count) if self.download is None else self.download.progress
         running = now - self._first_value_at
         came = received - (0 if self.download is None else self.download.resumed)
         rate = came / running if came > 0 and running > 0 else 0.0
         left = (total - received) / rate if rate and total is not None else None
         return Progress(received, total, rate, left)
-
-    def _progress_of_file(self, file: PackFetch, now: float) -> Progress:
-        share, total, running = file.share, self._table.count, now - self.begun_at - self.held_up(now)
-        left = running * (1 - share) / share if share else None
-        received = int(share * (total or 0))
-        return Progress(received, total, received / running if running > 0 else 0.0, left)
 
     def _sample(self, sampled: Sampled, count: int, now: float) -> None:
         """Judge the cached table by some of its parameters."""
@@ -250,10 +254,7 @@ class Fetch(Operation[FetchResult]):
                 self._notes += (NOT_SAMPLED.format(why),)
                 self._begin_download(sampling.ended_at)
 
-        if sampling.done:
-            ended()
-        else:
-            sampling.on_done.append(ended)
+        sampling.on_done.append(ended)
 
     def _ask_hash(self, then: Callable[[Read], None], now: float) -> None:
         read = self._hash_read = self._reads.ask(HASH_CHECK, now)
@@ -276,9 +277,7 @@ class Fetch(Operation[FetchResult]):
         if read.result is None:
             self._begin_download(read.ended_at)
         else:
-            message = read.result
-            announced = int.from_bytes(message.raw, "little")
-            self._compare(Announcement(announced, message.param_count, read.ended_at), read.ended_at)
+            self._compare(Announcement.of(read.result, read.ended_at), read.ended_at)
 
     def _compare(self, announcement: Announcement, now: float) -> None:
         table = self._table
@@ -307,9 +306,7 @@ class Fetch(Operation[FetchResult]):
 
     def _hash_came_to_resume(self, read: Read) -> None:
         if read.result is not None:
-            message = read.result
-            announced = int.from_bytes(message.raw, "little")
-            self._resume_under(Announcement(announced, message.param_count, read.ended_at), read.ended_at)
+            self._resume_under(Announcement.of(read.result, read.ended_at), read.ended_at)
         elif isinstance(read.error, UnknownParameter):
             self._is_hash_unknown = True
             self._resume(read.ended_at)
@@ -333,7 +330,13 @@ class Fetch(Operation[FetchResult]):
         means = self._means
         self._has_begun = True
         means.doubt(now)
-        if self._may_use_file and not self._listed:
+        may_use_file = not (self._listed or self._had_no_file) and self._may_use_file()
+        if may_use_file is None and now < self.begun_at + IDENTITY_PATIENCE:
+            self._undecided_until = self.begun_at + IDENTITY_PATIENCE
+            self._present = present
+            return
+        self._undecided_until = math.inf
+        if may_use_file:
             file = self.file = PackFetch(means.files, means.turns, means.table, means.changed, now)
             file.on_done.append(partial(self._file_ended, file))
             return
@@ -370,7 +373,7 @@ class Fetch(Operation[FetchResult]):
         if isinstance(file.error, LinkError):
             self.fail(file.error, now)
             return
-        self._may_use_file = False
+        self._had_no_file = True
         self.file_failed = None if isinstance(file.error, NoReply) else True
         self._notes += (NO_FILE.format(file.error),)
         self._begin_download(now)
@@ -527,6 +530,7 @@ class Fetch(Operation[FetchResult]):
         sampling, self._sampling = self._sampling, None
         if sampling is not None:
             sampling.cancel()
+        self._undecided_until = math.inf
         file, self.file = self.file, None
         if file is not None:
             file.cancel(now)

@@ -12,6 +12,7 @@ from paramclient.protocol.ftp import FileRead, FileTransfers
 from paramclient.protocol.ftp.packets import MOST_DATA
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.pack import LARGEST_FILE, Pack, decode
+from paramclient.protocol.result import Progress
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.turns import Seen, Turns
 from paramclient.protocol.wire import NO_INDEX, ParamValue
@@ -104,11 +105,13 @@ class PackFetch(Operation[None]):
         """Seconds for which it has waited for its turn so far."""
         return self.held_up + (0.0 if self._waits_since is None else now - self._waits_since)
 
-    @property
-    def share(self) -> float:
-        """How much of the file has come, 0 to 1, as far as its size can be told."""
-        job = self._job
-        return min(job.received / job.size, 1.0) if job is not None and job.size else 0.0
+    def progress(self, now: float) -> Progress:
+        """How far it is, by the size that the vehicle gives and the count that is known of before."""
+        job, total = self._job, self._table.count
+        share = min(job.received / job.size, 1.0) if job is not None and job.size else 0.0
+        received, running = int(share * (total or 0)), now - self.begun_at - self.held_for(now)
+        left = running * (1 - share) / share if share else None
+        return Progress(received, total, received / running if running > 0 else 0.0, left)
 
     def heard(self, message: ParamValue) -> None:
         """Every PARAM_VALUE of the component passes here, after it went into the table."""

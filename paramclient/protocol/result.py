@@ -12,7 +12,7 @@ from paramclient.protocol.sampling import Sample
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.turns import Turns
-from paramclient.protocol.wire import Message
+from paramclient.protocol.wire import Message, ParamValue
 from paramclient.values import Param, Trust
 
 __all__ = ["Announcement", "FetchResult", "Means", "Policy", "Progress", "Sampled"]
@@ -77,6 +77,11 @@ class Announcement:
     hash: int
     count: int
     at: float
+
+    @classmethod
+    def of(cls, message: ParamValue, at: float) -> Announcement:
+        """What such a message says."""
+        return cls(int.from_bytes(message.raw, "little"), message.param_count, at)
 
 
 @dataclass(frozen=True, slots=True)

@@ -183,8 +183,7 @@ class Sync:
 
     def hash_heard(self, message: ParamValue, now: float) -> Announcement:
         """A `_HASH_CHECK` has come."""
-        announced = int.from_bytes(message.raw, "little")
-        self.announced = Announcement(announced, message.param_count, now)
+        self.announced = Announcement.of(message, now)
         self._has_no_hash = False
         return self.announced
 
