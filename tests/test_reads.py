@@ -379,6 +379,47 @@ def test_a_control_that_was_lost_is_not_answered_by_what_passes_by_much_later() 
     assert desk.round_trip.timeout == INITIAL_TIMEOUT
 
 
+def test_where_index_0_is_silent_the_index_heard_last_is_the_control() -> None:
+    desk = Desk()
+    desk.reads.is_idle = False
+    desk.ask("B", urgent=True)
+    desk.hear("B", index=7)
+    desk.hear("PUSHED")
+    read = desk.ask("A")
+    desk.measure()
+    desk.take()
+    while read.attempts < 5 and not read.done:
+        desk.now = desk.reads.next_deadline()
+        desk.reads.tick(desk.now)
+    assert [key for key in desk.take() if key != "A"][:3] == [CONTROL, 7, CONTROL]
+
+
+def test_index_0_has_the_index_heard_last_as_its_control() -> None:
+    desk = Desk()
+    desk.reads.is_idle = False
+    desk.hear("B", index=7)
+    desk.measure()
+    read = desk.ask(CONTROL)
+    while not read.done:
+        desk.now = desk.reads.next_deadline()
+        desk.reads.tick(desk.now)
+        if desk.take()[-1:] == [7]:
+            desk.hear("B", index=7)
+    assert read.controls >= ENOUGH_CONTROLS
+    assert isinstance(read.error, NoReply)
+    assert desk.now < 5.0
+
+
+def test_answered_controls_end_what_stays_silent_soon() -> None:
+    """Many silent indices look like a link that loses half; what else is asked for says that it does not."""
+    desk = answering_desk()
+    silent = [desk.ask(index) for index in range(20, 50)]
+    desk.pass_time()
+    assert all(isinstance(read.error, NoReply) for read in silent)
+    assert max(read.attempts for read in silent) <= desk.round_trip.tries / 2
+    assert desk.now < 10.0
+
+
 def test_index_0_needs_no_other_control() -> None:
     desk = Desk()
     desk.reads.is_idle = False

@@ -11,7 +11,7 @@ from paramclient.errors import NoReply, ParamErrorCode, Refused, TypeMismatch, U
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.pacing import Pace
 from paramclient.protocol.timing import FEWEST_TRIES, LONGEST_SILENCE, MOST_TRIES, RoundTrip
-from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
+from paramclient.protocol.wire import NO_INDEX, Message, ParamError, ParamRequestRead, ParamValue
 
 __all__ = ["Key", "Read", "Reads"]
 
@@ -19,7 +19,7 @@ Key: TypeAlias = str | int
 """What a read asks for: a name, or an index."""
 
 CONTROL: Final = 0
-"""The index that is asked for to learn whether the component answers at all."""
+"""The index that is asked for to learn whether the component answers at all, as long as it is answered."""
 COPY_RESERVE: Final = 2.0
 """Requests that must remain possible when one is sent again early."""
 COPY_RISK: Final = 0.01
@@ -61,9 +61,11 @@ class Reads:
     """Every read of one component: as fast as it serves them, single ones before a download's.
 
     Silence is not an answer: PX4 up to 1.17 and ArduPilot say nothing to what they do not have. What stays
-    silent is therefore asked for together with index 0, which every component with parameters has. When that
-    keeps being answered, and a name that nobody has heard of or an index that is not below the count does
-    not, the link is not the reason: the parameter is unknown.
+    silent is therefore asked for together with index 0, which every component with parameters has, or, where
+    that stays silent too, with the index that was heard last. When this control keeps being answered, and a
+    name that nobody has heard of or an index that is not below the count does not, the link is not the
+    reason: the parameter is unknown. Of what should be there, the controls tell how often it is to be asked
+    for: they go over the same link, and many indices that are never answered look like a bad one.
 
     Attributes:
         pace: how fast requests may go out.
@@ -95,8 +97,10 @@ class Reads:
         self.is_idle = True
         self._silences = 0  # time-outs since anything was answered
         self._silent_since = math.inf  # the first request since then
+        self._control = self._last_heard = CONTROL
         self._control_at = math.inf
         self._control_attempts = 0
+        self._controls = RoundTrip()  # what they alone tell of the link
 
     def __len__(self) -> int:
         return len(self._open)
@@ -136,10 +140,13 @@ class Reads:
             self._drop(read)
             read.finish(message, now)
             self._send_waiting(now)
-        if message.param_index == CONTROL and self._control_at < math.inf:
+        if message.param_index != NO_INDEX:
+            self._last_heard = message.param_index
+        if message.param_index == self._control and self._control_at < math.inf:
             # one that was lost may have nobody left to ask again; then this is not its answer
             is_late = now - self._control_at > 2 * self._round_trip.timeout
             self._round_trip.answered(self._control_at, now, self._control_attempts + is_late)
+            self._controls.answered(self._control_at, now, 1)
             self._control_at = math.inf
             self._not_silent(now)
             for read in self._flying.values():
@@ -245,6 +252,8 @@ class Reads:
             or (self._silences >= SILENCES_TO_GIVE_UP and read.attempts >= FEWEST_TRIES)
         ):
             return True  # not one of all these was answered
+        if read.controls >= ENOUGH_CONTROLS and self._controls.is_sure(read.attempts):
+            return True
         # half as often will do where nothing speaks for it and the link is good enough for others
         weight = 2 if self._seems_unknown(read) else 1
         return self._round_trip.is_hopeless(weight * read.attempts, now)
@@ -290,8 +299,8 @@ class Reads:
         self._silent_since = min(self._silent_since, now)
         self.pace.sent(now)
         self._request(read)
-        if read.key != CONTROL and read.attempts > (2 if self._is_known(read.key) else 1):
-            self._send_control(now)
+        if read.attempts > (2 if self._is_known(read.key) else 1):
+            self._send_control(read.key, now)
 
     def _request(self, read: Read) -> None:
         if isinstance(read.key, int):
@@ -299,18 +308,23 @@ class Reads:
         else:
             self._send(ParamRequestRead(*self._target, read.key, -1))
 
-    def _send_control(self, now: float) -> None:
-        """Ask for what is known to exist, unless that is under way for another read."""
-        if self._control_at < math.inf:
+    def _send_control(self, key: Key, now: float) -> None:
+        """Ask for what is known to exist, unless that is under way for another read, or is the read itself."""
+        is_silent = self._control_at < math.inf
+        if is_silent:
             if now - self._control_at < self._round_trip.timeout:
                 return
             self._round_trip.timed_out(self._control_attempts)
-            self._control_attempts += 1
-        else:
-            self._control_attempts = 1
+            self._controls.timed_out(1)
+        if is_silent or self._control == key:
+            self._control = self._last_heard if self._control == CONTROL else CONTROL
+        if self._control == key:
+            self._control_at = math.inf
+            return
+        self._control_attempts = self._control_attempts + 1 if is_silent else 1
         self._control_at = now
         self.pace.sent(now)
-        self._send(ParamRequestRead(*self._target, "", CONTROL))
+        self._send(ParamRequestRead(*self._target, "", self._control))
 
     def _send_waiting(self, now: float) -> None:
         """Send what waits, as far as the pace allows; on an idle link ask twice rather than wait."""
