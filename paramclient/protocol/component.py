@@ -449,6 +449,7 @@ class ComponentMachine:
     def _count_moved(self, count: int, now: float) -> None:
         if self.table.count is not None:
             self.table.complete = False
+            self.table.passed_over.clear()
             self.sync.count_moved(now)
         self.table.count = count
 

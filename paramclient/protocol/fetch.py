@@ -14,6 +14,7 @@ from paramclient.protocol.download import Download
 from paramclient.protocol.hashing import find_volatile
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.reads import Read, Reads
+from paramclient.protocol.repeated import Repeated, repeated_names
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.wire import HASH_CHECK, Message, ParamValue
@@ -162,6 +163,7 @@ class Fetch(Operation[FetchResult]):
         self._is_hash_unknown = False  # the vehicle answers, but not to that
         self._first_value_at = math.inf
         self._listed = listed
+        self._repeated: Repeated | None = None
         self._policy = policy
         self._restarts = 0
         self.holders = 0
@@ -197,8 +199,12 @@ class Fetch(Operation[FetchResult]):
     def tick(self, now: float) -> None:
         if self.download is not None:
             self.download.tick(now)
+        if self._repeated is not None:
+            self._repeated.tick(now)
 
     def next_deadline(self) -> float:
+        if self._repeated is not None:
+            return self._repeated.next_deadline()
         return math.inf if self.download is None else self.download.next_deadline()
 
     def resume(self, now: float) -> None:
@@ -321,14 +327,26 @@ class Fetch(Operation[FetchResult]):
     def _download_ended(self, download: Download) -> None:
         if download.error is not None:
             self.fail(download.error, download.ended_at)
-        elif self._hash_read is not None:
+            return
+        if self._hash_read is not None or self._asks_for_repeated(download):
             return  # it is on its way
-        elif self._is_proven(download):
-            self._finish_download(download, download.ended_at, ())
+        now = download.ended_at if self._repeated is None else self._repeated.ended_at
+        if self._is_proven(download):
+            self._finish_download(download, now, ())
         elif self._expects_hash() and not self._is_hash_unknown:
-            self._ask_hash(partial(self._hash_came_last, download), download.ended_at)
+            self._ask_hash(partial(self._hash_came_last, download), now)
         else:
-            self._settle(download, None, download.ended_at)
+            self._settle(download, None, now)
+
+    def _asks_for_repeated(self, download: Download) -> bool:
+        """Whether it is still being asked what the vehicle means by names that came more than once."""
+        if self._repeated is None:
+            names = repeated_names(download.names)
+            if not (names or self._table.passed_over):
+                return False
+            self._repeated = Repeated(names, self._round_trip, self._reads, self._table, download.ended_at)
+            self._repeated.on_done.append(lambda: self._download_ended(download))
+        return not self._repeated.done
 
     def _is_proven(self, download: Download) -> bool:
         """Whether the hash computed from what came is the one that was announced meanwhile.
@@ -376,7 +394,10 @@ class Fetch(Operation[FetchResult]):
         count = download.count or 0
         missing = download.missing
         table = self._table
-        if not missing:
+        if self._repeated is not None and self._repeated.names:
+            notes += (self._repeated.note,)
+            table.complete = False
+        elif not missing:
             table.complete = download.is_settled
         table.count = count
         self.finish(
@@ -415,6 +436,9 @@ class Fetch(Operation[FetchResult]):
         read, self._hash_read = self._hash_read, None
         if read is not None:
             self._reads.release(read)
+        repeated, self._repeated = self._repeated, None
+        if repeated is not None:
+            repeated.cancel()
         if self.download is not None:
             self.download.cancel()
 

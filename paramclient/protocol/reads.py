@@ -309,7 +309,7 @@ class Reads:
             self._send(ParamRequestRead(*self._target, read.key, -1))
 
     def _send_control(self, key: Key, now: float) -> None:
-        """Ask for what is known to exist, unless that is under way for another read, or is the read itself."""
+        """Ask for what is known to exist, unless that is under way for another read, or is the same."""
         is_silent = self._control_at < math.inf
         if is_silent:
             if now - self._control_at < self._round_trip.timeout:

@@ -43,6 +43,7 @@ class Table:
         volatile_known: whether a recomputed hash has proven that set.
         complete: whether every index below `count` has its parameter here.
         hash: the PX4 hash under which the vehicle would confirm exactly this table, or None while unknown.
+        passed_over: by a name that several parameters share, the indices of those that it does not mean.
         dirty: names whose value, type or index changed since `take_dirty` was called last.
     """
 
@@ -52,6 +53,7 @@ class Table:
         self.volatile: frozenset[str] = frozenset()
         self.volatile_known = False
         self.complete = False
+        self.passed_over: dict[str, frozenset[int]] = {}
         self.dirty: dict[str, str] = {}
         self._hash: int | None = None
         self._hash_is_stale = False
@@ -97,6 +99,8 @@ class Table:
         """
         name, raw, number, count, given = message
         index: int | None = given
+        if self.passed_over and given in self.passed_over.get(name, ()):
+            return None
         old = self.params.get(name)
         if given == NO_INDEX:
             index = None if old is None else old.index
