@@ -108,7 +108,8 @@ def test_the_last_one_who_waits_ends_it() -> None:
     machine = world.meet()
     fetch = machine.begin_fetch(world.now)
     world.until(lambda: fetch._repeated is not None and bool(fetch._repeated._open))
-    (read,) = fetch._repeated._open.values() if fetch._repeated is not None else ()
+    assert fetch._repeated is not None
+    (read,) = fetch._repeated._open.values()
     machine.end_fetch(fetch)
     assert read.holders <= 1  # a value that has changed twice is asked for too
     world.run(60.0)

@@ -157,8 +157,8 @@ class Fetch(Operation[FetchResult]):
         self._doubt = doubt
         self._expects_hash = expects_hash
         self._hash_read: Read | None = None
-        self._before: int | None = None  # the hash announced before any value counted
-        self._meanwhile: int | None = None  # the hash announced in the course of the download
+        self._before: Announcement | None = None  # announced before any value counted
+        self._meanwhile: Announcement | None = None  # announced in the course of the download
         self._was_asked_meanwhile = False
         self._is_hash_unknown = False  # the vehicle answers, but not to that
         self._first_value_at = math.inf
@@ -180,7 +180,7 @@ class Fetch(Operation[FetchResult]):
         if self.download is not None and not self.download.names:
             self.download.heed(announcement.at)
             if self._before is None:
-                self._before = announcement.hash
+                self._before = announcement
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
@@ -271,25 +271,23 @@ class Fetch(Operation[FetchResult]):
         read.on_done.append(ended)
 
     def _hash_came_meanwhile(self, read: Read) -> None:
-        if read.result is not None:
-            self._meanwhile = int.from_bytes(read.result.raw, "little")
+        self._meanwhile = _announced_in(read)
         self._is_hash_unknown = isinstance(read.error, UnknownParameter)
         if self.download is not None and self.download.done:
             self._download_ended(self.download)
 
     def _hash_came_first(self, read: Read) -> None:
-        if read.result is None:
+        announcement = _announced_in(read)
+        if announcement is None:
             self._begin_download(read.ended_at)
         else:
-            message = read.result
-            announced = int.from_bytes(message.raw, "little")
-            self._compare(Announcement(announced, message.param_count, read.ended_at), read.ended_at)
+            self._compare(announcement, read.ended_at)
 
     def _compare(self, announcement: Announcement, now: float) -> None:
         table = self._table
         listed = table.listed()
         if announcement.hash != table.hash or announcement.count != len(listed):
-            self._before = announcement.hash
+            self._before = announcement
             self._begin_download(now)
             return
         table.count = announcement.count
@@ -356,11 +354,13 @@ class Fetch(Operation[FetchResult]):
         announced = self._before if self._meanwhile is None else self._meanwhile
         if announced is None or download.missing or not download.is_settled:
             return False
+        if announced.count != download.count:
+            return False  # what came into use since would be taken for what the hash leaves out
         self._remove_what_is_gone(download)
         table = self._table
-        volatile, is_proven = find_volatile(table.listed(), announced, believed=table.volatile)
+        volatile, is_proven = find_volatile(table.listed(), announced.hash, believed=table.volatile)
         if is_proven:
-            table.confirm(announced, volatile, proven=True)
+            table.confirm(announced.hash, volatile, proven=True)
         return is_proven
 
     def _remove_what_is_gone(self, download: Download) -> None:
@@ -369,10 +369,9 @@ class Fetch(Operation[FetchResult]):
         self._changed(gone)
 
     def _hash_came_last(self, download: Download, read: Read) -> None:
-        after = None if read.result is None else int.from_bytes(read.result.raw, "little")
-        self._settle(download, after, read.ended_at)
+        self._settle(download, _announced_in(read), read.ended_at)
 
-    def _settle(self, download: Download, after: int | None, now: float) -> None:
+    def _settle(self, download: Download, after: Announcement | None, now: float) -> None:
         """The download is over and the hash is known, if there is one."""
         table = self._table
         notes: tuple[str, ...] = ()
@@ -382,12 +381,16 @@ class Fetch(Operation[FetchResult]):
                 notes = (_UNSETTLED,)
             table.unconfirm()
         if after is not None and not download.missing:
-            volatile, proven = find_volatile(table.listed(), after, believed=table.volatile)
-            if proven or after == self._before:
-                table.confirm(after, volatile, proven=proven)
-                notes += () if proven else (_UNPROVEN,)
+            before = self._before
+            if after.count != download.count:
+                notes += (_MOVED,)
             else:
-                notes += (_UNBRACKETED,) if self._before is None else (_MOVED,)
+                volatile, proven = find_volatile(table.listed(), after.hash, believed=table.volatile)
+                if proven or (before is not None and before.hash == after.hash):
+                    table.confirm(after.hash, volatile, proven=proven)
+                    notes += () if proven else (_UNPROVEN,)
+                else:
+                    notes += (_UNBRACKETED,) if before is None else (_MOVED,)
         self._finish_download(download, now, notes)
 
     def _finish_download(self, download: Download, now: float, notes: tuple[str, ...]) -> None:
@@ -441,6 +444,14 @@ class Fetch(Operation[FetchResult]):
             repeated.cancel()
         if self.download is not None:
             self.download.cancel()
+
+
+def _announced_in(read: Read) -> Announcement | None:
+    """What the answer to a read of `_HASH_CHECK` says, or None without one."""
+    message = read.result
+    if message is None:
+        return None
+    return Announcement(int.from_bytes(message.raw, "little"), message.param_count, read.ended_at)
 
 
 _UNPROVEN = (

@@ -30,6 +30,8 @@ SILENCES_TO_SPARE: Final = 24
 SILENCES_TO_GIVE_UP: Final = 16
 """Time-outs in a row, within `LONGEST_SILENCE` at the least, after which the component is one that does not
 answer reads at all: where two exchanges of three are lost, it comes to that once in 650 times."""
+SILENT_CONTROLS: Final = 2
+"""Time-outs in a row after which something else is asked for instead."""
 ENOUGH_CONTROLS: Final = 4
 """Answered controls, at the least, after which a silence is the component's and not the link's."""
 
@@ -316,7 +318,7 @@ class Reads:
                 return
             self._round_trip.timed_out(self._control_attempts)
             self._controls.timed_out(1)
-        if is_silent or self._control == key:
+        if self._control == key or (is_silent and self._control_attempts % SILENT_CONTROLS == 0):
             self._control = self._last_heard if self._control == CONTROL else CONTROL
         if self._control == key:
             self._control_at = math.inf

@@ -20,7 +20,7 @@ MOST_TOLD: Final = 5
 SHORTEST_WAIT: Final = 0.3
 """Seconds until the names are asked for, at the least: late answers to reads by index carry them too."""
 ENOUGH_ANSWERS: Final = 2
-"""Answers in a row that must say the same: a list that another station has asked for brings every value that has
+"""Answers in a row that must say the same: a list that another station has asked for brings every value of
 the name."""
 MOST_ANSWERS: Final = 8
 """Answers after which it is left open."""
