@@ -428,6 +428,21 @@ def test_index_0_needs_no_other_control() -> None:
     assert desk.take() == [CONTROL] * 3
 
 
+def test_silences_of_the_past_do_not_count_against_what_is_asked_later() -> None:
+    """A vehicle that was away for long and is back: each read has its tries again."""
+    desk = Desk("A", count=MOST_TRIES)
+    gone = [desk.ask(index) for index in range(MOST_TRIES)]
+    desk.pass_time()
+    assert all(read.done for read in gone)
+    desk.now += 60.0
+    desk.reads.found()
+    read = desk.ask("A")
+    desk.now = desk.reads.next_deadline()
+    desk.reads.tick(desk.now)
+    assert not read.done
+    assert read.attempts == 2
+
+
 def test_a_component_that_is_gone_is_given_up_sooner() -> None:
     patient, gone = Desk("A"), Desk("A")
     gone.round_trip.heard_at = 0.0

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 
 from paramclient import ParamClient
-from paramclient.protocol.repeated import MOST_ANSWERS, MOST_TOLD, Repeated, repeated_names
+from paramclient.protocol.repeated import ENOUGH_ANSWERS, MOST_ANSWERS, MOST_TOLD, Repeated, repeated_names
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Table
 from paramclient.protocol.timing import RoundTrip
@@ -140,7 +140,7 @@ def test_answers_that_never_agree_leave_it_open() -> None:
 def test_a_name_that_is_not_answered_leaves_it_open() -> None:
     desk = Desk("A", "B")
     asking, table = repeated(desk, A=(3, 5), B=(0, 1))
-    for _ in range(2):
+    for _ in range(ENOUGH_ANSWERS):
         desk.hear("B", index=1)
     desk.pass_time()
     assert asking.done

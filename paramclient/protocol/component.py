@@ -448,8 +448,7 @@ class ComponentMachine:
 
     def _count_moved(self, count: int, now: float) -> None:
         if self.table.count is not None:
-            self.table.complete = False
-            self.table.passed_over.clear()
+            self.table.count_moved()
             self.sync.count_moved(now)
         self.table.count = count
 
@@ -481,6 +480,7 @@ class ComponentMachine:
     def _find(self, silence: float, now: float) -> None:
         """It is heard again: who it is and its hash are asked for before anything counts."""
         self.presence.is_lost = False
+        self.reads.found()
         self._emit(ComponentFound(self, silence))
         self.sync.check(now)
 

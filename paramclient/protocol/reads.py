@@ -233,6 +233,11 @@ class Reads:
             self._again.append(read)
         self._send_waiting(now)
 
+    def found(self) -> None:
+        """The component is back: the silence of before says nothing of it."""
+        self._silences = 0
+        self._silent_since = math.inf
+
     def lose(self, now: float) -> None:
         """The component is lost: callers wait no longer. What a fetch asks for goes on for a while."""
         for read in list(self._open.values()):

@@ -19,10 +19,10 @@ MOST_TOLD: Final = 5
 """Names that a note gives one by one."""
 SHORTEST_WAIT: Final = 0.3
 """Seconds until the names are asked for, at the least: late answers to reads by index carry them too."""
-ENOUGH_ANSWERS: Final = 2
+ENOUGH_ANSWERS: Final = 3
 """Answers in a row that must say the same: a list that another station has asked for brings every value of
 the name."""
-MOST_ANSWERS: Final = 8
+MOST_ANSWERS: Final = 12
 """Answers after which it is left open."""
 
 

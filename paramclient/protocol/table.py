@@ -188,6 +188,11 @@ class Table:
                 changes.append(Change(name, None, new))
         return changes
 
+    def count_moved(self) -> None:
+        """The component has another number of parameters: indices mean something else."""
+        self.complete = False
+        self.passed_over.clear()
+
     def verify(self) -> None:
         """The vehicle's hash has confirmed it: what is cached and counts into it becomes *verified*."""
         unhashed = self.unhashed()
