@@ -157,7 +157,9 @@ class Component:
         finally:
             machine.reads.release(read)
         known = machine.table.params.get(message.param_id)
-        return known if known is not None else _param_of(message, machine.table.encoding)
+        if known is None or (isinstance(name, int) and known.index != name):
+            return _param_of(message, machine.table.encoding)
+        return known
 
     async def set(
         self,
@@ -383,7 +385,7 @@ def _outcome(operation: Operation[Result]) -> Result:
 
 
 def _param_of(message: ParamValue, encoding: Encoding) -> Param:
-    """What a message says: of a hash, or of a parameter that has left the table since."""
+    """What a message says of what is not in the table: a hash, what has left it, what shares its name."""
     value, bits = decode(message.raw, message.param_type, encoding)
     index = None if message.param_index == NO_INDEX else message.param_index
     return Param(message.param_id, value, known_type(message.param_type), index, bits)

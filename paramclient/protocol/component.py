@@ -492,6 +492,7 @@ class ComponentMachine:
         presence = self.presence
         if presence.is_lost:
             presence.is_lost = False
+            self.reads.forgive()  # the silence of before says nothing of it
             self._emit(events.ComponentFound(self, silence))
             self.sync.check(now)
             self.who.doubt(now)

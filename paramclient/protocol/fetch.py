@@ -10,10 +10,8 @@ from typing import Final
 
 from paramclient.errors import CacheError, LinkError, NoReply, UnknownParameter
 from paramclient.protocol.download import Download
-from paramclient.protocol.hashing import find_volatile
 from paramclient.protocol.notes import (
     FROM_MEMORY,
-    MOVED,
     NO_FILE,
     NOT_ASKED,
     NOT_CONFIRMED,
@@ -21,13 +19,14 @@ from paramclient.protocol.notes import (
     NOT_RESUMED,
     NOT_SAMPLED,
     SAMPLED,
-    UNBRACKETED,
     UNPROVEN,
     UNSETTLED,
 )
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.packfetch import PackFetch
+from paramclient.protocol.proof import Proof
 from paramclient.protocol.reads import Read, Reads
+from paramclient.protocol.repeated import Repeated, repeated_names
 from paramclient.protocol.result import Announcement, FetchResult, Means, Policy, Progress, Sampled
 from paramclient.protocol.sampling import Sampling
 from paramclient.protocol.table import Table
@@ -96,8 +95,8 @@ class Fetch(Operation[FetchResult]):
         self._has_begun = self._had_no_file = False
         self._sampling: Sampling | None = None
         self._hash_read: Read | None = None
-        self._before: int | None = None  # the hash announced before any value counted
-        self._meanwhile: int | None = None  # the hash announced in the course of the download
+        self._proof = Proof(table)
+        self._repeated: Repeated | None = None
         self._was_asked_meanwhile = False
         self._is_hash_unknown = False  # the vehicle answers, but not to that
         self._first_value_at = math.inf
@@ -125,8 +124,8 @@ class Fetch(Operation[FetchResult]):
         """A `_HASH_CHECK` passed by: PX4 sends one at the head of its list."""
         if self.download is not None and not self.download.names:
             self.download.heed(announcement.at)
-            if self._before is None:
-                self._before = announcement.hash
+            if self._proof.before is None:
+                self._proof.before = announcement
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
@@ -137,7 +136,7 @@ class Fetch(Operation[FetchResult]):
             if self._first_value_at > now:
                 self._first_value_at = now
             download.heard(message, now)
-            if self._before is not None or self._was_asked_meanwhile:
+            if self._proof.before is not None or self._was_asked_meanwhile:
                 return
             if self._expects_hash() and not self.done:
                 # the one at the head of the list was lost; asked for now, it need not be waited for later
@@ -146,10 +145,14 @@ class Fetch(Operation[FetchResult]):
 
     def tick(self, now: float) -> None:
         self.identified(now)
+        if self._repeated is not None:
+            self._repeated.tick(now)
         if self.download is not None:
             self.download.tick(now)
 
     def next_deadline(self) -> float:
+        if self._repeated is not None:
+            return self._repeated.next_deadline()
         return self._undecided_until if self.download is None else self.download.next_deadline()
 
     def identified(self, now: float) -> None:
@@ -184,7 +187,7 @@ class Fetch(Operation[FetchResult]):
             self.fail(NoReply(what, attempts=self._restarts, waited=now - self.begun_at), now)
             return
         self._held_before = held_up
-        self._before = self._meanwhile = None
+        self._proof.forget()
         self._was_asked_meanwhile = False
         self._listed = False
         self._begin_download(now)
@@ -267,8 +270,7 @@ class Fetch(Operation[FetchResult]):
         read.on_done.append(ended)
 
     def _hash_came_meanwhile(self, read: Read) -> None:
-        if read.result is not None:
-            self._meanwhile = int.from_bytes(read.result.raw, "little")
+        self._proof.meanwhile = _announced_in(read)
         self._is_hash_unknown = isinstance(read.error, UnknownParameter)
         if self.download is not None and self.download.done:
             self._download_ended(self.download)
@@ -283,7 +285,7 @@ class Fetch(Operation[FetchResult]):
         table = self._table
         listed = table.listed()
         if announcement.hash != table.hash or announcement.count != len(listed):
-            self._before = announcement.hash
+            self._proof.before = announcement
             self._begin_download(now)
             return
         table.count = announcement.count
@@ -314,7 +316,7 @@ class Fetch(Operation[FetchResult]):
             self._begin_download(read.ended_at)
 
     def _resume_under(self, announcement: Announcement, now: float) -> None:
-        self._before = announcement.hash
+        self._proof.before = announcement
         if announcement.count == self._table.count:
             self._resume(now)
         else:
@@ -380,19 +382,11 @@ class Fetch(Operation[FetchResult]):
 
     def _hash_came_after_file(self, file: PackFetch, read: Read) -> None:
         """The file is the vehicle's table at one moment; its hash may be of a later one."""
-        table, now = self._table, read.ended_at
-        notes: tuple[str, ...] = ()
-        table.unconfirm()
-        if read.result is not None:
-            after = int.from_bytes(read.result.raw, "little")
-            volatile, proven = find_volatile(table.listed(), after, believed=table.volatile)
-            if proven or after == self._before:
-                table.confirm(after, volatile, proven=proven)
-                table.verify()
-                notes = () if proven else (UNPROVEN,)
-            else:
-                notes = (MOVED,)
-        self.finish(self._result("ftp", file.count, (), table.hash, now, notes), now)
+        after = _announced_in(read)
+        self._table.unconfirm()
+        notes = () if after is None else self._proof.settle(after, file.count)
+        result = self._result("ftp", file.count, (), self._table.hash, read.ended_at, notes or ())
+        self.finish(result, read.ended_at)
 
     def _stay_with_cache(self, now: float) -> None:
         """The policy allows no download: give what is known, and say so."""
@@ -411,30 +405,33 @@ class Fetch(Operation[FetchResult]):
     def _download_ended(self, download: Download) -> None:
         if download.error is not None:
             self.fail(download.error, download.ended_at)
-        elif self._hash_read is not None:
+            return
+        if self._hash_read is not None or self._asks_for_repeated(download):
             return  # it is on its way
-        elif self._is_proven(download):
-            self._finish_download(download, download.ended_at, ())
+        now = download.ended_at if self._repeated is None else self._repeated.ended_at
+        if self._is_proven(download):
+            self._finish_download(download, now, ())
         elif self._expects_hash() and not self._is_hash_unknown:
-            self._ask_hash(partial(self._hash_came_last, download), download.ended_at)
+            self._ask_hash(partial(self._hash_came_last, download), now)
         else:
-            self._settle(download, None, download.ended_at)
+            self._settle(download, None, now)
+
+    def _asks_for_repeated(self, download: Download) -> bool:
+        """Whether it is still being asked what the vehicle means by names that came more than once."""
+        if self._repeated is None:
+            names = repeated_names(download.names)
+            if not (names or self._table.passed_over):
+                return False
+            self._repeated = Repeated(names, self._round_trip, self._reads, self._table, download.ended_at)
+            self._repeated.on_done.append(partial(self._download_ended, download))
+        return not self._repeated.done
 
     def _is_proven(self, download: Download) -> bool:
-        """Whether the hash computed from what came is the one that was announced meanwhile.
-
-        Then the table is what the vehicle had at that moment, and the hash need not be waited for again.
-        """
-        announced = self._before if self._meanwhile is None else self._meanwhile
-        if announced is None or download.missing or not download.is_settled:
+        """Whether what was announced in its course proves the table that it brought."""
+        if download.missing or not download.is_settled:
             return False
         self._remove_what_is_gone(download)
-        table = self._table
-        volatile, is_proven = find_volatile(table.listed(), announced, believed=table.volatile)
-        if is_proven:
-            table.confirm(announced, volatile, proven=True)
-            table.verify()
-        return is_proven
+        return self._proof.is_given(download.count or 0)
 
     def _remove_what_is_gone(self, download: Download) -> None:
         table = self._table
@@ -449,10 +446,9 @@ class Fetch(Operation[FetchResult]):
         self._means.changed(gone)
 
     def _hash_came_last(self, download: Download, read: Read) -> None:
-        after = None if read.result is None else int.from_bytes(read.result.raw, "little")
-        self._settle(download, after, read.ended_at)
+        self._settle(download, _announced_in(read), read.ended_at)
 
-    def _settle(self, download: Download, after: int | None, now: float) -> None:
+    def _settle(self, download: Download, after: Announcement | None, now: float) -> None:
         """The download is over and the hash is known, if there is one."""
         table = self._table
         notes: tuple[str, ...] = ()
@@ -462,27 +458,25 @@ class Fetch(Operation[FetchResult]):
                 notes = (UNSETTLED,)
             table.unconfirm()
         if after is not None and not download.missing:
-            volatile, proven = find_volatile(table.listed(), after, believed=table.volatile)
-            if download.resumed and not proven:
+            judged = self._proof.settle(after, download.count or 0, needs_proof=download.resumed > 0)
+            if judged is None:
                 # what was heard earlier is not what the vehicle has now, or cannot be told from it
                 self._notes = (NOT_RESUMED,)
-                self._before = self._meanwhile = None
+                self._proof.forget()
                 self._was_asked_meanwhile = False
                 self._begin_download(now)
                 return
-            if proven or after == self._before:
-                table.confirm(after, volatile, proven=proven)
-                table.verify()
-                notes += () if proven else (UNPROVEN,)
-            else:
-                notes += (UNBRACKETED,) if self._before is None else (MOVED,)
+            notes += judged
         self._finish_download(download, now, notes)
 
     def _finish_download(self, download: Download, now: float, notes: tuple[str, ...]) -> None:
         count = download.count or 0
         missing = download.missing
         table = self._table
-        if not missing:
+        if self._repeated is not None and self._repeated.names:
+            notes += (self._repeated.note,)
+            table.complete = False
+        elif not missing:
             table.complete = download.is_settled
         else:
             table.place(download.names)
@@ -531,11 +525,19 @@ class Fetch(Operation[FetchResult]):
         if sampling is not None:
             sampling.cancel()
         self._undecided_until = math.inf
+        repeated, self._repeated = self._repeated, None
+        if repeated is not None:
+            repeated.cancel()
         file, self.file = self.file, None
         if file is not None:
             file.cancel(now)
         if self.download is not None:
             self.download.cancel()
+
+
+def _announced_in(read: Read) -> Announcement | None:
+    """What the answer to a read of `_HASH_CHECK` says, or None without one."""
+    return None if read.result is None else Announcement.of(read.result, read.ended_at)
 
 
 def present_of(table: Table, reads: Reads) -> dict[int, str]:

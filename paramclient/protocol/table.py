@@ -48,6 +48,7 @@ class Table:
         hash: the PX4 hash under which the vehicle would confirm exactly this table, or None while unknown.
         displaced: names whose index was of an earlier count, and that the vehicle may no longer have; some of
             them may have come again since.
+        passed_over: by a name that several parameters share, the indices of those that it does not mean.
         dirty: names whose value, type or index changed since `take_dirty` was called last.
     """
 
@@ -58,6 +59,7 @@ class Table:
         self.volatile_known = False
         self.complete = False
         self.displaced: set[str] = set()
+        self.passed_over: dict[str, frozenset[int]] = {}
         self.dirty: dict[str, str] = {}
         self._hash: int | None = None
         self._hash_is_stale = False
@@ -103,6 +105,8 @@ class Table:
         """
         name, raw, number, count, given = message
         index: int | None = given
+        if self.passed_over and given in self.passed_over.get(name, ()):
+            return None
         old = self.params.get(name)
         if given == NO_INDEX:
             index = None if old is None else old.index
@@ -240,6 +244,7 @@ class Table:
         """Another count was heard: which parameter has which index is open again."""
         if self.count is not None:
             self.complete = False
+            self.passed_over.clear()
             for param in self.listed():
                 self.params[param.name] = self._displaced(param)
         self.count = count
@@ -255,6 +260,8 @@ class Table:
         """A download has settled which parameter has which index."""
         for index, name in names.items():
             param = self.params.get(name)
+            if index in self.passed_over.get(name, ()):
+                continue
             if param is not None and param.index != index:
                 self.params[name] = Param(name, param.value, param.type, index, param.bits, param.trust)
                 self.dirty.setdefault(name, "vehicle")
