@@ -184,7 +184,7 @@ class Vehicle(ABC):
         """Whether it speaks as on a satellite link; can be set at any moment, also in flight.
 
         HIGH_LATENCY2 every 5 s then stands in for heartbeat, SYSTEM_TIME and telemetry. Reads and sets are
-        answered; a list or a file waits until it is off, and what PX4 pushes too (its `MAVLINK_MODE_IRIDIUM`).
+        answered; lists and files wait until it is off, and what PX4 pushes too (its `MAVLINK_MODE_IRIDIUM`).
         """
         return self._high_latency
 
