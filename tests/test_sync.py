@@ -1040,3 +1040,27 @@ def test_what_a_users_choice_means() -> None:
     for interval, policy in wrong:
         with pytest.raises(UsageError):
             Upkeep.chosen(interval, policy)
+
+
+def test_a_table_that_moved_while_it_came_is_not_synced_and_is_fetched_again() -> None:
+    """Parameters come into use behind the front of the list: only the hash tells."""
+    vehicle = PX4Vehicle(table={**PLAIN, "ZZ_LATE": 1}, not_in_use=["ZZ_LATE"], burst=1, period=0.02)
+    world = World(air=Air.symmetric([vehicle], delay=0.3), upkeep=Upkeep(INTERVAL))
+    vehicle.when_listed(len(vehicle.params), lambda: vehicle.use("ZZ_LATE"))
+    result = world.fetch()
+    assert result.has_moved
+    assert state(world) is SyncState.UNSYNCED
+    world.run(GAPS_INTERVAL + 5.0)
+    assert state(world) is SyncState.SYNCED
+    assert "ZZ_LATE" in world.machine.table.params
+
+
+def test_nothing_is_begun_for_a_component_that_is_lost() -> None:
+    vehicle = ArduPilotVehicle(ftp=False, table=PLAIN)
+    world = World(vehicle, upkeep=Upkeep(5.0, without_hash=True))
+    world.fetch()
+    fetch = world.machine.begin_fetch(world.now, refresh=True)
+    vehicle.reboot(world.now, down=math.inf)
+    world.run(60.0)
+    assert fetch.done
+    assert state(world) is SyncState.LOST

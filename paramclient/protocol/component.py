@@ -328,7 +328,6 @@ class ComponentMachine:
         """The link was away and is back: whatever waits for an answer is asked for again."""
         self.round_trip.heard_at = now
         if not self.presence.is_lost:
-            # it could not be heard meanwhile, nor be lost
             if self.presence.was_away(silence := self.presence.heard(now)):
                 self._doubt()
                 self.sync.check(now)
@@ -464,8 +463,9 @@ class ComponentMachine:
 
     @property
     def _is_spared(self) -> bool:
-        """Whether it is in a mode in which nothing is asked of it unasked."""
-        return self.presence.is_high_latency or self.reads.pace.gap >= LOW_BANDWIDTH_GAP
+        """Whether it is lost, or in a mode in which nothing is asked of it unasked."""
+        presence = self.presence
+        return presence.is_lost or presence.is_high_latency or self.reads.pace.gap >= LOW_BANDWIDTH_GAP
 
     def _check_present(self, what: str, now: float) -> None:
         if self.presence.is_lost:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from paramclient.protocol.ftp import FileTransfers
+from paramclient.protocol.notes import MOVED
 from paramclient.protocol.reads import Reads
 from paramclient.protocol.sampling import Sample
 from paramclient.protocol.table import Change, Table
@@ -146,6 +147,11 @@ class FetchResult:
     @property
     def complete(self) -> bool:
         return not self.missing
+
+    @property
+    def has_moved(self) -> bool:
+        """Whether the vehicle's hash has told that the table moved while it came: it may be a mixture."""
+        return MOVED in self.notes
 
     @property
     def is_confirmed(self) -> bool:

@@ -236,15 +236,17 @@ class Sync:
             self._not_confirmed()
             return False
         table = self._table
-        complete = result.complete and table.complete
+        complete = result.complete and table.complete and not result.has_moved
         if result.hash is None:  # what came before it was lost may have moved since
             complete = complete and all(param.trust is not Trust.CACHED for param in table.listed())
         if not complete:
             self._fall()
         self.synced = complete
-        self._was_synced |= complete
+        self._was_synced |= complete or result.has_moved
         self._moved_by_us_alone = result.hash is not None
         self._settled(now)
+        if result.has_moved and self._is_kept_up:
+            self._check_at = now + GAPS_INTERVAL
         if result.hash is not None:
             self._read_unhashed(result.hash, now)
         return True
