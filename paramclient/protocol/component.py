@@ -464,13 +464,13 @@ class ComponentMachine:
 
     @property
     def _is_spared(self) -> bool:
-        """Whether it is in a mode in which nothing is asked of it unasked."""
-        return self.presence.is_high_latency or self.reads.pace.gap >= LOW_BANDWIDTH_GAP
+        """Whether it is lost, or in a mode in which nothing is asked of it unasked."""
+        presence = self.presence
+        return presence.is_lost or presence.is_high_latency or self.reads.pace.gap >= LOW_BANDWIDTH_GAP
 
     def _check_present(self, what: str, now: float) -> None:
         if self.presence.is_lost:
-            silence = now - self.presence.heard_at
-            raise NoReply(f"{what} (lost)", attempts=0, waited=silence)
+            raise NoReply(f"{what} (lost)", attempts=0, waited=now - self.presence.heard_at)
 
     def _doubt(self) -> None:
         """What is known may be of the past: it counts again when the vehicle has confirmed it."""
