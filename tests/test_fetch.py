@@ -573,6 +573,17 @@ def test_what_never_comes_is_named_and_the_table_is_not_complete() -> None:
     assert world.machine.state == "partial"
 
 
+def test_with_something_missing_no_hash_is_waited_for() -> None:
+    vehicle = PX4Vehicle()
+    world = Simulation(air=Air.symmetric([vehicle], delay=0.05))
+    fetch = world.meet().begin_fetch(world.now)
+    world.until(lambda: fetch.progress(world.now).received > 0)
+    vehicle.reboot(down=math.inf)
+    world.until(lambda: fetch.download is not None and fetch.download.done)
+    assert fetch.result is not None
+    assert fetch.result.missing
+
+
 def test_what_does_not_come_stays_as_the_cache_knows_it() -> None:
     vehicle = PX4Vehicle(table=SMALL)
     deaf_to(vehicle, ["P03"])

@@ -29,6 +29,7 @@ from paramclient.protocol.sync import GAPS_INTERVAL, WATCH_INTERVAL, SyncState, 
 from paramclient.protocol.wire import (
     HASH_CHECK,
     CommandLong,
+    FileTransfer,
     ParamRequestList,
     ParamRequestRead,
     ParamSet,
@@ -285,6 +286,33 @@ def test_a_resync_that_fails_is_tried_again() -> None:
     tap.is_deaf = False
     world.run(INTERVAL + 1.0)
     assert resynced(world) == [("P07",)]
+
+
+def test_of_one_that_was_lost_during_its_fetch_nothing_is_asked() -> None:
+    world = World(ArduPilotVehicle(ftp=False, table=PLAIN), upkeep=Upkeep(INTERVAL, without_hash=True))
+    world.fetch()
+    fetch = world.machine.begin_fetch(world.now, refresh=True)
+    world.until(lambda: fetch.progress(world.now).received > 0)
+    world.tap.is_mute = True
+    assert world.outcome(fetch).missing
+    assert state(world) is SyncState.LOST
+    world.sent.clear()
+    world.run(3 * INTERVAL)
+    assert world.requests() == 0
+
+
+def test_a_table_that_came_as_a_file_is_kept_up_by_its_hash_alone() -> None:
+    unknown = [SimParam(row.name, row.type, row.value, volatile=row.name in NAMES[::9]) for row in TABLE]
+    vehicle = PX4Vehicle(ftp=True, table=unknown)
+    world = World(air=Air.symmetric([vehicle], delay=0.05), upkeep=Upkeep(INTERVAL))
+    result = world.fetch()
+    assert result.source == "ftp"
+    assert result.hash == vehicle.announced_hash(), "it was the same before and after"
+    world.run(1.0)
+    world.sent.clear()
+    world.run(3 * INTERVAL)
+    assert world.requests() == 3
+    assert world.sent_of(FileTransfer) == []
 
 
 def test_a_missing_value_of_our_own_set_is_settled_by_a_read() -> None:

@@ -21,6 +21,16 @@ def test_a_first_value() -> None:
     assert table.take_dirty() == {}
 
 
+def test_what_turns_out_to_be_volatile_or_not_is_news() -> None:
+    table = Table()
+    for index, name in enumerate("ABC"):
+        table.hear(param_value(name, 1.5, index=index), "vehicle")
+    table.confirm(1, frozenset("A"), proven=False)
+    table.take_dirty()
+    table.confirm(2, frozenset("B"), proven=True)
+    assert set(table.take_dirty()) == {"A", "B"}
+
+
 def test_the_same_once_more_is_no_change() -> None:
     table = Table()
     table.hear(param_value("A", 1.5, index=3), "vehicle")

@@ -469,8 +469,7 @@ class ComponentMachine:
 
     def _check_present(self, what: str, now: float) -> None:
         if self.presence.is_lost:
-            silence = now - self.presence.heard_at
-            raise NoReply(f"{what} (lost)", attempts=0, waited=silence)
+            raise NoReply(f"{what} (lost)", attempts=0, waited=now - self.presence.heard_at)
 
     def _doubt(self) -> None:
         """What is known may be of the past: it counts again when the vehicle has confirmed it."""

@@ -9,7 +9,7 @@ from functools import partial
 from typing import Final
 
 from paramclient.errors import CacheError, LinkError, NoReply, UnknownParameter
-from paramclient.protocol.download import Download
+from paramclient.protocol.download import Download, present_of
 from paramclient.protocol.notes import (
     FROM_MEMORY,
     NO_FILE,
@@ -25,22 +25,18 @@ from paramclient.protocol.notes import (
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.packfetch import PackFetch
 from paramclient.protocol.proof import Proof
-from paramclient.protocol.reads import Read, Reads
+from paramclient.protocol.reads import Read
 from paramclient.protocol.repeated import Repeated, repeated_names
 from paramclient.protocol.result import Announcement, FetchResult, Means, Policy, Progress, Sampled
 from paramclient.protocol.sampling import Sampling
-from paramclient.protocol.table import Table
-from paramclient.protocol.wire import HASH_CHECK, ParamValue
+from paramclient.protocol.wire import HASH_CHECK, ParamRequestRead, ParamValue
 from paramclient.values import Trust
 
-__all__ = ["Fetch", "present_of"]
+__all__ = ["Fetch"]
 
 FRESH_HASH: Final = 1.0
 """Seconds for which an announced hash answers the question what the hash is. It is asked for when a component
 is found, so that a fetch right after that need not wait for another round trip."""
-ENOUGH_PRESENT: Final = 0.5
-"""The share of a table that must be there for its rest to be worth asking for one by one, where it is not
-known how fast the list comes."""
 IDENTITY_PATIENCE: Final = 1.0
 """Seconds for which a component may say whether it serves the file before its list is asked for."""
 MOST_RESTARTS: Final = 8
@@ -122,6 +118,8 @@ class Fetch(Operation[FetchResult]):
 
     def announced(self, announcement: Announcement) -> None:
         """A `_HASH_CHECK` passed by: PX4 sends one at the head of its list."""
+        if self.file is not None and self.file.is_awaited:
+            self._proof.before = announcement
         if self.download is not None and not self.download.names:
             self.download.heed(announcement.at)
             if self._proof.before is None:
@@ -339,6 +337,9 @@ class Fetch(Operation[FetchResult]):
             return
         self._undecided_until = math.inf
         if may_use_file:
+            if self._expects_hash():
+                # once, beside the file: with nothing of that there, the answer is of the time before it
+                means.send(ParamRequestRead(*self._target, HASH_CHECK, -1))
             file = self.file = PackFetch(means.files, means.turns, means.table, means.changed, now)
             file.on_done.append(partial(self._file_ended, file))
             return
@@ -366,7 +367,9 @@ class Fetch(Operation[FetchResult]):
         if file.error is None:
             self.file_failed = False
             self._table.complete = True
-            if self._expects_hash() and not self._is_hash_unknown:
+            if self._proof.is_given(file.count):
+                self.finish(self._result("ftp", file.count, (), self._table.hash, now, ()), now)
+            elif self._expects_hash() and not self._is_hash_unknown:
                 self._ask_hash(partial(self._hash_came_after_file, file), now)
             else:
                 self._table.unconfirm()
@@ -406,12 +409,14 @@ class Fetch(Operation[FetchResult]):
         if download.error is not None:
             self.fail(download.error, download.ended_at)
             return
+        if download.missing:
+            self._drop_hash_read()  # it can prove nothing
         if self._hash_read is not None or self._asks_for_repeated(download):
             return  # it is on its way
         now = download.ended_at if self._repeated is None else self._repeated.ended_at
         if self._is_proven(download):
             self._finish_download(download, now, ())
-        elif self._expects_hash() and not self._is_hash_unknown:
+        elif self._expects_hash() and not (self._is_hash_unknown or download.missing):
             self._ask_hash(partial(self._hash_came_last, download), now)
         else:
             self._settle(download, None, now)
@@ -497,19 +502,17 @@ class Fetch(Operation[FetchResult]):
         now: float,
         notes: tuple[str, ...],
     ) -> FetchResult:
-        params = dict(self._table.params)
         received = count - len(missing)
-        elapsed = now - self.begun_at
         download = self.download
         return FetchResult(
             *self._target,
-            params,
+            dict(self._table.params),
             source,
             count,
             received,
             missing,
             confirmed,
-            elapsed,
+            now - self.begun_at,
             self._notes + notes,
             resumed=0 if download is None else download.resumed,
             lost=0 if download is None else download.lost,
@@ -517,10 +520,13 @@ class Fetch(Operation[FetchResult]):
             round_trip=self._round_trip.smoothed,
         )
 
-    def _drop(self, now: float) -> None:
+    def _drop_hash_read(self) -> None:
         read, self._hash_read = self._hash_read, None
         if read is not None:
             self._reads.release(read)
+
+    def _drop(self, now: float) -> None:
+        self._drop_hash_read()
         sampling, self._sampling = self._sampling, None
         if sampling is not None:
             sampling.cancel()
@@ -538,13 +544,3 @@ class Fetch(Operation[FetchResult]):
 def _announced_in(read: Read) -> Announcement | None:
     """What the answer to a read of `_HASH_CHECK` says, or None without one."""
     return None if read.result is None else Announcement.of(read.result, read.ended_at)
-
-
-def present_of(table: Table, reads: Reads) -> dict[int, str]:
-    """What is there of an unfinished table, by index; nothing where that is too little to go on with."""
-    count = table.count
-    if table.complete or not count:
-        return {}
-    present = table.present()
-    # with a list's pace measured, the download finds out itself whether another one is faster
-    return present if reads.pace.gap or len(present) >= ENOUGH_PRESENT * count else {}

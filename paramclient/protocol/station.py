@@ -9,8 +9,9 @@ from typing import Final, TypeAlias
 from paramclient.errors import LinkError, UsageError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.download import present_of
 from paramclient.protocol.events import ComponentHeard, Event
-from paramclient.protocol.fetch import Fetch, present_of
+from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.result import Policy
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.traffic import Traffic

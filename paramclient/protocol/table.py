@@ -81,8 +81,12 @@ class Table:
         """The vehicle announced this hash for exactly this table.
 
         With `proven`, the hash computed here without the volatile names was the same. Then it can be computed
-        again whenever a value moves, and the vehicle can confirm the table in the next session as well.
+        again whenever a value moves, and the vehicle can confirm the table in the next session as well. What
+        is taken for volatile now and was not before, or the other way round, is news for the cache.
         """
+        for name in volatile ^ self.volatile:
+            if name in self.params:
+                self.dirty.setdefault(name, "vehicle")
         self._hash = announced
         self._hash_is_stale = False
         self.volatile = volatile
