@@ -774,7 +774,7 @@ async def test_a_fetch_brings_every_parameter() -> None:
             assert component.state == "new"
             result = await component.fetch_all()
             assert result.complete
-            assert result.source == "stream"
+            assert result.source == ("ftp" if isinstance(vehicle, ArduPilotVehicle) else "stream")
             assert bits(result.params) == bits(vehicle.params)
             assert component.params == result.params
             assert (component.state, component.count) == ("synced", len(vehicle.params))

@@ -10,12 +10,16 @@ from paramclient.errors import NoReply
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.stream import SHORTEST_QUIET, ListStream
+from paramclient.protocol.table import Table
 from paramclient.protocol.timing import LONGEST_SILENCE, RoundTrip
 from paramclient.protocol.turns import Seen, Turns
 from paramclient.protocol.wire import NO_INDEX, Message, ParamRequestList, ParamValue
 
-__all__ = ["Download"]
+__all__ = ["Download", "present_of"]
 
+ENOUGH_PRESENT: Final = 0.5
+"""The share of a table that must be there for its rest to be worth asking for one by one, where it is not
+known how fast the list comes."""
 LIST_PATIENCE: Final = 20.0
 """Seconds of silence after which PARAM_REQUEST_LIST counts as not answered: longer than ArduPilot leaves it
 unanswered after a boot."""
@@ -511,3 +515,13 @@ class Download(Operation[None]):
         what = f"the parameter list of {system}/{component}"
         waited = now - self.begun_at - self.held_up
         self.fail(NoReply(what, attempts=self.lists, waited=waited), now)
+
+
+def present_of(table: Table, reads: Reads) -> dict[int, str]:
+    """What is there of an unfinished table, by index; nothing where that is too little to go on with."""
+    count = table.count
+    if table.complete or not count:
+        return {}
+    present = table.present()
+    # with a list's pace measured, the download finds out itself whether another one is faster
+    return present if reads.pace.gap or len(present) >= ENOUGH_PRESENT * count else {}

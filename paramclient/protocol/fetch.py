@@ -9,7 +9,7 @@ from functools import partial
 from typing import Final
 
 from paramclient.errors import CacheError, LinkError, NoReply, UnknownParameter
-from paramclient.protocol.download import Download
+from paramclient.protocol.download import Download, present_of
 from paramclient.protocol.hashing import find_volatile
 from paramclient.protocol.notes import (
     FROM_MEMORY,
@@ -27,21 +27,17 @@ from paramclient.protocol.notes import (
 )
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.packfetch import PackFetch
-from paramclient.protocol.reads import Read, Reads
+from paramclient.protocol.reads import Read
 from paramclient.protocol.result import Announcement, FetchResult, Means, Policy, Progress, Sampled
 from paramclient.protocol.sampling import Sampling
-from paramclient.protocol.table import Table
 from paramclient.protocol.wire import HASH_CHECK, ParamValue
 from paramclient.values import Trust
 
-__all__ = ["Fetch", "present_of"]
+__all__ = ["Fetch"]
 
 FRESH_HASH: Final = 1.0
 """Seconds for which an announced hash answers the question what the hash is. It is asked for when a component
 is found, so that a fetch right after that need not wait for another round trip."""
-ENOUGH_PRESENT: Final = 0.5
-"""The share of a table that must be there for its rest to be worth asking for one by one, where it is not
-known how fast the list comes."""
 MOST_RESTARTS: Final = 8
 """Times that a vehicle may start again, or turn out to be another one, before a fetch is given up."""
 
@@ -64,9 +60,9 @@ class Fetch(Operation[FetchResult]):
     Attributes:
         holders: how many wait for it; with none left it is cancelled.
         download: the download by list, once it is needed.
-        file: the download as a file, while that is tried.
-        file_failed: whether the file could not be had, once that is known: None before, and where the
-            component just did not answer.
+        file: the download as a file, while that is tried and when it has come.
+        file_failed: whether the component has no such file, once that is known: None before, and where it may
+            be bad luck.
     """
 
     def __init__(
@@ -78,7 +74,7 @@ class Fetch(Operation[FetchResult]):
         refresh: bool,
         listed: bool,
         policy: Policy,
-        may_use_file: bool,
+        may_use_file: Callable[[], bool],
         sampled: Sampled | None,
     ) -> None:
         super().__init__(now)
@@ -90,6 +86,9 @@ class Fetch(Operation[FetchResult]):
         self._expects_hash = means.expects_hash
         self._may_use_file = may_use_file
         self._has_begun = False
+        self._may_resume = False
+        self._file_tried = False
+        self._file_was_silent = False
         self._sampling: Sampling | None = None
         self._hash_read: Read | None = None
         self._before: int | None = None  # the hash announced before any value counted
@@ -108,7 +107,13 @@ class Fetch(Operation[FetchResult]):
         self._notes: tuple[str, ...] = ()
         if policy is Policy.CACHE_ONLY or refresh or listed:
             self._begin_download(now)
-        elif sampled is not None and table.complete and table.count and not self._expects_hash():
+        elif (
+            sampled is not None
+            and policy is Policy.AUTO
+            and table.complete
+            and table.count
+            and not self._expects_hash()
+        ):
             self._sample(sampled, table.count, now)
         elif table.hash is None or not table.complete:
             self._begin_or_resume(announced, now)
@@ -155,18 +160,26 @@ class Fetch(Operation[FetchResult]):
     @property
     def is_about_the_cache(self) -> bool:
         """Whether it is still to be seen if what is known already will do."""
-        return self.file is None and (self.download is None or self.download.resumed > 0)
+        return not self._has_begun or (self.download is not None and self.download.resumed > 0)
+
+    @property
+    def is_sampling(self) -> bool:
+        """Whether a sample is being read that may settle it."""
+        return self._sampling is not None
 
     @property
     def is_under_way(self) -> bool:
         """Whether parameters have come, which are of the past if the vehicle starts again."""
-        return self._has_begun
+        return self._has_begun or self.is_sampling
 
     def restart(self, now: float) -> None:
         """The vehicle is another one, or has started again: what came is not about it. Fetch it anew."""
         held_up = self.held_up(now)
         self._drop(now)
         self.download = None
+        self._notes = ()
+        self.file_failed = None
+        self._file_tried = self._file_was_silent = self._may_resume = False
         self._restarts += 1
         if self._restarts > MOST_RESTARTS:
             system, component = self._target
@@ -190,9 +203,10 @@ class Fetch(Operation[FetchResult]):
             NoReply: nothing has come.
         """
         download = self.download
-        count = self._table.count
-        if self.file is not None and not self.file.is_awaited and count:
-            return self._result("ftp", count, tuple(range(count)), None, now, (note,))
+        file = self.file
+        if file is not None and file.count:
+            missing = () if file.done else tuple(range(file.count))
+            return self._result("ftp", file.count, missing, None, now, (note,))
         if download is None or download.count is None:
             system, component = self._target
             attempts = 1 if download is None else download.lists
@@ -218,19 +232,13 @@ class Fetch(Operation[FetchResult]):
     def progress(self, now: float) -> Progress:
         """How far it is."""
         if self.file is not None:
-            return self._progress_of_file(self.file, now)
+            return self.file.progress(now - self.begun_at - self.held_up(now), self._table.count)
         received, total = (0, self._table.count) if self.download is None else self.download.progress
         running = now - self._first_value_at
         came = received - (0 if self.download is None else self.download.resumed)
         rate = came / running if came > 0 and running > 0 else 0.0
         left = (total - received) / rate if rate and total is not None else None
         return Progress(received, total, rate, left)
-
-    def _progress_of_file(self, file: PackFetch, now: float) -> Progress:
-        share, total, running = file.share, self._table.count, now - self.begun_at - self.held_up(now)
-        left = running * (1 - share) / share if share else None
-        received = int(share * (total or 0))
-        return Progress(received, total, received / running if running > 0 else 0.0, left)
 
     def _sample(self, sampled: Sampled, count: int, now: float) -> None:
         """Judge the cached table by some of its parameters."""
@@ -333,7 +341,9 @@ class Fetch(Operation[FetchResult]):
         means = self._means
         self._has_begun = True
         means.doubt(now)
-        if self._may_use_file and not self._listed:
+        if self._may_use_file() and not (self._file_tried or self._listed):
+            self._file_tried = True
+            self._may_resume = present is not None
             file = self.file = PackFetch(means.files, means.turns, means.table, means.changed, now)
             file.on_done.append(partial(self._file_ended, file))
             return
@@ -355,9 +365,7 @@ class Fetch(Operation[FetchResult]):
     def _file_ended(self, file: PackFetch) -> None:
         if self.file is not file:
             return
-        self.file = None
         now = file.ended_at
-        self._held_before += file.held_up
         if file.error is None:
             self.file_failed = False
             self._table.complete = True
@@ -365,15 +373,20 @@ class Fetch(Operation[FetchResult]):
                 self._ask_hash(partial(self._hash_came_after_file, file), now)
             else:
                 self._table.unconfirm()
-                self.finish(self._result("ftp", file.count, (), None, now, ()), now)
+                self.finish(self._result("ftp", file.count or 0, (), None, now, ()), now)
             return
+        self.file = None
+        self._held_before += file.held_up
         if isinstance(file.error, LinkError):
             self.fail(file.error, now)
             return
-        self._may_use_file = False
-        self.file_failed = None if isinstance(file.error, NoReply) else True
+        self.file_failed = True if file.is_useless else None
+        self._file_was_silent = file.is_unheard
         self._notes += (NO_FILE.format(file.error),)
-        self._begin_download(now)
+        if self._may_resume:
+            self._resume(now)
+        else:
+            self._begin_download(now)
 
     def _hash_came_after_file(self, file: PackFetch, read: Read) -> None:
         """The file is the vehicle's table at one moment; its hash may be of a later one."""
@@ -388,8 +401,8 @@ class Fetch(Operation[FetchResult]):
                 table.verify()
                 notes = () if proven else (UNPROVEN,)
             else:
-                notes = (MOVED,)
-        self.finish(self._result("ftp", file.count, (), table.hash, now, notes), now)
+                notes = (UNBRACKETED,) if self._before is None else (MOVED,)
+        self.finish(self._result("ftp", file.count or 0, (), table.hash, now, notes), now)
 
     def _stay_with_cache(self, now: float) -> None:
         """The policy allows no download: give what is known, and say so."""
@@ -481,6 +494,8 @@ class Fetch(Operation[FetchResult]):
         table = self._table
         if not missing:
             table.complete = download.is_settled
+            if self._file_was_silent:  # while the list has come
+                self.file_failed = True
         else:
             table.place(download.names)
         table.count = count
@@ -532,13 +547,3 @@ class Fetch(Operation[FetchResult]):
             file.cancel(now)
         if self.download is not None:
             self.download.cancel()
-
-
-def present_of(table: Table, reads: Reads) -> dict[int, str]:
-    """What is there of an unfinished table, by index; nothing where that is too little to go on with."""
-    count = table.count
-    if table.complete or not count:
-        return {}
-    present = table.present()
-    # with a list's pace measured, the download finds out itself whether another one is faster
-    return present if reads.pace.gap or len(present) >= ENOUGH_PRESENT * count else {}

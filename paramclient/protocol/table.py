@@ -48,6 +48,7 @@ class Table:
         hash: the PX4 hash under which the vehicle would confirm exactly this table, or None while unknown.
         displaced: names whose index was of an earlier count, and that the vehicle may no longer have; some of
             them may have come again since.
+        doubts: how often what had been heard was no longer to be relied on.
         dirty: names whose value, type or index changed since `take_dirty` was called last.
     """
 
@@ -58,6 +59,7 @@ class Table:
         self.volatile_known = False
         self.complete = False
         self.displaced: set[str] = set()
+        self.doubts = 0
         self.dirty: dict[str, str] = {}
         self._hash: int | None = None
         self._hash_is_stale = False
@@ -256,7 +258,7 @@ class Table:
         for index, name in names.items():
             param = self.params.get(name)
             if param is not None and param.index != index:
-                self.params[name] = Param(name, param.value, param.type, index, param.bits, param.trust)
+                self.params[name] = replace(param, index=index)
                 self.dirty.setdefault(name, "vehicle")
 
     def present(self) -> dict[int, str]:
@@ -279,6 +281,7 @@ class Table:
 
     def doubt(self, *trusts: Trust) -> None:
         """It may have moved unheard: what was trusted like this is no more than *cached*."""
+        self.doubts += Trust.LIVE in trusts
         for name, param in self.params.items():
             if param.trust in trusts:
                 self._wire.pop(name, None)  # the next value counts, also if it is the same
@@ -294,6 +297,22 @@ class Table:
             if self._hash is not None:
                 self._moved(param.name)
         return [Change(param.name, param, None) for param in gone]
+
+    def forget(self) -> list[Change]:
+        """It is another vehicle's: nothing is known of it."""
+        changes = self.remove(lambda param: True)
+        self.unconfirm()
+        self.volatile = frozenset()
+        self.volatile_known = False
+        self.count = None
+        self.complete = False
+        return changes
+
+    def forget_defaults(self) -> None:
+        """They were those of another firmware."""
+        for name, param in self.params.items():
+            if param.default is not None:
+                self.params[name] = replace(param, default=None)
 
     def listed(self) -> list[Param]:
         """The parameters that have an index: those that the count and the hash are about."""
