@@ -63,7 +63,7 @@ class FetchTogether:
         self._is_any_awaited = False
 
     def join(self, now: float) -> None:
-        """Begin the fetches of components that have none yet, as soon as what must be known first is there."""
+        """Begin the fetches of components that have none yet, as soon as enough is known of them."""
         self._is_any_awaited = False
         ready: dict[int, list[ComponentMachine]] = {}
         untold = {each.system for each in self._components.values() if each._may_tell_of_files(now)}

@@ -169,22 +169,23 @@ class PackFetch(Operation[None]):
                 self._turns.give_back(self)
                 self.fail(job.error, now)
             return
-        is_doubted = self._doubts != self._table.doubts
+        total = total_of(job.result)
+        if self._doubts != self._table.doubts:
+            self._is_none(PackError("the vehicle was away meanwhile", offset=0), now)
+            return
+        if total is not None and self._heard_count not in (None, total):
+            self._is_none(PackError(f"the vehicle has {self._heard_count} parameters by now", offset=4), now)
+            return
         try:
             pack = decode(job.result)
             if len(pack.entries) < pack.total:
-                raise PackError(f"it has {len(pack.entries)} of {pack.total} parameters", offset=0)
+                raise PackError(f"it has {len(pack.entries)} of {pack.total} parameters", offset=2)
         except PackError as error:
-            self._is_none(error, now, is_useless=not is_doubted)
+            self._is_none(error, now, is_useless=True)
             return
-        if is_doubted:
-            self._is_none(PackError("the vehicle was away meanwhile", offset=0), now)
-        elif self._heard_count not in (None, pack.total):
-            self._is_none(PackError(f"the vehicle has {self._heard_count} parameters by now", offset=4), now)
-        else:
-            self._turns.give_back(self)
-            self._fill(pack)
-            self.finish(None, now)
+        self._turns.give_back(self)
+        self._fill(pack)
+        self.finish(None, now)
 
     def _is_none(self, error: PackError, now: float, *, is_useless: bool = False) -> None:
         """What came is not the vehicle's table: read it again, or give up."""
