@@ -21,7 +21,7 @@ from paramclient.protocol.sync import Upkeep
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, PX4Vehicle
 from paramclient.values import ParamType
 from tests.shell import Tap, bits
-from tests.simulation import Simulation, listing_ardupilot
+from tests.simulation import Simulation, is_so, listing_ardupilot
 
 FULL_PATH = PARAMETER_FILE + WITH_DEFAULTS
 EXACT = 2_147_483_001
@@ -170,16 +170,19 @@ def test_a_vehicle_that_does_not_say_so_is_not_asked() -> None:
 
 
 def test_values_that_are_heard_while_the_file_comes_win() -> None:
-    vehicle = ArduPilotVehicle(live_period=0)
-    session = Simulation(vehicle, air=Air.symmetric([vehicle], delay=0.05))
+    server = Server(vehicle := ArduPilotVehicle(live_period=0))
+    session = Simulation(server, air=Air.symmetric([server], delay=0.05))
     fetch = in_the_middle(session)
-    name = list(vehicle.params)[3]  # at the beginning of the file, which has come
-    value = vehicle.param(name).value
-    assert not isinstance(value, bytes)
-    session.set(name, value + 1)
+    session.until(lambda: fetch.progress(session.now).received > 150)
+    name = (
+        "RELAY1_FUNCTION"  # in what has come; it is not the default now nor then, so the file stays as long
+    )
+    assert vehicle.param(name).value == 1
+    session.set(name, 2)
     result = session.outcome(fetch)
-    assert result.source == "ftp"
-    assert result.params[name].value == value + 1
+    assert (result.source, len(server.opened)) == ("ftp", 1)
+    assert result.params[name].value == 2
+    assert (result.params[name].default, result.params[name].index) == (0, 61)
     assert is_whole(result, vehicle)
 
 
@@ -347,6 +350,7 @@ def test_another_vehicle_does_not_inherit_that_there_is_no_file() -> None:
     other = ArduPilotVehicle(live_period=0, uid2=b"another", boot_time=0.0)
     session.air.vehicles = (other,)
     session.machine.become_another(session.now)
+    assert is_so(fetch.file_failed is None)
     result = session.outcome(fetch)
     assert (result.source, result.notes) == ("ftp", ())
     assert remembered(session) is True
@@ -391,18 +395,17 @@ def test_what_came_before_an_absence_is_read_again() -> None:
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
     session = Simulation(server)
     fetch = in_the_middle(session)
-    server.is_mute = server.is_deaf = True
-    session.run(8.0)
-    assert session.machine.presence.is_lost
-    name = next(iter(vehicle.params))
-    value = vehicle.param(name).value
-    assert not isinstance(value, bytes)
-    vehicle.set_param(name, value + 1)  # in what had come
-    session.run(0.5)
-    server.is_mute = server.is_deaf = False
+    session.until(lambda: fetch.progress(session.now).received > 150)
+    session.station.pause()
+    vehicle.set_param("RELAY1_FUNCTION", 2)  # in what has come, and nobody hears of it
+    session.now += 8.0
+    vehicle.tick(session.now)
+    server.data_to_send()
+    session.station.resume(session.now)
     result = session.outcome(fetch)
+    assert (result.source, len(server.opened)) == ("ftp", 2)
+    assert result.params["RELAY1_FUNCTION"].value == 2
     assert is_whole(result, vehicle)
-    assert result.params[name].value == value + 1
 
 
 def test_a_vehicle_that_stays_away_is_given_up() -> None:
@@ -442,6 +445,9 @@ def test_cancelled_it_closes_the_file_on_board() -> None:
     fetch = in_the_middle(session)
     assert vehicle.open_files == [FULL_PATH]
     session.machine.end_fetch(fetch, session.now)
+    session.run(0.01)
+    last = session.sent_of(wire.FileTransfer)[-1]
+    assert Packet.unpack(last.payload).opcode == Opcode.TERMINATE_SESSION
     session.run(1.0)
     assert not vehicle.open_files
     assert not fetch.done
