@@ -5,7 +5,7 @@
 #   make lint       style and types                make docs       the pages, into docs/_build/html
 #   make bench      speed of parser and start      make dist       wheel and sdist, into dist
 #   make cost       CPU and memory                 make peers      downloads beside other programs
-#   make clean      remove all that was made
+#   make soak       10,000 sessions at random      make clean      remove all that was made
 
 PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
 	"$$python" -c $(IS_NEW_ENOUGH) 2>/dev/null && echo "$$python" && break; done)
@@ -15,12 +15,13 @@ VENV ?= .venv
 BIN = $(VENV)/bin
 PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 TESTS ?=
+SESSIONS ?= 10000
 
 MEASURED = 'protocol/*' 'sim/*' 'cache/*' values.py errors.py identity.py params.py
 # what they start are programs of their own, which are not measured
 UNMEASURED = $(addprefix --ignore=tests/test_,bench.py docs.py examples.py packaging.py)
 
-.PHONY: demo test coverage lint docs bench cost peers dist clean
+.PHONY: demo test coverage soak lint docs bench cost peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -35,6 +36,9 @@ coverage: $(VENV)/with-test
 		echo "== paramclient/$$room"; \
 		$(BIN)/coverage report --include="paramclient/$$room" --fail-under=95 || failed=1; \
 	done; test -z "$$failed"
+
+soak: $(VENV)/with-test
+	$(BIN)/python -m tests.soak --sessions $(SESSIONS)
 
 lint: $(VENV)/with-test $(VENV)/with-lint
 	$(BIN)/ruff check

@@ -444,7 +444,6 @@ class ParamClient:
             if isinstance(event, ComponentHeard):
                 self._meet(machine)
             elif isinstance(event, ComponentIdentified):
-                self._components[machine.system, machine.component]._is_identified.set()
                 self._tell()
                 for component in self._components.values():
                     if component.system == machine.system:

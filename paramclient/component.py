@@ -66,7 +66,6 @@ class Component:
         self.component = machine.component
         self.params = ParamMap(machine.table.params)
         self._cache_is_read = anyio.Event()
-        self._is_identified = anyio.Event()
 
     @property
     def autopilot(self) -> str:
@@ -158,7 +157,9 @@ class Component:
         finally:
             machine.reads.release(read)
         known = machine.table.params.get(message.param_id)
-        return known if known is not None else _param_of(message, machine.table.encoding)
+        if known is None or (isinstance(name, int) and known.index != name):
+            return _param_of(message, machine.table.encoding)
+        return known
 
     async def set(
         self,
@@ -251,8 +252,9 @@ class Component:
         if accept == "sampled" and not refresh:
             sampled = Sampled(sample, random.getrandbits(32) if seed is None else seed)
         began = anyio.current_time()
-        with anyio.move_on_after(timeout):
-            await self._wait_until_ready(for_cache=not refresh)
+        if not refresh:
+            with anyio.move_on_after(timeout):
+                await self._wait_for_cache()
         machine = self._machine
         fetch = machine.begin_fetch(anyio.current_time(), refresh=refresh, sampled=sampled)
         try:
@@ -302,20 +304,6 @@ class Component:
             or now >= self._heard_at + IDENTITY_PATIENCE
         )
 
-    def _may_tell_of_files(self, now: float) -> bool:
-        """Whether it is still to say what it can, and is expected to."""
-        return self._machine.who.may_say_file and now < self._heard_at + IDENTITY_PATIENCE
-
-    async def _wait_until_ready(self, *, for_cache: bool) -> None:
-        """Wait until it is known whether it serves files, and the cached table is there; but not for long."""
-        now = anyio.current_time()
-        if self._may_tell_of_files(now):
-            with anyio.move_on_after(self._heard_at + IDENTITY_PATIENCE - now):
-                await self._is_identified.wait()
-            self._client._check_open()
-        if for_cache:
-            await self._wait_for_cache()
-
     async def _wait_for_cache(self) -> None:
         """Wait until the cached table, if the cache may have one, is in `params`; but not for long."""
         now = anyio.current_time()
@@ -332,7 +320,6 @@ class Component:
     def _end(self, error: ParamClientError) -> None:
         """Nothing will come any more."""
         self._cache_is_read.set()
-        self._is_identified.set()
         for changes in list(self._subscriptions):
             changes.end(error)
 
@@ -398,7 +385,7 @@ def _outcome(operation: Operation[Result]) -> Result:
 
 
 def _param_of(message: ParamValue, encoding: Encoding) -> Param:
-    """What a message says: of a hash, or of a parameter that has left the table since."""
+    """What a message says of what is not in the table: a hash, what has left it, what shares its name."""
     value, bits = decode(message.raw, message.param_type, encoding)
     index = None if message.param_index == NO_INDEX else message.param_index
     return Param(message.param_id, value, known_type(message.param_type), index, bits)

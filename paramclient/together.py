@@ -60,23 +60,22 @@ class FetchTogether:
         self._system = system
         self._refresh = refresh
         self._fetches: dict[Address, Fetch] = {}
-        self._is_any_awaited = False
+        self._is_cache_awaited = False
 
     def join(self, now: float) -> None:
-        """Begin the fetches of components that have none yet, as soon as enough is known of them."""
-        self._is_any_awaited = False
+        """Begin the fetches of components that have none yet, as soon as their cached table is there."""
+        self._is_cache_awaited = False
         ready: dict[int, list[ComponentMachine]] = {}
-        untold = {each.system for each in self._components.values() if each._may_tell_of_files(now)}
         for address, component in self._components.items():
             machine = component._machine
             if address in self._fetches or not machine.who.has_parameters:
                 continue
             if self._system not in (None, machine.system) or (machine.presence.is_lost and not machine.fetch):
                 continue
-            if machine.system not in untold and (self._refresh or component._cache_is_due(now)):
+            if self._refresh or component._cache_is_due(now):
                 ready.setdefault(machine.system, []).append(machine)
             else:
-                self._is_any_awaited = True
+                self._is_cache_awaited = True
         for machines in ready.values():
             begun = self._station.begin_fetches(machines, now, refresh=self._refresh)
             for machine, fetch in zip(machines, begun, strict=True):
@@ -90,7 +89,7 @@ class FetchTogether:
             listen_until: until then somebody else may be heard.
             hear_until: until then it is waited for anybody at all.
         """
-        if now < listen_until or self._is_any_awaited:
+        if now < listen_until or self._is_cache_awaited:
             return True
         if not self._fetches:
             return now < hear_until

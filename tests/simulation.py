@@ -109,9 +109,9 @@ class Simulation:
             volatile_known=table.volatile_known,
         )
 
-    def next_session(self) -> None:
+    def next_session(self, station: Station | None = None) -> None:
         """Put a new station, which knows nothing, in the place of the one there was; the vehicles go on."""
-        self.station = Station(link="sim:test", is_stream=False)
+        self.station = Station(link="sim:test", is_stream=False) if station is None else station
         self.sent.clear()
         self.events.clear()
         self.exchange()

@@ -457,9 +457,10 @@ async def test_an_identity_that_comes_long_after_the_values(path: Path, fetched:
 @pytest.mark.parametrize("volatile", [("CAL_ACC0_XOFF",), ODD], ids=["proven", "not proven"])
 @pytest.mark.parametrize("fetched", [True, False])
 @swiftly
-async def test_after_our_own_set_the_next_session_hits(
+async def test_after_our_own_set_the_next_session_hits_where_the_hash_is_computed(
     path: Path, volatile: Collection[str], fetched: bool
 ) -> None:
+    """Where it cannot be, it may stand for more than our set: for what was not heard as well."""
     vehicle = small_px4(volatile=volatile)
     await session(vehicle, path)
     for name, value in (("PARAM_01", 100), ("PARAM_04", 400), ("PARAM_01", 101)):
@@ -468,7 +469,7 @@ async def test_after_our_own_set_the_next_session_hits(
             if fetched:
                 assert (await component.fetch_all()).source == "cache"
             await component.set(name, value)
-        assert (await session(vehicle, path)).source == "cache", name
+        assert (await session(vehicle, path)).source == ("stream" if volatile is ODD else "cache"), name
         assert kept(path) == bits(vehicle.params)
     with ParamCache(path) as cache:
         lines = cache.component().history("PARAM_01")

@@ -20,6 +20,8 @@ from paramclient.protocol import table as table_room
 from paramclient.protocol.authors import DOUBT, FOREIGN_SET_MEMORY, MOST_FOREIGN_SETS
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentIdentified, Event, Fetched, ParamChanged
+from paramclient.protocol.station import Station
+from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.table import Change
 from paramclient.protocol.wire import (
     CAPABILITY_PARAM_ENCODE_BYTEWISE,
@@ -785,3 +787,17 @@ def test_hit_results_do_not_change_afterwards() -> None:
     world.set("A", 5)
     assert result.params["A"].value == 1
     assert replace(result, elapsed=0.0).params is result.params
+
+
+def test_upkeep_goes_on_when_a_vehicle_is_found_whose_count_had_moved() -> None:
+    vehicle = ArduPilotVehicle(table={"A": 1, "B_ENABLE": 0}, groups={"B_ENABLE": {"B_X": 5}}, live=())
+    station = Station(link="sim:test", is_stream=False, upkeep=Upkeep(30.0, without_hash=True))
+    world = Simulation(vehicle, station=station)
+    world.fetch()
+    world.run(10.0)  # so that its clock tells that it has started again
+    world.machine.table.move(1)
+    vehicle._entry("B_ENABLE").store(1)
+    vehicle.reboot(world.now, down=8.0)
+    world.run(60.0)
+    assert world.machine.sync.synced
+    assert world.machine.table.params["B_X"].value == 5

@@ -514,7 +514,8 @@ def test_after_our_own_write_the_next_session_hits() -> None:
     assert result.params["P05"].value == 500
 
 
-def test_after_our_own_write_an_unproven_hash_is_taken_from_the_vehicle() -> None:
+def test_after_our_own_write_an_unproven_hash_is_not_believed() -> None:
+    """It cannot be computed here, so it may stand for more than our write: for what was not heard as well."""
     vehicle = PX4Vehicle(table=STRANGE)
     world = Simulation(vehicle)
     world.fetch()
@@ -522,9 +523,10 @@ def test_after_our_own_write_an_unproven_hash_is_taken_from_the_vehicle() -> Non
     assert is_so(world.machine.is_settling)
     world.run(0.5)
     assert not world.machine.is_settling
-    assert world.machine.table.hash == vehicle.announced_hash()
+    assert world.machine.table.hash is None
+    assert world.machine.sync.synced
     go_on(world)
-    assert world.fetch().source == "cache"
+    assert world.fetch().source == "stream"
 
 
 def test_after_another_stations_change_an_unproven_hash_is_not_believed() -> None:
@@ -824,3 +826,24 @@ def test_small_tables_on_bad_links(table: Table, loss: float, seed: int) -> None
     assert result.complete
     assert values_of(result) == vehicle.values
     assert result.hash in (None, vehicle.announced_hash())
+
+
+# the file or the list
+
+
+def test_an_ardupilot_may_first_say_whether_it_serves_the_file() -> None:
+    world = Simulation(air=Air.symmetric([ArduPilotVehicle(live=())], delay=0.05))
+    world.until(lambda: (1, 1) in world.station.components)
+    assert not world.machine.who.settled
+    result = world.outcome(world.machine.begin_fetch(world.now))
+    assert result.source == "ftp"
+    assert not world.sent_of(ParamRequestList)
+
+
+def test_one_that_does_not_say_who_it_is_is_asked_for_its_list_soon() -> None:
+    world = Simulation(air=Air.symmetric([ArduPilotVehicle(live=())], delay=0.05))
+    world.until(lambda: (1, 1) in world.station.components)
+    world.machine.who.version = lambda message, now: False  # type: ignore[method-assign]  # as if it was lost
+    result = world.outcome(world.machine.begin_fetch(world.now))
+    assert result.source == "stream"
+    assert 1.0 < result.elapsed < 3.0

@@ -16,7 +16,7 @@ from paramclient.errors import (
 )
 from paramclient.protocol.pacing import FIRST_RATE, SMALLEST_BURST
 from paramclient.protocol.reads import CONTROL, ENOUGH_CONTROLS, MOST_COPIES, Key, Read, Reads
-from paramclient.protocol.timing import INITIAL_TIMEOUT, LONGEST_SILENCE, MOST_TRIES, RoundTrip
+from paramclient.protocol.timing import FEWEST_TRIES, INITIAL_TIMEOUT, LONGEST_SILENCE, MOST_TRIES, RoundTrip
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
 from tests.simulation import param_value
 
@@ -407,12 +407,69 @@ def test_a_control_that_was_lost_is_not_answered_by_what_passes_by_much_later() 
     assert desk.round_trip.timeout == INITIAL_TIMEOUT
 
 
+@pytest.mark.parametrize(("count", "control"), [(20, 7), (5, CONTROL)])
+def test_the_index_heard_last_is_the_control_as_long_as_there_is_one(count: int, control: int) -> None:
+    desk = Desk(count=count)
+    desk.reads.is_idle = False
+    desk.ask("B", urgent=True)
+    desk.hear("B", index=7)
+    desk.hear("PUSHED")
+    read = desk.ask("A")
+    desk.measure()
+    desk.take()
+    while read.attempts < 8 and not read.done:
+        desk.now = desk.reads.next_deadline()
+        desk.reads.tick(desk.now)
+    assert {key for key in desk.take() if key != "A"} == {control}
+
+
+def test_index_0_has_the_index_heard_last_as_its_control() -> None:
+    desk = Desk()
+    desk.reads.is_idle = False
+    desk.hear("B", index=7)
+    desk.measure()
+    read = desk.ask(CONTROL)
+    while not read.done:
+        desk.now = desk.reads.next_deadline()
+        desk.reads.tick(desk.now)
+        if desk.take()[-1:] == [7]:
+            desk.hear("B", index=7)
+    assert read.controls >= ENOUGH_CONTROLS
+    assert isinstance(read.error, NoReply)
+    assert desk.now < 5.0
+
+
+def test_answered_controls_end_what_stays_silent_soon() -> None:
+    """Many silent indices look like a link that loses half; what else is asked for says that it does not."""
+    desk = answering_desk()
+    silent = [desk.ask(index) for index in range(20, 50)]
+    desk.pass_time()
+    assert all(isinstance(read.error, NoReply) for read in silent)
+    assert max(read.attempts for read in silent) == FEWEST_TRIES < desk.round_trip.tries
+    assert desk.now < 10.0
+
+
 def test_index_0_needs_no_other_control() -> None:
     desk = Desk()
     desk.reads.is_idle = False
     desk.ask(CONTROL)
     desk.pass_time(2.5 * INITIAL_TIMEOUT)
     assert desk.take() == [CONTROL] * 3
+
+
+def test_silences_of_the_past_do_not_count_against_what_is_asked_later() -> None:
+    """A vehicle that was away for long and is back: each read has its tries again."""
+    desk = Desk("A", count=MOST_TRIES)
+    gone = [desk.ask(index) for index in range(MOST_TRIES)]
+    desk.pass_time()
+    assert all(read.done for read in gone)
+    desk.now += 60.0
+    desk.reads.forgive()
+    read = desk.ask("A")
+    desk.now = desk.reads.next_deadline()
+    desk.reads.tick(desk.now)
+    assert not read.done
+    assert read.attempts == 2
 
 
 def test_a_component_that_is_gone_is_given_up_sooner() -> None:

@@ -392,3 +392,14 @@ class TestSwitches:
         pilot.send(Packet(1, 0, Opcode.ACK))
         pilot.send(Packet(1, 0, Opcode.NAK))
         assert pilot.listen(1.0) == []
+
+
+def test_files_wait_for_the_end_of_the_high_latency_mode() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    pilot.vehicle.files["a"] = b"abcdefgh"
+    pilot.vehicle.high_latency = True
+    pilot.send(Packet(2, 3, Opcode.OPEN_FILE_RO, b"a"))
+    assert pilot.listen(10.0) == []
+    pilot.vehicle.high_latency = False
+    (answer,) = pilot.listen(0.1)
+    assert (answer.opcode, answer.requested) == (Opcode.ACK, Opcode.OPEN_FILE_RO)

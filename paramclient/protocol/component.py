@@ -372,8 +372,6 @@ class ComponentMachine:
         if self.fetch is not None:
             self.fetch.restart(now)
 
-    # how it stands
-
     @property
     def identity(self) -> Identity:
         """Who the vehicle is, as far as this component has said."""
@@ -483,8 +481,7 @@ class ComponentMachine:
         """It is not heard any more. A fetch goes on for a while: it may only be starting again."""
         presence = self.presence
         presence.is_lost = True
-        silence = now - presence.heard_at
-        self._emit(events.ComponentLost(self, silence))
+        self._emit(events.ComponentLost(self, now - presence.heard_at))
         self.writes.lose(now)
         self.reads.lose(now)
         self.files.lose(now)
@@ -495,6 +492,7 @@ class ComponentMachine:
         presence = self.presence
         if presence.is_lost:
             presence.is_lost = False
+            self.reads.forgive()  # the silence of before says nothing of it
             self._emit(events.ComponentFound(self, silence))
             self.sync.check(now)
             self.who.doubt(now)
@@ -522,6 +520,8 @@ class ComponentMachine:
     def _follow_identity(self, now: float) -> None:
         """What the identification has come to know takes effect."""
         self._report(self.table.use_encoding(self.who.encoding))
+        if self.fetch is not None:
+            self.fetch.identified(now)
         if self.who.settled and self._known_as != self.identity.key:
             self._known_as = self.identity.key
             self._emit(events.ComponentIdentified(self))

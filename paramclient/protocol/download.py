@@ -211,6 +211,9 @@ class Download(Operation[None]):
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
         name, _, _, count, index = message
+        if index == NO_INDEX and self.count is not None and count != NO_INDEX:
+            # pushed, or an answer by name: it goes by the count of now, where ArduPilot's stream does not
+            self._other_count = None if count == self.count else count
         if index == NO_INDEX or count == NO_INDEX or index >= count or self.done:
             return
         self._is_heard = True

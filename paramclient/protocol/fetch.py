@@ -10,10 +10,8 @@ from typing import Final
 
 from paramclient.errors import CacheError, LinkError, NoReply, UnknownParameter
 from paramclient.protocol.download import Download, present_of
-from paramclient.protocol.hashing import find_volatile
 from paramclient.protocol.notes import (
     FROM_MEMORY,
-    MOVED,
     NO_FILE,
     NOT_ASKED,
     NOT_CONFIRMED,
@@ -21,13 +19,14 @@ from paramclient.protocol.notes import (
     NOT_RESUMED,
     NOT_SAMPLED,
     SAMPLED,
-    UNBRACKETED,
     UNPROVEN,
     UNSETTLED,
 )
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.packfetch import PackFetch
+from paramclient.protocol.proof import Proof
 from paramclient.protocol.reads import Read
+from paramclient.protocol.repeated import Repeated, repeated_names
 from paramclient.protocol.result import Announcement, FetchResult, Means, Policy, Progress, Sampled
 from paramclient.protocol.sampling import Sampling
 from paramclient.protocol.wire import HASH_CHECK, ParamValue
@@ -38,6 +37,8 @@ __all__ = ["Fetch"]
 FRESH_HASH: Final = 1.0
 """Seconds for which an announced hash answers the question what the hash is. It is asked for when a component
 is found, so that a fetch right after that need not wait for another round trip."""
+IDENTITY_PATIENCE: Final = 1.0
+"""Seconds for which a component may say whether it serves the file before its list is asked for."""
 MOST_RESTARTS: Final = 8
 """Times that a vehicle may start again, or turn out to be another one, before a fetch is given up."""
 
@@ -74,7 +75,7 @@ class Fetch(Operation[FetchResult]):
         refresh: bool,
         listed: bool,
         policy: Policy,
-        may_use_file: Callable[[], bool],
+        may_use_file: Callable[[], bool | None],
         sampled: Sampled | None,
     ) -> None:
         super().__init__(now)
@@ -85,14 +86,13 @@ class Fetch(Operation[FetchResult]):
         table = self._table = means.table
         self._expects_hash = means.expects_hash
         self._may_use_file = may_use_file
-        self._has_begun = False
-        self._may_resume = False
-        self._file_tried = False
-        self._file_was_silent = False
+        self._undecided_until = math.inf  # whether to ask for the file or for the list
+        self._present: Mapping[int, str] | None = None  # with what the latter would go on
+        self._has_begun = self._had_no_file = self._file_was_silent = False
         self._sampling: Sampling | None = None
         self._hash_read: Read | None = None
-        self._before: int | None = None  # the hash announced before any value counted
-        self._meanwhile: int | None = None  # the hash announced in the course of the download
+        self._proof = Proof(table)
+        self._repeated: Repeated | None = None
         self._was_asked_meanwhile = False
         self._is_hash_unknown = False  # the vehicle answers, but not to that
         self._first_value_at = math.inf
@@ -107,13 +107,7 @@ class Fetch(Operation[FetchResult]):
         self._notes: tuple[str, ...] = ()
         if policy is Policy.CACHE_ONLY or refresh or listed:
             self._begin_download(now)
-        elif (
-            sampled is not None
-            and policy is Policy.AUTO
-            and table.complete
-            and table.count
-            and not self._expects_hash()
-        ):
+        elif sampled is not None and table.complete and table.count and not self._expects_hash():
             self._sample(sampled, table.count, now)
         elif table.hash is None or not table.complete:
             self._begin_or_resume(announced, now)
@@ -126,8 +120,8 @@ class Fetch(Operation[FetchResult]):
         """A `_HASH_CHECK` passed by: PX4 sends one at the head of its list."""
         if self.download is not None and not self.download.names:
             self.download.heed(announcement.at)
-            if self._before is None:
-                self._before = announcement.hash
+            if self._proof.before is None:
+                self._proof.before = announcement
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
@@ -138,7 +132,7 @@ class Fetch(Operation[FetchResult]):
             if self._first_value_at > now:
                 self._first_value_at = now
             download.heard(message, now)
-            if self._before is not None or self._was_asked_meanwhile:
+            if self._proof.before is not None or self._was_asked_meanwhile:
                 return
             if self._expects_hash() and not self.done:
                 # the one at the head of the list was lost; asked for now, it need not be waited for later
@@ -146,11 +140,21 @@ class Fetch(Operation[FetchResult]):
                 self._ask_hash(self._hash_came_meanwhile, now)
 
     def tick(self, now: float) -> None:
+        self.identified(now)
+        if self._repeated is not None:
+            self._repeated.tick(now)
         if self.download is not None:
             self.download.tick(now)
 
     def next_deadline(self) -> float:
-        return math.inf if self.download is None else self.download.next_deadline()
+        if self._repeated is not None:
+            return self._repeated.next_deadline()
+        return self._undecided_until if self.download is None else self.download.next_deadline()
+
+    def identified(self, now: float) -> None:
+        """It may be known by now whether the component serves the file."""
+        if self._undecided_until < math.inf:
+            self._begin_download(now, self._present)
 
     def resume(self, now: float) -> None:
         """The link is back."""
@@ -160,6 +164,8 @@ class Fetch(Operation[FetchResult]):
     @property
     def is_about_the_cache(self) -> bool:
         """Whether it is still to be seen if what is known already will do."""
+        if self._undecided_until < math.inf:
+            return self._present is not None
         return not self._has_begun or (self.download is not None and self.download.resumed > 0)
 
     @property
@@ -179,7 +185,7 @@ class Fetch(Operation[FetchResult]):
         self.download = None
         self._notes = ()
         self.file_failed = None
-        self._file_tried = self._file_was_silent = self._may_resume = False
+        self._had_no_file = self._file_was_silent = False
         self._restarts += 1
         if self._restarts > MOST_RESTARTS:
             system, component = self._target
@@ -187,7 +193,7 @@ class Fetch(Operation[FetchResult]):
             self.fail(NoReply(what, attempts=self._restarts, waited=now - self.begun_at), now)
             return
         self._held_before = held_up
-        self._before = self._meanwhile = None
+        self._proof.forget()
         self._was_asked_meanwhile = False
         self._listed = False
         self._begin_download(now)
@@ -232,7 +238,7 @@ class Fetch(Operation[FetchResult]):
     def progress(self, now: float) -> Progress:
         """How far it is."""
         if self.file is not None:
-            return self.file.progress(now - self.begun_at - self.held_up(now), self._table.count)
+            return self.file.progress(now)
         received, total = (0, self._table.count) if self.download is None else self.download.progress
         running = now - self._first_value_at
         came = received - (0 if self.download is None else self.download.resumed)
@@ -258,10 +264,7 @@ class Fetch(Operation[FetchResult]):
                 self._notes += (NOT_SAMPLED.format(why),)
                 self._begin_download(sampling.ended_at)
 
-        if sampling.done:
-            ended()
-        else:
-            sampling.on_done.append(ended)
+        sampling.on_done.append(ended)
 
     def _ask_hash(self, then: Callable[[Read], None], now: float) -> None:
         read = self._hash_read = self._reads.ask(HASH_CHECK, now)
@@ -274,8 +277,7 @@ class Fetch(Operation[FetchResult]):
         read.on_done.append(ended)
 
     def _hash_came_meanwhile(self, read: Read) -> None:
-        if read.result is not None:
-            self._meanwhile = int.from_bytes(read.result.raw, "little")
+        self._proof.meanwhile = Announcement.answering(read)
         self._is_hash_unknown = isinstance(read.error, UnknownParameter)
         if self.download is not None and self.download.done:
             self._download_ended(self.download)
@@ -284,15 +286,13 @@ class Fetch(Operation[FetchResult]):
         if read.result is None:
             self._begin_download(read.ended_at)
         else:
-            message = read.result
-            announced = int.from_bytes(message.raw, "little")
-            self._compare(Announcement(announced, message.param_count, read.ended_at), read.ended_at)
+            self._compare(Announcement.of(read.result, read.ended_at), read.ended_at)
 
     def _compare(self, announcement: Announcement, now: float) -> None:
         table = self._table
         listed = table.listed()
         if announcement.hash != table.hash or announcement.count != len(listed):
-            self._before = announcement.hash
+            self._proof.before = announcement
             self._begin_download(now)
             return
         table.count = announcement.count
@@ -315,9 +315,7 @@ class Fetch(Operation[FetchResult]):
 
     def _hash_came_to_resume(self, read: Read) -> None:
         if read.result is not None:
-            message = read.result
-            announced = int.from_bytes(message.raw, "little")
-            self._resume_under(Announcement(announced, message.param_count, read.ended_at), read.ended_at)
+            self._resume_under(Announcement.of(read.result, read.ended_at), read.ended_at)
         elif isinstance(read.error, UnknownParameter):
             self._is_hash_unknown = True
             self._resume(read.ended_at)
@@ -325,7 +323,7 @@ class Fetch(Operation[FetchResult]):
             self._begin_download(read.ended_at)
 
     def _resume_under(self, announcement: Announcement, now: float) -> None:
-        self._before = announcement.hash
+        self._proof.before = announcement
         if announcement.count == self._table.count:
             self._resume(now)
         else:
@@ -340,10 +338,14 @@ class Fetch(Operation[FetchResult]):
             return
         means = self._means
         self._has_begun = True
+        self._present = present
         means.doubt(now)
-        if self._may_use_file() and not (self._file_tried or self._listed):
-            self._file_tried = True
-            self._may_resume = present is not None
+        may_use_file = not (self._listed or self._had_no_file) and self._may_use_file()
+        if may_use_file is None and now < self.begun_at + IDENTITY_PATIENCE:
+            self._undecided_until = self.begun_at + IDENTITY_PATIENCE
+            return
+        self._undecided_until = math.inf
+        if may_use_file:
             file = self.file = PackFetch(means.files, means.turns, means.table, means.changed, now)
             file.on_done.append(partial(self._file_ended, file))
             return
@@ -380,29 +382,23 @@ class Fetch(Operation[FetchResult]):
         if isinstance(file.error, LinkError):
             self.fail(file.error, now)
             return
+        self._had_no_file = True
         self.file_failed = True if file.is_useless else None
         self._file_was_silent = file.is_unheard
         self._notes += (NO_FILE.format(file.error),)
-        if self._may_resume:
+        if self._present is not None:
             self._resume(now)
         else:
             self._begin_download(now)
 
     def _hash_came_after_file(self, file: PackFetch, read: Read) -> None:
         """The file is the vehicle's table at one moment; its hash may be of a later one."""
-        table, now = self._table, read.ended_at
-        notes: tuple[str, ...] = ()
-        table.unconfirm()
-        if read.result is not None:
-            after = int.from_bytes(read.result.raw, "little")
-            volatile, proven = find_volatile(table.listed(), after, believed=table.volatile)
-            if proven or after == self._before:
-                table.confirm(after, volatile, proven=proven)
-                table.verify()
-                notes = () if proven else (UNPROVEN,)
-            else:
-                notes = (UNBRACKETED,) if self._before is None else (MOVED,)
-        self.finish(self._result("ftp", file.count or 0, (), table.hash, now, notes), now)
+        after = Announcement.answering(read)
+        self._table.unconfirm()
+        count = file.count or 0
+        notes = () if after is None else self._proof.settle(after, count)
+        result = self._result("ftp", count, (), self._table.hash, read.ended_at, notes or ())
+        self.finish(result, read.ended_at)
 
     def _stay_with_cache(self, now: float) -> None:
         """The policy allows no download: give what is known, and say so."""
@@ -421,30 +417,33 @@ class Fetch(Operation[FetchResult]):
     def _download_ended(self, download: Download) -> None:
         if download.error is not None:
             self.fail(download.error, download.ended_at)
-        elif self._hash_read is not None:
+            return
+        if self._hash_read is not None or self._asks_for_repeated(download):
             return  # it is on its way
-        elif self._is_proven(download):
-            self._finish_download(download, download.ended_at, ())
+        now = download.ended_at if self._repeated is None else self._repeated.ended_at
+        if self._is_proven(download):
+            self._finish_download(download, now, ())
         elif self._expects_hash() and not self._is_hash_unknown:
-            self._ask_hash(partial(self._hash_came_last, download), download.ended_at)
+            self._ask_hash(partial(self._hash_came_last, download), now)
         else:
-            self._settle(download, None, download.ended_at)
+            self._settle(download, None, now)
+
+    def _asks_for_repeated(self, download: Download) -> bool:
+        """Whether it is still being asked what the vehicle means by names that came more than once."""
+        if self._repeated is None:
+            names = repeated_names(download.names)
+            if not (names or self._table.passed_over):
+                return False
+            self._repeated = Repeated(names, self._round_trip, self._reads, self._table, download.ended_at)
+            self._repeated.on_done.append(partial(self._download_ended, download))
+        return not self._repeated.done
 
     def _is_proven(self, download: Download) -> bool:
-        """Whether the hash computed from what came is the one that was announced meanwhile.
-
-        Then the table is what the vehicle had at that moment, and the hash need not be waited for again.
-        """
-        announced = self._before if self._meanwhile is None else self._meanwhile
-        if announced is None or download.missing or not download.is_settled:
+        """Whether what was announced in its course proves the table that it brought."""
+        if download.missing or not download.is_settled:
             return False
         self._remove_what_is_gone(download)
-        table = self._table
-        volatile, is_proven = find_volatile(table.listed(), announced, believed=table.volatile)
-        if is_proven:
-            table.confirm(announced, volatile, proven=True)
-            table.verify()
-        return is_proven
+        return self._proof.is_given(download.count or 0)
 
     def _remove_what_is_gone(self, download: Download) -> None:
         table = self._table
@@ -459,10 +458,9 @@ class Fetch(Operation[FetchResult]):
         self._means.changed(gone)
 
     def _hash_came_last(self, download: Download, read: Read) -> None:
-        after = None if read.result is None else int.from_bytes(read.result.raw, "little")
-        self._settle(download, after, read.ended_at)
+        self._settle(download, Announcement.answering(read), read.ended_at)
 
-    def _settle(self, download: Download, after: int | None, now: float) -> None:
+    def _settle(self, download: Download, after: Announcement | None, now: float) -> None:
         """The download is over and the hash is known, if there is one."""
         table = self._table
         notes: tuple[str, ...] = ()
@@ -472,33 +470,31 @@ class Fetch(Operation[FetchResult]):
                 notes = (UNSETTLED,)
             table.unconfirm()
         if after is not None and not download.missing:
-            volatile, proven = find_volatile(table.listed(), after, believed=table.volatile)
-            if download.resumed and not proven:
+            judged = self._proof.settle(after, download.count or 0, needs_proof=download.resumed > 0)
+            if judged is None:
                 # what was heard earlier is not what the vehicle has now, or cannot be told from it
                 self._notes = (NOT_RESUMED,)
-                self._before = self._meanwhile = None
+                self._proof.forget()
                 self._was_asked_meanwhile = False
                 self._begin_download(now)
                 return
-            if proven or after == self._before:
-                table.confirm(after, volatile, proven=proven)
-                table.verify()
-                notes += () if proven else (UNPROVEN,)
-            else:
-                notes += (UNBRACKETED,) if self._before is None else (MOVED,)
+            notes += judged
         self._finish_download(download, now, notes)
 
     def _finish_download(self, download: Download, now: float, notes: tuple[str, ...]) -> None:
         count = download.count or 0
         missing = download.missing
         table = self._table
-        if not missing:
+        if self._repeated is not None and self._repeated.names:
+            notes += (self._repeated.note,)
+            table.complete = False
+        elif not missing:
             table.complete = download.is_settled
-            if self._file_was_silent:  # while the list has come
-                self.file_failed = True
         else:
             table.place(download.names)
         table.count = count
+        if self._file_was_silent and not missing:  # while the list has come
+            self.file_failed = True
         if download.resumed and table.hash is None:
             earlier = sum(param.trust is Trust.CACHED for param in table.listed())
             notes += (FROM_MEMORY.format(earlier),) if earlier else ()
@@ -542,6 +538,10 @@ class Fetch(Operation[FetchResult]):
         sampling, self._sampling = self._sampling, None
         if sampling is not None:
             sampling.cancel()
+        self._undecided_until = math.inf
+        repeated, self._repeated = self._repeated, None
+        if repeated is not None:
+            repeated.cancel()
         file, self.file = self.file, None
         if file is not None:
             file.cancel(now)

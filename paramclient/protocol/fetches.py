@@ -24,7 +24,7 @@ class Fetches:
         means: what each of them works with.
         sync: the component's.
         policy: what may be asked.
-        says_file: whether the component says that it serves files.
+        says_file: whether the component says that it serves files; None while that is worth waiting for.
         ended: is told of each result in which the vehicle has said something of its table.
 
     Attributes:
@@ -40,7 +40,7 @@ class Fetches:
         sync: Sync,
         policy: Policy,
         *,
-        says_file: Callable[[], bool],
+        says_file: Callable[[], bool | None],
         ended: Callable[[FetchResult], None],
     ) -> None:
         self.current: Fetch | None = None
@@ -54,8 +54,7 @@ class Fetches:
         self._ended = ended
         self._file_took: float | None = None
 
-    @property
-    def may_use_file(self) -> bool:
+    def may_use_file(self) -> bool | None:
         """Whether the table is worth asking for as a file: it has come as one, or the component says so."""
         return self._says_file() if self.file_works is None else self.file_works
 
@@ -87,8 +86,8 @@ class Fetches:
                 refresh=refresh,
                 listed=listed,
                 policy=self._policy,
-                may_use_file=lambda: self.may_use_file,
-                sampled=sampled if self.is_same_firmware else None,
+                may_use_file=self.may_use_file,
+                sampled=sampled if self.is_same_firmware and self._policy is Policy.AUTO else None,
             )
             if fetch.done:
                 self._fetch_ended(fetch)

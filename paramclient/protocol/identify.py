@@ -115,18 +115,16 @@ class Identification:
         return self.vehicle_type != MAV_TYPE_GCS
 
     @property
-    def says_file(self) -> bool:
+    def says_file(self) -> bool | None:
         """Whether it says that it serves files, and has the packed parameter file among them.
 
-        PX4 says so since long before it had that: 1.17 answers "file not found" (measured).
+        PX4 says so since long before it had that: 1.17 answers "file not found" (measured). None as long as
+        an ArduPilot, which mostly has it, has not said what it can.
         """
+        if self.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not self.settled:
+            return None
         has_none = self.autopilot == MAV_AUTOPILOT_PX4 and self.identity.firmware < PX4_WITH_FILE
         return bool((self.capabilities or 0) & CAPABILITY_FTP) and not has_none
-
-    @property
-    def may_say_file(self) -> bool:
-        """Whether it is still to say that, and its like serve such a file."""
-        return not self.settled and self.autopilot in (MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4)
 
     @property
     def firmware(self) -> tuple[int, str] | None:

@@ -109,17 +109,11 @@ class PackFetch(Operation[None]):
         """Seconds for which it has waited for its turn so far."""
         return self.held_up + (0.0 if self._waits_since is None else now - self._waits_since)
 
-    def progress(self, running: float, known: int | None) -> Progress:
-        """How far it is, in parameters: the same share of them as of the file.
-
-        Args:
-            running: seconds for which it has run.
-            known: parameters that the component had when it was last heard of them.
-        """
-        job = self._job
+    def progress(self, now: float) -> Progress:
+        """How far it is: by the share of the file, whose size the vehicle gives."""
+        job, total = self._job, self.count or self._table.count
         share = min(job.received / job.size, 1.0) if job is not None and job.size else float(self.done)
-        total = self.count or known
-        received = int(share * (total or 0))
+        received, running = int(share * (total or 0)), now - self.begun_at - self.held_for(now)
         left = running * (1 - share) / share if share else None
         return Progress(received, total, received / running if running > 0 else 0.0, left)
 

@@ -148,6 +148,8 @@ class Reads:
             self._drop(read)
             read.finish(message, now)
             self._send_waiting(now)
+        if message.param_index < message.param_count:
+            self.control = message.param_index  # it exists, and is answered
         if message.param_index == self._control_index and self._control_at < math.inf:
             # one that was lost may have nobody left to ask again; then this is not its answer
             is_late = now - self._control_at > 2 * self._round_trip.timeout
@@ -336,6 +338,8 @@ class Reads:
             self._control_attempts += 1
         else:
             self._control_attempts = 1
+        if not self._is_known(self.control):
+            self.control = CONTROL  # the vehicle has fewer by now
         self._control_at = now
         self._control_index = self.control
         self._controls_sent = self._controls_sent * MEMORY + 1

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from paramclient.protocol.ftp import FileTransfers
-from paramclient.protocol.reads import Reads
+from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.sampling import Sample
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.turns import Turns
-from paramclient.protocol.wire import Message
+from paramclient.protocol.wire import Message, ParamValue
 from paramclient.values import Param, Trust
 
 __all__ = ["Announcement", "FetchResult", "Means", "Policy", "Progress", "Sampled"]
@@ -77,6 +77,16 @@ class Announcement:
     hash: int
     count: int
     at: float
+
+    @classmethod
+    def of(cls, message: ParamValue, at: float) -> Announcement:
+        """What such a message says."""
+        return cls(int.from_bytes(message.raw, "little"), message.param_count, at)
+
+    @classmethod
+    def answering(cls, read: Read) -> Announcement | None:
+        """What the answer to a read of `_HASH_CHECK` says, or None without one."""
+        return None if read.result is None else cls.of(read.result, read.ended_at)
 
 
 @dataclass(frozen=True, slots=True)

@@ -183,8 +183,7 @@ class Sync:
 
     def hash_heard(self, message: ParamValue, now: float) -> Announcement:
         """A `_HASH_CHECK` has come."""
-        announced = int.from_bytes(message.raw, "little")
-        self.announced = Announcement(announced, message.param_count, now)
+        self.announced = Announcement.of(message, now)
         self._has_no_hash = False
         return self.announced
 
@@ -345,6 +344,8 @@ class Sync:
         if read.result is None:
             self._has_no_hash = isinstance(read.error, UnknownParameter) and self.announced is None
             self._is_checking = False
+            if self._has_no_hash and self._is_kept_up:
+                self._check_at = now  # in the way of those without one
             return
         if self._is_doubted():
             self._check_at = now  # again, when it is known whose it is
@@ -357,9 +358,9 @@ class Sync:
             self._settled(now)
         elif self._is_writing() or self._is_fetching():
             return
-        elif table.complete and table.hash is None and self._moved_by_us_alone:
-            # it cannot be computed here, and all that was heard to move it since was our own doing
-            table.confirm(announced, table.volatile, proven=False)
+        elif table.hash is None and self._moved_by_us_alone and not self._is_kept_up:
+            # it cannot be computed here: what moved it may be our doing alone, or something unheard too
+            self._is_checking = False
         else:
             self._not_confirmed()
             self._is_checking = False

@@ -49,6 +49,7 @@ class Table:
         displaced: names whose index was of an earlier count, and that the vehicle may no longer have; some of
             them may have come again since.
         doubts: how often what had been heard was no longer to be relied on.
+        passed_over: by a name that several parameters share, the indices of those that it does not mean.
         dirty: names whose value, type or index changed since `take_dirty` was called last.
     """
 
@@ -60,6 +61,7 @@ class Table:
         self.complete = False
         self.displaced: set[str] = set()
         self.doubts = 0
+        self.passed_over: dict[str, frozenset[int]] = {}
         self.dirty: dict[str, str] = {}
         self._hash: int | None = None
         self._hash_is_stale = False
@@ -105,6 +107,8 @@ class Table:
         """
         name, raw, number, count, given = message
         index: int | None = given
+        if self.passed_over and given in self.passed_over.get(name, ()):
+            return None
         old = self.params.get(name)
         if given == NO_INDEX:
             index = None if old is None else old.index
@@ -242,6 +246,7 @@ class Table:
         """Another count was heard: which parameter has which index is open again."""
         if self.count is not None:
             self.complete = False
+            self.passed_over.clear()
             for param in self.listed():
                 self.params[param.name] = self._displaced(param)
         self.count = count
@@ -257,6 +262,8 @@ class Table:
         """A download has settled which parameter has which index."""
         for index, name in names.items():
             param = self.params.get(name)
+            if index in self.passed_over.get(name, ()):
+                continue
             if param is not None and param.index != index:
                 self.params[name] = replace(param, index=index)
                 self.dirty.setdefault(name, "vehicle")

@@ -29,6 +29,8 @@ LIKELY: Final = 0.8
 FEWEST_TRIES: Final = 5
 MOST_TRIES: Final = 60
 """Enough for a link that loses two exchanges of three."""
+ENOUGH_SEEN: Final = 10
+"""Answers and silences beyond which the share of the silences is measured, and no longer guessed."""
 LONGEST_SILENCE: Final = 20.0
 """Seconds without a word, not even one of the heartbeats that come every second, after which a component that
 was asked `FEWEST_TRIES` times counts as gone."""
@@ -110,7 +112,7 @@ class RoundTrip:
         """How often to ask before silence can no longer be bad luck on this link (one in a million)."""
         seen = self._unanswered + self._answered + 2.0
         chance = self.loss
-        if seen > 10:
+        if seen > ENOUGH_SEEN:
             # the share is measured on few: reckon with a link that is worse than it looks
             chance = min(chance + 2 * math.sqrt(chance * (1 - chance) / seen), 0.99)
         return min(max(math.ceil(math.log(_CHANCE_OF_BAD_LUCK) / math.log(chance)), FEWEST_TRIES), MOST_TRIES)
@@ -119,6 +121,10 @@ class RoundTrip:
         """Whether something was asked for often enough: `tries` times, or the component is gone."""
         is_gone = now - self.heard_at >= LONGEST_SILENCE
         return attempts >= self.tries or (is_gone and attempts >= FEWEST_TRIES)
+
+    def is_sure(self, attempts: int) -> bool:
+        """Whether so many tries are enough by more than a guess: by more than a few answers and silences."""
+        return self._answered + self._unanswered > ENOUGH_SEEN and attempts >= self.tries
 
     def answered(self, sent_at: float, now: float, attempts: int) -> None:
         """A request got its answer; it had been sent `attempts` times, the last time at `sent_at`."""

@@ -184,7 +184,7 @@ class Vehicle(ABC):
         """Whether it speaks as on a satellite link; can be set at any moment, also in flight.
 
         HIGH_LATENCY2 every 5 s then stands in for heartbeat, SYSTEM_TIME and telemetry. Reads and sets are
-        answered; a list waits until it is off, and what PX4 pushes too (its `MAVLINK_MODE_IRIDIUM`).
+        answered; lists and files wait until it is off, and what PX4 pushes too (its `MAVLINK_MODE_IRIDIUM`).
         """
         return self._high_latency
 
@@ -271,9 +271,10 @@ class Vehicle(ABC):
         if self._now < self._on_at:
             return None if self._on_at == math.inf else self._on_at
         due = [self._next_heartbeat, *self._timers()]
-        if self._ftp is not None:
-            due.append(self._ftp.next_deadline())
-        return min(due) if self._high_latency else min(self._next_telemetry, self._next_burst, *due)
+        if self._high_latency:
+            return min(due)
+        files = math.inf if self._ftp is None else self._ftp.next_deadline()
+        return min(self._next_telemetry, self._next_burst, files, *due)
 
     def data_to_send(self) -> list[bytes]:
         """Hand over the frames to send, and forget them."""
