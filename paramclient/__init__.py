@@ -8,8 +8,11 @@ from paramclient.component import Component
 from paramclient.errors import (
     CacheError,
     ClientClosed,
+    FileErrorCode,
+    FileTransferError,
     LinkError,
     NoReply,
+    PackError,
     ParamClientError,
     ParamErrorCode,
     Refused,
@@ -20,9 +23,12 @@ from paramclient.errors import (
     VehicleError,
 )
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
+from paramclient.ftp import Ftp
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
+from paramclient.protocol.ftp import DirectoryEntry
 from paramclient.protocol.result import FetchResult, Policy, Progress
+from paramclient.protocol.sampling import Sample
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
 from paramclient.protocol.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport
@@ -39,12 +45,16 @@ __all__ = [
     "ClientClosed",
     "Component",
     "ComponentTraffic",
+    "DirectoryEntry",
     "Encoding",
     "Event",
     "Events",
     "FetchResult",
     "FetchedAll",
+    "FileErrorCode",
+    "FileTransferError",
     "Found",
+    "Ftp",
     "Heard",
     "HistoryEntry",
     "Identity",
@@ -52,6 +62,7 @@ __all__ = [
     "Lost",
     "MessageTraffic",
     "NoReply",
+    "PackError",
     "Param",
     "ParamCache",
     "ParamClient",
@@ -65,6 +76,7 @@ __all__ = [
     "RadioStatus",
     "Refused",
     "Resynced",
+    "Sample",
     "SetResult",
     "SyncState",
     "TrafficReport",

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 import anyio
 
-from paramclient.protocol.ftp import LARGEST_FILE, DirectoryEntry
+from paramclient.protocol.ftp import LARGEST_FILE, DirectoryEntry, FileTransfers
 from paramclient.protocol.ftp.jobs import Job
 
 if TYPE_CHECKING:
@@ -25,8 +25,8 @@ class Ftp:
     A vehicle serves one file at a time, so calls are done in order, a `fetch_all` that reads the parameter
     file among them. However one ends, also cancelled, the file is closed on board.
 
-    Every call raises FileTransferError when the vehicle says no, NoReply when it does not answer in time, and
-    LinkError when the link failed or the client was closed.
+    Every call raises FileTransferError when the vehicle says no, NoReply when it does not answer in time or
+    is lost, and LinkError when the link failed or the client was closed.
     """
 
     def __init__(self, component: Component) -> None:
@@ -56,11 +56,11 @@ class Ftp:
         Raises:
             UsageError: the path cannot be.
         """
-        machine = self._component._machine
-        self._component._client._check_open()
-        job = machine.files.read(path, anyio.current_time(), limit=limit)
+        what = f"the file {path}"
+        files, now = self._begin(what)
+        job = files.read(path, now, limit=limit)
         tell = None if progress is None else lambda: progress(job.received, job.size)
-        return await self._wait(job, f"the file {path}", timeout, tell)
+        return await self._wait(job, what, timeout, tell)
 
     async def write(self, path: str, data: bytes, *, timeout: float | None = None) -> None:
         """Write a whole file in the place of one that may be there.
@@ -70,10 +70,10 @@ class Ftp:
         Raises:
             UsageError: the path cannot be.
         """
-        machine = self._component._machine
-        self._component._client._check_open()
-        job = machine.files.write(path, data, anyio.current_time())
-        await self._wait(job, f"the writing of {path}", timeout)
+        what = f"the writing of {path}"
+        files, now = self._begin(what)
+        job = files.write(path, data, now)
+        await self._wait(job, what, timeout)
 
     async def list(
         self, path: str = "/", *, timeout: float | None = None
@@ -83,10 +83,10 @@ class Ftp:
         Raises:
             UsageError: the path cannot be.
         """
-        machine = self._component._machine
-        self._component._client._check_open()
-        job = machine.files.list(path, anyio.current_time())
-        return await self._wait(job, f"the directory {path}", timeout)
+        what = f"the directory {path}"
+        files, now = self._begin(what)
+        job = files.list(path, now)
+        return await self._wait(job, what, timeout)
 
     async def checksum(self, path: str, *, timeout: float | None = None) -> int:
         """The CRC-32 of a file, computed on board: start value 0 and no final xor, as in PX4's hash.
@@ -94,10 +94,17 @@ class Ftp:
         Raises:
             UsageError: the path cannot be.
         """
-        machine = self._component._machine
-        self._component._client._check_open()
-        job = machine.files.checksum(path, anyio.current_time())
-        return await self._wait(job, f"the checksum of {path}", timeout)
+        what = f"the checksum of {path}"
+        files, now = self._begin(what)
+        job = files.checksum(path, now)
+        return await self._wait(job, what, timeout)
+
+    def _begin(self, what: str) -> builtins.tuple[FileTransfers, float]:
+        """What to ask, and the time, if anything may be asked."""
+        component, now = self._component, anyio.current_time()
+        component._client._check_open()
+        component._machine.check_present(f"{what} of {component.system}/{component.component}", now)
+        return component._machine.files, now
 
     async def _wait(
         self,
@@ -107,6 +114,7 @@ class Ftp:
         tell: Callable[[], None] | None = None,
     ) -> Result:
         component = self._component
+        job.is_of_caller = True
         awaited = f"{what} of {component.system}/{component.component}"
         try:
             return await component._wait(job, timeout, lambda: (awaited, 0), tell)

@@ -43,7 +43,7 @@ ESCAPE = "\x1b"
 
 FETCH_KEYS = [
     *("system", "component", "autopilot", "uid", "count", "received", "source", "hash", "missing"),
-    *("cached", "lost", "repeated", "round_trip_s"),
+    *("cached", "sample", "lost", "repeated", "round_trip_s"),
     *("elapsed_s", "bytes_received", "bytes_sent", "params"),
 ]
 PARAM_KEYS = ["value", "type", "index", "bits"]
@@ -555,6 +555,86 @@ def test_a_policy_and_refresh_exclude_each_other(command: Command) -> None:
     assert "cache-only" in refused.err
     unknown = command("fetch", "sim:px4", "--policy", "never", "--no-cache")
     assert unknown.code == 2
+
+
+# what differs from the defaults
+
+
+def test_fetch_prints_what_differs_from_the_defaults(command: Command) -> None:
+    shown = command("fetch", "sim:ardupilot", "--changed", "--no-cache")
+    assert shown.code == 0
+    assert shown.rows[0] == ["name", "value", "type", "index", "trust", "default"]
+    assert len(shown.rows) == 42
+    assert ["RELAY1_FUNCTION", "1", "INT8", "61", "live", "0"] in shown.rows
+    found = command("fetch", "sim:ardupilot", "--changed", "--json", "--no-cache").json
+    assert list(found) == FETCH_KEYS
+    assert (found["count"], found["received"], len(found["params"])) == (1382, 1382, 41)
+    assert list(found["params"]["RELAY1_FUNCTION"]) == [*PARAM_KEYS, "default"]
+    assert found["params"]["RELAY1_FUNCTION"]["default"] == 0
+    everything = command("fetch", "sim:ardupilot", "--json", "--no-cache").json["params"]
+    assert {name: param for name, param in everything.items() if param["value"] != param["default"]} == (
+        found["params"]
+    )
+
+
+def test_without_defaults_there_is_nothing_to_differ_from(command: Command, warm: Path) -> None:
+    for arguments in (("fetch", "sim:px4", "--changed"), ("show", "--changed")):
+        shown = command(*arguments, "--cache", warm)
+        assert (shown.code, shown.out) == (1, "")
+        assert "defaults are not known" in shown.err
+        found = command(*arguments, "--cache", warm, "--json")
+        assert found.code == 1
+        assert "defaults are not known" in found.err
+        assert (found.json["components"][0] if "show" in arguments else found.json)["params"] == {}
+
+
+def test_show_prints_what_differs_from_the_defaults(command: Command, tmp_path: Path) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    assert command("fetch", "sim:ardupilot", "--cache", cache).code == 0
+    shown = command("show", "--changed", "--cache", cache)
+    assert shown.code == 0
+    assert shown.rows[0] == ["name", "value", "default", "type", "index", "heard"]
+    assert [row[:5] for row in shown.rows if row[0] == "RELAY1_FUNCTION"] == [
+        ["RELAY1_FUNCTION", "1", "0", "INT8", "61"]
+    ]
+    assert len(shown.rows) == 42
+    assert "41 of 1382 parameters differ" in shown.err
+    (table,) = command("show", "--changed", "--json", "--cache", cache).json["components"]
+    assert len(table["params"]) == 41
+    assert table["params"]["RELAY1_FUNCTION"]["default"] == 0
+    assert len(command("show", "--cache", cache).rows) == 1383
+
+
+# fetch with a sample
+
+
+def test_a_sample_may_be_enough_and_says_how_sure_that_is(command: Command, tmp_path: Path) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    arguments = ("fetch", "sim:ardupilot", "--cache", cache, "--accept", "sampled")
+    first = command(*arguments, "--json")
+    assert (first.json["source"], first.json["sample"]) == ("ftp", None)
+    found = command(*arguments, "--json")
+    assert found.code == 0
+    assert (found.json["source"], found.json["received"], found.json["missing"]) == ("cache", 1382, [])
+    assert len(found.json["params"]) == 1382
+    assert len(found.json["cached"]) == 1382 - 30
+    assert found.json["sample"] == {
+        "size": 30,
+        "count": 1382,
+        "confidence": {"1": 0.0217, "10": 0.1976, "100": 0.8975},
+    }
+    shown = command(*arguments, "--sample", 1382)
+    assert shown.code == 0
+    assert "1382 of 1382 parameters were read and agreed" in shown.err
+    assert "100% for 1 and 100% for 10 and 100% for 100" in shown.err
+
+
+def test_a_sample_needs_to_be_accepted(command: Command) -> None:
+    refused = command("fetch", "sim:ardupilot", "--sample", 5, "--no-cache")
+    assert (refused.code, refused.out) == (2, "")
+    assert "--accept sampled" in refused.err
+    for words in (["--accept", "sampled", "--sample", "0"], ["--accept", "guessed"]):
+        assert command("fetch", "sim:ardupilot", "--no-cache", *words).code == 2
 
 
 # watch

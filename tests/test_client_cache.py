@@ -9,6 +9,7 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Collection
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -773,3 +774,75 @@ def test_a_process_that_is_killed_during_a_download(path: Path, after: int) -> N
     assert cached.hash is None
     real = bits(PX4Vehicle().params)
     assert bits(cached.params).items() <= real.items()
+
+
+# Defaults, and whether there is a file
+
+
+def said(path: Path) -> tuple[int, bool | None]:
+    """How many defaults the cache knows of the first vehicle, and whether it gives its table as a file."""
+    with ParamCache(path) as cache:
+        params = cache.component(system=1).params.values()
+        return sum(param.default is not None for param in params), cache.components()[0].file_works
+
+
+@swiftly
+async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Path) -> None:
+    vehicle = ArduPilotVehicle(live_period=0)
+    result = await session(vehicle, path)
+    defaults = {name: param.default for name, param in result.params.items()}
+    assert said(path) == (1382, True)
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        assert {name: param.default for name, param in component.params.items()} == defaults
+        assert len(component.params.changed()) == 41
+    vehicle._version = replace(vehicle._version, git_hash=b"01234567")
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        assert component.params.changed() == {}
+        before = component.params["STAT_RUNTIME"].value
+        await component.set("STAT_RUNTIME", int(before) + 5)  # something is written, and no fetch
+    assert said(path) == (0, None), "those of the other firmware are not passed off as this one's"
+    assert len(kept(path)) == 1382
+    assert (await session(vehicle, path)).source == "ftp"
+    assert said(path) == (1382, True)
+
+
+@pytest.mark.parametrize("kind", ["no file", "silent"])
+@swiftly
+async def test_that_there_is_no_file_is_remembered_for_the_firmware(path: Path, kind: str) -> None:
+    vehicle = ArduPilotVehicle(live_period=0)
+    server = vehicle._ftp
+    assert server is not None
+    rows = server.params
+    if kind == "no file":
+        server.params = lambda: None
+    else:
+        vehicle._ftp = None
+    asked = Tap(vehicle)
+    first = await session(asked, path)
+    assert (first.source, first.complete) == ("stream", True)
+    assert "so they were listed" in first.notes[0]
+    assert said(path)[1] is False
+    assert asked.messages(wire.FileTransfer)
+    asked.heard.clear()
+    second = await session(asked, path)
+    assert (second.source, second.notes) == ("stream", ())
+    assert not asked.messages(wire.FileTransfer)
+    vehicle._ftp, server.params = server, rows
+    assert (await session(asked, path)).source == "stream", "nobody has asked"
+    vehicle._version = replace(vehicle._version, flight_sw_version=67502081)
+    assert (await session(asked, path)).source == "ftp"
+    assert said(path)[1] is True
+
+
+@swiftly
+async def test_the_first_fetch_waits_until_it_is_known_whether_there_is_a_file() -> None:
+    air = Air.symmetric([ArduPilotVehicle(live_period=0)], delay=0.2)
+    async with ParamClient(air, cache=False) as client:
+        component = await client.component()
+        assert (await component.fetch_all()).source == "ftp"
+    async with ParamClient(air, cache=False) as client:
+        await client.component()
+        together = await client.fetch_all(refresh=True)
+        assert [result.source for result in together.results.values()] == ["ftp"]

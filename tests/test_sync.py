@@ -1071,16 +1071,19 @@ def test_what_a_users_choice_means() -> None:
 
 
 def test_a_table_that_moved_while_it_came_is_not_synced_and_is_fetched_again() -> None:
-    """Parameters come into use behind the front of the list: only the hash tells."""
-    vehicle = PX4Vehicle(table={**PLAIN, "ZZ_LATE": 1}, not_in_use=["ZZ_LATE"], burst=1, period=0.02)
+    """Parameters come into use when the list is over, and only the hash tells."""
+    names = ["A_LATE", "SWITCH", *list(PLAIN)[:12]]
+    rows = [SimParam(name, ParamType.INT32, number) for number, name in enumerate(names)]
+    vehicle = PX4Vehicle(table=rows, late_use={"SWITCH": ["A_LATE"]})
     world = World(air=Air.symmetric([vehicle], delay=0.3), upkeep=Upkeep(INTERVAL))
-    vehicle.when_listed(len(vehicle.params), lambda: vehicle.use("ZZ_LATE"))
-    result = world.fetch()
-    assert result.has_moved
+    vehicle.when_listed(3, lambda: vehicle.set_param("SWITCH", 9))
+    world.until(lambda: (1, 1) in world.station.components)
+    fetch = world.machine.begin_fetch(world.now, refresh=True)
+    assert world.outcome(fetch).has_moved
     assert state(world) is SyncState.UNSYNCED
     world.run(GAPS_INTERVAL + 5.0)
     assert state(world) is SyncState.SYNCED
-    assert "ZZ_LATE" in world.machine.table.params
+    assert "A_LATE" in world.machine.table.params
 
 
 def test_nothing_is_begun_for_a_component_that_is_lost() -> None:

@@ -329,3 +329,12 @@ def test_a_default_goes_with_the_type() -> None:
     table.take("A", ParamType.INT32, 1, 0, 7, is_older=False)
     table.hear(param_value("A", 1.0, index=0), "vehicle")
     assert table.params["A"].default is None
+
+
+def test_another_place_leaves_value_and_default() -> None:
+    table = Table()
+    table.take("A", ParamType.INT32, 7, 0, 5, is_older=False)
+    table.place({3: "A"})
+    assert (table.params["A"].index, table.params["A"].value, table.params["A"].default) == (3, 7, 5)
+    table.forget_defaults()
+    assert (table.params["A"].value, table.params["A"].default) == (7, None)

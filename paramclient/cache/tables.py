@@ -25,6 +25,7 @@ from paramclient.cache.records import (
     TableUpdate,
 )
 from paramclient.cache.rows import Row, cells, checksum, identity_cells, read_identity, read_param, time_cell
+from paramclient.identity import Identity
 from paramclient.params import ParamMap
 
 __all__ = ["HISTORY_LINES", "component", "history", "remove", "save", "summaries", "vehicles"]
@@ -44,6 +45,7 @@ _IDENTITY: Final = (
 def save(connection: sqlite3.Connection, updates: Iterable[TableUpdate]) -> None:
     """Write what was learnt, in the order given."""
     for update in updates:
+        _forget_other_firmware(connection, update.identity)
         owner = _owner(connection, update)
         before = _rows(connection, owner)
         after, lines = _applied(update, before)
@@ -133,6 +135,20 @@ def history(
         (key, component, name, -1 if limit is None else limit),
     ).fetchall()
     return [_entry(row) for row in reversed(rows)]
+
+
+def _forget_other_firmware(connection: sqlite3.Connection, identity: Identity) -> None:
+    """Where a vehicle has another firmware than before: drop what was true of that one only."""
+    updated = connection.execute(
+        "SELECT c.id FROM vehicle JOIN component c ON vehicle = key"
+        " WHERE key = ? AND (firmware, git_hash) != (?, ?)",
+        (identity.key, identity.firmware, identity.git_hash),
+    ).fetchall()
+    for (owner,) in updated:
+        before = _rows(connection, owner)
+        after = {name: row._replace(default_bits=None) for name, row in before.items()}
+        _write_rows(connection, owner, before, after)
+        connection.execute("UPDATE component SET file_works = NULL WHERE id = ?", (owner,))
 
 
 def _owner(connection: sqlite3.Connection, update: TableUpdate) -> int:

@@ -12,13 +12,16 @@ from paramclient.cache import CachedComponent, CachedSummary, HistoryEntry, Para
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import (
+    NO_DEFAULTS,
     as_json,
     by_index,
+    default_text,
     hash_text,
     print_json,
     print_line,
     print_table,
     printable,
+    report,
     say,
     time_text,
     value_json,
@@ -33,27 +36,38 @@ _DEFAULTS: Final = CacheOptions()
 
 
 def show(
-    vehicle: str | None = None, /, *, component: Id = None, options: CacheOptions = _DEFAULTS
+    vehicle: str | None = None,
+    /,
+    *,
+    component: Id = None,
+    changed: bool = False,
+    options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
     """Print what was last known of a vehicle, with no link.
+
+    With --changed, exit code 1 says that the firmware's defaults are not known.
 
     Args:
         vehicle: Its system id, the beginning of its hardware id, or its key in the cache.
         component: This component only.
+        changed: Only what differs from the firmware's defaults.
     """
     with _open(options) as cache:
         summaries = _choose(cache, vehicle, component)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
         tables = [] if is_list else _load(cache, summaries)
     if options.json:
-        print_json({"components": [_table_json(table) for table in tables]})
+        print_json({"components": [_table_json(table, changed=changed) for table in tables]})
     elif is_list:
         _print_summaries(summaries)
         say("paramclient show VEHICLE shows one of them: by its system id, or the beginning of its key")
     elif not summaries:
         say(f"the cache {printable(str(cache.path))} is empty")
     for table in [] if options.json else tables:
-        _print_table(table)
+        _print_table(table, changed=changed)
+    if changed and tables and not any(_has_defaults(table) for table in tables):
+        report(NO_DEFAULTS)
+        return ExitCode.INCOMPLETE
     return ExitCode.DONE
 
 
@@ -165,7 +179,11 @@ def _load(cache: ParamCache, summaries: Sequence[CachedSummary]) -> list[CachedC
     return [table for table in loaded if table is not None]  # another process may have removed one
 
 
-def _table_json(table: CachedComponent) -> dict[str, Any]:
+def _has_defaults(table: CachedComponent) -> bool:
+    return any(param.default is not None for param in table.params.values())
+
+
+def _table_json(table: CachedComponent, *, changed: bool) -> dict[str, Any]:
     return {
         "system": table.system,
         "component": table.component,
@@ -173,7 +191,7 @@ def _table_json(table: CachedComponent) -> dict[str, Any]:
         "uid": table.identity.uid,
         "hash": hash_text(table.hash),
         "synced_at": _time(table.synced_at),
-        "params": as_json(table.params.values()),
+        "params": as_json((table.params.changed() if changed else table.params).values()),
     }
 
 
@@ -225,16 +243,25 @@ def _print_summaries(summaries: Sequence[CachedSummary]) -> None:
     print_table(["component", "autopilot", "params", "hash", "synced", "key"], rows, right="params")
 
 
-def _print_table(table: CachedComponent) -> None:
+def _print_table(table: CachedComponent, *, changed: bool) -> None:
+    if changed and not _has_defaults(table):
+        return
+    params = by_index((table.params.changed() if changed else table.params).values())
     rows = (
-        (param.name, _value(param), type_name(param.type), param.index, time_text(table.heard_at[param.name]))
-        for param in by_index(table.params.values())
+        (
+            *(param.name, _value(param), *([default_text(param)] if changed else [])),
+            *(type_name(param.type), param.index, time_text(table.heard_at[param.name])),
+        )
+        for param in params
     )
-    print_table(["name", "value", "type", "index", "heard"], rows, right="value index")
+    default = ["default"] if changed else []
+    print_table(["name", "value", *default, "type", "index", "heard"], rows, right="value default index")
     synced = "never complete" if table.synced_at is None else f"synced {time_text(table.synced_at)}"
     crc = "" if table.hash is None else f"; hash {hash_text(table.hash)}"
     who = f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"
-    say(printable(f"{table.size} parameters of {who}, {synced}{crc}"))
+    number = f"{len(params)} of {table.size} parameters differ from their default" if changed else table.size
+    what = f"{number}: {who}" if changed else f"{number} parameters of {who}"
+    say(printable(f"{what}, {synced}{crc}"))
 
 
 def _value(param: Param) -> str:

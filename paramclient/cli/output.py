@@ -21,9 +21,11 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 __all__ = [
+    "NO_DEFAULTS",
     "as_json",
     "bits_text",
     "by_index",
+    "default_text",
     "hash_text",
     "live_view",
     "milliseconds",
@@ -40,6 +42,10 @@ __all__ = [
     "value_json",
 ]
 
+NO_DEFAULTS: Final = (
+    "the firmware's defaults are not known, so nor is what differs from them: they come with the parameter "
+    "file over MAVFTP, which ArduPilot and PX4 from 1.18 on serve"
+)
 UNLIMITED: Final = 10_000
 """Columns of an output that is no terminal: nothing is wrapped or cut there."""
 
@@ -76,6 +82,11 @@ def bits_text(param: Param) -> str:
     return f"{param.bits:0{16 if is_wide else 8}x}"
 
 
+def default_text(param: Param) -> str | None:
+    """The firmware's default as people see it, or None where it is not known."""
+    return None if param.default is None else format_value(param.default, param.type)
+
+
 def by_index(params: Iterable[Param]) -> list[Param]:
     """In the vehicle's own order; those without an index last, by name."""
     return sorted(params, key=lambda param: (param.index is None, param.index or 0, param.name))
@@ -110,6 +121,7 @@ def param_json(param: Param) -> dict[str, Any]:
         "type": type_name(param.type),
         "index": param.index,
         "bits": bits_text(param),
+        **({} if param.default is None else {"default": value_json(param.default, param.type)}),
     }
 
 

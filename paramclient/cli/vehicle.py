@@ -8,17 +8,20 @@ import re
 import time
 from collections.abc import AsyncGenerator, Iterable, Sequence
 from contextlib import aclosing, suppress
-from dataclasses import dataclass
-from typing import Annotated, Any, Final
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, Final, Literal
 
 import anyio
 from cyclopts import Parameter
+from cyclopts.validators import Number
 
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.outcome import ExitCode, code_of, status_of
 from paramclient.cli.output import (
+    NO_DEFAULTS,
     as_json,
     by_index,
+    default_text,
     hash_text,
     milliseconds,
     print_json,
@@ -36,6 +39,7 @@ from paramclient.cli.session import Session, connect
 from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError, ValueNotApplied
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
 from paramclient.protocol.result import FetchResult, Policy
+from paramclient.protocol.sampling import SAMPLE_SIZE, Sample
 from paramclient.protocol.table import Change
 from paramclient.values import Param, ParamType, Trust, Value, check_name, format_value, type_name
 
@@ -54,31 +58,52 @@ async def fetch(
     /,
     *,
     refresh: bool = False,
+    changed: bool = False,
+    accept: Literal["verified", "sampled"] = "verified",
+    sample: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
     policy: Policy = Policy.AUTO,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Bring every parameter: from the cache where the vehicle's hash confirms it, else by download.
 
-    Exit code 1 says that some are missing.
+    Exit code 1 says that some are missing, or with --changed that the firmware's defaults are not known.
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
         refresh: Download even what the cache has.
+        changed: Print only what differs from the firmware's defaults.
+        accept: With "sampled", a cached table of a vehicle without a hash is believed when a sample of it
+            agrees, and it is said what that is worth.
+        sample: How many parameters are read for that, 30 without it.
         policy: What the vehicle may be asked: whatever is needed, only for its hash, or nothing.
     """
+    if sample is not None and accept != "sampled":
+        raise UsageError("--sample goes with --accept sampled")
     async with connect(url, options, policy=policy) as session:
-        result = await _fetch_all(session, refresh=refresh)
+        result = await _fetch_all(session, refresh=refresh, accept=accept, sample=sample or SAMPLE_SIZE)
         with suppress(NoReply):
             await session.component.refreshed(timeout=session.deadline.left(REFRESH_PATIENCE))
         fetched = _Fetched.of(session, result, policy)
+    has_defaults = any(param.default is not None for param in fetched.params)
+    if changed:
+        fetched = replace(fetched, params=[param for param in fetched.params if param.is_changed])
     for note in result.notes:
         report(note)
+    if result.sample is not None:
+        report(_confidence(result.sample))
     if options.json:
         print_json(fetched.as_json())
     else:
-        rows = ((*_cells(param), param.trust) for param in fetched.params)
-        print_table([*_COLUMNS, "trust"], rows, right="value index")
+        if not changed:
+            rows = ((*_cells(param), param.trust) for param in fetched.params)
+            print_table([*_COLUMNS, "trust"], rows, right="value index")
+        elif has_defaults:
+            rows = ((*_cells(param), param.trust, default_text(param)) for param in fetched.params)
+            print_table([*_COLUMNS, "trust", "default"], rows, right="value index default")
         say(printable(fetched.summary))
+    if changed and not has_defaults:
+        report(NO_DEFAULTS)
+        return ExitCode.INCOMPLETE
     if fetched.missing:
         report(f"incomplete: {_named(fetched.missing)} did not come")
         return ExitCode.INCOMPLETE
@@ -166,7 +191,7 @@ async def watch(
                 return _report_all(errors.values())
         else:
             with suppress(CacheError):  # there may be nothing in it: then all that is heard is new
-                await _fetch_all(session, refresh=False)
+                await _fetch_all(session)
         known = set(session.component.params)
         what = ", ".join(wanted) if wanted else f"{len(known)} parameters"
         say(printable(f"watching {what} of {session.who}"))
@@ -185,7 +210,8 @@ class _Fetched:
     """What the vehicle has given or confirmed in this session.
 
     A value that only the cache knows is left out, and its index is missing like one that did not come; but
-    where the policy keeps it from being asked for, it is among the others, and named in `cached`.
+    where the policy keeps it from being asked for, or a sample speaks for it, it is among the others, and
+    named in `cached`.
     """
 
     session: Session
@@ -201,7 +227,7 @@ class _Fetched:
         params = by_index(session.component.params.values())
         cached = [param for param in params if param.trust is Trust.CACHED]
         missing = set(result.missing)
-        if policy is Policy.AUTO:
+        if policy is Policy.AUTO and result.sample is None:
             if result.source == "cache":
                 missing = {param.index for param in cached if param.index is not None}
             params = [param for param in params if param.trust is not Trust.CACHED]
@@ -246,6 +272,7 @@ class _Fetched:
             "hash": hash_text(self.result.hash),
             "missing": self.missing,
             "cached": self.cached,
+            "sample": None if self.result.sample is None else _sample_json(self.result.sample),
             "lost": self.result.lost,
             "repeated": self.result.repeated,
             "round_trip_s": rounded(self.result.round_trip),
@@ -256,11 +283,31 @@ class _Fetched:
         }
 
 
-async def _fetch_all(session: Session, *, refresh: bool) -> FetchResult:
+async def _fetch_all(
+    session: Session, *, refresh: bool = False, accept: str = "verified", sample: int = SAMPLE_SIZE
+) -> FetchResult:
     with progress_bar(f"fetching {session.who}") as progress:
         return await session.component.fetch_all(
-            refresh=refresh, timeout=session.deadline.left(), progress=progress
+            refresh=refresh,
+            accept=accept,
+            sample=sample,
+            timeout=session.deadline.left(),
+            progress=progress,
         )
+
+
+def _confidence(sample: Sample) -> str:
+    """What a sample that agreed is worth, in words."""
+    chances = " and ".join(f"{sample.confidence(each):.0%} for {each}" for each in _SUPPOSED)
+    return (
+        f"{sample.size} of {sample.count} parameters were read and agreed. If others had changed, the chance "
+        f"to see it so is {chances} of them."
+    )
+
+
+def _sample_json(sample: Sample) -> dict[str, Any]:
+    chances = {str(each): round(sample.confidence(each), 4) for each in _SUPPOSED}
+    return {"size": sample.size, "count": sample.count, "confidence": chances}
 
 
 def _named(indices: Sequence[int]) -> str:
@@ -268,6 +315,8 @@ def _named(indices: Sequence[int]) -> str:
     more = len(indices) - MOST_INDICES
     return f"ind{'ex' if len(indices) == 1 else 'ices'} {shown}{f' and {more} more' if more > 0 else ''}"
 
+
+_SUPPOSED: Final = (1, 10, 100)  # parameters that may have changed
 
 # get
 

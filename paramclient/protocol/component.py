@@ -173,8 +173,11 @@ class ComponentMachine:
                 self._rebooted(now)
             self._authors.forget(now)
         elif isinstance(message, AutopilotVersion):
+            before = self.who.firmware
             if self.who.version(message, now):
                 self._another(now)
+            elif before not in (None, self.who.firmware):
+                self.fetches.updated()
         elif isinstance(message, ParamError):
             addressee = (message.target_system, message.target_component)
             if addressee in (self._own, (0, 0)) and not self.writes.refused(message, now):
@@ -246,7 +249,7 @@ class ComponentMachine:
             NoReply: the component is lost. Nothing was sent.
         """
         what = key if isinstance(key, str) else f"parameter {key}"
-        self._check_present(f"{what} of {self.system}/{self.component}", now)
+        self.check_present(f"{what} of {self.system}/{self.component}", now)
         read = self.reads.ask(self.spelling(key) if isinstance(key, str) else key, now)
         read.is_of_caller = True
         return read
@@ -258,7 +261,7 @@ class ComponentMachine:
             UsageError: the type is known and the value does not fit it. Nothing was sent.
             NoReply: the component is lost. Nothing was sent.
         """
-        self._check_present(f"PARAM_SET {name} to {self.system}/{self.component}", now)
+        self.check_present(f"PARAM_SET {name} to {self.system}/{self.component}", now)
         name = self.spelling(name)
         known = self.table.params.get(name)
         if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
@@ -282,7 +285,7 @@ class ComponentMachine:
             NoReply: the component is lost, and no fetch is under way. Nothing was sent.
         """
         if self.fetch is None and self._policy is not Policy.CACHE_ONLY:
-            self._check_present(f"the parameters of {self.system}/{self.component}", now)
+            self.check_present(f"the parameters of {self.system}/{self.component}", now)
         return self.fetches.begin(now, refresh=refresh, listed=listed, sampled=sampled)
 
     def end_fetch(self, fetch: Fetch, now: float) -> None:
@@ -292,6 +295,12 @@ class ComponentMachine:
     def spelling(self, name: str) -> str:
         """The name as the vehicle has it. ArduPilot answers to any case; its own names have capitals only."""
         return name.upper() if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA else name
+
+    def check_present(self, what: str, now: float) -> None:
+        """See whether it can be asked for something; NoReply is raised where it is lost."""
+        if self.presence.is_lost:
+            silence = now - self.presence.heard_at
+            raise NoReply(f"{what} (lost)", attempts=0, waited=silence)
 
     # time
 
@@ -353,12 +362,7 @@ class ComponentMachine:
 
     def become_another(self, now: float) -> None:
         """Another vehicle has taken this system id: nothing that is known is about it."""
-        self._report(self.table.remove(lambda param: True))
-        self.table.unconfirm()
-        self.table.volatile = frozenset()
-        self.table.volatile_known = False
-        self.table.count = None
-        self.table.complete = False
+        self._report(self.table.forget())
         self.sync.forget()
         self.fetches.forget()
         self._known_as = None
@@ -412,8 +416,9 @@ class ComponentMachine:
 
     @property
     def is_waiting(self) -> bool:
-        """Whether an answer is awaited: to a read, a write or a fetch, or to the question who it is."""
-        return len(self.reads) > 0 or len(self.writes) > 0 or self.fetch is not None or self.who.is_asking
+        """Whether anything is awaited: an answer, a fetch, a file, or who it is."""
+        is_asked = len(self.reads) > 0 or len(self.writes) > 0 or not self.files.is_idle
+        return is_asked or self.fetch is not None or self.who.is_asking
 
     @property
     def is_settling(self) -> bool:
@@ -467,10 +472,6 @@ class ComponentMachine:
         presence = self.presence
         return presence.is_lost or presence.is_high_latency or self.reads.pace.gap >= LOW_BANDWIDTH_GAP
 
-    def _check_present(self, what: str, now: float) -> None:
-        if self.presence.is_lost:
-            raise NoReply(f"{what} (lost)", attempts=0, waited=now - self.presence.heard_at)
-
     def _doubt(self) -> None:
         """What is known may be of the past: it counts again when the vehicle has confirmed it."""
         self.table.doubt(Trust.LIVE, Trust.VERIFIED)
@@ -480,10 +481,10 @@ class ComponentMachine:
         """It is not heard any more. A fetch goes on for a while: it may only be starting again."""
         presence = self.presence
         presence.is_lost = True
-        silence = now - presence.heard_at
-        self._emit(events.ComponentLost(self, silence))
+        self._emit(events.ComponentLost(self, now - presence.heard_at))
         self.writes.lose(now)
         self.reads.lose(now)
+        self.files.lose(now)
         self._doubt()
 
     def _was_silent(self, silence: float, now: float) -> None:

@@ -50,9 +50,7 @@ class Fetch(Operation[FetchResult]):
     quicker. When that fails, the list follows, and `notes` says why. Where there is no hash, a sample of a
     cached table may settle it, if that was asked for.
 
-    The table that a download brought is confirmed when the hash that is computed from it is one that the
-    vehicle announced in the course of it, or when the vehicle announced the same before and after: then
-    nothing moved between. For the latter it is asked for once more after the download.
+    Of a vehicle with a hash, `Proof` says whether what came is confirmed.
 
     What an earlier download has left unfinished is gone on with, when the count is still the same. With a
     hash it must be proven in the end, or all is downloaded after all; without one what the cache knows stays
@@ -61,9 +59,9 @@ class Fetch(Operation[FetchResult]):
     Attributes:
         holders: how many wait for it; with none left it is cancelled.
         download: the download by list, once it is needed.
-        file: the download as a file, while that is tried.
-        file_failed: whether the file could not be had, once that is known: None before, and where the
-            component just did not answer.
+        file: the download as a file, while that is tried and when it has come.
+        file_failed: whether the component has no such file, once that is known: None before, and where it may
+            be bad luck.
     """
 
     def __init__(
@@ -88,7 +86,7 @@ class Fetch(Operation[FetchResult]):
         self._may_use_file = may_use_file
         self._undecided_until = math.inf  # whether to ask for the file or for the list
         self._present: Mapping[int, str] | None = None  # with what the latter would go on
-        self._has_begun = self._had_no_file = False
+        self._has_begun = self._had_no_file = self._file_was_silent = False
         self._sampling: Sampling | None = None
         self._hash_read: Read | None = None
         self._proof = Proof(table)
@@ -134,9 +132,8 @@ class Fetch(Operation[FetchResult]):
             if self._first_value_at > now:
                 self._first_value_at = now
             download.heard(message, now)
-            if self._proof.before is not None or self._was_asked_meanwhile:
-                return
-            if self._expects_hash() and not self.done:
+            is_heard = self._proof.before is not None or self._was_asked_meanwhile
+            if not is_heard and self._expects_hash() and not self.done:
                 # the one at the head of the list was lost; asked for now, it need not be waited for later
                 self._was_asked_meanwhile = True
                 self._ask_hash(self._hash_came_meanwhile, now)
@@ -166,18 +163,28 @@ class Fetch(Operation[FetchResult]):
     @property
     def is_about_the_cache(self) -> bool:
         """Whether it is still to be seen if what is known already will do."""
-        return self.file is None and (self.download is None or self.download.resumed > 0)
+        if self._undecided_until < math.inf:
+            return self._present is not None
+        return not self._has_begun or (self.download is not None and self.download.resumed > 0)
+
+    @property
+    def is_sampling(self) -> bool:
+        """Whether a sample is being read that may settle it."""
+        return self._sampling is not None
 
     @property
     def is_under_way(self) -> bool:
         """Whether parameters have come, which are of the past if the vehicle starts again."""
-        return self._has_begun
+        return self._has_begun or self.is_sampling
 
     def restart(self, now: float) -> None:
         """The vehicle is another one, or has started again: what came is not about it. Fetch it anew."""
         held_up = self.held_up(now)
         self._drop(now)
         self.download = None
+        self._notes = ()
+        self.file_failed = None
+        self._had_no_file = self._file_was_silent = False
         self._restarts += 1
         if self._restarts > MOST_RESTARTS:
             system, component = self._target
@@ -201,9 +208,10 @@ class Fetch(Operation[FetchResult]):
             NoReply: nothing has come.
         """
         download = self.download
-        count = self._table.count
-        if self.file is not None and not self.file.is_awaited and count:
-            return self._result("ftp", count, tuple(range(count)), None, now, (note,))
+        file = self.file
+        if file is not None and file.count:
+            missing = () if file.done else tuple(range(file.count))
+            return self._result("ftp", file.count, missing, None, now, (note,))
         if download is None or download.count is None:
             system, component = self._target
             attempts = 1 if download is None else download.lists
@@ -268,7 +276,7 @@ class Fetch(Operation[FetchResult]):
         read.on_done.append(ended)
 
     def _hash_came_meanwhile(self, read: Read) -> None:
-        self._proof.meanwhile = _announced_in(read)
+        self._proof.meanwhile = Announcement.answering(read)
         self._is_hash_unknown = isinstance(read.error, UnknownParameter)
         if self.download is not None and self.download.done:
             self._download_ended(self.download)
@@ -329,16 +337,16 @@ class Fetch(Operation[FetchResult]):
             return
         means = self._means
         self._has_begun = True
+        self._present = present
         means.doubt(now)
         may_use_file = not (self._listed or self._had_no_file) and self._may_use_file()
         if may_use_file is None and now < self.begun_at + IDENTITY_PATIENCE:
             self._undecided_until = self.begun_at + IDENTITY_PATIENCE
-            self._present = present
             return
         self._undecided_until = math.inf
         if may_use_file:
             if self._expects_hash():
-                # once, beside the file: with nothing of that there, the answer is of the time before it
+                # once, and before the file: so the answer is of the time before it
                 means.send(ParamRequestRead(*self._target, HASH_CHECK, -1))
             file = self.file = PackFetch(means.files, means.turns, means.table, means.changed, now)
             file.on_done.append(partial(self._file_ended, file))
@@ -361,47 +369,49 @@ class Fetch(Operation[FetchResult]):
     def _file_ended(self, file: PackFetch) -> None:
         if self.file is not file:
             return
-        self.file = None
         now = file.ended_at
-        self._held_before += file.held_up
         if file.error is None:
             self.file_failed = False
             self._table.complete = True
-            if self._proof.is_given(file.count):
-                self.finish(self._result("ftp", file.count, (), self._table.hash, now, ()), now)
-            elif self._expects_hash() and not self._is_hash_unknown:
+            is_proven = self._proof.is_given(file.count or 0)
+            if not is_proven and self._expects_hash() and not self._is_hash_unknown:
                 self._ask_hash(partial(self._hash_came_after_file, file), now)
-            else:
+                return
+            if not is_proven:
                 self._table.unconfirm()
-                self.finish(self._result("ftp", file.count, (), None, now, ()), now)
+            self.finish(self._result("ftp", file.count or 0, (), self._table.hash, now, ()), now)
             return
+        self.file = None
+        self._held_before += file.held_up
         if isinstance(file.error, LinkError):
             self.fail(file.error, now)
             return
         self._had_no_file = True
-        self.file_failed = None if isinstance(file.error, NoReply) else True
+        self.file_failed = True if file.is_useless else None
+        self._file_was_silent = file.is_unheard
         self._notes += (NO_FILE.format(file.error),)
-        self._begin_download(now)
+        if self._present is not None:
+            self._resume(now)
+        else:
+            self._begin_download(now)
 
     def _hash_came_after_file(self, file: PackFetch, read: Read) -> None:
         """The file is the vehicle's table at one moment; its hash may be of a later one."""
-        after = _announced_in(read)
+        after = Announcement.answering(read)
         self._table.unconfirm()
-        notes = () if after is None else self._proof.settle(after, file.count)
-        result = self._result("ftp", file.count, (), self._table.hash, read.ended_at, notes or ())
+        count = file.count or 0
+        notes = () if after is None else self._proof.settle(after, count)
+        result = self._result("ftp", count, (), self._table.hash, read.ended_at, notes or ())
         self.finish(result, read.ended_at)
 
     def _stay_with_cache(self, now: float) -> None:
         """The policy allows no download: give what is known, and say so."""
         table = self._table
         if not table.params:
-            system, component = self._target
-            what = f"nothing is cached of {system}/{component}, and the policy is {self._policy}"
-            self.fail(CacheError(what), now)
+            whose = "/".join(map(str, self._target))
+            self.fail(CacheError(f"nothing is cached of {whose}, and the policy is {self._policy}"), now)
             return
-        present = {param.index for param in table.listed()}
-        count = len(present) if table.count is None else table.count
-        missing = tuple(index for index in range(count) if index not in present)
+        count, missing = table.gaps()
         note = NOT_ASKED if self._policy is Policy.CACHE_ONLY else NOT_CONFIRMED
         self.finish(self._result("cache", count, missing, None, now, (note,)), now)
 
@@ -417,7 +427,7 @@ class Fetch(Operation[FetchResult]):
         if self._is_proven(download):
             self._finish_download(download, now, ())
         elif self._expects_hash() and not (self._is_hash_unknown or download.missing):
-            self._ask_hash(partial(self._hash_came_last, download), now)
+            self._ask_hash(lambda read: self._settle(download, read, read.ended_at), now)
         else:
             self._settle(download, None, now)
 
@@ -439,29 +449,17 @@ class Fetch(Operation[FetchResult]):
         return self._proof.is_given(download.count or 0)
 
     def _remove_what_is_gone(self, download: Download) -> None:
-        table = self._table
-        table.place(download.names)
-        present = frozenset(download.names.values())
-        gone = table.remove(
-            lambda param: (
-                param.name not in present and (param.index is not None or param.name in table.displaced)
-            )
-        )
-        table.displaced.clear()
-        self._means.changed(gone)
+        self._means.changed(self._table.settle(download.names))
 
-    def _hash_came_last(self, download: Download, read: Read) -> None:
-        self._settle(download, _announced_in(read), read.ended_at)
-
-    def _settle(self, download: Download, after: Announcement | None, now: float) -> None:
+    def _settle(self, download: Download, read: Read | None, now: float) -> None:
         """The download is over and the hash is known, if there is one."""
-        table = self._table
+        after = None if read is None else Announcement.answering(read)
         notes: tuple[str, ...] = ()
         if not download.missing:
             self._remove_what_is_gone(download)
             if not download.is_settled:
                 notes = (UNSETTLED,)
-            table.unconfirm()
+            self._table.unconfirm()
         if after is not None and not download.missing:
             judged = self._proof.settle(after, download.count or 0, needs_proof=download.resumed > 0)
             if judged is None:
@@ -486,6 +484,8 @@ class Fetch(Operation[FetchResult]):
         else:
             table.place(download.names)
         table.count = count
+        if self._file_was_silent and not missing:  # while the list has come
+            self.file_failed = True
         if download.resumed and table.hash is None:
             earlier = sum(param.trust is Trust.CACHED for param in table.listed())
             notes += (FROM_MEMORY.format(earlier),) if earlier else ()
@@ -539,8 +539,3 @@ class Fetch(Operation[FetchResult]):
             file.cancel(now)
         if self.download is not None:
             self.download.cancel()
-
-
-def _announced_in(read: Read) -> Announcement | None:
-    """What the answer to a read of `_HASH_CHECK` says, or None without one."""
-    return None if read.result is None else Announcement.of(read.result, read.ended_at)

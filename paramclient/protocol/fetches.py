@@ -74,7 +74,9 @@ class Fetches:
             sampled: the sample that may settle it where there is no hash, or None.
         """
         fetch = self.current
-        if fetch is not None and refresh and fetch.is_about_the_cache:
+        if fetch is not None and (
+            (refresh and fetch.is_about_the_cache) or (sampled is None and fetch.is_sampling)
+        ):
             fetch.restart(now)
         if fetch is None:
             fetch = self.current = Fetch(
@@ -85,7 +87,7 @@ class Fetches:
                 listed=listed,
                 policy=self._policy,
                 may_use_file=self.may_use_file,
-                sampled=sampled if self.is_same_firmware else None,
+                sampled=sampled if self.is_same_firmware and self._policy is Policy.AUTO else None,
             )
             if fetch.done:
                 self._fetch_ended(fetch)
@@ -106,6 +108,11 @@ class Fetches:
         """Another vehicle has taken the address."""
         self.file_works = self._file_took = None
         self.is_same_firmware = False
+
+    def updated(self) -> None:
+        """The vehicle has another firmware now."""
+        self._means.table.forget_defaults()
+        self.forget()
 
     def _fetch_ended(self, fetch: Fetch) -> None:
         self.current = None

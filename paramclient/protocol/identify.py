@@ -127,6 +127,11 @@ class Identification:
         return bool((self.capabilities or 0) & CAPABILITY_FTP) and not has_none
 
     @property
+    def firmware(self) -> tuple[int, str] | None:
+        """Its version and git hash, once it has said them."""
+        return None if self.known_at == -math.inf else (self.identity.firmware, self.identity.git_hash)
+
+    @property
     def encoding_is_certain(self) -> bool:
         """Whether nothing that is still to come can tell otherwise."""
         has_said = self.autopilot in (MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4)

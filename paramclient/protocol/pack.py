@@ -85,6 +85,14 @@ def decode(data: bytes) -> Pack:
     return Pack(_entries(data, number, with_defaults), total, with_defaults)
 
 
+def total_of(beginning: bytes) -> int | None:
+    """How many parameters the vehicle has, by the beginning of its file; None where that does not say."""
+    if len(beginning) < _HEADER.size:
+        return None
+    magic, _, total = _header(beginning)
+    return total if magic in (_MAGIC, _MAGIC_WITH_DEFAULTS) else None
+
+
 def decode_upload(data: bytes) -> tuple[PackedParam, ...]:
     """Read a file in the form that is written to a vehicle.
 

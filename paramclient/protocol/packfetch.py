@@ -7,11 +7,11 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from paramclient.errors import FileTransferError, PackError
+from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError
 from paramclient.protocol.ftp import FileRead, FileTransfers
 from paramclient.protocol.ftp.packets import MOST_DATA
 from paramclient.protocol.operation import Operation
-from paramclient.protocol.pack import LARGEST_FILE, Pack, decode
+from paramclient.protocol.pack import LARGEST_FILE, Pack, decode, total_of
 from paramclient.protocol.result import Progress
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.turns import Seen, Turns
@@ -45,8 +45,10 @@ class PackFetch(Operation[None]):
         now: the time.
 
     Attributes:
-        count: parameters in the table, once it is there.
         held_up: seconds for which it waited for its turn.
+        is_useless: whether the component does not have the file, or one that cannot be read: with this
+            firmware that will not change.
+        is_unheard: whether it ended as nothing at all came of it, though the component was there.
     """
 
     def __init__(
@@ -68,8 +70,11 @@ class PackFetch(Operation[None]):
         self._query = WITH_DEFAULTS
         self._job: FileRead | None = None
         self._silent_at = math.inf
-        self.count = 0
+        self._doubts = table.doubts
         self.held_up = 0.0
+        self.is_useless = False
+        self.is_unheard = False
+        self._count: int | None = None
         self._waits_since: float | None = now
         turns.ask(self, now)
 
@@ -98,7 +103,6 @@ class PackFetch(Operation[None]):
         if self._waits_since is not None:
             self.held_up += now - self._waits_since
             self._waits_since = None
-        self._silent_at = now + SILENCE
         self._read(now)
 
     def held_for(self, now: float) -> float:
@@ -106,12 +110,17 @@ class PackFetch(Operation[None]):
         return self.held_up + (0.0 if self._waits_since is None else now - self._waits_since)
 
     def progress(self, now: float) -> Progress:
-        """How far it is, by the size that the vehicle gives and the count that is known of before."""
-        job, total = self._job, self._table.count
-        share = min(job.received / job.size, 1.0) if job is not None and job.size else 0.0
+        """How far it is: by the share of the file, whose size the vehicle gives."""
+        job, total = self._job, self.count or self._table.count
+        share = min(job.received / job.size, 1.0) if job is not None and job.size else float(self.done)
         received, running = int(share * (total or 0)), now - self.begun_at - self.held_for(now)
         left = running * (1 - share) / share if share else None
         return Progress(received, total, received / running if running > 0 else 0.0, left)
+
+    @property
+    def count(self) -> int | None:
+        """Parameters that the component has, as soon as the file's beginning has said so."""
+        return self._count if self._job is None else total_of(self._job.beginning)
 
     def heard(self, message: ParamValue) -> None:
         """Every PARAM_VALUE of the component passes here, after it went into the table."""
@@ -128,6 +137,8 @@ class PackFetch(Operation[None]):
 
     def _read(self, now: float) -> None:
         self._attempts += 1
+        self._silent_at = now + SILENCE
+        self._doubts = self._table.doubts
         self._heard.clear()
         self._heard_count = None
         job = self._job = self._files.read(PARAMETER_FILE + self._query, now, limit=LARGEST_FILE)
@@ -146,25 +157,38 @@ class PackFetch(Operation[None]):
                 self._read(now)
             else:
                 assert job.error is not None
+                self.is_useless = may_be_the_query or _is_unknown(job.error)
+                is_there = self._doubts == self._table.doubts
+                self.is_unheard = is_there and isinstance(job.error, NoReply) and not job.received
                 self._turns.give_back(self)
                 self.fail(job.error, now)
+            return
+        total = total_of(job.result)
+        if self._doubts != self._table.doubts:
+            self._is_none(PackError("the vehicle was away meanwhile", offset=0), now)
+            return
+        if total is not None and self._heard_count not in (None, total):
+            self._is_none(PackError(f"the vehicle has {self._heard_count} parameters by now", offset=4), now)
             return
         try:
             pack = decode(job.result)
             if len(pack.entries) < pack.total:
-                raise PackError(f"it has {len(pack.entries)} of {pack.total} parameters", offset=0)
-            if self._heard_count not in (None, pack.total):
-                raise PackError(f"the vehicle has {self._heard_count} parameters by now", offset=4)
+                raise PackError(f"it has {len(pack.entries)} of {pack.total} parameters", offset=2)
         except PackError as error:
-            if self._attempts < MOST_TRIES:
-                self._read(now)
-            else:
-                self._turns.give_back(self)
-                self.fail(error, now)
+            self._is_none(error, now, is_useless=True)
             return
         self._turns.give_back(self)
         self._fill(pack)
         self.finish(None, now)
+
+    def _is_none(self, error: PackError, now: float, *, is_useless: bool = False) -> None:
+        """What came is not the vehicle's table: read it again, or give up."""
+        if self._attempts < MOST_TRIES:
+            self._read(now)
+            return
+        self.is_useless = is_useless
+        self._turns.give_back(self)
+        self.fail(error, now)
 
     def _fill(self, pack: Pack) -> None:
         table = self._table
@@ -176,6 +200,16 @@ class PackFetch(Operation[None]):
             if change is not None:
                 changes.append(change)
         present = {entry.name for entry in pack.entries}
-        changes += table.remove(lambda param: param.index is not None and param.name not in present)
-        table.count = self.count = pack.total
+        changes += table.remove(
+            lambda param: (
+                param.name not in present and (param.index is not None or param.name in table.displaced)
+            )
+        )
+        table.displaced.clear()
+        table.count = self._count = pack.total
         self._changed(changes)
+
+
+def _is_unknown(error: Exception) -> bool:
+    """Whether it says that the component does not know what was asked for."""
+    return isinstance(error, FileTransferError) and error.code == FileErrorCode.UNKNOWN_COMMAND

@@ -8,7 +8,7 @@ from enum import StrEnum
 
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.notes import MOVED
-from paramclient.protocol.reads import Reads
+from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.sampling import Sample
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.timing import RoundTrip
@@ -83,6 +83,11 @@ class Announcement:
     def of(cls, message: ParamValue, at: float) -> Announcement:
         """What such a message says."""
         return cls(int.from_bytes(message.raw, "little"), message.param_count, at)
+
+    @classmethod
+    def answering(cls, read: Read) -> Announcement | None:
+        """What the answer to a read of `_HASH_CHECK` says, or None without one."""
+        return None if read.result is None else cls.of(read.result, read.ended_at)
 
 
 @dataclass(frozen=True, slots=True)

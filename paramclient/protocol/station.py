@@ -227,12 +227,13 @@ class Station:
         """Begin a fetch of several components of one system.
 
         When they are all that is known of it, none of them has a table worth going on with, none is being
-        fetched, and no other list runs, the list is asked for once, of all components.
+        fetched, none may give it as a file, and no other list runs, the list is asked for once, of all.
         """
         is_new = self._turns.is_free and all(machine.fetch is None for machine in machines)
         may_list = self.policy is Policy.AUTO
         is_fresh = refresh or not any(m.can_hit or present_of(m.table, m.reads) for m in machines)
-        if len(machines) > 1 and may_list and is_new and is_fresh:
+        has_file = any(machine.fetches.may_use_file() is not False for machine in machines)
+        if len(machines) > 1 and may_list and is_new and is_fresh and not has_file:
             system = machines[0].system
             known = [m for m in self.components.values() if m.system == system and m.who.has_parameters]
             if len(known) == len(machines):

@@ -48,6 +48,7 @@ class Table:
         hash: the PX4 hash under which the vehicle would confirm exactly this table, or None while unknown.
         displaced: names whose index was of an earlier count, and that the vehicle may no longer have; some of
             them may have come again since.
+        doubts: how often what had been heard was no longer to be relied on.
         passed_over: by a name that several parameters share, the indices of those that it does not mean.
         dirty: names whose value, type or index changed since `take_dirty` was called last.
     """
@@ -59,6 +60,7 @@ class Table:
         self.volatile_known = False
         self.complete = False
         self.displaced: set[str] = set()
+        self.doubts = 0
         self.passed_over: dict[str, frozenset[int]] = {}
         self.dirty: dict[str, str] = {}
         self._hash: int | None = None
@@ -267,8 +269,20 @@ class Table:
             if index in self.passed_over.get(name, ()):
                 continue
             if param is not None and param.index != index:
-                self.params[name] = Param(name, param.value, param.type, index, param.bits, param.trust)
+                self.params[name] = replace(param, index=index)
                 self.dirty.setdefault(name, "vehicle")
+
+    def settle(self, names: Mapping[int, str]) -> list[Change]:
+        """A download is whole: place what it brought, and take out what the vehicle no longer has."""
+        self.place(names)
+        present = frozenset(names.values())
+        gone = self.remove(
+            lambda param: (
+                param.name not in present and (param.index is not None or param.name in self.displaced)
+            )
+        )
+        self.displaced.clear()
+        return gone
 
     def present(self) -> dict[int, str]:
         """Names by index, as far as they are known under the count of now; none where two claim one index."""
@@ -290,6 +304,7 @@ class Table:
 
     def doubt(self, *trusts: Trust) -> None:
         """It may have moved unheard: what was trusted like this is no more than *cached*."""
+        self.doubts += Trust.LIVE in trusts
         for name, param in self.params.items():
             if param.trust in trusts:
                 self._wire.pop(name, None)  # the next value counts, also if it is the same
@@ -306,9 +321,31 @@ class Table:
                 self._moved(param.name)
         return [Change(param.name, param, None) for param in gone]
 
+    def forget(self) -> list[Change]:
+        """It is another vehicle's: nothing is known of it."""
+        changes = self.remove(lambda param: True)
+        self.unconfirm()
+        self.volatile = frozenset()
+        self.volatile_known = False
+        self.count = None
+        self.complete = False
+        return changes
+
+    def forget_defaults(self) -> None:
+        """They were those of another firmware."""
+        for name, param in self.params.items():
+            if param.default is not None:
+                self.params[name] = replace(param, default=None)
+
     def listed(self) -> list[Param]:
         """The parameters that have an index: those that the count and the hash are about."""
         return [param for param in self.params.values() if param.index is not None]
+
+    def gaps(self) -> tuple[int, tuple[int, ...]]:
+        """How many parameters there should be, and the indices of those that are not known."""
+        present = {param.index for param in self.listed()}
+        count = len(present) if self.count is None else self.count
+        return count, tuple(index for index in range(count) if index not in present)
 
     def unhashed(self) -> set[str]:
         """The names that the hash says nothing about: the volatile ones, or any while those are not known."""

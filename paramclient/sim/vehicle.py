@@ -181,10 +181,9 @@ class Vehicle(ABC):
 
     @property
     def high_latency(self) -> bool:
-        """Whether it speaks as on a satellite link; can be set at any moment, also in flight.
+        """Whether it speaks as on a satellite link (PX4's `MAVLINK_MODE_IRIDIUM`); can be set in flight.
 
-        HIGH_LATENCY2 every 5 s then stands in for heartbeat, SYSTEM_TIME and telemetry. Reads and sets are
-        answered; lists and files wait until it is off, and what PX4 pushes too (its `MAVLINK_MODE_IRIDIUM`).
+        HIGH_LATENCY2 every 5 s then stands in for heartbeat and telemetry; lists, files and pushes wait.
         """
         return self._high_latency
 

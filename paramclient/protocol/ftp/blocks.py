@@ -34,6 +34,11 @@ class Blocks:
         """The whole file, when it is complete."""
         return b"".join(self._pieces[at] for at in sorted(self._pieces))
 
+    @property
+    def beginning(self) -> bytes:
+        """The first piece; b"" where that has not come."""
+        return self._pieces.get(0, b"")
+
     def take(self, offset: int, data: bytes) -> bool:
         """A piece has come; whether anything in it is new. What lies behind the end is passed over."""
         stop = offset + len(data)

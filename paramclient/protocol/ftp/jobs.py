@@ -92,6 +92,7 @@ class Job(Operation[Result]):
 
     Attributes:
         path: of the file or directory.
+        is_of_caller: whether somebody waits for it who is to be told when the component is lost.
         session: the number of the session that is open for it, or None.
         asked_session: the one that was asked for when it is not known whether that is open, or None.
     """
@@ -100,6 +101,7 @@ class Job(Operation[Result]):
         super().__init__(now)
         self._line = line
         self.path = path
+        self.is_of_caller = False
         self.session: int | None = None
         self.asked_session: int | None = None
         self._path_data = path_bytes(path)

@@ -119,6 +119,11 @@ class FileRead(Job[bytes]):
         """Bytes that have come."""
         return self._blocks.received
 
+    @property
+    def beginning(self) -> bytes:
+        """What stands at the beginning of the file, as much of it as has come in one piece; b"" before."""
+        return self._blocks.beginning
+
     def begin(self, now: float) -> None:
         round_trip = self._line.round_trip
         if round_trip.smoothed is not None and round_trip.seen_loss < COPY_RISK:

@@ -239,6 +239,19 @@ class FileTransfers:
             self._job.resume(now)
             self._go_on(now)
 
+    def lose(self, now: float) -> None:
+        """The component is lost: callers wait no longer. What a fetch reads goes on for a while."""
+        system, component = self._target
+        jobs = [*([] if self._job is None else [self._job]), *self._waiting]
+        for job in jobs:
+            if job.is_of_caller and not job.done:
+                what = f"{job.path} of {system}/{component} (lost)"
+                error = NoReply(what, attempts=job.attempts, waited=now - job.begun_at)
+                if job is not self._job:
+                    self._waiting.remove(job)
+                job.fail(error, now)
+        self._go_on(now)
+
     def fail_all(self, error: Exception, now: float) -> None:
         """Nothing can be answered any more. What is asked for from now on stands."""
         jobs = [*([] if self._job is None else [self._job]), *self._waiting]
