@@ -372,7 +372,7 @@ def test_where_much_is_silent_the_controls_tell_how_good_the_link_is() -> None:
         if CONTROL in desk.take():
             desk.hear("P0", index=CONTROL)
     assert read.done
-    assert read.attempts < 15
+    assert 9 < read.attempts < 15  # five answered controls of five are no proof of a link that loses nothing
 
 
 def test_what_a_list_may_have_brought_is_no_answered_control() -> None:
