@@ -70,8 +70,11 @@ def test_the_oracle_by_file_waits_one_round_trip_for_what_was_lost(
 
 
 def test_peers_prints_a_table_of_who_got_everything() -> None:
-    text = bench("peers", "--repeat", "1", "--only", "paramclient", "pymavlink", "PX4 clean")
-    head, _, *rows = text.splitlines()[:4]
-    assert head == "| client | PX4 (903), clean |"
-    for row, client in zip(rows, ("paramclient", "pymavlink"), strict=True):
-        assert re.fullmatch(rf"\| {client}.* \| \d+\.\d\d \(\d+\.\d\) \|", row), text
+    text = bench("peers", "--repeat", "1", "--only", "paramclient", "pymavlink", "clean")
+    head, _, *rows = text.splitlines()[:5]
+    assert head == "| vehicle, parameters, loss | paramclient | pymavlink, the usual loop |"
+    seconds = r"\d+\.\d\d \(\d+\.\d\)"
+    assert re.fullmatch(rf"\| PX4, 903, clean \| {seconds} \| {seconds} \|", rows[0]), text
+    assert re.fullmatch(rf"\| ArduPilot, 1382, clean \| {seconds} \| {seconds} \|", rows[1]), text
+    assert re.fullmatch(rf"\| ArduPilot by file, 1382, clean \| {seconds} \| has no .* \|", rows[2]), text
+    assert re.search(r"\d{4}-\d\d-\d\d, \d+ cores, .*Python \S+, load [\d.]+ to [\d.]+", text), text
