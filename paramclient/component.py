@@ -36,7 +36,7 @@ Result = TypeVar("Result")
 PROGRESS_INTERVAL = 0.1
 """Seconds between two calls of a progress callback."""
 IDENTITY_PATIENCE = 1.5
-"""Seconds to wait for a component to say who it is before its cached table is done without."""
+"""Seconds to wait for a component to say who it is before its cached table, or its file, is done without."""
 TIME_IS_OVER = "The time given for the fetch was over."
 """Why a result is partial that a time limit ended."""
 
@@ -217,7 +217,7 @@ class Component:
 
         Otherwise the table comes as one packed file over MAVFTP where the component serves that: quicker than
         the list, exact, and with the firmware's defaults. Else it comes by list. `source` and `notes` of the
-        result say what was done, and why.
+        result say what was done, and why. ArduPilot is given 1.5 s since it was heard to say what it serves.
 
         It ends by itself in every case: indices that never answer are given up and named in `missing`.
         Calls at the same time share one fetch. Cancelling it leaves what has come in the table.
@@ -250,9 +250,8 @@ class Component:
         if accept == "sampled" and not refresh:
             sampled = Sampled(sample, random.getrandbits(32) if seed is None else seed)
         began = anyio.current_time()
-        if not refresh:
-            with anyio.move_on_after(timeout):
-                await self._wait_for_cache()
+        with anyio.move_on_after(timeout):
+            await self._wait_to_fetch(refresh=refresh)
         machine = self._machine
         fetch = machine.begin_fetch(anyio.current_time(), refresh=refresh, sampled=sampled)
         try:
@@ -302,13 +301,26 @@ class Component:
             or now >= self._heard_at + IDENTITY_PATIENCE
         )
 
+    def _may_fetch(self, now: float, *, refresh: bool) -> bool:
+        """Whether what decides how to fetch is there, or is not worth waiting for."""
+        is_open = self._machine.who.may_say_file and now < self._heard_at + IDENTITY_PATIENCE
+        return not is_open and (refresh or self._cache_is_due(now))
+
     async def _wait_for_cache(self) -> None:
         """Wait until the cached table, if the cache may have one, is in `params`; but not for long."""
-        now = anyio.current_time()
-        if not self._cache_is_due(now):
-            with anyio.move_on_after(self._heard_at + IDENTITY_PATIENCE - now):
-                await self._cache_is_read.wait()
-            self._client._check_open()
+        if not self._cache_is_due(anyio.current_time()):
+            await self._wait_for_identity()
+
+    async def _wait_to_fetch(self, *, refresh: bool) -> None:
+        """The same, and until it has said whether it serves its table as a file."""
+        if not self._may_fetch(anyio.current_time(), refresh=refresh):
+            await self._wait_for_identity()
+
+    async def _wait_for_identity(self) -> None:
+        """Wait until it has said who it is, and what the cache has of it is read."""
+        with anyio.move_on_after(self._heard_at + IDENTITY_PATIENCE - anyio.current_time()):
+            await self._cache_is_read.wait()
+        self._client._check_open()
 
     def _publish(self, change: Change) -> None:
         """Hand a change to everyone who listens."""

@@ -63,7 +63,7 @@ class FetchTogether:
         self._is_cache_awaited = False
 
     def join(self, now: float) -> None:
-        """Begin the fetches of components that have none yet, as soon as their cached table is there."""
+        """Begin the fetches of components that have none yet, as soon as it is known how to fetch them."""
         self._is_cache_awaited = False
         ready: dict[int, list[ComponentMachine]] = {}
         for address, component in self._components.items():
@@ -72,7 +72,7 @@ class FetchTogether:
                 continue
             if self._system not in (None, machine.system) or (machine.presence.is_lost and not machine.fetch):
                 continue
-            if self._refresh or component._cache_is_due(now):
+            if component._may_fetch(now, refresh=self._refresh):
                 ready.setdefault(machine.system, []).append(machine)
             else:
                 self._is_cache_awaited = True

@@ -124,6 +124,11 @@ class Identification:
         return bool((self.capabilities or 0) & CAPABILITY_FTP) and not has_none
 
     @property
+    def may_say_file(self) -> bool:
+        """Whether that is still open, of one whose list takes so much longer that it is worth waiting for."""
+        return self.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not self.settled
+
+    @property
     def encoding_is_certain(self) -> bool:
         """Whether nothing that is still to come can tell otherwise."""
         has_said = self.autopilot in (MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4)
