@@ -3,22 +3,31 @@
 It sees what no client can see: a frame that the simulated link loses is reported to it at the moment when
 it, or the answer to it, would have arrived. So it never waits longer than one round trip for anything, and it
 keeps as many requests in flight as the vehicle serves. What it cannot do is to make the vehicle or the link
-faster. `oracle_time` runs it once with single reads only and once with further passes of the list, and takes
-the quicker.
+faster. `oracle_time` runs it by list: reads for the gaps, after as many passes of the list as it is told.
+`file_oracle_time` runs it by file: one burst, and reads for the gaps.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
+from collections.abc import Callable
 from heapq import heappop, heappush
-from typing import Any
+from typing import Any, Final
 
 from paramclient.protocol import wire
+from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.packfetch import PARAMETER_FILE, WITH_DEFAULTS
 from paramclient.sim import Air, Endpoint, FaultyLink
 
-__all__ = ["TellingLink", "oracle_time"]
+__all__ = ["FILE_FRAME", "TellingLink", "file_oracle_time", "oracle_time"]
 
 GROUND = {"system": 255, "component": 190}
+LIMIT: Final = 600.0
+FILE_FRAME: Final = 27 + MOST_DATA
+"""Bytes of a frame with a full block of a file."""
+SESSION: Final = 1
+ROUNDING: Final = 1e-9
 
 
 class TellingLink(FaultyLink):
@@ -39,6 +48,11 @@ class TellingLink(FaultyLink):
     def is_free_at(self) -> float:
         """When the next datagram would leave without waiting."""
         return self._free_at
+
+    @property
+    def travel(self) -> float:
+        """Seconds on the way."""
+        return self._delay
 
 
 class _Oracle:
@@ -96,7 +110,7 @@ class _Oracle:
         for at, data in downlink.losses:
             self.report(at, data)
         for at, data in uplink.losses:
-            self.report(at + downlink._delay, data)
+            self.report(at + downlink.travel, data)
         downlink.losses.clear()
         uplink.losses.clear()
         while self.known and self.known[0][0] <= now:
@@ -153,6 +167,116 @@ class _Oracle:
         self.air.receive(wire.encode(message, **GROUND, sequence=self.sequence), now)
 
 
+class _FileOracle:
+    """One run by file: what has come, what was reported lost, and when to ask for it.
+
+    It asks for the burst together with the open, and for each lost block singly, so that the vehicle gets to
+    hear that as soon as its burst is over and then no quicker than it serves.
+
+    Attributes:
+        end: where the file ends, once the end of the burst has come or was reported lost.
+    """
+
+    def __init__(self, air: Air, *, burst_seconds: float, reads_per_second: float) -> None:
+        self.air = air
+        self.burst_seconds = burst_seconds
+        self.per_read = 1.0 / reads_per_second
+        self.end: int | None = None
+        self.sequence = 0
+        self.lost_opens: set[int] = set()
+        self.missing: set[int] = set()
+        self.to_ask: deque[int] = deque()
+        self.known: list[tuple[float, int, Packet]] = []  # reports that are still to come, and in which order
+        self.next_send = 0.0
+
+    def run(self) -> float:
+        """Seconds until the whole file has come."""
+        now = 0.0
+        self.air.tick(now)
+        self.begin(now)
+        framer = wire.Framer({110}, stream=False)
+        while (self.end is None or self.missing) and now < LIMIT:
+            self.learn_of_losses(now)
+            self.ask(now)
+            now = self.next_event(now)
+            self.air.tick(now)
+            for data in self.air.data_to_send():
+                for frame in framer.receive(data):
+                    message = wire.decode(frame)
+                    assert isinstance(message, wire.FileTransfer)
+                    self.take(Packet.unpack(message.payload))
+        return now
+
+    def take(self, packet: Packet) -> None:
+        if packet.opcode == Opcode.ACK:
+            self.missing.discard(packet.offset)
+        elif packet.requested == Opcode.BURST_READ_FILE and packet.data[:1] == b"\x06":
+            self.end = packet.offset
+
+    def next_event(self, now: float) -> float:
+        deadline = self.air.next_deadline()
+        times = [math.inf if deadline is None else deadline]
+        if self.known:
+            times.append(self.known[0][0])
+        if self.to_ask:
+            times.append(self.next_send)
+        return max(min(times), now + 1e-7)
+
+    def learn_of_losses(self, now: float) -> None:
+        """Turn what the links lost into reports at their time, and take those that are due."""
+        uplink, downlink = self.air.uplink, self.air.downlink
+        assert isinstance(uplink, TellingLink)
+        assert isinstance(downlink, TellingLink)
+        for losses, later in ((downlink.losses, 0.0), (uplink.losses, downlink.travel)):
+            for at, data in losses:
+                for frame in wire.Framer({110}, stream=False).receive(data):
+                    message = wire.decode(frame)
+                    assert isinstance(message, wire.FileTransfer)
+                    packet = Packet.unpack(message.payload)
+                    heappush(self.known, (at + later, packet.sequence, packet))
+            losses.clear()
+        while self.known and self.known[0][0] <= now:
+            self.reported(heappop(self.known)[2], now)
+
+    def reported(self, packet: Packet, now: float) -> None:
+        """This would have come by now, or the answer to it."""
+        match packet.opcode:
+            case Opcode.OPEN_FILE_RO:
+                self.lost_opens.add(packet.sequence)
+                self.begin(now)
+            case Opcode.BURST_READ_FILE:
+                if packet.sequence - 1 not in self.lost_opens:
+                    self.burst(now)
+            case Opcode.READ_FILE:
+                self.to_ask.append(packet.offset)
+            case Opcode.ACK if packet.requested in (Opcode.READ_FILE, Opcode.BURST_READ_FILE):
+                self.missing.add(packet.offset)
+                self.to_ask.append(packet.offset)
+            case _:  # the answer to the open says nothing that it needs, the end of the burst does
+                self.take(packet)
+
+    def begin(self, now: float) -> None:
+        self.send(Packet(0, SESSION, Opcode.OPEN_FILE_RO, (PARAMETER_FILE + WITH_DEFAULTS).encode()), now)
+        self.burst(now)
+
+    def burst(self, now: float) -> None:
+        self.send(Packet(0, SESSION, Opcode.BURST_READ_FILE, size=MOST_DATA), now)
+        self.next_send = now + self.burst_seconds
+
+    def ask(self, now: float) -> None:
+        """Ask for what is known to be missing, at the rate at which it is served."""
+        while self.to_ask and self.next_send <= now + ROUNDING:
+            offset = self.to_ask.popleft()
+            self.send(Packet(0, SESSION, Opcode.READ_FILE, size=MOST_DATA, offset=offset), now)
+            self.next_send = max(self.next_send, now) + self.per_read
+
+    def send(self, packet: Packet, now: float) -> None:
+        self.sequence += 1
+        payload = packet._replace(sequence=self.sequence).pack()
+        message = wire.FileTransfer(0, 1, 1, payload)
+        self.air.receive(wire.encode(message, **GROUND, sequence=self.sequence & 0xFF), now)
+
+
 def oracle_time(vehicle: Endpoint, air: Air, count: int, *, passes: int, reads_per_second: float) -> float:
     """Seconds that one run of the oracle takes.
 
@@ -163,4 +287,34 @@ def oracle_time(vehicle: Endpoint, air: Air, count: int, *, passes: int, reads_p
         passes: times that the list is asked for; reads fill the gaps after the last one.
         reads_per_second: what the vehicle or the link serves.
     """
-    return _Oracle(vehicle, air, count, passes=passes, reads_per_second=reads_per_second).run(600.0)
+    return _Oracle(vehicle, air, count, passes=passes, reads_per_second=reads_per_second).run(LIMIT)
+
+
+def file_oracle_time(
+    make: Callable[[], Endpoint],
+    uplink: TellingLink,
+    downlink: TellingLink,
+    *,
+    burst_rate: float,
+    reads_per_second: float,
+) -> float:
+    """Seconds that one run of the oracle by file takes.
+
+    Args:
+        make: makes a fresh simulated vehicle, which serves param.pck.
+        uplink, downlink: what lies between.
+        burst_rate: bytes per second of the vehicle's burst.
+        reads_per_second: what the vehicle or the link serves.
+    """
+    alone = _FileOracle(
+        Air([make()], uplink=TellingLink(), downlink=TellingLink()),
+        burst_seconds=0.0,
+        reads_per_second=reads_per_second,
+    )
+    alone.run()
+    assert alone.end is not None
+    return _FileOracle(
+        Air([make()], uplink=uplink, downlink=downlink),
+        burst_seconds=math.ceil(alone.end / MOST_DATA) * FILE_FRAME / burst_rate,
+        reads_per_second=reads_per_second,
+    ).run()

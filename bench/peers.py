@@ -5,8 +5,11 @@
 Simulated PX4 and ArduPilot vehicles speak over real UDP on loopback, each in a process of its own, behind a
 link that loses datagrams in both directions. Every client starts with nothing known and hears the vehicle
 first; then its time runs from asking until it has every value. What it got is compared with what the vehicle
-holds. Prints a Markdown table of the median seconds, each with its ratio to this library. A whole run takes
-about 20 minutes.
+holds. An ArduPilot "by file" serves its table over MAVFTP too, and whoever can fetch it as one file does.
+
+Prints a Markdown table of the median seconds, each with its ratio to this library, and below it the date, the
+machine and its load, to be pasted as it is; what goes on meanwhile goes to the standard error. A whole run
+takes about 25 minutes.
 
 MAVSDK and MAVProxy are in the dependency group `peers`; one that is not installed is named as such.
 """
@@ -78,17 +81,28 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Case:
-    """One vehicle behind one link."""
+    """One vehicle behind one link.
+
+    Attributes:
+        kind: of vehicle.
+        loss: the share of datagrams lost in each direction.
+        by_file: it serves its table as a file too.
+    """
 
     kind: str
     loss: float
+    by_file: bool = False
 
     @property
     def name(self) -> str:
-        return f"{self.kind} {f'{self.loss:.0%}' if self.loss else 'clean'}"
+        return f"{self.kind}{' by file' if self.by_file else ''} {self.link}"
+
+    @property
+    def link(self) -> str:
+        return f"{self.loss:.0%}" if self.loss else "clean"
 
     def vehicle(self) -> Vehicle:
-        return PX4Vehicle() if self.kind == "PX4" else ArduPilotVehicle(live_period=0.0)
+        return PX4Vehicle() if self.kind == "PX4" else ArduPilotVehicle(live_period=0.0, ftp=self.by_file)
 
     def air(self, seed: int) -> Air:
         return Air.symmetric(
@@ -108,7 +122,8 @@ def main() -> None:
         help="clients and cases whose names hold one of these",
     )
     arguments = parser.parse_args()
-    cases = [Case(kind, loss) for kind in ("PX4", "ArduPilot") for loss in LOSSES]
+    kinds = (("PX4", False), ("ArduPilot", False), ("ArduPilot", True))
+    cases = [Case(kind, loss, by_file) for kind, by_file in kinds for loss in LOSSES]
     clients = choose(list(CLIENTS), arguments.only)
     chosen = [case for case in cases if case.name in choose([case.name for case in cases], arguments.only)]
     results: dict[tuple[str, Case], list[Outcome]] = {}
@@ -117,6 +132,8 @@ def main() -> None:
     for seed in range(arguments.repeat):
         for case in chosen:
             for client in clients:
+                if case.by_file and not CLIENTS[client].fetches_files:
+                    continue
                 outcome = CLIENTS[client].run(case, seed, arguments.limit)
                 results.setdefault((client, case), []).append(outcome)
                 loads.append(os.getloadavg()[0])
@@ -143,16 +160,21 @@ def print_table(
     clients: list[str], cases: list[Case], results: Mapping[tuple[str, Case], list[Outcome]]
 ) -> None:
     notes: list[str] = []
-    heads = [f"{case.kind} ({len(case.vehicle().params)}), {case.name.partition(' ')[2]}" for case in cases]
-    print(f"| client | {' | '.join(heads)} |")
-    print(f"|---|{'---|' * len(cases)}")
-    for client in clients:
+    print(f"| vehicle, parameters, loss | {' | '.join(clients)} |")
+    print(f"|---|{'---|' * len(clients)}")
+    for case in cases:
         cells = []
-        for case in cases:
-            outcomes = results[client, case]
-            ours = results.get(("paramclient", case))
-            cells.append(cell(outcomes, ours) + "".join(mark(notes, note) for note in remarks(outcomes)))
-        print(f"| {client} | {' | '.join(cells)} |")
+        ours = results.get(("paramclient", case))
+        for client in clients:
+            outcomes = results.get((client, case))
+            if outcomes is None:
+                cells.append("has no way by file")
+            else:
+                cells.append(cell(outcomes, ours) + "".join(mark(notes, note) for note in remarks(outcomes)))
+        count = len(case.vehicle().params)
+        print(
+            f"| {case.kind}{' by file' if case.by_file else ''}, {count}, {case.link} | {' | '.join(cells)} |"
+        )
     if notes:
         print()
     for number, note in enumerate(notes, 1):
@@ -215,7 +237,7 @@ def installed(package: str) -> str:
 def flying(case: Case, seed: int) -> Iterator[tuple[int, Any]]:
     """A vehicle in a process of its own.
 
-    Gives the port that it speaks to, and a shared number: when it was first asked for its list.
+    Gives the port that it speaks to, and a shared number: when it was first asked for its list or file.
     """
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
@@ -236,12 +258,12 @@ def fly(case: Case, seed: int, port: int, asked_at: Any) -> None:
 
 
 class Watched:
-    """An endpoint that notes when the list was first asked for, before anything can be lost."""
+    """An endpoint that notes when its list or file was first asked for, before anything can be lost."""
 
     def __init__(self, air: Air, asked_at: Any) -> None:
         self._air = air
         self._asked_at = asked_at
-        self._framer = wire.Framer({21}, stream=False)
+        self._framer = wire.Framer({21, 110}, stream=False)
         self.tick = air.tick
         self.next_deadline = air.next_deadline
         self.data_to_send = air.data_to_send
@@ -261,9 +283,17 @@ class PythonClient:
     Args:
         package: what must be installed.
         fetch: takes the port and the seconds that it may take; gives those that it took, and the values.
+        fetches_files: whether it takes the table as one file where there is one.
     """
 
-    def __init__(self, package: str, fetch: Callable[[int, float], tuple[float, Values]]) -> None:
+    def __init__(
+        self,
+        package: str,
+        fetch: Callable[[int, float], tuple[float, Values]],
+        *,
+        fetches_files: bool = False,
+    ) -> None:
+        self.fetches_files = fetches_files
         self._package = package
         self._fetch = fetch
 
@@ -384,17 +414,20 @@ def fetch_with_mavsdk(port: int, limit: float) -> tuple[float, Values]:
 
 
 class MavProxy:
-    """MAVProxy, as a program of its own. It asks for the list by itself once it has heard the vehicle."""
+    """MAVProxy, as a program of its own. It asks by itself once it has heard the vehicle."""
+
+    fetches_files = True
 
     def run(self, case: Case, seed: int, limit: float) -> Outcome:
         if installed("MAVProxy") == "not installed":
             return Outcome(math.inf, "not installed")
         with tempfile.TemporaryDirectory() as folder, flying(case, seed) as (port, asked_at):
-            # without its module for MAVFTP it downloads by list
+            # with its module for MAVFTP it always tries the file first, without it downloads by list
+            modules = "ftp,param" if case.by_file else "param"
             command = [sys.executable, "-m", "MAVProxy.mavproxy", f"--master=udpin:127.0.0.1:{port}"]
             command += [
                 "--non-interactive",
-                "--default-modules=param",
+                f"--default-modules={modules}",
                 f"--state-basedir={folder}",
                 "--aircraft=bench",
             ]
@@ -433,7 +466,7 @@ class MavProxy:
 
 
 CLIENTS: dict[str, PythonClient | MavProxy] = {
-    "paramclient": PythonClient("paramclient", fetch_with_paramclient),
+    "paramclient": PythonClient("paramclient", fetch_with_paramclient, fetches_files=True),
     "pymavlink, the usual loop": PythonClient("pymavlink", fetch_with_pymavlink),
     "MAVSDK": PythonClient("mavsdk", fetch_with_mavsdk),
     "MAVProxy": MavProxy(),

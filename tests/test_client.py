@@ -35,6 +35,7 @@ from paramclient import (
     ValueNotApplied,
 )
 from paramclient import client as client_module
+from paramclient.component import IDENTITY_PATIENCE
 from paramclient.links import Peer, create_link, serve_endpoint
 from paramclient.protocol import wire
 from paramclient.protocol.station import Station
@@ -768,13 +769,14 @@ async def test_a_fetch_whose_time_is_over_gives_what_came() -> None:
 
 @swiftly
 async def test_a_fetch_brings_every_parameter() -> None:
-    for vehicle in (small_px4(), generic(), ArduPilotVehicle()):
+    by_list = (small_px4(), generic(), ArduPilotVehicle(ftp=False))
+    for vehicle in (*by_list, ArduPilotVehicle()):
         async with a_client(vehicle) as client:
             component = await client.component()
             assert component.state == "new"
             result = await component.fetch_all()
             assert result.complete
-            assert result.source == ("ftp" if isinstance(vehicle, ArduPilotVehicle) else "stream")
+            assert result.source == ("stream" if vehicle in by_list else "ftp")
             assert bits(result.params) == bits(vehicle.params)
             assert component.params == result.params
             assert (component.state, component.count) == ("synced", len(vehicle.params))
@@ -784,6 +786,35 @@ async def test_a_fetch_brings_every_parameter() -> None:
                 == (vehicle.announced_hash() if isinstance(vehicle, PX4Vehicle) else None)
             )
             assert component.round_trip is not None
+
+
+@swiftly
+@pytest.mark.parametrize("refresh", [False, True])
+async def test_a_first_fetch_waits_to_hear_whether_there_is_a_file(refresh: bool) -> None:
+    """The list of ArduPilot takes several times longer, on a radio ten times."""
+    for of_all in (False, True):
+        async with a_client(Air.symmetric([ArduPilotVehicle()], delay=0.2)) as client:
+            component = await client.component()
+            assert component.identity.uid is None  # it has not said who it is yet
+            if of_all:
+                results = (await client.fetch_all(refresh=refresh)).results
+                assert [result.source for result in results.values()] == ["ftp"]
+            else:
+                assert (await component.fetch_all(refresh=refresh)).source == "ftp"
+
+
+@swiftly
+async def test_a_first_fetch_does_not_wait_for_long_to_hear_that() -> None:
+    class Unknown(ArduPilotVehicle):
+        def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
+            """It never says who it is."""
+
+    async with a_client(Unknown()) as client:
+        component = await client.component()
+        began = anyio.current_time()
+        result = await component.fetch_all()
+        assert (result.complete, result.source) == (True, "stream")
+        assert anyio.current_time() - began < IDENTITY_PATIENCE + 2.0  # simulated seconds
 
 
 @swiftly

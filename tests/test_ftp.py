@@ -724,6 +724,20 @@ class TestHaste:
         desk.answer(burst, code=FileErrorCode.EOF, offset=5, nth=2)
         assert read.result == b"abcde"
 
+    def test_nor_where_requests_were_repeated_and_nothing_was_measured(self) -> None:
+        """The round trip is longer than the first time-out: what came before got its answer too late."""
+        desk = Desk()
+        desk.round_trip.answered(2.0, 2.5, 3)
+        read = desk.transfers.read("a", desk.now)
+        first, _, burst = desk.take()
+        assert (burst.opcode, burst.session) == (Opcode.BURST_READ_FILE, first.session)
+        desk.pass_time(2.5)
+        assert {packet.sequence for packet in desk.take()} == {first.sequence}
+        desk.answer(first, (5).to_bytes(4, "little"))
+        desk.answer(burst, b"abcde")
+        desk.answer(burst, code=FileErrorCode.EOF, offset=5, nth=2)
+        assert read.result == b"abcde"
+
     def test_a_server_that_gives_another_session_is_asked_anew(self) -> None:
         desk = self.known_link()
         read = desk.transfers.read("a", desk.now)

@@ -372,7 +372,7 @@ def test_where_much_is_silent_the_controls_tell_how_good_the_link_is() -> None:
         if CONTROL in desk.take():
             desk.hear("P0", index=CONTROL)
     assert read.done
-    assert read.attempts < 15
+    assert 9 < read.attempts < 15  # five answered controls of five are no proof of a link that loses nothing
 
 
 def test_what_a_list_may_have_brought_is_no_answered_control() -> None:
@@ -445,7 +445,7 @@ def test_answered_controls_end_what_stays_silent_soon() -> None:
     silent = [desk.ask(index) for index in range(20, 50)]
     desk.pass_time()
     assert all(isinstance(read.error, NoReply) for read in silent)
-    assert max(read.attempts for read in silent) == FEWEST_TRIES < desk.round_trip.tries
+    assert FEWEST_TRIES <= max(read.attempts for read in silent) <= FEWEST_TRIES + 1 < desk.round_trip.tries
     assert desk.now < 10.0
 
 

@@ -33,7 +33,7 @@ that answers no reads at all: where two exchanges of three are lost, it comes to
 FEWEST_CONTROLS: Final = 3
 BAD_LUCK: Final = 1e-6
 """Answered controls, at the least, and the chance of bad luck below which a silence is the component's doing,
-by the share of the controls that were answered. Where much is silent, no other share tells of the link."""
+by the controls that were answered. Where much is silent, nothing else tells of the link."""
 ENOUGH_CONTROLS: Final = 4
 """Answered controls, at the least, after which a silence is the component's and not the link's."""
 
@@ -272,13 +272,23 @@ class Reads:
             self._silences >= SILENCES_TO_GIVE_UP and is_mute
         ):
             return True  # not one of all these was answered
-        if read.controls >= FEWEST_CONTROLS and read.attempts >= FEWEST_TRIES:
-            lost = 1 - (self._controls_answered + 0.5) / (self._controls_sent + 1)
-            if lost**read.attempts < BAD_LUCK:
-                return True
+        are_enough = read.controls >= FEWEST_CONTROLS and read.attempts >= FEWEST_TRIES
+        if are_enough and self._bad_luck(read.attempts) < BAD_LUCK:
+            return True
         # half as often will do where nothing speaks for it and the link is good enough for others
         weight = 2 if self._seems_unknown(read) else 1
         return self._round_trip.is_hopeless(weight * read.attempts, now)
+
+    def _bad_luck(self, attempts: int) -> float:
+        """The chance that so many reads in a row get lost, by what became of the controls.
+
+        It is reckoned by the rule of succession: ten of ten that were answered are no proof of a link that
+        loses nothing, where so many reads ask that the luckiest ten and the unluckiest read come together.
+        """
+        lost = self._controls_sent - self._controls_answered
+        return math.prod(
+            (lost + 1 + before) / (self._controls_sent + 2 + before) for before in range(attempts)
+        )
 
     def _seems_unknown(self, read: Read) -> bool:
         return read.controls >= ENOUGH_CONTROLS and not self._is_known(read.key)

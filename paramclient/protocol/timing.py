@@ -58,6 +58,7 @@ class RoundTrip:
         "_samples",
         "_silences",
         "_unanswered",
+        "_was_answered",
         "heard_at",
         "smoothed",
         "variation",
@@ -72,6 +73,15 @@ class RoundTrip:
         self._silences = 0  # time-outs since the last sample
         self._answered = 0.0
         self._unanswered = 0.0
+        self._was_answered = False
+
+    @property
+    def is_guessed(self) -> bool:
+        """Whether answers have come, but only to what was asked for repeatedly, so that nothing is measured.
+
+        The way is then longer than the first time-out, or much is lost on it.
+        """
+        return self.smoothed is None and self._was_answered
 
     @property
     def timeout(self) -> float:
@@ -128,6 +138,7 @@ class RoundTrip:
 
     def answered(self, sent_at: float, now: float, attempts: int) -> None:
         """A request got its answer; it had been sent `attempts` times, the last time at `sent_at`."""
+        self._was_answered = True
         if attempts <= 2:
             self._answered = self._answered * MEMORY + 1
             self._unanswered *= MEMORY

@@ -126,7 +126,9 @@ class FileRead(Job[bytes]):
 
     def begin(self, now: float) -> None:
         round_trip = self._line.round_trip
-        if round_trip.smoothed is not None and round_trip.seen_loss < COPY_RISK:
+        is_good = round_trip.smoothed is not None and round_trip.seen_loss < COPY_RISK
+        # where the round trip is a guess, what waits for the answer before it may wait for several time-outs
+        if is_good or round_trip.is_guessed:
             self._begin_early(now)
         else:
             self._open_file(Opcode.OPEN_FILE_RO, self._opened, now)
