@@ -12,8 +12,8 @@ from paramclient import ClientClosed, NoReply, ParamClient, UsageError
 from paramclient.errors import FileErrorCode, FileTransferError, LinkError
 from paramclient.ftp import Ftp
 from paramclient.protocol.ftp import DirectoryEntry
-from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
-from paramclient.values import crc32_px4
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
+from paramclient.values import ParamType, crc32_px4
 from tests.shell import FlakyLink, Tap, a_client, outcome, swiftly, tasks_beside
 
 LOG = bytes(range(256)) * 200
@@ -224,3 +224,16 @@ async def test_a_bad_link_only_takes_longer() -> None:
         assert await files.read("/APM/LOGS/1.BIN") == LOG
         await files.write("/APM/new", LOG[:3000])
         assert vehicle.files["/APM/new"] == LOG[:3000]
+
+
+@swiftly
+async def test_a_neighbour_of_a_large_integer_can_be_set() -> None:
+    big = (1 << 24) + 1
+    vehicle = ArduPilotVehicle(table=[SimParam("BIG", ParamType.INT32, big)], live_period=0)
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        await component.fetch_all()
+        assert component.params["BIG"].value == big
+        result = await component.set("BIG", big - 1)
+        assert (result.status, result.actual) == ("accepted", big - 1)
+        assert component.params["BIG"].value == vehicle.params["BIG"].value == big - 1

@@ -7,7 +7,7 @@ import pytest
 from paramclient.protocol import table as room
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.wire import ParamValue
-from paramclient.values import Encoding, ParamType, Trust, px4_hash
+from paramclient.values import Encoding, Param, ParamType, Trust, as_sent, px4_hash
 from tests.simulation import known, param_value
 
 
@@ -294,6 +294,47 @@ def test_a_message_that_rounds_an_exact_integer_changes_nothing(is_doubted: bool
     assert change is not None
     assert table.params["A"].value == BIG - 3
     assert table.params["A"].default == 7
+
+
+def test_a_message_that_says_what_was_written_rounds_nothing() -> None:
+    table = Table(Encoding.C_CAST)
+    table.take("A", ParamType.INT32, BIG, 3, 7, is_older=False)
+    written = param_value("A", BIG - 1, index=3, kind=ParamType.INT32, encoding=Encoding.C_CAST)
+    change = table.hear(written, "us", is_exact=True)
+    assert change is not None
+    assert (table.params["A"].value, table.params["A"].default) == (BIG - 1, 7)
+
+
+@pytest.mark.parametrize("first", list(Encoding))
+def test_what_a_file_says_is_the_same_in_every_encoding(first: Encoding) -> None:
+    second = Encoding.C_CAST if first is Encoding.BYTEWISE else Encoding.BYTEWISE
+    table = Table(first)
+    table.take("A", ParamType.INT32, BIG, 0, 7, is_older=False)
+    table.take("B", ParamType.INT16, 5, 1, 7, is_older=False)
+    table.take("C", ParamType.INT16, 5, 2, 7, is_older=False)
+    table.hear(param_value("C", 6, index=2, kind=ParamType.INT16, encoding=second), "vehicle")
+    changes = table.use_encoding(second)
+    assert {change.name for change in changes} == {"C"}
+    assert [table.params[name].value for name in "ABC"] == [BIG, 5, 6]
+    heard = ParamValue("A", as_sent(BIG, ParamType.INT32, second), ParamType.INT32, 3, 0)
+    assert table.hear(heard, "vehicle") is None
+    assert table.params["A"].value == BIG
+
+
+def test_the_cache_adds_what_a_message_that_came_before_it_did_not_say() -> None:
+    cached = {
+        "A": Param("A", BIG, ParamType.INT32, 0, BIG, Trust.CACHED, 7),
+        "B": Param("B", 5, ParamType.INT32, 1, 5, Trust.CACHED, 5),
+        "C": Param("C", 5, ParamType.INT16, 2, 5, Trust.CACHED, 5),
+    }
+    table = Table(Encoding.C_CAST)
+    for index, (name, value) in enumerate({"A": BIG, "B": 6, "C": 5}.items()):
+        raw = as_sent(value, ParamType.INT32, Encoding.C_CAST)
+        table.hear(ParamValue(name, raw, ParamType.INT32, 3, index), "vehicle")
+    changes = table.fill(cached)
+    assert [change.name for change in changes] == ["A"]
+    assert [(param.value, param.default) for param in table.params.values()] == [(BIG, 7), (6, 5), (5, None)]
+    assert {param.trust for param in table.params.values()} == {Trust.LIVE}
 
 
 def test_a_byte_wise_integer_is_what_the_message_says() -> None:

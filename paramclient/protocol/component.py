@@ -448,7 +448,7 @@ class ComponentMachine:
         authors = self._authors
         is_ours = bool(self.writes.queues) and name in self.writes
         by = "us" if is_ours else authors.of(name, now) if authors.foreign_sets else "vehicle"
-        change = table.hear(message, by)
+        change = table.hear(message, by, is_exact=is_ours and self.writes.wants(message))
         if change is not None:
             authors.changed(name, now, is_ours)
             self.sync.changed(change)

@@ -67,6 +67,7 @@ class Table:
         self._hash_is_stale = False
         self._encoding = encoding
         self._wire: dict[str, bytes] = {}  # the four bytes as they came, for another encoding
+        self._filed: set[str] = set()  # whose value came in a file, which has no such encoding
 
     @property
     def encoding(self) -> Encoding:
@@ -103,11 +104,17 @@ class Table:
         """Values may have moved under the confirmed hash: compute it again when it is asked for."""
         self._hash_is_stale = self._hash is not None
 
-    def hear(self, message: ParamValue, by: str) -> Change | None:
+    def hear(self, message: ParamValue, by: str, *, is_exact: bool = False) -> Change | None:
         """Take one PARAM_VALUE; give the change if it brought one (a first value is one).
 
         The value counts whatever the index says. An index of 65535 leaves the known one as it is, one that
         is not below the count is no index.
+
+        Args:
+            message: what came.
+            by: who did it, as in `Change`.
+            is_exact: whether it says what was just written, so that it cannot stand for an integer that it
+                would round.
         """
         name, raw, number, count, given = message
         index: int | None = given
@@ -121,17 +128,21 @@ class Table:
         if old is None:
             if len(self.params) >= MOST_NAMES:
                 return None
-        elif old.type == number and self._wire.get(name) == raw:
+        elif old.type == number and self._wire.get(name) == raw and not is_exact:
             if old.index != index:
                 self.params[name] = Param(name, old.value, old.type, index, old.bits, Trust.LIVE, old.default)
                 self.dirty.setdefault(name, by)
             return None
         value, bits = decode(raw, number, self._encoding)
         default: Value | None = None
+        is_rounded = False
         if old is not None and old.type == number:
             default = old.default
-            if self._rounds(old, raw):
-                value, bits = old.value, old.bits
+            is_rounded = not is_exact and self._rounds(old, raw)
+        if is_rounded and old is not None:
+            value, bits = old.value, old.bits
+        elif self._filed:
+            self._filed.discard(name)
         new = Param(name, value, known_type(number), index, bits, _LIVE, default)
         self.params[name] = new
         self._wire[name] = raw
@@ -168,6 +179,7 @@ class Table:
             return None
         new = self.params[name] = Param(name, from_bits(bits, number), kind, index, bits, _LIVE, initial)
         self._wire[name] = raw
+        self._filed.add(name)
         if old is None or old.index != index or old.default != initial:
             self.dirty.setdefault(name, "vehicle")
         if old is not None and old.same_value(new):
@@ -184,6 +196,9 @@ class Table:
         changes = []
         for name, raw in self._wire.items():
             old = self.params[name]
+            if name in self._filed:
+                self._wire[name] = as_sent(old.bits, old.type, encoding)
+                continue
             value, bits = decode(raw, old.type, encoding)
             new = Param(name, value, old.type, old.index, bits, old.trust, old.default)
             self.params[name] = new
@@ -232,13 +247,19 @@ class Table:
     def fill(self, params: Mapping[str, Param], *, placed: bool = True) -> list[Change]:
         """Put in what the cache knows, as *cached*; what was heard on this link stays.
 
+        To that it adds the firmware's default, and an integer that the message has rounded.
+
         Args:
             params: the cached table.
             placed: whether its indices are still worth anything.
         """
         changes = []
         for name, param in params.items():
-            if name not in self.params:
+            old = self.params.get(name)
+            if old is not None:
+                if old.type == param.type and name not in self._filed:
+                    changes += self._complement(old, param)
+            else:
                 new = param.with_trust(Trust.CACHED)
                 if not placed and new.index is not None:
                     new = self._displaced(new)
@@ -316,6 +337,7 @@ class Table:
         for param in gone:
             del self.params[param.name]
             self._wire.pop(param.name, None)
+            self._filed.discard(param.name)
             self.dirty[param.name] = "vehicle"
             if self._hash is not None:
                 self._moved(param.name)
@@ -355,6 +377,19 @@ class Table:
         """Names that changed since the last call, each with who did it; gone names too."""
         dirty, self.dirty = self.dirty, {}
         return dirty
+
+    def _complement(self, heard: Param, cached: Param) -> list[Change]:
+        """Add to what was heard what its message does not say."""
+        new = heard if heard.default is not None else replace(heard, default=cached.default)
+        if self._rounds(cached, self._wire.get(heard.name, b"")):
+            new = replace(new, value=cached.value, bits=cached.bits)
+        self.params[heard.name] = new
+        if new.default != heard.default:
+            self.dirty.setdefault(heard.name, "vehicle")
+        if heard.same_value(new):
+            return []
+        self.dirty.setdefault(heard.name, "vehicle")
+        return [Change(heard.name, heard, new)]
 
     def _rounds(self, known: Param, raw: bytes) -> bool:
         """Whether a message rounds what is known exactly: an integer beyond the 24 bits of a float32."""

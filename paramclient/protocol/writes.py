@@ -146,6 +146,14 @@ class Writes:
             if queue and not queue[0].attempts and queue[0].read is None:
                 self._start(queue[0], now)
 
+    def wants(self, message: ParamValue) -> bool:
+        """Whether a PARAM_VALUE says what the PARAM_SET under way to its name has said."""
+        write = self._active(message.param_id)
+        wanted = None if write is None else write.wanted
+        if wanted is None or wanted.type != message.param_type:
+            return False
+        return wanted.bits == decode(message.raw, message.param_type, self._encoding())[1]
+
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here after it went into the table."""
         queue = self.queues.get(message.param_id)
