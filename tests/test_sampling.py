@@ -19,7 +19,7 @@ from paramclient.protocol.sampling import SAMPLE_SIZE, Sample
 from paramclient.protocol.station import Station
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
-from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle
 from tests.shell import Tap, bits, swiftly
 from tests.simulation import Memory, Simulation
 
@@ -152,6 +152,29 @@ def test_a_reboot_meanwhile_makes_it_worthless() -> None:
     result = session.outcome(fetch)
     assert result.sample is None
     assert result.source in ("ftp", "stream")
+
+
+def test_another_firmware_after_a_reboot_is_not_sampled() -> None:
+    vehicle = ArduPilotVehicle(live_period=0)
+    first = Simulation(vehicle)
+    first.fetch()
+    for sampled_at in ("once it is heard", "while it is asked who it is"):
+        session = Simulation(air=Air.symmetric([vehicle], delay=0.05))
+        machine = session.meet()
+        session.run(5.0)
+        machine.use_cached(now=session.now, **first.memory())
+        machine.fetches.is_same_firmware = True
+        version = vehicle._version
+        assert version is not None
+        vehicle._version = replace(version, git_hash=version.git_hash[::-1])
+        if sampled_at == "once it is heard":
+            vehicle.reboot(session.now, down=1.0)
+            session.until(lambda: machine.who.is_doubted)
+        else:
+            machine.who.ask_again(session.now)
+        fetch = machine.begin_fetch(session.now, sampled=Sampled(SAMPLE_SIZE, 1))
+        result = session.outcome(fetch)
+        assert (result.source, result.sample) == ("ftp", None), sampled_at
 
 
 @pytest.mark.parametrize("policy", [Policy.HASH_ONLY, Policy.CACHE_ONLY])

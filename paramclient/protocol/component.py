@@ -177,7 +177,7 @@ class ComponentMachine:
             if self.who.version(message, now):
                 self._another(now)
             elif before not in (None, self.who.firmware):
-                self.fetches.updated()
+                self.fetches.updated(now)
         elif isinstance(message, ParamError):
             addressee = (message.target_system, message.target_component)
             if addressee in (self._own, (0, 0)) and not self.writes.refused(message, now):

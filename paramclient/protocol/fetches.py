@@ -78,6 +78,7 @@ class Fetches:
             (refresh and fetch.is_about_the_cache) or (sampled is None and fetch.is_sampling)
         ):
             fetch.restart(now)
+        may_sample = self.is_same_firmware and self._policy is Policy.AUTO and not self._sync.is_doubted
         if fetch is None:
             fetch = self.current = Fetch(
                 self._means,
@@ -87,7 +88,7 @@ class Fetches:
                 listed=listed,
                 policy=self._policy,
                 may_use_file=self.may_use_file,
-                sampled=sampled if self.is_same_firmware and self._policy is Policy.AUTO else None,
+                sampled=sampled if may_sample else None,
             )
             if fetch.done:
                 self._fetch_ended(fetch)
@@ -109,10 +110,12 @@ class Fetches:
         self.file_works = self._file_took = None
         self.is_same_firmware = False
 
-    def updated(self) -> None:
-        """The vehicle has another firmware now."""
+    def updated(self, now: float) -> None:
+        """The vehicle has another firmware now, of which no sample says anything."""
         self._means.table.forget_defaults()
         self.forget()
+        if self.current is not None and self.current.is_sampling:
+            self.current.restart(now)
 
     def _fetch_ended(self, fetch: Fetch) -> None:
         self.current = None

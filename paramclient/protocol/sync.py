@@ -175,6 +175,11 @@ class Sync:
         return not self._has_no_hash and (self.announced is not None or self._is_px4())
 
     @property
+    def is_doubted(self) -> bool:
+        """Whether it is open who the component is."""
+        return self._is_doubted()
+
+    @property
     def is_settling(self) -> bool:
         """Whether the hash after a write of ours has not come yet."""
         return self._settle_at < math.inf or HASH_CHECK in self._reads
