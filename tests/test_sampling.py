@@ -169,7 +169,7 @@ def test_another_firmware_after_a_reboot_is_not_sampled() -> None:
         vehicle._version = replace(version, git_hash=version.git_hash[::-1])
         if sampled_at == "once it is heard":
             vehicle.reboot(session.now, down=1.0)
-            session.until(lambda: machine.who.is_doubted)
+            session.until(lambda: machine.who.is_doubted)  # noqa: B023 - called at once
         else:
             machine.who.ask_again(session.now)
         fetch = machine.begin_fetch(session.now, sampled=Sampled(SAMPLE_SIZE, 1))
