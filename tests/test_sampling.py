@@ -52,6 +52,7 @@ def test_a_sample_that_agrees_settles_it() -> None:
     result = session.outcome(sampled(session))
     assert (result.source, result.complete, result.hash) == ("cache", True, None)
     assert result.sample == Sample(SAMPLE_SIZE, 200)
+    assert result.sampled
     assert result.sample.agrees
     assert len(result.notes) == 1
     assert len(set(read(session))) == SAMPLE_SIZE
@@ -95,7 +96,7 @@ def test_a_sample_of_everything_is_everything() -> None:
 def test_what_does_not_agree_leads_to_the_whole_table(vehicle: GenericVehicle, why: str) -> None:
     session = Simulation(vehicle)
     result = session.outcome(sampled(session, size=200))
-    assert (result.source, result.complete, result.sample) == ("stream", True, None)
+    assert (result.source, result.complete, result.sampled) == ("stream", True, False)
     assert why in result.notes[0]
     assert result.notes[0].startswith("The sample did not confirm the cached table: ")
     assert bits(result.params) == bits(vehicle.params)

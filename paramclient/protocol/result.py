@@ -154,6 +154,11 @@ class FetchResult:
         return not self.missing
 
     @property
+    def sampled(self) -> bool:
+        """Whether a sample of the cached table settled it, so that nothing of it is *verified*."""
+        return self.sample is not None
+
+    @property
     def has_moved(self) -> bool:
         """Whether the vehicle's hash has told that the table moved while it came: it may be a mixture."""
         return MOVED in self.notes
