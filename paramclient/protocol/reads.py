@@ -139,8 +139,9 @@ class Reads:
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here after it went into the table."""
+        name, _, _, count, index = message
         wanted = self._open
-        for read in (wanted.get(message.param_id), wanted.get(message.param_index)) if wanted else ():
+        for read in (wanted.get(name), wanted.get(index)) if wanted else ():
             if read is None or wanted.get(read.key) is not read:
                 continue
             if read.attempts:
@@ -148,9 +149,9 @@ class Reads:
             self._drop(read)
             read.finish(message, now)
             self._send_waiting(now)
-        if message.param_index < message.param_count:
-            self.control = message.param_index  # it exists, and is answered
-        if message.param_index == self._control_index and self._control_at < math.inf:
+        if index < count:
+            self.control = index  # it exists, and is answered
+        if index == self._control_index and self._control_at < math.inf:
             # one that was lost may have nobody left to ask again; then this is not its answer
             is_late = now - self._control_at > 2 * self._round_trip.timeout
             self._round_trip.answered(self._control_at, now, self._control_attempts + is_late)
