@@ -47,7 +47,7 @@ MOST_MEMORY = 300
 
 TELEMETRY = 2_000
 """Frames a second for the client that listens."""
-WARM_UP = 5.0
+WARM_UP = 9.0
 """Seconds before its CPU time is read first: until then it asks the component, in vain, who it is."""
 
 
