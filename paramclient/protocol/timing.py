@@ -132,10 +132,6 @@ class RoundTrip:
         is_gone = now - self.heard_at >= LONGEST_SILENCE
         return attempts >= self.tries or (is_gone and attempts >= FEWEST_TRIES)
 
-    def is_sure(self, attempts: int) -> bool:
-        """Whether so many tries are enough by more than a guess: by more than a few answers and silences."""
-        return self._answered + self._unanswered > ENOUGH_SEEN and attempts >= self.tries
-
     def answered(self, sent_at: float, now: float, attempts: int) -> None:
         """A request got its answer; it had been sent `attempts` times, the last time at `sent_at`."""
         self._was_answered = True
