@@ -34,11 +34,20 @@ MAY_IMPORT = {
     "sim": {"errors", "values", "protocol.wire", "protocol.ftp.packets", "protocol.pack", "sim"},
     "links": {"errors", "values", "sim", "links"},
     "cache": {"errors", "values", "identity", "params", "paramset", "cache"},
+    "provision.cautions": {"errors"},
+    "provision.nearest": set[str](),
+    "provision.plan": {
+        *("errors", "values", "identity", "params", "paramset"),
+        *("provision.cautions", "provision.nearest"),
+    },
 }
 """Which rooms of the package a room may know; the longest name that fits counts. A room that is not named
 here belongs to the shell: it may know all of these and the rest of the shell, and none of these knows it."""
 
-PURE = ("errors", "values", "params", "paramset", "identity", "protocol", "sim")
+PURE = (
+    *("errors", "values", "params", "paramset", "identity", "protocol", "sim"),
+    *("provision.plan", "provision.nearest"),
+)
 """Rooms without input and output: time comes in as an argument, bytes as bytes."""
 
 IMPURE_MODULES = {
@@ -124,7 +133,8 @@ def room_of(module: str) -> str:
 
 
 def is_pure(module: str) -> bool:
-    return room_of(module).split(".")[0] in PURE
+    room = room_of(module)
+    return room in PURE or room.split(".")[0] in PURE
 
 
 def is_command(module: str) -> bool:
