@@ -4,6 +4,7 @@ The tree says who is to blame::
 
     ParamClientError
     ├── UsageError(ValueError)        the caller: a name, value, link name or argument that cannot be right
+    │   └── MetadataError             a description of parameters that is none
     ├── VehicleError                  the vehicle answered, and the answer is no
     │   ├── UnknownParameter          it has no parameter of that name or index
     │   ├── Refused                   it gave a reason: PARAM_ERROR, or ArduPilot's text
@@ -29,6 +30,7 @@ __all__ = [
     "FileErrorCode",
     "FileTransferError",
     "LinkError",
+    "MetadataError",
     "NoReply",
     "PackError",
     "ParamClientError",
@@ -94,6 +96,18 @@ class ParamClientError(Exception):
 
 class UsageError(ParamClientError, ValueError):
     """The caller asked for something that cannot be right. Nothing was sent."""
+
+
+class MetadataError(UsageError):
+    """A file that should describe parameters does not, or lies where it is not fetched from.
+
+    Attributes:
+        source: the file or the place, in words.
+    """
+
+    def __init__(self, message: str, *, source: str) -> None:
+        super().__init__(message)
+        self.source = source
 
 
 class VehicleError(ParamClientError):

@@ -12,6 +12,7 @@ from paramclient.errors import (
     FileErrorCode,
     FileTransferError,
     LinkError,
+    MetadataError,
     NoReply,
     PackError,
     ParamClientError,
@@ -29,6 +30,7 @@ from paramclient.errors import (
     ("kind", "base"),
     [
         (UsageError, ValueError),
+        (MetadataError, UsageError),
         (UnknownParameter, VehicleError),
         (Refused, VehicleError),
         (TypeMismatch, VehicleError),
