@@ -47,7 +47,7 @@ HEARING_PATIENCE: Final = 10.0
 """Seconds to wait for a first component, unless the caller says otherwise."""
 LISTENING_TIME: Final = 1.2
 """Seconds from opening in which every component has been heard: each sends a heartbeat once a second."""
-REST: Final = 0.01
+REST: Final = 0.02
 """Seconds for which the reader lets telemetry pile up while nobody waits for an answer: to take 20 datagrams
 at once costs a fifth of taking them one by one, and a change that comes meanwhile is told that much later."""
 MOST_PER_REST: Final = 64
