@@ -16,7 +16,7 @@ from paramclient.protocol.station import Station
 
 __all__ = ["Carrier"]
 
-REST: Final = 0.01
+REST: Final = 0.02
 """Seconds for which the reader lets telemetry pile up while nobody waits for an answer: to take 20 datagrams
 at once costs a fifth of taking them one by one, and a change that comes meanwhile is told that much later."""
 MOST_PER_REST: Final = 64
