@@ -22,6 +22,7 @@ from paramclient.protocol.wire import (
     NO_INDEX,
     AutopilotVersion,
     CommandAck,
+    ComponentMetadata,
     FileTransfer,
     Heartbeat,
     HighLatency2,
@@ -64,6 +65,7 @@ class ComponentMachine(Parts):
         presence: whether it is there.
         sync: whether the table is still the vehicle's.
         files: its files.
+        descriptions: where it says that what it has to say of itself lies.
         fetches: what was and is being fetched.
     """
 
@@ -96,6 +98,7 @@ class ComponentMachine(Parts):
                 self.reads.refused(message, now)
         elif isinstance(message, CommandAck):
             self.who.acknowledged(message, now)
+            self.descriptions.acknowledged(message, now)
         elif isinstance(message, StatusText):
             denied = _WRITE_DENIED.search(message.text)
             if denied:
@@ -105,6 +108,8 @@ class ComponentMachine(Parts):
                 self._rebooted(now)
         elif isinstance(message, FileTransfer):
             self.files.heard(message, now)
+        elif isinstance(message, ComponentMetadata):
+            self.descriptions.heard(message, now)
         elif isinstance(message, HighLatency2):
             self.who.heartbeat(message)
             self.presence.high_latency()
@@ -226,6 +231,7 @@ class ComponentMachine(Parts):
         if self.fetch is not None:
             self.fetch.tick(now)
         self.who.tick(now)
+        self.descriptions.tick(now)
         self._follow_identity(now)
         self.sync.tick(now)
         for name in self._authors.doubted(now):
@@ -240,6 +246,7 @@ class ComponentMachine(Parts):
             self.files.next_deadline(),
             math.inf if self.fetch is None else self.fetch.next_deadline(),
             self.who.next_deadline(),
+            self.descriptions.next_deadline(),
             self.sync.next_deadline(),
             self.presence.lost_at(),
             self._authors.next_deadline(),
@@ -256,6 +263,7 @@ class ComponentMachine(Parts):
         self.reads.resume(now)
         self.writes.resume(now)
         self.files.resume(now)
+        self.descriptions.resume(now)
         if self.fetch is not None:
             self.fetch.resume(now)
 
@@ -267,6 +275,7 @@ class ComponentMachine(Parts):
         if self.sync.refresh is not None:
             self.sync.refresh.fail(error, now)
         self.files.fail_all(error, now)
+        self.descriptions.fail_all(error, now)
         self.writes.fail_all(error, now)
         self.reads.fail_all(error, now)
         self.sync.stop()
@@ -337,6 +346,7 @@ class ComponentMachine(Parts):
         self.writes.lose(now)
         self.reads.lose(now)
         self.files.lose(now)
+        self.descriptions.lose(now)
         self._doubt()
 
     def _was_silent(self, silence: float, now: float) -> None:

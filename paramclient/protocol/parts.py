@@ -7,6 +7,7 @@ from collections.abc import Callable
 
 from paramclient.identity import Identity
 from paramclient.protocol.authors import Authors
+from paramclient.protocol.descriptions import Descriptions
 from paramclient.protocol.events import Event
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.fetches import Fetches
@@ -82,6 +83,9 @@ class Parts(ABC):
             begin_fetch=lambda now, refresh: self.begin_fetch(now, refresh=refresh),
             end_fetch=self.end_fetch,
             resynced=self._resynced,
+        )
+        self.descriptions = Descriptions(
+            target, own, self.round_trip, send, is_identifying=lambda: self.who.is_asking
         )
         self.files = FileTransfers(target, own, self.round_trip, send)
         self.fetches = Fetches(
@@ -172,7 +176,7 @@ class Parts(ABC):
     def is_waiting(self) -> bool:
         """Whether anything is awaited: an answer, a fetch, a file, or who it is."""
         is_asked = len(self.reads) > 0 or len(self.writes) > 0 or not self.files.is_idle
-        return is_asked or self.fetch is not None or self.who.is_asking
+        return is_asked or self.fetch is not None or self.who.is_asking or self.descriptions.is_asking
 
     @property
     def is_settling(self) -> bool:
