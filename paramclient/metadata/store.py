@@ -48,6 +48,14 @@ class MetadataStore:
     def __repr__(self) -> str:
         return f"<MetadataStore {self.folder}>"
 
+    @property
+    def has_notes(self) -> bool:
+        """Whether anything is kept for any firmware."""
+        try:
+            return any(path.suffix == _NOTES for path in self.folder.iterdir())
+        except OSError:
+            return False
+
     def get(self, crc: int) -> bytes | None:
         """A file as the vehicle has it, or None where it is not here."""
         path = self._file(crc)
@@ -105,7 +113,7 @@ class MetadataStore:
             identity.product_id,
             component,
         )
-        return self.folder / f"{hashlib.sha256(repr(what).encode()).hexdigest()[:16]}.firmware"
+        return self.folder / f"{hashlib.sha256(repr(what).encode()).hexdigest()[:16]}{_NOTES}"
 
     def _read(self, path: Path) -> bytes | None:
         try:
@@ -162,4 +170,5 @@ def has_checksum(content: bytes, crc: int) -> bool:
         return False
 
 
+_NOTES: Final = ".firmware"
 _NOTE: Final = re.compile(rb"[0-9a-f]{8}\n")

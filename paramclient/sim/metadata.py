@@ -93,7 +93,7 @@ _KNOWN: Final[dict[str, dict[str, Any]]] = {
     },
     "MC_ROLL_P": {
         "shortDesc": "Gain from the error of the roll angle to the roll rate",
-        "longDesc": "The rate that is wanted per unit of error. Higher reacts quicker and swings sooner.",
+        "longDesc": "The rate per unit of error. Higher reacts quicker and swings sooner.",
         "units": "1/s",
         "min": 0,
         "max": 12,
