@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import math
 from types import MappingProxyType
-from typing import Final, TypeVar
+from typing import Annotated, Final, NotRequired, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, with_config
+from typing_extensions import TypedDict  # pydantic, whose own it is, takes no other before Python 3.12
 
 from paramclient.errors import MetadataError
 from paramclient.metadata.info import MOST_BITS, Metadata, ParamInfo
@@ -20,28 +21,34 @@ __all__ = ["MetadataFile", "read_general", "read_parameters", "told", "whole"]
 
 MOST_PARAMS: Final = 65_535
 """As many as a vehicle can count."""
+MOST_NAMES: Final = 10_000
+"""Values of one parameter that have names."""
 MOST_FILES: Final = 1_000
 """Kinds of metadata; MAVLink has six."""
 MOST_DECIMALS: Final = 50
 """Places behind the point; a float32 has no use for more."""
 
+_STRICT: Final = ConfigDict(strict=True, frozen=True)
 Model = TypeVar("Model", bound=BaseModel)
 
 
 class _Strict(BaseModel):
     """No text counts as a number, and no number as a flag."""
 
-    model_config = ConfigDict(strict=True, frozen=True)
+    model_config = _STRICT
 
 
-class _Named(_Strict):
+# no models: there are many of them, and a model takes three times the memory
+@with_config(_STRICT)
+class _Named(TypedDict):
     value: float
-    description: str = ""
+    description: NotRequired[str]
 
 
-class _Bit(_Strict):
-    index: int = Field(ge=0, lt=MOST_BITS)
-    description: str = ""
+@with_config(_STRICT)
+class _Bit(TypedDict):
+    index: Annotated[int, Field(ge=0, lt=MOST_BITS)]
+    description: NotRequired[str]
 
 
 class _Parameter(_Strict):
@@ -55,8 +62,8 @@ class _Parameter(_Strict):
     increment: float | None = None
     decimals: int | None = Field(None, alias="decimalPlaces", ge=0, le=MOST_DECIMALS)
     default: float | None = None
-    values: list[_Named] = []
-    bits: list[_Bit] = Field([], alias="bitmask")
+    values: list[_Named] = Field([], max_length=MOST_NAMES)
+    bits: list[_Bit] = Field([], alias="bitmask", max_length=MOST_BITS)
     reboot_required: bool = Field(False, alias="rebootRequired")
     is_read_only: bool = Field(False, alias="readOnly")
     is_volatile: bool = Field(False, alias="volatile")
@@ -67,8 +74,8 @@ class _Parameter(_Strict):
         low, high = _finite(self.minimum), _finite(self.maximum)
         if low is not None and high is not None and low > high:
             low = high = None
-        values = {whole(each.value): each.description for each in self.values if math.isfinite(each.value)}
-        bits = {each.index: each.description for each in self.bits}
+        values = {whole(each["value"]): each.get("description") for each in self.values}
+        bits = {each["index"]: each.get("description") for each in self.bits}
         return ParamInfo(
             self.name,
             _TYPES.get(self.type),
@@ -80,7 +87,9 @@ class _Parameter(_Strict):
             _finite(self.increment),
             self.decimals,
             None if self.default is None else whole(self.default),
-            MappingProxyType({value: name for value, name in values.items() if name}),
+            MappingProxyType(
+                {value: name for value, name in values.items() if name and math.isfinite(value)}
+            ),
             MappingProxyType({bit: name for bit, name in bits.items() if name}),
             self.reboot_required,
             self.is_read_only,
