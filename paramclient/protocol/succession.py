@@ -16,8 +16,9 @@ SEARCH_PACE: Final = 0.5
 ASKING_PACE: Final = 2.0
 """Seconds between two rounds of questions to a candidate that does not say who it is."""
 HUSH: Final = 3.0
-"""Seconds of silence under the old system id, with heartbeats under the new one, after which a vehicle that
-has no hardware id of its own has moved: two heartbeats did not come."""
+"""Seconds by which a vehicle without a hardware id of its own was heard longer under the new system id than
+under the old one when it has moved: two heartbeats did not come. Whoever was not heard for so long is not
+there to be judged."""
 
 
 class Succession:
@@ -49,11 +50,10 @@ class Succession:
         Raises:
             AnotherVehicle: another one is.
         """
+        if self._identity.uid is None:  # it may just be saying it
+            self._identity = self._before.identity
         found = components.get(self.address)
-        if found is None or found.presence.is_lost:
-            return False
-        old_heard_at = self._before.presence.heard_at
-        if found.presence.heard_at <= old_heard_at or not found.presence.has_beaten:
+        if found is None or now - found.presence.heard_at > HUSH or not found.presence.has_beaten:
             return False
         if found.who.is_asking or not found.who.settled:
             return False
@@ -63,7 +63,8 @@ class Succession:
             return False
         if not self._identity.is_same_vehicle(identity):
             raise AnotherVehicle(*self.address, str(self._identity), str(identity))
-        return self._identity.has_own_uid or now - old_heard_at >= HUSH
+        hush = found.presence.heard_at - self._before.presence.heard_at
+        return hush > 0.0 if self._identity.has_own_uid else hush >= HUSH
 
     def _ask_again(self, found: ComponentMachine, now: float) -> None:
         if now >= self._ask_at:
