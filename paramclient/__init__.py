@@ -6,8 +6,11 @@ from paramclient.cache import CachedComponent, CachedVehicle, HistoryEntry, Para
 from paramclient.client import FetchedAll, ParamClient
 from paramclient.component import Component
 from paramclient.errors import (
+    AnotherVehicle,
     CacheError,
     ClientClosed,
+    CommandRefused,
+    CommandResult,
     FileErrorCode,
     FileTransferError,
     LinkError,
@@ -38,12 +41,15 @@ from paramclient.values import Encoding, Param, ParamType, Trust
 from paramclient.version import __version__
 
 __all__ = [
+    "AnotherVehicle",
     "CacheError",
     "CachedComponent",
     "CachedVehicle",
     "Change",
     "Changes",
     "ClientClosed",
+    "CommandRefused",
+    "CommandResult",
     "Component",
     "ComponentTraffic",
     "DirectoryEntry",

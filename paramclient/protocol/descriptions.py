@@ -10,15 +10,12 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from paramclient.errors import LinkError, NoReply
+from paramclient.errors import CommandResult, LinkError, NoReply
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.wire import (
     COMPONENT_METADATA_ID,
     MAV_CMD_REQUEST_MESSAGE,
-    MAV_RESULT_DENIED,
-    MAV_RESULT_FAILED,
-    MAV_RESULT_UNSUPPORTED,
     CommandAck,
     CommandLong,
     ComponentMetadata,
@@ -27,7 +24,7 @@ from paramclient.protocol.wire import (
 
 __all__ = ["DescriptionAsk", "Descriptions"]
 
-NONE_THERE: Final = (MAV_RESULT_UNSUPPORTED, MAV_RESULT_DENIED, MAV_RESULT_FAILED)
+NONE_THERE: Final = (CommandResult.UNSUPPORTED, CommandResult.DENIED, CommandResult.FAILED)
 """Results that say that the protocol is not spoken; others are no answer."""
 
 
