@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import lzma
 import math
+import tracemalloc
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -353,6 +354,35 @@ def test_more_parameters_than_a_vehicle_can_have_are_refused(monkeypatch: pytest
     for path in (XML, JSON):
         with pytest.raises(MetadataError, match="describes more than 5 parameters"):
             read_metadata(path)
+
+
+def test_more_parameters_than_that_are_refused_of_px4_too() -> None:
+    with pytest.raises(MetadataError, match="parameters: List should have at most 65535 items"):
+        read_content(px4(*[{"name": "A"}] * 65_536), source="the file")
+
+
+def test_a_range_without_room_and_a_value_that_is_none_are_left_out() -> None:
+    rows = {"name": "A", "min": 2, "max": 1, "values": [{"value": math.nan, "description": "NaN"}]}
+    info = read_content(px4(rows), source="the file")["A"]
+    assert (info.minimum, info.maximum, dict(info.values)) == (None, None, {})
+    text = '<paramfile><param name="A"><field name="Range">2 1</field></param></paramfile>'
+    info = read_content(text.encode(), source="the file")["A"]
+    assert (info.minimum, info.maximum) == (None, None)
+
+
+def test_no_more_is_read_or_unpacked_than_may_be(tmp_path: Path) -> None:
+    packed = lzma.compress(bytes(8 * reading.LARGEST), preset=1)
+    with (tmp_path / "huge").open("wb") as file:
+        file.truncate(20 * reading.LARGEST)  # takes no room on the disk
+    tracemalloc.start()
+    try:
+        with pytest.raises(MetadataError, match="too large"):
+            read_content(packed, source="the file")
+        with pytest.raises(MetadataError, match="too large"):
+            read_metadata(tmp_path / "huge")
+        assert tracemalloc.get_traced_memory()[1] < 4 * reading.LARGEST
+    finally:
+        tracemalloc.stop()
 
 
 def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:

@@ -252,6 +252,17 @@ def test_a_name_is_never_taken_from_what_was_kept_alone(command: Command, put: A
     assert not vehicle.requests["FILE_TRANSFER_PROTOCOL"]
 
 
+def test_where_nothing_is_kept_nothing_is_looked_for(
+    command: Command, put: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def forbidden(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(MetadataStore, "known", forbidden)
+    assert command("get", put(quad()), "MC_ROLL_P", "--cache", tmp_path / "cache.sqlite3").code == 0
+    assert command("get", put(quad()), "MC_ROLL_P", "--no-cache").code == 0
+
+
 def test_a_vehicle_that_cannot_give_its_file(command: Command, put: Any) -> None:
     vehicle = quad()
     del vehicle.files[PARAMETER_FILE]

@@ -19,13 +19,25 @@ from paramclient import ClientClosed, FileTransferError, NoReply, ParamCache, Us
 from paramclient.errors import MetadataError
 from paramclient.identity import Identity
 from paramclient.metadata import Metadata, MetadataStore, download, metadata_of, store
+from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.descriptions import Descriptions
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.wire import CommandAck, CommandLong, ComponentMetadata, FileTransfer
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle
 from paramclient.sim.metadata import GENERAL_FILE, PARAMETER_FILE
 from paramclient.values import crc32_px4
-from tests.shell import Tap, a_client, generic, outcome, residue, small_px4, swift_loop, swiftly, tasks_beside
+from tests.shell import (
+    FlakyLink,
+    Tap,
+    a_client,
+    generic,
+    outcome,
+    residue,
+    small_px4,
+    swift_loop,
+    swiftly,
+    tasks_beside,
+)
 
 IDENTITY = Identity(1, "link", "abcd", 12, 2, 0x01110000, "0123abcd", 1)
 
@@ -283,6 +295,9 @@ async def test_a_vehicle_that_does_not_answer() -> None:
         result = await outcome(metadata_of(component))
         assert isinstance(result, NoReply)
         assert "lost" in str(result)
+        result = await outcome(metadata_of(component))
+        assert isinstance(result, NoReply)
+        assert result.attempts == 0  # nothing was asked
         tap.is_mute = tap.is_deaf = False
         await anyio.sleep(1.5)
         assert await metadata_of(component) is not None
@@ -331,6 +346,58 @@ async def test_those_who_ask_at_the_same_time_share_the_answer() -> None:
             for _ in range(3):
                 tasks.start_soon(metadata_of, component)
         assert [message.params[0] for message in tap.messages(CommandLong)].count(397.0) == 1
+
+
+@swiftly
+async def test_a_link_that_drops_meanwhile() -> None:
+    tap = Tap(describing())
+    link = FlakyLink(tap)
+    async with a_client(link) as client:
+        component = await client.component()
+        await component.get("PARAM_03")
+        await anyio.sleep(2.0)
+        waited = [component._machine.is_waiting]
+        tap.is_deaf = True
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(metadata_of, component)
+            await anyio.sleep(0.01)
+            waited.append(component._machine.is_waiting)
+            await link.drop()
+            asked = len(tap.messages(CommandLong))
+            tap.is_deaf = False
+        assert len(tap.messages(CommandLong)) > asked
+        assert link.openings == 2
+        assert waited == [False, True]
+
+
+@swiftly
+async def test_what_is_too_long_for_a_description_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(download, "LARGEST_PACKED", 400)
+    vehicle = describing()
+    assert len(vehicle.files[GENERAL_FILE]) < 400 < len(vehicle.files[PARAMETER_FILE])
+    async with a_client(vehicle) as client:
+        with pytest.raises(FileTransferError, match="longer than 400 bytes"):
+            await metadata_of(await client.component())
+
+
+@swiftly
+async def test_nothing_is_noted_of_a_vehicle_that_another_one_has_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = MetadataStore(tmp_path)
+    read_parameters = download._read_parameters
+    async with a_client(describing()) as client:
+        component = await client.component()
+        await anyio.sleep(1.0)
+
+        def read(content: bytes, source: str) -> Metadata:
+            who = component._machine.who
+            who.identity = replace(who.identity, uid="another")
+            return read_parameters(content, source)
+
+        monkeypatch.setattr(download, "_read_parameters", read)
+        assert await metadata_of(component, store=kept) is not None
+        assert not kept.has_notes
 
 
 # the question
@@ -408,6 +475,11 @@ def test_it_is_asked_again_when_the_link_is_back() -> None:
     asked.machine.ask(0.0)
     asked.machine.resume(0.5)
     assert len(asked.sent) == 2
+    sent: list[Any] = []
+    machine = ComponentMachine(1, 1, own=(255, 190), link="link", send=sent.append, emit=lambda _: None)
+    machine.descriptions.ask(0.0)
+    machine.resume(0.5)
+    assert len(sent) == 2
 
 
 # what is kept
