@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 from paramclient.errors import UsageError
 from paramclient.links.base import Link, Peer
 from paramclient.links.names import FORMS, LinkKind, LinkSpec, parse_link
+from paramclient.links.ports import SerialPort, list_ports
 from paramclient.links.serial import SerialLink
 from paramclient.links.sim import SimLink, serve_endpoint, simulated
 from paramclient.links.tcp import TcpIn, TcpOut
@@ -26,8 +27,10 @@ __all__ = [
     "LinkKind",
     "LinkSpec",
     "Peer",
+    "SerialPort",
     "SimLink",
     "create_link",
+    "list_ports",
     "parse_link",
     "serve_endpoint",
 ]

@@ -181,10 +181,10 @@ class SerialLink:
         return LinkError(f"{self.name}: {problem}", link=self.name)
 
 
-def need_serialx(wanted: str) -> None:
+def need_serialx(what: str) -> None:
     """UsageError with the command that installs the extra, where it is missing."""
     if find_spec("serialx") is None:
-        raise UsageError(f"{wanted}: serial ports need serialx: pip install 'paramclient[serial]'")
+        raise UsageError(f"{what} needs serialx: pip install 'paramclient[serial]'")
 
 
 class _Port(Protocol):
