@@ -219,7 +219,7 @@ async def test_a_device_that_takes_nothing_is_lost_and_what_waits_for_it_dropped
                 sent += 1000
                 if sent == 5000:
                     cable.send(b"still here")
-        assert 5000 < sent < 100_000
+        assert 5000 < sent < 60_000  # what Linux holds for a pseudo-terminal, and nothing here
         await until(lambda: failures)
         assert str(failures[0]) == str(caught.value)
         assert b"".join(data for _, data in got) == b"still here"
@@ -272,12 +272,8 @@ async def test_a_transport_brings_no_more_than_is_read(cable: Cable) -> None:
 @pytest.mark.asyncio
 async def test_how_a_port_is_set_up(cable: Cable) -> None:
     """Raw bytes, 8N1, no flow control; DTR falls with the last program that closes it, as everywhere."""
-    async with opened(cable):
-        file = os.open(cable.device, os.O_RDWR | os.O_NOCTTY)
-        try:
-            iflag, oflag, cflag, lflag, _, ospeed, _ = termios.tcgetattr(file)
-        finally:
-            os.close(file)
+    async with opened(cable) as link:
+        iflag, oflag, cflag, lflag, _, ospeed, _ = termios.tcgetattr(link._port._file)
     assert (iflag, oflag, lflag, ospeed) == (0, 0, 0, termios.B115200)
     assert cflag & (termios.CSIZE | termios.CSTOPB | termios.PARENB | termios.CRTSCTS) == termios.CS8
     assert cflag & termios.HUPCL
@@ -290,16 +286,18 @@ async def test_how_a_port_is_set_up(cable: Cable) -> None:
 @pytest.mark.asyncio
 async def test_a_port_is_ours_alone_and_free_again_after(cable: Cable) -> None:
     def is_exclusive() -> bool:
-        file = os.open(cable.device, os.O_RDWR | os.O_NOCTTY)
         try:
+            file = os.open(cable.device, os.O_RDWR | os.O_NOCTTY)
+        except OSError as error:
+            return error.errno == errno.EBUSY
+        try:  # the privileged get in, and can look
             (flag,) = struct.unpack("i", fcntl.ioctl(file, TIOCGEXCL, bytes(4)))
         finally:
             os.close(file)
         return bool(flag)
 
     async with opened(cable) as link:
-        if os.geteuid() == 0:  # who else may look
-            assert is_exclusive()
+        assert is_exclusive()
         error = await refusal(create_link(cable.link))
         assert str(error) == f"{cable.link}: {cable.device} is in use by another program"
         await link.send(HEARTBEAT, None)
@@ -378,26 +376,39 @@ async def test_a_rate_that_the_system_does_not_have(cable: Cable, monkeypatch: p
         await create_link(cable.link).open()
 
 
-class Stuck:
-    """A driver that takes its time with opening or closing."""
+@pytest.mark.asyncio
+async def test_a_driver_that_does_not_tell_its_rate(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise RuntimeError("termios2 speed fields are zero")
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch, call: str) -> None:
+    monkeypatch.setattr(serialx.Serial, "_reconfigure_port", refuse)
+    error = await refusal(create_link(cable.link))
+    assert str(error) == f"{cable.link}: {cable.device} cannot be set to 115200 baud"
+
+
+class Stuck:
+    """A driver that takes its time with opening or closing a port: the next one, or the one that is given."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, call: str, port: object = None) -> None:
         self.is_in_it = threading.Event()
         self.may_go_on = threading.Event()
         self.is_closed = threading.Event()
-        real = {name: getattr(serialx.Serial, name) for name in ("open", "close")}
+        self._port = None if port is None else id(port)  # not the port: it would end with the patch
+        self._slow = call
+        self._real = {name: getattr(serialx.Serial, name) for name in ("open", "close")}
+        monkeypatch.setattr(serialx.Serial, "open", lambda port: self._call("open", port))
+        monkeypatch.setattr(serialx.Serial, "close", lambda port: self._call("close", port))
 
-        def slow(port: Any) -> None:
+    def _call(self, name: str, port: object) -> None:
+        if name == "open" and self._port is None:
+            self._port = id(port)
+        is_it = id(port) == self._port  # the collector closes others, of tests before
+        if is_it and name == self._slow:
             self.is_in_it.set()
             assert self.may_go_on.wait(PATIENCE)
-            real[call](port)
-
-        def close(port: Any) -> None:
-            real["close"](port)
+        self._real[name](port)
+        if is_it and name == "close":
             self.is_closed.set()
-
-        monkeypatch.setattr(serialx.Serial, "close", close)
-        monkeypatch.setattr(serialx.Serial, call, slow)
 
 
 @pytest.mark.asyncio
@@ -438,7 +449,7 @@ async def test_closed_while_it_is_opened(cable: Cable, monkeypatch: pytest.Monke
 async def test_a_driver_that_does_not_close(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serial, "CLOSE_TIMEOUT", 0.01)
     async with opened(cable) as link:
-        stuck = Stuck(monkeypatch, "close")
+        stuck = Stuck(monkeypatch, "close", link._port._serial)
         await link.close()
         assert stuck.is_in_it.is_set()
         stuck.may_go_on.set()
@@ -454,11 +465,14 @@ async def test_closing_does_not_wait_for_what_is_not_taken(
     close = serialx.Serial.close
     monkeypatch.setattr(termios, "tcflush", lambda _, queue: calls.append(f"flush {queue}"))
 
-    def closed(port: serialx.BaseSerial) -> None:
-        calls.append("close")
-        close(port)
-
     async with opened(cable) as link:
+        ours = id(link._port._serial)  # not the port: it would end with the patch, and call it
+
+        def closed(port: serialx.BaseSerial) -> None:
+            if id(port) == ours:
+                calls.append("close")
+            close(port)
+
         calls.clear()
         monkeypatch.setattr(serialx.Serial, "close", closed)
         await link.close()

@@ -225,7 +225,7 @@ if sys.platform != "win32":
         @classmethod
         async def opened(cls, device: str, baud: int) -> _Descriptor:
             """Open a port in a thread. One that comes when nobody waits for it any more is closed."""
-            return await _in_thread(lambda: cls._open(device, baud), undo=cls._release)
+            return await _in_thread(lambda: cls._open(device, baud), undo=cls._release, grace=CLOSE_TIMEOUT)
 
         async def read(self) -> bytes:
             with suppress(anyio.ClosedResourceError):
@@ -247,14 +247,17 @@ if sys.platform != "win32":
         async def close(self) -> None:
             anyio.notify_closing(self._file)
             with anyio.move_on_after(CLOSE_TIMEOUT, shield=True):
-                await _in_thread(self._release, undo=_nothing)
+                await _in_thread(self._release, undo=_nothing, grace=0)
 
         @classmethod
         def _open(cls, device: str, baud: int) -> _Descriptor:
             import serialx  # only here: most links need none
 
             serial = serialx.serial_for_url(device, baud)
-            serial.open()
+            try:
+                serial.open()
+            except RuntimeError as error:  # of drivers that do not tell their rate back
+                raise OSError(errno.EINVAL, os.strerror(errno.EINVAL)) from error
             try:
                 # serialx's own lock is one that only those heed who ask for it
                 fcntl.ioctl(serial.fileno(), termios.TIOCEXCL)
@@ -271,10 +274,10 @@ if sys.platform != "win32":
                 self._serial.close()
 
 
-async def _in_thread(work: Callable[[], T], *, undo: Callable[[T], object]) -> T:
+async def _in_thread(work: Callable[[], T], *, undo: Callable[[T], object], grace: float) -> T:
     """Do it in a thread of its own, which ends with it.
 
-    Cancelled, it is undone, also when it is done late; that is waited for no longer than `CLOSE_TIMEOUT`.
+    Cancelled, it is undone, also when it is done late; that is waited for `grace` seconds at most.
     """
     ended = anyio.Event()
     token = anyio.lowlevel.current_token()
@@ -305,7 +308,7 @@ async def _in_thread(work: Callable[[], T], *, undo: Callable[[T], object]) -> T
         with lock:
             is_wanted = False
             came_too_early = bool(results)
-        with anyio.move_on_after(CLOSE_TIMEOUT, shield=True):
+        with anyio.move_on_after(grace, shield=True):
             await ended.wait()
             thread.join()
         if came_too_early:
