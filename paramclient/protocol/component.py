@@ -4,30 +4,21 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 from paramclient.errors import LinkError, NoReply
-from paramclient.identity import Identity, autopilot_name
+from paramclient.identity import autopilot_name
 from paramclient.protocol import events
-from paramclient.protocol.authors import Authors
-from paramclient.protocol.events import Event, ParamChanged
+from paramclient.protocol.events import ParamChanged
 from paramclient.protocol.fetch import Fetch
-from paramclient.protocol.fetches import Fetches
-from paramclient.protocol.ftp import FileTransfers
-from paramclient.protocol.identify import Identification
-from paramclient.protocol.presence import Presence
-from paramclient.protocol.reads import Key, Read, Reads
-from paramclient.protocol.refresh import Refresh
-from paramclient.protocol.result import Means, Policy, Sampled
-from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
-from paramclient.protocol.table import Change, Table
-from paramclient.protocol.timing import RoundTrip
-from paramclient.protocol.turns import Turns
+from paramclient.protocol.parts import Parts
+from paramclient.protocol.reads import Key, Read
+from paramclient.protocol.result import FetchResult, Policy, Sampled
+from paramclient.protocol.table import Change
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
-    MAV_AUTOPILOT_PX4,
     NO_INDEX,
     AutopilotVersion,
     CommandAck,
@@ -40,8 +31,8 @@ from paramclient.protocol.wire import (
     StatusText,
     SystemTime,
 )
-from paramclient.protocol.writes import Write, Writes
-from paramclient.values import Encoding, Param, Trust, Value, encode
+from paramclient.protocol.writes import Write
+from paramclient.values import Param, Trust, Value, encode
 
 __all__ = ["ComponentMachine"]
 
@@ -49,7 +40,7 @@ FRESH_IDENTITY: Final = 1.0
 """Seconds for which an AUTOPILOT_VERSION needs no other."""
 
 
-class ComponentMachine:
+class ComponentMachine(Parts):
     """Everything about one component that needs no clock and no socket.
 
     Args:
@@ -76,98 +67,15 @@ class ComponentMachine:
         fetches: what was and is being fetched.
     """
 
-    def __init__(
-        self,
-        system: int,
-        component: int,
-        *,
-        own: tuple[int, int],
-        link: str,
-        send: Callable[[Message], None],
-        emit: Callable[[Event], None],
-        encoding: Encoding | None = None,
-        upkeep: Upkeep | None = None,
-        is_link_busy: Callable[[], bool] = lambda: False,
-        is_vehicle_doubted: Callable[[], bool] = lambda: False,
-        another: Callable[[float], None] | None = None,
-        turns: Turns | None = None,
-    ) -> None:
-        target = (system, component)
-        upkeep = upkeep or Upkeep()
-        self.system = system
-        self.component = component
-        self.version = 1
-        self.round_trip = RoundTrip()
-        self.who = Identification(target, link, self.round_trip, send, encoding)
-        self.table = Table(self.who.encoding)
-        self.turns = Turns() if turns is None else turns
-        self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share)
-        self.writes = Writes(
-            target,
-            self.round_trip,
-            send,
-            self.reads,
-            self.table.params,
-            encoding=lambda: self.table.encoding,
-            is_certain=lambda: self.may_be_written,
-        )
-        self.presence = Presence()
-        self.sync = Sync(
-            self.reads,
-            self.table,
-            upkeep,
-            is_px4=lambda: self.who.autopilot == MAV_AUTOPILOT_PX4,
-            is_writing=lambda: len(self.writes) > 0,
-            is_fetching=lambda: self.fetch is not None,
-            is_busy=is_link_busy,
-            file_is_cheap=lambda interval: self.fetches.file_is_cheap(interval),
-            is_spared=lambda: self._is_spared,
-            is_doubted=lambda: self.who.is_doubted,
-            begin_fetch=lambda now, refresh: self.begin_fetch(now, refresh=refresh),
-            end_fetch=self.end_fetch,
-            resynced=lambda changed, confirmed: emit(events.TableResynced(self, changed, confirmed)),
-        )
-        self.files = FileTransfers(target, own, self.round_trip, send)
-        self.fetches = Fetches(
-            Means(
-                target,
-                self.round_trip,
-                send,
-                self.reads,
-                self.table,
-                self.turns,
-                self.files,
-                expects_hash=lambda: self.sync.expects_hash,
-                changed=self._moved,
-                doubt=self._doubt_identity,
-            ),
-            self.sync,
-            upkeep.policy,
-            says_file=lambda: self.who.says_file,
-            ended=lambda result: emit(events.Fetched(self, result)),
-        )
-        self._own = own
-        self._emit = emit
-        self._policy = upkeep.policy
-        self._another = another or self.become_another
-        self._is_vehicle_doubted = is_vehicle_doubted
-        self._known_as: str | None = None  # the key of the identity that was reported
-        self._may_write = False
-        self._authors = Authors()
-
     # what comes in
 
     def receive(self, message: Message, now: float, *, version: int = 2) -> None:
         """Take a message that this component sent."""
-        silence = self.presence.heard(now)
-        self.round_trip.heard_at = now
-        if silence >= self.presence.gap or self.presence.is_lost:
-            self._was_silent(silence, now)
-        if version > self.version:
-            self.version = version
         if isinstance(message, ParamValue):
-            self._receive_value(message, now)
-        elif isinstance(message, Heartbeat):
+            self.receive_value(message, now, version)
+            return
+        self._heard(now, version)
+        if isinstance(message, Heartbeat):
             self.who.heartbeat(message)
             if self.presence.heartbeat(message, now):
                 self._rebooted(now)
@@ -197,8 +105,45 @@ class ComponentMachine:
             self.who.heartbeat(message)
             self.presence.high_latency()
         self.who.heard(now)
-        if not isinstance(message, ParamValue):  # a value tells nothing of who it is
-            self._follow_identity(now)
+        self._follow_identity(now)
+
+    def receive_value(self, message: ParamValue, now: float, version: int = 2) -> None:
+        """Take a PARAM_VALUE that it sent: for those who know that it is one."""
+        self._heard(now, version)
+        who = self.who
+        who.heard(now)
+        name, _, _, count, _ = message
+        if not name:
+            return
+        if name == HASH_CHECK:
+            announced = self.sync.hash_heard(message, now)
+            if self.fetch is not None:
+                self.fetch.announced(announced)
+            self.reads.heard(message, now)
+            return
+        if who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
+            name = name.upper()
+            message = message._replace(param_id=name)
+        table = self.table
+        if count != table.count and count != NO_INDEX:
+            self._count_moved(count, now)
+        authors = self._authors
+        writes = self.writes
+        is_ours = bool(writes.queues) and name in writes
+        by = "us" if is_ours else authors.of(name, now) if authors.foreign_sets else "vehicle"
+        change = table.hear(message, by, is_exact=is_ours and writes.wants(message))
+        if change is not None:
+            authors.changed(name, now, is_ours)
+            self.sync.changed(change)
+            self._emit(_new(ParamChanged, (self, change)))
+        elif name not in table.params:
+            return  # more names than there can be
+        fetch = self.fetches.current
+        if fetch is not None:
+            fetch.heard(message, now)
+        if writes.queues:
+            writes.heard(message, now)
+        self.reads.heard(message, now)
 
     def foreign_set(self, name: str, station: str, now: float) -> None:
         """Another station was heard setting a parameter of this component."""
@@ -371,106 +316,24 @@ class ComponentMachine:
         if self.fetch is not None:
             self.fetch.restart(now)
 
-    @property
-    def identity(self) -> Identity:
-        """Who the vehicle is, as far as this component has said."""
-        return self.who.identity
-
-    @property
-    def may_be_written(self) -> bool:
-        """Whether it is certain whom a write reaches, and what it makes of it."""
-        return self.who.may_be_written and not self._is_vehicle_doubted()
-
-    @property
-    def state(self) -> str:
-        """The table's state in a word: new, cached, fetching, synced, partial, lost."""
-        if self.presence.is_lost:
-            return "lost"
-        if self.fetch is not None:
-            return "fetching"
-        if self.sync.synced:
-            return "synced"
-        if not self.table.params:
-            return "new"
-        return "cached" if self.table.complete else "partial"
-
-    @property
-    def fetch(self) -> Fetch | None:
-        """The fetch under way, or None."""
-        return self.fetches.current
-
-    @property
-    def sync_state(self) -> SyncState:
-        """How the table stands to the vehicle's."""
-        return SyncState.LOST if self.presence.is_lost else self.sync.state
-
-    @property
-    def refresh(self) -> Refresh | None:
-        """The reading of volatile values under way after a hash hit, or None."""
-        return self.sync.refresh
-
-    @property
-    def can_hit(self) -> bool:
-        """Whether the vehicle's hash may confirm the table as it stands."""
-        return self.table.complete and self.table.hash is not None
-
-    @property
-    def is_waiting(self) -> bool:
-        """Whether anything is awaited: an answer, a fetch, a file, or who it is."""
-        is_asked = len(self.reads) > 0 or len(self.writes) > 0 or not self.files.is_idle
-        return is_asked or self.fetch is not None or self.who.is_asking
-
-    @property
-    def is_settling(self) -> bool:
-        """Whether a write is under way, or the hash after one has not come yet."""
-        return len(self.writes) > 0 or self.sync.is_settling
-
     def __repr__(self) -> str:
         kind = "unknown" if self.who.autopilot is None else autopilot_name(self.who.autopilot)
         return f"<ComponentMachine {self.system}/{self.component} {kind} {self.state}>"
 
-    def _receive_value(self, message: ParamValue, now: float) -> None:
-        name, _, _, count, _ = message
-        if not name:
-            return
-        if name == HASH_CHECK:
-            announced = self.sync.hash_heard(message, now)
-            if self.fetch is not None:
-                self.fetch.announced(announced)
-            self.reads.heard(message, now)
-            return
-        if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
-            name = name.upper()
-            message = message._replace(param_id=name)
-        table = self.table
-        if count != table.count and count != NO_INDEX:
-            self._count_moved(count, now)
-        authors = self._authors
-        is_ours = bool(self.writes.queues) and name in self.writes
-        by = "us" if is_ours else authors.of(name, now) if authors.foreign_sets else "vehicle"
-        change = table.hear(message, by, is_exact=is_ours and self.writes.wants(message))
-        if change is not None:
-            authors.changed(name, now, is_ours)
-            self.sync.changed(change)
-            self._emit(_new(ParamChanged, (self, change)))
-        elif name not in table.params:
-            return  # more names than there can be
-        if self.fetch is not None:
-            self.fetch.heard(message, now)
-        if self.writes.queues:
-            self.writes.heard(message, now)
-        self.reads.heard(message, now)
+    def _heard(self, now: float, version: int) -> None:
+        """Anything has come."""
+        presence = self.presence
+        silence = presence.heard(now)
+        self.round_trip.heard_at = now
+        if silence >= presence.gap or presence.is_lost:
+            self._was_silent(silence, now)
+        if version > self.version:
+            self.version = version
 
     def _count_moved(self, count: int, now: float) -> None:
         if self.table.count is not None:
             self.sync.count_moved(now)
         self.table.move(count)
-
-    @property
-    def _is_spared(self) -> bool:
-        """Whether it is lost, or in a mode in which nothing is asked of it unasked."""
-        presence = self.presence
-        return presence.is_lost or presence.is_high_latency or self.reads.pace.gap >= LOW_BANDWIDTH_GAP
 
     def _doubt(self) -> None:
         """What is known may be of the past: it counts again when the vehicle has confirmed it."""
@@ -511,12 +374,6 @@ class ComponentMachine:
         if self.fetch is not None and self.fetch.is_under_way:
             self.fetch.restart(now)
 
-    def _is_known(self, key: Key) -> bool:
-        """Whether anything speaks for such a parameter."""
-        if isinstance(key, str):
-            return key in self.table.params
-        return self.table.count is None or key < self.table.count
-
     def _follow_identity(self, now: float) -> None:
         """What the identification has come to know takes effect."""
         self._report(self.table.use_encoding(self.who.encoding))
@@ -540,6 +397,12 @@ class ComponentMachine:
         for change in changes:
             self.sync.changed(change)
         self._report(changes)
+
+    def _resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
+        self._emit(events.TableResynced(self, changed, confirmed))
+
+    def _fetched(self, result: FetchResult) -> None:
+        self._emit(events.Fetched(self, result))
 
     def _report(self, changes: list[Change]) -> None:
         for change in changes:
