@@ -24,8 +24,7 @@ import anyio.lowlevel
 import pytest
 import serialx
 
-from paramclient import ParamClient
-from paramclient import client as client_module
+from paramclient import ParamClient, carrier
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link, serial
 from paramclient.links.transport import UNREAD_LIMIT, Transport
@@ -134,15 +133,15 @@ async def test_unplugged_in_the_middle_of_a_download(
         assert bits(result.params) == bits(vehicle.params)
         assert (await component.set("PARAM_01", 77)).status == "accepted"
         tasks.cancel_scope.cancel()
-    [warning] = [record.getMessage() for record in caplog.records if record.name == "paramclient.client"]
+    [warning] = [record.getMessage() for record in caplog.records if record.name == "paramclient.carrier"]
     assert warning.startswith(f"{cable.link}: lost {cable.device}: unplugged, or ")
 
 
 @pytest.mark.asyncio
 async def test_unplugged_for_good(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client_module, "LINK_PATIENCE", 0.2)
-    monkeypatch.setattr(client_module, "FIRST_BACKOFF", 0.05)
-    monkeypatch.setattr(client_module, "LONGEST_BACKOFF", 0.1)
+    monkeypatch.setattr(carrier, "LINK_PATIENCE", 0.2)
+    monkeypatch.setattr(carrier, "FIRST_BACKOFF", 0.05)
+    monkeypatch.setattr(carrier, "LONGEST_BACKOFF", 0.1)
     vehicle = generic(stream=True)
     async with asyncio.timeout(PATIENCE), a_client(cable.link) as client, anyio.create_task_group() as tasks:
         tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
