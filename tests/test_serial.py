@@ -366,11 +366,13 @@ async def test_without_permission_it_is_said_which_group_helps(
 
 
 @pytest.mark.asyncio
-async def test_a_rate_that_the_system_does_not_have(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
-    def refuse(_: object) -> None:
+async def test_a_rate_that_the_system_does_not_have(
+    cable: Cable, port: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
         raise serialx.UnsupportedSetting("Unsupported baudrate")
 
-    monkeypatch.setattr(serialx.Serial, "open", refuse)
+    monkeypatch.setattr(serialx.Serial, "_reconfigure_port", refuse)
     with pytest.raises(UsageError, match="no serial port of this system has 115200 baud"):
         await create_link(cable.link).open()
 
@@ -476,6 +478,20 @@ async def test_closing_does_not_wait_for_what_is_not_taken(
         monkeypatch.setattr(serialx.Serial, "close", closed)
         await link.close()
         assert calls[:2] == [f"flush {termios.TCOFLUSH}", "close"]
+
+
+def test_a_transport_needs_asyncio() -> None:
+    program = (
+        "import asyncio\n"
+        "from paramclient.links.transport import Transport\n"
+        "opening = Transport.opened('COM5', 57600)\n"
+        "try:\n"
+        "    opening.send(None)\n"
+        "except ValueError as error:\n"
+        "    print(error)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
+    assert run.stdout == "COM5: on Windows serial ports need asyncio's own event loop\n"
 
 
 # The extra

@@ -201,16 +201,11 @@ class _Port(Protocol):
 
 
 async def _open_port(device: str, baud: int) -> _Port:
-    import serialx  # only here: most links need none
+    if sys.platform == "win32":
+        from paramclient.links.transport import Transport  # only here: brings asyncio along
 
-    try:
-        if sys.platform == "win32":
-            from paramclient.links.transport import Transport  # only here: brings asyncio along
-
-            return await Transport.opened(device, baud)
-        return await _Descriptor.opened(device, baud)
-    except serialx.UnsupportedSetting as error:
-        raise UsageError(f"{device}: no serial port of this system has {baud} baud") from error
+        return await Transport.opened(device, baud)
+    return await _Descriptor.opened(device, baud)
 
 
 if sys.platform != "win32":
@@ -251,11 +246,13 @@ if sys.platform != "win32":
 
         @classmethod
         def _open(cls, device: str, baud: int) -> _Descriptor:
-            import serialx  # only here: most links need none
+            import serialx  # only here: most links need none, and it takes longer than a loop should wait
 
             serial = serialx.serial_for_url(device, baud)
             try:
                 serial.open()
+            except serialx.UnsupportedSetting as error:
+                raise UsageError(f"{device}: no serial port of this system has {baud} baud") from error
             except RuntimeError as error:  # of drivers that do not tell their rate back
                 raise OSError(errno.EINVAL, os.strerror(errno.EINVAL)) from error
             try:

@@ -46,6 +46,8 @@ class Transport(asyncio.Protocol):
         try:
             loop = asyncio.get_running_loop()
             port._transport, _ = await serialx.create_serial_connection(loop, lambda: port, device, baud)
+        except serialx.UnsupportedSetting as error:
+            raise UsageError(f"{device}: no serial port of this system has {baud} baud") from error
         except RuntimeError as error:  # trio, or a loop that is not for pipes
             raise UsageError(f"{device}: on Windows serial ports need asyncio's own event loop") from error
         port._transport.set_write_buffer_limits(high=0)
