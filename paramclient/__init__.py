@@ -2,7 +2,14 @@
 
 from __future__ import annotations
 
-from paramclient.cache import CachedComponent, CachedVehicle, HistoryEntry, ParamCache
+from paramclient.cache import (
+    CachedComponent,
+    CachedVehicle,
+    HistoryEntry,
+    ParamCache,
+    Snapshot,
+    SnapshotSummary,
+)
 from paramclient.client import FetchedAll, ParamClient
 from paramclient.component import Component
 from paramclient.errors import (
@@ -26,6 +33,7 @@ from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Reboo
 from paramclient.ftp import Ftp
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
+from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.protocol.ftp import DirectoryEntry
 from paramclient.protocol.result import FetchResult, Policy, Progress
 from paramclient.protocol.sampling import Sample
@@ -69,6 +77,7 @@ __all__ = [
     "ParamClientError",
     "ParamErrorCode",
     "ParamMap",
+    "ParamSet",
     "ParamType",
     "Policy",
     "Progress",
@@ -78,6 +87,8 @@ __all__ = [
     "Resynced",
     "Sample",
     "SetResult",
+    "Snapshot",
+    "SnapshotSummary",
     "SyncState",
     "TrafficReport",
     "Trust",
@@ -86,5 +97,6 @@ __all__ = [
     "UsageError",
     "ValueNotApplied",
     "VehicleError",
+    "WrittenParam",
     "__version__",
 ]

@@ -1,11 +1,13 @@
 """Tables, identities and history on disk: what a vehicle's parameters were when it was last heard.
 
 `records` says what goes in and comes out. The other rooms stand on one another: `store` is what is called,
-`tables` keeps tables and their history, `rows` lays them into cells, `database` looks after the file.
+`tables` keeps tables and their history, `earlier` tells what they were before, `rows` lays them into cells,
+`database` looks after the file.
 """
 
 from __future__ import annotations
 
+from paramclient.cache.earlier import SNAPSHOTS
 from paramclient.cache.records import (
     BY_US,
     BY_VEHICLE,
@@ -13,6 +15,8 @@ from paramclient.cache.records import (
     CachedSummary,
     CachedVehicle,
     HistoryEntry,
+    Snapshot,
+    SnapshotSummary,
     StoredParam,
     TableState,
     TableUpdate,
@@ -30,6 +34,9 @@ __all__ = [
     "HISTORY_LINES",
     "HistoryEntry",
     "ParamCache",
+    "SNAPSHOTS",
+    "Snapshot",
+    "SnapshotSummary",
     "StoredParam",
     "TableState",
     "TableUpdate",
