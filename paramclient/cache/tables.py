@@ -140,15 +140,20 @@ def component(
 
 
 def history(
-    connection: sqlite3.Connection, key: str, component: int | None, name: str | None, limit: int | None
+    connection: sqlite3.Connection,
+    key: str,
+    component: int | None,
+    name: str | None,
+    limit: int | None,
+    since: float | None = None,
 ) -> list[HistoryEntry]:
     """The changes of a vehicle's values, newest last."""
     rows = connection.execute(
         "SELECT at, component, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
         " FROM history h JOIN component c ON c.id = owner"
         " WHERE vehicle = ? AND component = ifnull(?, component) AND name = ifnull(?, name)"
-        " ORDER BY h.id DESC LIMIT ?",
-        (key, component, name, -1 if limit is None else limit),
+        " AND at >= ifnull(?, at) ORDER BY h.id DESC LIMIT ?",
+        (key, component, name, since, -1 if limit is None else limit),
     ).fetchall()
     return [_entry(row) for row in reversed(rows)]
 
