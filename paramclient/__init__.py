@@ -20,6 +20,7 @@ from paramclient.component import Component
 from paramclient.errors import (
     CacheError,
     ClientClosed,
+    FileError,
     FileErrorCode,
     FileTransferError,
     LinkError,
@@ -35,6 +36,7 @@ from paramclient.errors import (
     VehicleError,
 )
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
+from paramclient.files import FileForm, ParamFile, read_file, write_file
 from paramclient.ftp import Ftp
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
@@ -64,7 +66,9 @@ __all__ = [
     "Events",
     "FetchResult",
     "FetchedAll",
+    "FileError",
     "FileErrorCode",
+    "FileForm",
     "FileTransferError",
     "FleetDiff",
     "FleetValue",
@@ -86,6 +90,7 @@ __all__ = [
     "ParamClient",
     "ParamClientError",
     "ParamErrorCode",
+    "ParamFile",
     "ParamMap",
     "ParamSet",
     "ParamType",
@@ -109,4 +114,6 @@ __all__ = [
     "VehicleError",
     "WrittenParam",
     "__version__",
+    "read_file",
+    "write_file",
 ]
