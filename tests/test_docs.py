@@ -147,13 +147,15 @@ def help_of(*words: str) -> str:
 
 
 def subcommand(words: list[str]) -> list[str]:
-    return words[:2] if words[0] == "cache" else words[:1]
+    return words[:2] if words[0] in ("cache", "fleet") else words[:1]
 
 
 def test_every_command_is_shown_and_exists() -> None:
     used = {tuple(subcommand(words)) for words in commands()}
     cache = {("cache", verb) for verb in ("list", "history", "path", "remove")}
-    assert used == {("fetch",), ("get",), ("set",), ("watch",), ("link",), ("show",), ("sim",)} | cache
+    fleet = {("fleet", "diff")}
+    alone = {("fetch",), ("get",), ("set",), ("watch",), ("link",), ("show",), ("history",), ("sim",)}
+    assert used == alone | cache | fleet
     for words in used:
         assert words[-1] in help_of(*words)
 
@@ -168,9 +170,10 @@ def test_options_in_examples_exist() -> None:
 def test_the_page_of_the_command_names_every_option() -> None:
     page = (DOCS / "command.md").read_text(encoding="utf-8")
     offered = set()
-    for command in ("fetch", "get", "set", "watch", "link", "show", "sim"):
+    for command in ("fetch", "get", "set", "watch", "link", "show", "history", "sim"):
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of(command)))
     for verb in ("list", "history", "path", "remove"):
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("cache", verb)))
+    offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("fleet", "diff")))
     named = set(re.findall(r"`(--[a-z][a-z-]+)", page))
     assert named - {"--help"} == offered - {"--help", "--version"}

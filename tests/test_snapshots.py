@@ -187,6 +187,10 @@ def test_what_is_not_there_is_an_error_that_creates_nothing(path: Path) -> None:
         with pytest.raises(UsageError, match="unix seconds"):
             cache.store_snapshot(PX4, 1, ParamSet({}), reason="", at=-1)
         assert cache.vehicles() == []
+        cache.save(whole_table(1))
+        for when in (float("nan"), float("inf"), -1.0):
+            with pytest.raises(UsageError, match="unix seconds"):
+                cache.state_at(PX4.key, 1, when)
 
 
 def test_a_snapshot_that_is_damaged_is_an_error_and_costs_nothing_else(path: Path) -> None:

@@ -182,6 +182,7 @@ def state_at(
     Raises:
         CacheError: that cannot be told.
     """
+    when = time_cell(when)
     number, since = _described(connection, owner)
     for (exact,) in connection.execute(
         "SELECT max(id) FROM snapshot WHERE owner = ? AND at = ? HAVING max(id) NOTNULL", (owner, when)

@@ -286,6 +286,7 @@ class ParamCache:
             when: a float is a time, in unix seconds; an int is the id of a snapshot.
 
         Raises:
+            UsageError: a time that is not in unix seconds.
             CacheError: there is no such table, or more than one; there is no such snapshot of it, or it is
                 damaged; history does not reach back so far (the text says how far, and which snapshots are
                 next to it), or the clock of this computer went through that moment twice.
