@@ -453,6 +453,8 @@ def test_look_alikes_of_a_list_are_read_as_meant(data: bytes) -> None:
 def test_a_name_that_comes_twice_with_one_value_is_told() -> None:
     assert loads(b"A 1\nB 2\nA 1\n").notes == ("A stands with one value in lines 1 and 3.",)
     assert loads(b"A nan\nA nan\n").notes != ()
+    many = loads(b"A 1\n" * 1000).notes
+    assert (len(many), many[-1]) == (21, "So do parameters in 979 more lines.")
 
 
 def test_what_only_ardupilot_reads_of_a_line_is_kept_as_a_comment() -> None:
@@ -643,6 +645,23 @@ def test_what_a_form_cannot_say_is_refused(params: ParamSet, form: str, problem:
         dumps(params, form=form, target="out.x")
     assert str(caught.value).startswith("out.x: ")
     assert problem in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("params", "problem"),
+    [
+        (params_of(WrittenParam("A", 1), system=256), "ids from 1 to 255, not 256"),
+        (params_of(WrittenParam("A", 1), component=0), "ids from 1 to 255, not 0"),
+        (params_of(WrittenParam("", 1)), "at least one character"),
+        (params_of(WrittenParam("A_VERY_LONG_NAME_", 1)), "a param_id holds 16"),
+        (replace(params_of(WrittenParam("A", 1)), at=math.inf), "inf is no time in unix seconds"),
+        (replace(params_of(WrittenParam("A", 1)), at=1e300), "is no time in unix seconds"),
+    ],
+)
+@pytest.mark.parametrize("form", ["parm", "json", "yaml"])
+def test_what_nobody_could_read_again_is_not_written(params: ParamSet, problem: str, form: str) -> None:
+    with pytest.raises(FileError, match=problem):
+        dumps(params, form=form)
 
 
 @pytest.mark.parametrize("form", [*PAIRS, FileForm.PCK])

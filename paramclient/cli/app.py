@@ -18,6 +18,7 @@ from paramclient.cli.link import link
 from paramclient.cli.offline import cache_history, cache_list, cache_path, cache_remove, show
 from paramclient.cli.outcome import ExitCode, code_of
 from paramclient.cli.output import report
+from paramclient.cli.save import save
 from paramclient.cli.simulate import sim
 from paramclient.cli.vehicle import fetch, get, set_, watch
 from paramclient.errors import ParamClientError
@@ -160,6 +161,15 @@ _app.command(
     show,
     usage="Usage: paramclient show [OPTIONS] [VEHICLE]",
     help_epilogue=_examples("show", "show 1", "show 00020000 --json"),
+)
+_app.command(
+    save,
+    usage="Usage: paramclient save [OPTIONS] URL|VEHICLE FILE",
+    help_epilogue=_examples(
+        "save udpin:0.0.0.0:14550 quad.yaml",
+        "save sim:ardupilot tuned.param --changed",
+        "save 1 before.params --all",
+    ),
 )
 _app.command(_cache)
 _app.command(

@@ -16,13 +16,12 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from datetime import UTC, datetime
 from importlib.util import find_spec
 from typing import Any, Final, NoReturn
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.model import FileForm, ParamFile
-from paramclient.files.text import MOST_PROBLEMS, is_plain
+from paramclient.files.text import MOST_PROBLEMS, is_plain, time_of
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.values import ParamType, Value, format_value, shortest_float, type_name
 
@@ -107,8 +106,8 @@ def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
             yield f"      {_json(key)}: {_json(content)},"
         yield '      "params": {'
         last = len(each) - 1
-        for number, (name, param) in enumerate(each.items()):
-            yield f"        {_json(name)}: {_json(_fields(param))}{',' if number < last else ''}"
+        for number, param in enumerate(each.values()):
+            yield f"        {_json(param.name)}: {_json(_fields(param))}{',' if number < last else ''}"
         yield "      }"
         yield "    }," if place < len(sets) - 1 else "    }"
     yield "  ]"
@@ -133,8 +132,8 @@ def write_yaml(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
             yield f"  {mark} {key}: {_flow(content)}"
             mark = " "
         yield f"  {mark} params:"
-        for name, param in each.items():
-            yield f"      {_key(name)}: {_flow(_fields(param))}"
+        for param in each.values():
+            yield f"      {_key(param.name)}: {_flow(_fields(param))}"
 
 
 def _file(content: object, form: FileForm, source: str, text: str) -> ParamFile:
@@ -198,12 +197,11 @@ def _header(around: ParamFile) -> list[str]:
 
 def _about(params: ParamSet) -> dict[str, Any]:
     """What a document says of a set but for its parameters."""
-    at = None if params.at is None else datetime.fromtimestamp(params.at, UTC)
     identity = None if params.identity is None else asdict(params.identity)
     about = {
         "system": params.system,
         "component": params.component,
-        "at": None if at is None else at.isoformat().replace("+00:00", "Z"),
+        "at": None if params.at is None else time_of(params.at),
         "source": _encodable(params.source) or None,
         "identity": identity,
     }
