@@ -21,7 +21,7 @@ from typing import Any, Final, NoReturn
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.model import FileForm, ParamFile
-from paramclient.files.text import MOST_PROBLEMS, is_plain, time_of
+from paramclient.files.text import MOST_PROBLEMS, is_plain, shown, time_of
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.values import ParamType, Value, format_value, shortest_float, type_name
 
@@ -29,6 +29,9 @@ __all__ = ["is_document", "read_json", "read_yaml", "write_json", "write_yaml"]
 
 VERSION: Final = 1
 """Of what a document holds; one that is read has this."""
+
+LONGEST_PROBLEM: Final = 300
+"""Characters in which an error tells of one field, whatever stands in it."""
 
 _first_key: Final = re.compile(r"""["']?paramclient["']?[ \t]*:""").match
 _plain_key: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*").fullmatch
@@ -158,7 +161,8 @@ def _problem(place: Sequence[str | int], what: str, text: str) -> tuple[int | No
     line = None
     if len(place) > 3 and place[2] == "params":
         line = _line_of(text, str(place[3]))
-    return line, f"{'.'.join(map(str, place)) or 'the document'}: {what}"
+    told = f"{'.'.join(map(str, place)) or 'the document'}: {what}"
+    return line, told if len(told) <= LONGEST_PROBLEM else f"{told[:LONGEST_PROBLEM]}…"
 
 
 def _at(source: str, line: int | None) -> str:
@@ -175,7 +179,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content: dict[str, Any] = {}
     for key, value in pairs:
         if key in content:
-            raise ValueError(f"{key!r} stands twice", key)
+            raise ValueError(f"{shown(key)} stands twice", key)
         content[key] = value
     return content
 
@@ -212,8 +216,7 @@ def _fields(param: WrittenParam) -> dict[str, Any]:
     """What a document says of a parameter."""
     fields: dict[str, Any] = {"value": _scalar(param.value, param.type)}
     if param.type is not None:
-        is_raw = isinstance(param.value, bytes)
-        is_wide = not is_raw and isinstance(param.type, ParamType) and param.type.size == 8
+        is_wide = isinstance(param.type, ParamType) and param.type.size == 8
         fields["type"] = type_name(param.type)
         fields["bits"] = f"{param.bits_as(param.type):0{16 if is_wide else 8}x}"
     elif isinstance(param.value, float) and not is_plain(param.value):

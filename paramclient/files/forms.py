@@ -126,7 +126,7 @@ def _form_of(text: str, source: str) -> FileForm:
         return FileForm.JSON
     if tables.is_qgc_row(first.text):
         return FileForm.QGC
-    if text.startswith("#!") or any(script.is_script_line(line.text) for line in lines_of(text)):
+    if any(script.is_script_line(line.text) for line in lines_of(text)):
         return FileForm.PX4_SCRIPT
     if document.is_document(first.text):
         return FileForm.YAML

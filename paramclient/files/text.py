@@ -75,7 +75,7 @@ class Problems:
     count: int = 0
 
     def add(self, line: int, expected: str, found: str) -> None:
-        """A line that is not what was expected. In a file of another kind that is every one, so few are kept."""
+        """A line that is not what was expected. Few are kept, as in a file of another kind all are so."""
         self.count += 1
         if self.count <= MOST_PROBLEMS:
             self.found.append((line, expected, found))

@@ -8,6 +8,8 @@ from typing import Any, Final
 
 import yaml
 
+from paramclient.files.text import shown
+
 __all__ = ["NotYaml", "load"]
 
 DEEPEST: Final = 20
@@ -78,7 +80,7 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
             if not isinstance(name, str):
                 raise _refused(key, "found a key that is no text")
             if name in seen:
-                raise _refused(key, f"{name!r} stands twice")
+                raise _refused(key, f"{shown(name)} stands twice")
             seen.add(name)
         mapping: dict[Hashable, Any] = super().construct_mapping(node, deep)
         return mapping
