@@ -89,6 +89,14 @@ def test_every_double_comes_back(form: FileForm, values: list[Value]) -> None:
     assert bits(back(numbered(values, ParamType.REAL64), form), ParamType.REAL64) == expected
 
 
+@pytest.mark.parametrize("form", [*PAIRS, *TYPED[1:]])
+@given(value=st.floats(allow_nan=False) | st.integers(-(2**70), 2**70))
+@settings(max_examples=40, deadline=None)
+def test_a_number_without_a_type_stays_as_it_was_written(form: FileForm, value: float) -> None:
+    read = back(params_of(WrittenParam("A", value)), form)["A"].value
+    assert (type(read), repr(read)) == (type(value), repr(value))
+
+
 @given(name=st.text("ABCXYZabcxyz0189_", min_size=1, max_size=16), written=finite_bits)
 @settings(max_examples=60, deadline=None)
 def test_what_was_read_is_written_as_it_was(name: str, written: int) -> None:
@@ -453,6 +461,8 @@ def test_look_alikes_of_a_list_are_read_as_meant(data: bytes) -> None:
 def test_a_name_that_comes_twice_with_one_value_is_told() -> None:
     assert loads(b"A 1\nB 2\nA 1\n").notes == ("A stands with one value in lines 1 and 3.",)
     assert loads(b"A nan\nA nan\n").notes != ()
+    many = loads(b"A 1\n" * 1000).notes
+    assert (len(many), many[-1]) == (21, "So do parameters in 979 more lines.")
 
 
 def test_what_only_ardupilot_reads_of_a_line_is_kept_as_a_comment() -> None:
@@ -526,7 +536,14 @@ def test_all_bad_lines_are_listed_but_no_more_than_anyone_reads() -> None:
     ]
     assert str(error).splitlines()[20:] == ["and 30 more bad lines"]
     assert (error.source, error.line, error.expected) == ("quad.x", 2, "NAME VALUE")
-    assert len(str(failed("A 1\n" + "x" * 10_000))) < 300
+    long = "x" * 10_000
+    assert len(str(failed(f"A 1\n{long}"))) < 300
+    assert (
+        len(str(failed(f'{{"paramclient": 1, "sets": [{{"params": {{"A": {{"value": "{long}"}}}}}}]}}')))
+        < 400
+    )
+    assert len(str(failed(f'{{"{long}": 1, "{long}": 2}}'))) < 300
+    assert len(str(failed(f"paramclient: 1\n{long}: 1\n{long}: 2\n"))) < 300
 
 
 @pytest.mark.parametrize(
@@ -585,6 +602,8 @@ def test_so_does_rubbish_that_looks_like_something(text: str, form: FileForm) ->
         ("A 1", "x.json", "parm"),
         ("1 1 A 1 9", "x.param", "qgc"),
         ("param set A 1", "x.param", "px4-script"),
+        ("#!/bin/sh\n. x\nparam set A 1", "x.param", "px4-script"),
+        ("#! mine\nA 1", "x.parm", "parm"),
         ('{"paramclient": 1, "sets": [{"params": {"A": {"value": 1}}}]}', "x.param", "json"),
         ("# hi\nparamclient: 1\nsets: [{params: {A: {value: 1}}}]", "x.param", "yaml"),
         ("---\nparamclient: 1\nsets: [{params: {A: {value: 1}}}]", "x", "yaml"),
@@ -643,6 +662,23 @@ def test_what_a_form_cannot_say_is_refused(params: ParamSet, form: str, problem:
         dumps(params, form=form, target="out.x")
     assert str(caught.value).startswith("out.x: ")
     assert problem in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("params", "problem"),
+    [
+        (params_of(WrittenParam("A", 1), system=256), "ids from 1 to 255, not 256"),
+        (params_of(WrittenParam("A", 1), component=0), "ids from 1 to 255, not 0"),
+        (params_of(WrittenParam("", 1)), "at least one character"),
+        (params_of(WrittenParam("A_VERY_LONG_NAME_", 1)), "a param_id holds 16"),
+        (replace(params_of(WrittenParam("A", 1)), at=math.inf), "inf is no time in unix seconds"),
+        (replace(params_of(WrittenParam("A", 1)), at=1e300), "is no time in unix seconds"),
+    ],
+)
+@pytest.mark.parametrize("form", ["parm", "json", "yaml"])
+def test_what_nobody_could_read_again_is_not_written(params: ParamSet, problem: str, form: str) -> None:
+    with pytest.raises(FileError, match=problem):
+        dumps(params, form=form)
 
 
 @pytest.mark.parametrize("form", [*PAIRS, FileForm.PCK])
@@ -705,7 +741,9 @@ def test_a_field_that_cannot_be_right_is_refused(fields: str, problem: str) -> N
         ('{"paramclient": 1, "sets": [{"params": {}}]}', "holds no parameter"),
         ('{"paramclient": 1, "sets": [{"at": 5, "params": {}}]}', "is written as 2026"),
         ('{"paramclient": 1, "sets": [{"at": "2026-01-31T12:00:00", "params": {}}]}', "needs its zone"),
-        ('{"paramclient": 1, "sets": [{"at": "soon", "params": {}}]}', "found 'soon'"),
+        ('{"paramclient": 1, "sets": [{"at": "soon", "params": {}}]}', "is written as 2026"),
+        ('{"paramclient": 1, "sets": [{"at": "1700000000", "params": {}}]}', "is written as 2026"),
+        ('{"paramclient": 1, "sets": [{"at": "2026-02-31T12:00:00Z", "params": {}}]}', "found '2026-02-31"),
         ('{"paramclient": 1, "sets": [{"system": 256, "params": {}}]}', "sets.0.system"),
         ('{"paramclient": 1, "sets": [{"params": {"": {"value": 1}}}]}', "at least one character"),
         ('{"paramclient": 1, "sets": [{"params": {"\\u001b": {"value": 1}}}]}', "only printable ASCII"),

@@ -20,6 +20,7 @@ from paramclient.cli.link import link
 from paramclient.cli.offline import cache_list, cache_path, cache_remove, show
 from paramclient.cli.outcome import ExitCode, code_of
 from paramclient.cli.output import report
+from paramclient.cli.save import save
 from paramclient.cli.simulate import sim
 from paramclient.cli.vehicle import fetch, get, set_, watch
 from paramclient.errors import ParamClientError
@@ -175,6 +176,15 @@ _app.command(
     help_epilogue=_examples("history 1 MC_ROLL_P", "history 1 --since '2h ago'", "history 1 --snapshots"),
 )
 _app.command(_fleet)
+_app.command(
+    save,
+    usage="Usage: paramclient save [OPTIONS] URL|VEHICLE FILE",
+    help_epilogue=_examples(
+        "save udpin:0.0.0.0:14550 quad.yaml",
+        "save sim:ardupilot tuned.param --changed",
+        "save 1 before.params --all",
+    ),
+)
 _app.command(_cache)
 _app.command(
     sim,

@@ -26,7 +26,7 @@ from paramclient.errors import CacheError
 from paramclient.identity import autopilot_name
 from paramclient.values import Param, format_value, type_name
 
-__all__ = ["cache_list", "cache_path", "cache_remove", "show", "vehicle_key"]
+__all__ = ["cache_list", "cache_path", "cache_remove", "show", "tables_of", "vehicle_key"]
 
 _DEFAULTS: Final = CacheOptions()
 
@@ -107,6 +107,16 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
     else:
         print_line(f"removed {removed} {'table' if removed == 1 else 'tables'} of {key}")
     return ExitCode.DONE
+
+
+def tables_of(options: CacheOptions, vehicle: str, component: int | None) -> list[CachedComponent]:
+    """The cached tables of a vehicle, or that of one of its components.
+
+    Raises:
+        CacheError: there is none, more than one vehicle fits, or the cache cannot be read.
+    """
+    with _open(options) as cache:
+        return _load(cache, _choose(cache, vehicle, component))
 
 
 def _open(options: CacheOptions) -> ParamCache:

@@ -16,13 +16,12 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict
-from datetime import UTC, datetime
 from importlib.util import find_spec
 from typing import Any, Final, NoReturn
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.model import FileForm, ParamFile
-from paramclient.files.text import MOST_PROBLEMS, is_plain
+from paramclient.files.text import MOST_PROBLEMS, is_plain, shown, time_of
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.values import ParamType, Value, format_value, shortest_float, type_name
 
@@ -30,6 +29,9 @@ __all__ = ["is_document", "read_json", "read_yaml", "write_json", "write_yaml"]
 
 VERSION: Final = 1
 """Of what a document holds; one that is read has this."""
+
+LONGEST_PROBLEM: Final = 300
+"""Characters in which an error tells of one field, whatever stands in it."""
 
 _first_key: Final = re.compile(r"""["']?paramclient["']?[ \t]*:""").match
 _plain_key: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*").fullmatch
@@ -107,8 +109,8 @@ def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
             yield f"      {_json(key)}: {_json(content)},"
         yield '      "params": {'
         last = len(each) - 1
-        for number, (name, param) in enumerate(each.items()):
-            yield f"        {_json(name)}: {_json(_fields(param))}{',' if number < last else ''}"
+        for number, param in enumerate(each.values()):
+            yield f"        {_json(param.name)}: {_json(_fields(param))}{',' if number < last else ''}"
         yield "      }"
         yield "    }," if place < len(sets) - 1 else "    }"
     yield "  ]"
@@ -133,8 +135,8 @@ def write_yaml(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
             yield f"  {mark} {key}: {_flow(content)}"
             mark = " "
         yield f"  {mark} params:"
-        for name, param in each.items():
-            yield f"      {_key(name)}: {_flow(_fields(param))}"
+        for param in each.values():
+            yield f"      {_key(param.name)}: {_flow(_fields(param))}"
 
 
 def _file(content: object, form: FileForm, source: str, text: str) -> ParamFile:
@@ -159,7 +161,8 @@ def _problem(place: Sequence[str | int], what: str, text: str) -> tuple[int | No
     line = None
     if len(place) > 3 and place[2] == "params":
         line = _line_of(text, str(place[3]))
-    return line, f"{'.'.join(map(str, place)) or 'the document'}: {what}"
+    told = f"{'.'.join(map(str, place)) or 'the document'}: {what}"
+    return line, told if len(told) <= LONGEST_PROBLEM else f"{told[:LONGEST_PROBLEM]}…"
 
 
 def _at(source: str, line: int | None) -> str:
@@ -176,7 +179,7 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content: dict[str, Any] = {}
     for key, value in pairs:
         if key in content:
-            raise ValueError(f"{key!r} stands twice", key)
+            raise ValueError(f"{shown(key)} stands twice", key)
         content[key] = value
     return content
 
@@ -198,12 +201,11 @@ def _header(around: ParamFile) -> list[str]:
 
 def _about(params: ParamSet) -> dict[str, Any]:
     """What a document says of a set but for its parameters."""
-    at = None if params.at is None else datetime.fromtimestamp(params.at, UTC)
     identity = None if params.identity is None else asdict(params.identity)
     about = {
         "system": params.system,
         "component": params.component,
-        "at": None if at is None else at.isoformat().replace("+00:00", "Z"),
+        "at": None if params.at is None else time_of(params.at),
         "source": _encodable(params.source) or None,
         "identity": identity,
     }
@@ -214,8 +216,7 @@ def _fields(param: WrittenParam) -> dict[str, Any]:
     """What a document says of a parameter."""
     fields: dict[str, Any] = {"value": _scalar(param.value, param.type)}
     if param.type is not None:
-        is_raw = isinstance(param.value, bytes)
-        is_wide = not is_raw and isinstance(param.type, ParamType) and param.type.size == 8
+        is_wide = isinstance(param.type, ParamType) and param.type.size == 8
         fields["type"] = type_name(param.type)
         fields["bits"] = f"{param.bits_as(param.type):0{16 if is_wide else 8}x}"
     elif isinstance(param.value, float) and not is_plain(param.value):

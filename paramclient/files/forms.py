@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from datetime import UTC, datetime
 from pathlib import PurePath
 from typing import Final, TypeAlias
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files import document, packed, script, tables
 from paramclient.files.model import AUTOPILOT, ENDINGS, FileForm, ParamFile, address, as_form
-from paramclient.files.text import decode_text, lines_of
+from paramclient.files.text import decode_text, lines_of, time_of
 from paramclient.identity import autopilot_name
 from paramclient.paramset import ParamSet
+from paramclient.values import check_name
 
 __all__ = ["LARGEST_FILE", "Content", "dumps", "loads"]
 
-LARGEST_FILE: Final = 32 * 1024 * 1024
+LARGEST_FILE: Final = 16 * 1024 * 1024
 """Bytes of the largest file that is looked at: 65,535 parameters, as many as an index can count, with names,
-bits, defaults and comments of 300 characters take less in the longest of the forms."""
+bits, defaults and comments take less in the longest of the forms."""
 
 Content: TypeAlias = ParamFile | ParamSet | Iterable[ParamSet]
 """What can be written: a file as it was read, the parameters of one component, or of several."""
@@ -80,9 +80,9 @@ def dumps(content: Content, *, form: FileForm | str | None = None, target: str =
     if form is None:
         raise UsageError("a form is needed to write parameters")
     form = as_form(form)
-    around = _as_file(content, form)
-    sets = [each for each in around.sets if each]
     try:
+        around = _as_file(content, form)
+        sets = [each for each in around.sets if each]
         return _bytes(sets, form, around)
     except FileError:
         raise
@@ -96,7 +96,7 @@ def _bytes(sets: list[ParamSet], form: FileForm, around: ParamFile) -> bytes:
     if len(sets) > 1 and form in (FileForm.PARM, FileForm.MISSION_PLANNER, FileForm.PCK):
         held = ", ".join(map(address, sets))
         raise UsageError(f"the form {form} holds one component, and there are {held}; choose one")
-    _check_addresses(sets)
+    _check(sets)
     match form:
         case FileForm.PCK:
             return packed.write_packed(sets[0])
@@ -126,7 +126,7 @@ def _form_of(text: str, source: str) -> FileForm:
         return FileForm.JSON
     if tables.is_qgc_row(first.text):
         return FileForm.QGC
-    if text.startswith("#!") or any(script.is_script_line(line.text) for line in lines_of(text)):
+    if any(script.is_script_line(line.text) for line in lines_of(text)):
         return FileForm.PX4_SCRIPT
     if document.is_document(first.text):
         return FileForm.YAML
@@ -159,15 +159,20 @@ def _about(params: ParamSet) -> Iterator[str]:
         firmware = f", firmware {version}{commit}" if who.firmware else ""
         yield f"of the vehicle {who.key}{firmware}"
     if params.at is not None:
-        yield f"as of {datetime.fromtimestamp(params.at, UTC).isoformat(timespec='seconds')}"
+        yield f"as of {time_of(params.at, 'seconds')}"
     if params.source:
         yield f"from {params.source}"
 
 
-def _check_addresses(sets: list[ParamSet]) -> None:
-    """Two sets of one component could not be told apart by whoever reads the file: UsageError."""
+def _check(sets: list[ParamSet]) -> None:
+    """Nobody could tell two sets of one component apart, nor use odd names or ids: UsageError."""
     seen = set()
     for each in sets:
+        for number in (each.system, each.component):
+            if number is not None and not 1 <= number <= 255:
+                raise UsageError(f"systems and components have ids from 1 to 255, not {number}")
+        for param in each.values():
+            check_name(param.name)
         whose = (each.system, each.component or AUTOPILOT)
         if whose in seen:
             raise UsageError(f"two sets are of one component, {address(each)}")

@@ -23,6 +23,7 @@ _A_NUMBER = "expected a number (or NaN, Infinity, 0x and 8 digits for raw bytes)
 _WORDS = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
 _raw = re.compile(r"0x([0-9a-fA-F]{8})").fullmatch
 _type_number = re.compile(r"TYPE_([0-9]{1,3})").fullmatch
+_date = re.compile(r"[0-9]{4}-[0-9]{2}-").match
 _bits = re.compile(r"[0-9a-fA-F]{8}(?:[0-9a-fA-F]{8})?").fullmatch
 
 
@@ -125,7 +126,8 @@ class _Set(_Model):
     @classmethod
     def _time_is_text(cls, content: Any) -> Any:
         """A bare number could be seconds or milliseconds."""
-        if isinstance(content, dict) and not isinstance(content.get("at"), str | None):
+        at = content.get("at") if isinstance(content, dict) else None
+        if at is not None and not (isinstance(at, str) and _date(at)):
             raise ValueError("the time `at` is written as 2026-01-31T12:00:00Z")
         return content
 

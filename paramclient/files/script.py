@@ -49,6 +49,7 @@ def read_script(text: str, source: str) -> ParamFile:
     header: list[str] = []
     waiting: list[str] = []
     skipped: list[int] = []
+    left_out = 0
     state = _Flow()
     for line in lines_of(text, _hash):
         if not line.text:
@@ -60,7 +61,8 @@ def read_script(text: str, source: str) -> ParamFile:
         obstacle = state.obstacle
         state.follow(line.text)
         if not _changes(line.text):
-            skipped.append(line.number)
+            left_out += 1
+            skipped += [line.number] if left_out <= MOST_NOTED else []
             continue
         comments = [*waiting, *([line.comment] if line.comment else [])]
         waiting = []
@@ -72,7 +74,7 @@ def read_script(text: str, source: str) -> ParamFile:
             builder.problems.add(line.number, str(error), shown(line.text))
     sets = builder.result()
     if skipped:
-        builder.notes.append(_left_out(skipped))
+        builder.notes.append(_left_out(skipped, left_out))
     return ParamFile(sets, FileForm.PX4_SCRIPT, source, tuple(header), tuple(waiting), tuple(builder.notes))
 
 
@@ -115,9 +117,9 @@ def _param(line: Line, comment: str) -> WrittenParam:
     return WrittenParam(check_name(name), value, comment=comment, line=line.number)
 
 
-def _left_out(lines: list[int]) -> str:
-    named = ", ".join(map(str, lines[:MOST_NOTED])) + (", …" if len(lines) > MOST_NOTED else "")
-    one = len(lines) == 1
+def _left_out(lines: list[int], count: int) -> str:
+    named = ", ".join(map(str, lines)) + (", …" if count > MOST_NOTED else "")
+    one = count == 1
     return (
         f"{'Line' if one else 'Lines'} {named} of the script {'sets' if one else 'set'} no parameter; "
         f"what other scripts set that {'it calls' if one else 'they call'} is not in this."

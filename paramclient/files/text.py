@@ -8,6 +8,7 @@ import re
 import struct
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
 from paramclient.errors import FileError, UsageError
@@ -26,6 +27,7 @@ __all__ = [
     "lines_of",
     "parse_number",
     "shown",
+    "time_of",
     "value_text",
 ]
 
@@ -70,24 +72,25 @@ class Problems:
 
     source: str
     found: list[tuple[int, str, str]] = field(default_factory=list)
+    count: int = 0
 
     def add(self, line: int, expected: str, found: str) -> None:
-        """A line that is not what was expected."""
-        self.found.append((line, expected, found))
+        """A line that is not what was expected. Few are kept, as in a file of another kind all are so."""
+        self.count += 1
+        if self.count <= MOST_PROBLEMS:
+            self.found.append((line, expected, found))
 
     def raise_if_any(self) -> None:
         """Raise one FileError for all of it, if there is anything."""
         if not self.found:
             return
-        ordered = sorted(self.found)
         place = f"{self.source}:" if self.source else "line "
         more = [
-            f"{place}{line}: expected {expected}, found {found}"
-            for line, expected, found in ordered[1:MOST_PROBLEMS]
+            f"{place}{line}: expected {expected}, found {found}" for line, expected, found in self.found[1:]
         ]
-        if len(ordered) > MOST_PROBLEMS:
-            more.append(f"and {len(ordered) - MOST_PROBLEMS} more bad lines")
-        line, expected, found = ordered[0]
+        if self.count > MOST_PROBLEMS:
+            more.append(f"and {self.count - MOST_PROBLEMS} more bad lines")
+        line, expected, found = self.found[0]
         raise FileError(
             f"expected {expected}, found {found}",
             source=self.source,
@@ -108,6 +111,7 @@ class Builder:
     problems: Problems
     sets: dict[tuple[int | None, int | None], dict[str, WrittenParam]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
+    repeated: int = 0
 
     def add(self, param: WrittenParam, *, system: int | None = None, component: int | None = None) -> None:
         """Take a parameter in."""
@@ -116,7 +120,11 @@ class Builder:
         if first is param or param.line is None:
             return
         if _same(first, param):
-            self.notes.append(f"{param.name} stands with one value in lines {first.line} and {param.line}.")
+            self.repeated += 1
+            if self.repeated <= MOST_PROBLEMS:
+                self.notes.append(
+                    f"{param.name} stands with one value in lines {first.line} and {param.line}."
+                )
         else:
             found = f"{_told(param)} behind {_told(first)} in line {first.line}"
             self.problems.add(param.line, f"one value for {param.name}", found)
@@ -130,6 +138,8 @@ class Builder:
         self.problems.raise_if_any()
         if not self.sets:
             raise FileError("the file holds no parameter", source=self.problems.source)
+        if self.repeated > MOST_PROBLEMS:
+            self.notes.append(f"So do parameters in {self.repeated - MOST_PROBLEMS} more lines.")
         return tuple(
             ParamSet(params, component, system, source=self.problems.source)
             for (system, component), params in self.sets.items()
@@ -171,7 +181,7 @@ def decode_text(data: bytes, source: str) -> str:
 
 def lines_of(text: str, mark: re.Pattern[str] = ANY_MARK) -> Iterator[Line]:
     """All lines, also the empty ones, with the comments that this mark begins."""
-    for number, line in enumerate(_line_end.split(text), start=1):
+    for number, line in enumerate(_split(text), start=1):
         found = mark.search(line)
         if found is None:
             yield Line(number, line.strip(" \t"), None)
@@ -237,6 +247,19 @@ def value_text(param: WrittenParam) -> str:
     return format_value(value, ParamType.REAL64 if param.type is None else param.type)
 
 
+def time_of(at: float, digits: str = "auto") -> str:
+    """A unix time in ISO 8601, UTC.
+
+    Raises:
+        UsageError: no calendar has it.
+    """
+    try:
+        moment = datetime.fromtimestamp(at, UTC)
+    except (ArithmeticError, OSError, ValueError):
+        raise UsageError(f"{at!r} is no time in unix seconds") from None
+    return moment.isoformat(timespec=digits).replace("+00:00", "Z")
+
+
 def is_plain(value: float) -> bool:
     """Whether the value is no NaN, or the one that the word stands for."""
     return not math.isnan(value) or struct.pack("<d", value) == _PLAIN_NAN
@@ -245,6 +268,14 @@ def is_plain(value: float) -> bool:
 def shown(text: str) -> str:
     """A piece of a file as an error shows it: quoted, and not all of a long one."""
     return repr(text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}…")
+
+
+def _split(text: str) -> Iterator[str]:
+    start = 0
+    for end in _line_end.finditer(text):
+        yield text[start : end.start()]
+        start = end.end()
+    yield text[start:]
 
 
 def _told(param: WrittenParam) -> str:

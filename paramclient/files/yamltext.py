@@ -8,6 +8,8 @@ from typing import Any, Final
 
 import yaml
 
+from paramclient.files.text import shown
+
 __all__ = ["NotYaml", "load"]
 
 DEEPEST: Final = 20
@@ -41,6 +43,7 @@ def load(text: str) -> Any:
         NotYaml: see there.
     """
     try:
+        _check_events(text)
         return yaml.load(text, _Loader)
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
@@ -49,40 +52,38 @@ def load(text: str) -> Any:
         raise NotYaml(str(error).splitlines()[0], None) from None
 
 
-class _Loader(yaml.SafeLoader):
-    """A safe loader that takes fewer words for something else than text, and follows no references."""
+def _check_events(text: str) -> None:
+    """Follow no references, trust no tags, and nest no deeper than any document of ours."""
+    depth = 0
+    for event in yaml.parse(text, _Loader):
+        depth += isinstance(event, yaml.CollectionStartEvent)
+        depth -= isinstance(event, yaml.CollectionEndEvent)
+        if isinstance(event, yaml.AliasEvent):
+            raise _refused(event, "found an alias (*), which is not followed")
+        if getattr(event, "anchor", None) is not None or getattr(event, "tag", None) is not None:
+            raise _refused(event, "found an anchor or a tag (&, !), which are not read")
+        if depth > DEEPEST:
+            raise _refused(event, f"found more than {DEEPEST} levels")
 
-    _depth = 0
 
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            raise self._refused("an alias (*), which is not followed")
-        event = self._next_event()
-        if event.anchor is not None or getattr(event, "tag", None) is not None:
-            raise self._refused("an anchor or a tag (&, !), which are not read")
-        self._depth += 1
-        if self._depth > DEEPEST:
-            raise self._refused(f"more than {DEEPEST} levels")
-        node = super().compose_node(parent, index)
-        self._depth -= 1
-        return node
+def _refused(at: Any, problem: str) -> yaml.MarkedYAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=at.start_mark)
+
+
+class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # the one in C is not everywhere
+    """A safe loader that takes fewer words for something else than text."""
 
     def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
         seen = set()
         for key, _ in node.value:
             name = self.construct_object(key, deep=True)
             if not isinstance(name, str):
-                raise yaml.MarkedYAMLError(problem="found a key that is no text", problem_mark=key.start_mark)
+                raise _refused(key, "found a key that is no text")
             if name in seen:
-                raise yaml.MarkedYAMLError(problem=f"{name!r} stands twice", problem_mark=key.start_mark)
+                raise _refused(key, f"{shown(name)} stands twice")
             seen.add(name)
-        return super().construct_mapping(node, deep)
-
-    def _next_event(self) -> Any:
-        return self.peek_event()  # type: ignore[no-untyped-call]  # the stubs say nothing of it
-
-    def _refused(self, what: str) -> yaml.MarkedYAMLError:
-        return yaml.MarkedYAMLError(problem=f"found {what}", problem_mark=self._next_event().start_mark)
+        mapping: dict[Hashable, Any] = super().construct_mapping(node, deep)
+        return mapping
 
 
 _Loader.yaml_implicit_resolvers = {}  # none of those of YAML 1.1
