@@ -224,6 +224,14 @@ def test_of_a_table_that_was_never_complete_it_is_known_when_it_was_heard_last(c
     assert since(cache.fleet_diff(wanted(A=9)).names[0]) == {1: (5, False)}
 
 
+def test_a_value_that_was_heard_before_the_table_was_complete_was_so_then(cache: ParamCache) -> None:
+    cache.save(update(stored("A", 1)))
+    cache.save(update(stored("B", 1, at=NOW + 5), at=NOW + 5, table=DONE))
+    cache.save(update(stored("B", 1, at=NOW + 9), at=NOW + 9))
+    found = cache.fleet_diff(wanted(A=9, B=9)).names
+    assert [since(each) for each in found] == [{1: (0, False)}, {1: (5, False)}]
+
+
 # The function
 
 
