@@ -42,6 +42,14 @@ def test_raw_bytes_are_held_by_raw_bytes_alone() -> None:
     assert not WrittenParam("P", b"\x01\0\0\0").is_held_by(number)
 
 
+def test_raw_bytes_count_with_all_four_also_in_a_small_type() -> None:
+    """ArduPilot can send a float that its own integer type cannot hold."""
+    raw = struct.pack("<f", 1e20)
+    param = Param("P", raw, ParamType.INT8, 0, int.from_bytes(raw, "little"))
+    assert WrittenParam.of(param).is_held_by(param)
+    assert not WrittenParam("P", struct.pack("<f", 2e20)).is_held_by(param)
+
+
 def test_a_value_that_does_not_fit_the_type_says_so_when_its_bits_are_asked_for() -> None:
     with pytest.raises(UsageError, match="300 does not fit UINT8"):
         WrittenParam("P", 300).bits_as(ParamType.UINT8)
