@@ -164,6 +164,8 @@ def same_value(left: WrittenParam, right: WrittenParam) -> bool:
     """
     if isinstance(left.value, bytes) or isinstance(right.value, bytes):
         return left.value == right.value and (None in (left.type, right.type) or left.type == right.type)
+    if left.value == right.value:  # then they are so in any type, and most are: what follows takes its time
+        return True
     kind = _common_type(left, right)
     if kind is None:
         return _same_number(left.value, right.value)
