@@ -8,6 +8,7 @@ from paramclient.component import Component
 from paramclient.errors import (
     CacheError,
     ClientClosed,
+    FileError,
     FileErrorCode,
     FileTransferError,
     LinkError,
@@ -23,9 +24,11 @@ from paramclient.errors import (
     VehicleError,
 )
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
+from paramclient.files import FileForm, ParamFile, read_file, write_file
 from paramclient.ftp import Ftp
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
+from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.protocol.ftp import DirectoryEntry
 from paramclient.protocol.result import FetchResult, Policy, Progress
 from paramclient.protocol.sampling import Sample
@@ -51,7 +54,9 @@ __all__ = [
     "Events",
     "FetchResult",
     "FetchedAll",
+    "FileError",
     "FileErrorCode",
+    "FileForm",
     "FileTransferError",
     "Found",
     "Ftp",
@@ -68,7 +73,9 @@ __all__ = [
     "ParamClient",
     "ParamClientError",
     "ParamErrorCode",
+    "ParamFile",
     "ParamMap",
+    "ParamSet",
     "ParamType",
     "Policy",
     "Progress",
@@ -86,5 +93,8 @@ __all__ = [
     "UsageError",
     "ValueNotApplied",
     "VehicleError",
+    "WrittenParam",
     "__version__",
+    "read_file",
+    "write_file",
 ]

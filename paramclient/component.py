@@ -45,7 +45,7 @@ class Component:
     """One component of a vehicle, as `ParamClient.component` gives it.
 
     All of its calls may be cancelled at any point, and the next call works. All of them wait on while a link
-    that comes back by itself is away, up to `LINK_PATIENCE` of `paramclient.client`; then, and when the
+    that comes back by itself is away, up to `LINK_PATIENCE` of `paramclient.carrier`; then, and when the
     client is closed, they raise LinkError. A component that is lost (see `Lost`) is not asked: calls that
     wait for an answer and new ones raise NoReply at once, but for a `fetch_all` under way, which goes on for
     a while, as the vehicle may only be starting again. The table stays, and what is in it is *cached* until
@@ -292,8 +292,8 @@ class Component:
         """
         changes = Changes()
         self._subscriptions.add(changes)
-        if self._client._ended is not None:
-            changes.end(self._client._ended)
+        if self._client._carrier.ended is not None:
+            changes.end(self._client._carrier.ended)
         return changes
 
     def _cache_is_due(self, now: float) -> bool:

@@ -45,6 +45,8 @@ class WrittenParam:
         Raises:
             UsageError: the value does not fit the type.
         """
+        if isinstance(self.value, bytes):
+            return int.from_bytes(self.value, "little")  # all four, also of a type that has fewer
         return bits_of(self.value, number)
 
     def is_held_by(self, param: Param) -> bool:

@@ -51,10 +51,11 @@ def commands() -> list[list[str]]:
     ]
 
 
-def run(*arguments: str, **environment: str) -> str:
+def run(*arguments: str, cwd: Path | None = None, **environment: str) -> str:
     """Run a Python program; what it printed. It must end well, and complain of nothing."""
     done = subprocess.run(
         [sys.executable, *arguments],
+        cwd=cwd,
         env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
         stdin=subprocess.DEVNULL,
         capture_output=True,
@@ -68,7 +69,7 @@ def run(*arguments: str, **environment: str) -> str:
 
 @pytest.mark.parametrize("program", [*programs()])
 def test_a_program_runs(program: str, tmp_path: Path) -> None:
-    run("-W", "error", "-c", program, XDG_CACHE_HOME=str(tmp_path))
+    run("-W", "error", "-c", program, cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path))
 
 
 def test_the_first_example_runs(tmp_path: Path) -> None:

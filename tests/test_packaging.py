@@ -97,7 +97,7 @@ def test_what_an_installation_brings(metadata: Message) -> None:
     always = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra ==" not in each}
     command = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra == 'cli'" in each}
     assert always == {"anyio", "fastcrc", "platformdirs", "pydantic", "pymavlink"}
-    assert command == {"cyclopts", "rich"}
+    assert command == {"cyclopts", "rich", "pyyaml"}
     assert metadata["Requires-Python"] == ">=3.11"
 
 

@@ -4,30 +4,21 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 from paramclient.errors import LinkError, NoReply
-from paramclient.identity import Identity, autopilot_name
+from paramclient.identity import autopilot_name
 from paramclient.protocol import events
-from paramclient.protocol.authors import Authors
-from paramclient.protocol.events import Event, ParamChanged
+from paramclient.protocol.events import ParamChanged
 from paramclient.protocol.fetch import Fetch
-from paramclient.protocol.fetches import Fetches
-from paramclient.protocol.ftp import FileTransfers
-from paramclient.protocol.identify import Identification
-from paramclient.protocol.presence import Presence
-from paramclient.protocol.reads import Key, Read, Reads
-from paramclient.protocol.refresh import Refresh
-from paramclient.protocol.result import Means, Policy, Sampled
-from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
-from paramclient.protocol.table import Change, Table
-from paramclient.protocol.timing import RoundTrip
-from paramclient.protocol.turns import Turns
+from paramclient.protocol.parts import Parts
+from paramclient.protocol.reads import Key, Read
+from paramclient.protocol.result import FetchResult, Policy, Sampled
+from paramclient.protocol.table import Change
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
-    MAV_AUTOPILOT_PX4,
     NO_INDEX,
     AutopilotVersion,
     CommandAck,
@@ -40,8 +31,8 @@ from paramclient.protocol.wire import (
     StatusText,
     SystemTime,
 )
-from paramclient.protocol.writes import Write, Writes
-from paramclient.values import Encoding, Param, Trust, Value, encode
+from paramclient.protocol.writes import Write
+from paramclient.values import Param, Trust, Value, encode
 
 __all__ = ["ComponentMachine"]
 
@@ -49,7 +40,7 @@ FRESH_IDENTITY: Final = 1.0
 """Seconds for which an AUTOPILOT_VERSION needs no other."""
 
 
-class ComponentMachine:
+class ComponentMachine(Parts):
     """Everything about one component that needs no clock and no socket.
 
     Args:
@@ -75,85 +66,6 @@ class ComponentMachine:
         files: its files.
         fetches: what was and is being fetched.
     """
-
-    def __init__(
-        self,
-        system: int,
-        component: int,
-        *,
-        own: tuple[int, int],
-        link: str,
-        send: Callable[[Message], None],
-        emit: Callable[[Event], None],
-        encoding: Encoding | None = None,
-        upkeep: Upkeep | None = None,
-        is_link_busy: Callable[[], bool] = lambda: False,
-        is_vehicle_doubted: Callable[[], bool] = lambda: False,
-        another: Callable[[float], None] | None = None,
-        turns: Turns | None = None,
-    ) -> None:
-        target = (system, component)
-        upkeep = upkeep or Upkeep()
-        self.system = system
-        self.component = component
-        self.version = 1
-        self.round_trip = RoundTrip()
-        self.who = Identification(target, link, self.round_trip, send, encoding)
-        self.table = Table(self.who.encoding)
-        self.turns = Turns() if turns is None else turns
-        self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share)
-        self.writes = Writes(
-            target,
-            self.round_trip,
-            send,
-            self.reads,
-            self.table.params,
-            encoding=lambda: self.table.encoding,
-            is_certain=lambda: self.may_be_written,
-        )
-        self.presence = Presence()
-        self.sync = Sync(
-            self.reads,
-            self.table,
-            upkeep,
-            is_px4=lambda: self.who.autopilot == MAV_AUTOPILOT_PX4,
-            is_writing=lambda: len(self.writes) > 0,
-            is_fetching=lambda: self.fetch is not None,
-            is_busy=is_link_busy,
-            file_is_cheap=lambda interval: self.fetches.file_is_cheap(interval),
-            is_spared=lambda: self._is_spared,
-            is_doubted=lambda: self.who.is_doubted,
-            begin_fetch=lambda now, refresh: self.begin_fetch(now, refresh=refresh),
-            end_fetch=self.end_fetch,
-            resynced=lambda changed, confirmed: emit(events.TableResynced(self, changed, confirmed)),
-        )
-        self.files = FileTransfers(target, own, self.round_trip, send)
-        self.fetches = Fetches(
-            Means(
-                target,
-                self.round_trip,
-                send,
-                self.reads,
-                self.table,
-                self.turns,
-                self.files,
-                expects_hash=lambda: self.sync.expects_hash,
-                changed=self._moved,
-                doubt=self._doubt_identity,
-            ),
-            self.sync,
-            upkeep.policy,
-            says_file=lambda: self.who.says_file,
-            ended=lambda result: emit(events.Fetched(self, result)),
-        )
-        self._own = own
-        self._emit = emit
-        self._policy = upkeep.policy
-        self._another = another or self.become_another
-        self._is_vehicle_doubted = is_vehicle_doubted
-        self._known_as: str | None = None  # the key of the identity that was reported
-        self._may_write = False
-        self._authors = Authors()
 
     # what comes in
 
@@ -371,60 +283,6 @@ class ComponentMachine:
         if self.fetch is not None:
             self.fetch.restart(now)
 
-    @property
-    def identity(self) -> Identity:
-        """Who the vehicle is, as far as this component has said."""
-        return self.who.identity
-
-    @property
-    def may_be_written(self) -> bool:
-        """Whether it is certain whom a write reaches, and what it makes of it."""
-        return self.who.may_be_written and not self._is_vehicle_doubted()
-
-    @property
-    def state(self) -> str:
-        """The table's state in a word: new, cached, fetching, synced, partial, lost."""
-        if self.presence.is_lost:
-            return "lost"
-        if self.fetch is not None:
-            return "fetching"
-        if self.sync.synced:
-            return "synced"
-        if not self.table.params:
-            return "new"
-        return "cached" if self.table.complete else "partial"
-
-    @property
-    def fetch(self) -> Fetch | None:
-        """The fetch under way, or None."""
-        return self.fetches.current
-
-    @property
-    def sync_state(self) -> SyncState:
-        """How the table stands to the vehicle's."""
-        return SyncState.LOST if self.presence.is_lost else self.sync.state
-
-    @property
-    def refresh(self) -> Refresh | None:
-        """The reading of volatile values under way after a hash hit, or None."""
-        return self.sync.refresh
-
-    @property
-    def can_hit(self) -> bool:
-        """Whether the vehicle's hash may confirm the table as it stands."""
-        return self.table.complete and self.table.hash is not None
-
-    @property
-    def is_waiting(self) -> bool:
-        """Whether anything is awaited: an answer, a fetch, a file, or who it is."""
-        is_asked = len(self.reads) > 0 or len(self.writes) > 0 or not self.files.is_idle
-        return is_asked or self.fetch is not None or self.who.is_asking
-
-    @property
-    def is_settling(self) -> bool:
-        """Whether a write is under way, or the hash after one has not come yet."""
-        return len(self.writes) > 0 or self.sync.is_settling
-
     def __repr__(self) -> str:
         kind = "unknown" if self.who.autopilot is None else autopilot_name(self.who.autopilot)
         return f"<ComponentMachine {self.system}/{self.component} {kind} {self.state}>"
@@ -466,12 +324,6 @@ class ComponentMachine:
             self.sync.count_moved(now)
         self.table.move(count)
 
-    @property
-    def _is_spared(self) -> bool:
-        """Whether it is lost, or in a mode in which nothing is asked of it unasked."""
-        presence = self.presence
-        return presence.is_lost or presence.is_high_latency or self.reads.pace.gap >= LOW_BANDWIDTH_GAP
-
     def _doubt(self) -> None:
         """What is known may be of the past: it counts again when the vehicle has confirmed it."""
         self.table.doubt(Trust.LIVE, Trust.VERIFIED)
@@ -511,12 +363,6 @@ class ComponentMachine:
         if self.fetch is not None and self.fetch.is_under_way:
             self.fetch.restart(now)
 
-    def _is_known(self, key: Key) -> bool:
-        """Whether anything speaks for such a parameter."""
-        if isinstance(key, str):
-            return key in self.table.params
-        return self.table.count is None or key < self.table.count
-
     def _follow_identity(self, now: float) -> None:
         """What the identification has come to know takes effect."""
         self._report(self.table.use_encoding(self.who.encoding))
@@ -540,6 +386,12 @@ class ComponentMachine:
         for change in changes:
             self.sync.changed(change)
         self._report(changes)
+
+    def _resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
+        self._emit(events.TableResynced(self, changed, confirmed))
+
+    def _fetched(self, result: FetchResult) -> None:
+        self._emit(events.Fetched(self, result))
 
     def _report(self, changes: list[Change]) -> None:
         for change in changes:

@@ -16,6 +16,7 @@ MOST_NAMES: Final = 65_535
 
 _EXACT = 1 << 24  # up to here every integer is a float32
 _LIVE = Trust.LIVE  # each look into an enumeration takes a tenth of what a value takes here
+_KNOWN_TYPES = tuple(map(known_type, range(256)))
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
 
 
@@ -143,8 +144,7 @@ class Table:
             value, bits = old.value, old.bits
         elif self._filed:
             self._filed.discard(name)
-        new = Param(name, value, known_type(number), index, bits, _LIVE, default)
-        self.params[name] = new
+        new = self.params[name] = Param(name, value, _KNOWN_TYPES[number], index, bits, _LIVE, default)
         self._wire[name] = raw
         if old is not None and old.same_value(new):
             if old.index != index:

@@ -68,7 +68,7 @@ class Framer:
 
     def __init__(self, wanted: Collection[int] | None = None, *, stream: bool = True) -> None:
         ids = _CRC_EXTRA if wanted is None else wanted
-        self._wanted = {number.to_bytes(3, "little"): number for number in ids}
+        self._number_of = {number.to_bytes(3, "little"): number for number in ids}.get
         self._stream = stream
         self._tail = b""
         self.frames = 0
@@ -86,7 +86,7 @@ class Framer:
             data = self._tail + data
         may_go_on = self._stream and not final
         found: list[Frame] = []
-        number_of = self._wanted.get
+        number_of = self._number_of
         extra_of = _EXTRA_BY_ID_BYTES.get
         length = len(data)
         padded = data + _PADDING
@@ -132,7 +132,8 @@ class Framer:
             skipped += next_at - at
             at = next_at
         self.frames += good
-        self.skipped += skipped
+        if skipped:
+            self.skipped += skipped
         self._tail = data[at:]
         return found
 
