@@ -26,6 +26,8 @@ from paramclient.cli.output import (
     time_text,
     value_json,
 )
+from paramclient.cli.sources import is_file, open_file, vehicle_key
+from paramclient.cli.written import show_file
 from paramclient.errors import CacheError
 from paramclient.identity import autopilot_name
 from paramclient.values import Param, check_name, format_value, type_name
@@ -43,15 +45,18 @@ def show(
     changed: bool = False,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Print what was last known of a vehicle, with no link.
+    """Print what was last known of a vehicle, or what a parameter file holds, with no link.
 
     With --changed, exit code 1 says that the firmware's defaults are not known.
 
     Args:
-        vehicle: Its system id, the beginning of its hardware id, or its key in the cache.
+        vehicle: A parameter file; else a vehicle's system id, the beginning of its hardware id, its key in
+            the cache, or cache: and one of these.
         component: This component only.
         changed: Only what differs from the firmware's defaults.
     """
+    if vehicle is not None and is_file(vehicle):
+        return show_file(open_file(vehicle), component, changed=changed, json=options.json)
     with _open(options) as cache:
         summaries = _choose(cache, vehicle, component)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
@@ -102,7 +107,7 @@ def cache_history(
         limit: The newest so many only.
     """
     with _open(options) as cache:
-        key = _key(cache, vehicle)
+        key = vehicle_key(cache, vehicle)
         entries = cache.history(key, component, None if name is None else check_name(name), limit)
     if options.json:
         print_json({"history": [_entry_json(entry) for entry in entries]})
@@ -131,7 +136,7 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
     """
     with _open(options) as cache:
         _choose(cache, vehicle, component)
-        key = _key(cache, vehicle)
+        key = vehicle_key(cache, vehicle)
         removed = cache.remove(key, component)
     if options.json:
         print_json({"key": key, "removed": removed})
@@ -144,29 +149,13 @@ def _open(options: CacheOptions) -> ParamCache:
     return ParamCache(options.cache)
 
 
-def _key(cache: ParamCache, vehicle: str) -> str:
-    """The key of the vehicle that the user means.
-
-    Raises:
-        CacheError: none fits, or more than one.
-    """
-    if vehicle.isdecimal():
-        fits = [known for known in cache.vehicles() if str(known.identity.system) == vehicle]
-        if len(fits) > 1:
-            listed = "; ".join(map(str, fits))
-            raise CacheError(f"system {vehicle} fits more than one vehicle in the cache: {listed}")
-        if fits:
-            return fits[0].key
-    return cache.components(vehicle)[0].key
-
-
 def _choose(cache: ParamCache, vehicle: str | None, component: int | None) -> list[CachedSummary]:
     """The tables that the user means.
 
     Raises:
         CacheError: a vehicle was named and there is none such, or more than one; or it has no such component.
     """
-    summaries = cache.components(None if vehicle is None else _key(cache, vehicle))
+    summaries = cache.components(None if vehicle is None else vehicle_key(cache, vehicle))
     chosen = [each for each in summaries if component in (None, each.component)]
     if not chosen and (summaries or vehicle is not None):
         known = ", ".join(f"{each.system}/{each.component}" for each in summaries)

@@ -29,6 +29,8 @@ class ExitCode(IntEnum):
     DONE = 0
     INCOMPLETE = 1
     """The vehicle refused something, or did not give everything."""
+    DIFFERENT = 1
+    """What was compared is not the same."""
     USAGE = 2
     """Something was asked for that cannot be right."""
     NO_ANSWER = 3
