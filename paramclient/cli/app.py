@@ -14,6 +14,7 @@ from typing import Final
 import anyio
 from cyclopts import App, CycloptsError, Parameter
 
+from paramclient.cli.diff import diff
 from paramclient.cli.fleet import fleet_diff
 from paramclient.cli.history import history
 from paramclient.cli.link import link
@@ -112,7 +113,7 @@ def _examples(*lines: str) -> str:
 
 _EXIT_CODES: Final = """
 
-Exit codes: 0 done; 1 refused or incomplete; 2 usage; 3 no vehicle or no answer; 4 link; 5 cache."""
+Exit codes: 0 done; 1 refused, incomplete, different; 2 usage; 3 no vehicle or no answer; 4 link; 5 cache."""
 
 _app: Final = App(
     name="paramclient",
@@ -168,8 +169,17 @@ _app.command(
 )
 _app.command(
     show,
-    usage="Usage: paramclient show [OPTIONS] [VEHICLE]",
-    help_epilogue=_examples("show", "show 1", "show 00020000 --json"),
+    usage="Usage: paramclient show [OPTIONS] [VEHICLE|FILE]",
+    help_epilogue=_examples("show", "show 1", "show 00020000 --json", "show quad.params"),
+)
+_app.command(
+    diff,
+    usage="Usage: paramclient diff [OPTIONS] A B",
+    help_epilogue=_examples(
+        "diff before.params after.params",
+        "diff quad.param udpin:0.0.0.0:14550 --only 'MC_*'",
+        "diff 1 2 --base defaults",
+    ),
 )
 _app.command(
     history,

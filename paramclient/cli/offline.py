@@ -22,11 +22,13 @@ from paramclient.cli.output import (
     say,
     time_text,
 )
+from paramclient.cli.sources import is_file, open_file, vehicle_key
+from paramclient.cli.written import show_file
 from paramclient.errors import CacheError
 from paramclient.identity import autopilot_name
 from paramclient.values import Param, format_value, type_name
 
-__all__ = ["cache_list", "cache_path", "cache_remove", "show", "tables_of", "vehicle_key"]
+__all__ = ["cache_list", "cache_path", "cache_remove", "show", "tables_of"]
 
 _DEFAULTS: Final = CacheOptions()
 
@@ -39,15 +41,18 @@ def show(
     changed: bool = False,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Print what was last known of a vehicle, with no link.
+    """Print what was last known of a vehicle, or what a parameter file holds, with no link.
 
     With --changed, exit code 1 says that the firmware's defaults are not known.
 
     Args:
-        vehicle: Its system id, the beginning of its hardware id, or its key in the cache.
+        vehicle: A parameter file; else a vehicle's system id, the beginning of its hardware id, its key in
+            the cache, or cache: and one of these.
         component: This component only.
         changed: Only what differs from the firmware's defaults.
     """
+    if vehicle is not None and is_file(vehicle):
+        return show_file(open_file(vehicle), component, changed=changed, json=options.json)
     with _open(options) as cache:
         summaries = _choose(cache, vehicle, component)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
@@ -121,22 +126,6 @@ def tables_of(options: CacheOptions, vehicle: str, component: int | None) -> lis
 
 def _open(options: CacheOptions) -> ParamCache:
     return ParamCache(options.cache)
-
-
-def vehicle_key(cache: ParamCache, vehicle: str) -> str:
-    """The key of the vehicle that the user means.
-
-    Raises:
-        CacheError: none fits, or more than one.
-    """
-    if vehicle.isdecimal():
-        fits = [known for known in cache.vehicles() if str(known.identity.system) == vehicle]
-        if len(fits) > 1:
-            listed = "; ".join(map(str, fits))
-            raise CacheError(f"system {vehicle} fits more than one vehicle in the cache: {listed}")
-        if fits:
-            return fits[0].key
-    return cache.components(vehicle)[0].key
 
 
 def _choose(cache: ParamCache, vehicle: str | None, component: int | None) -> list[CachedSummary]:
