@@ -111,9 +111,9 @@ def test_save_needs_no_link_for_a_vehicle_in_the_cache(command: Command, tmp_pat
     uid = vehicle.identity.uid
     assert uid is not None
     for where in ("1", uid[:6], vehicle.key):
-        path = tmp_path / "quad.yaml"
+        path = tmp_path / "quad.json"
         saved = command("save", where, path, "--cache", cache)
-        assert (saved.code, saved.err) == (0, f"903 parameters of 1/1 written to {path} (yaml)\n")
+        assert (saved.code, saved.err) == (0, f"903 parameters of 1/1 written to {path} (json)\n")
         params = read_file(path).choose()
         assert params.identity == vehicle.identity
         path.unlink()
@@ -274,3 +274,18 @@ def test_a_name_that_is_no_text_reaches_no_terminal(command: Command, tmp_path: 
     assert saved.code == 0
     assert "\x1b" not in saved.err
     assert path.exists()
+
+
+def test_a_value_that_is_only_last_known_is_not_written(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+) -> None:
+    """No hash speaks for a volatile value: where the vehicle does not give it, nobody knows what it is."""
+    cache, path = tmp_path / "cache.sqlite3", tmp_path / "quad.param"
+    rows = [SimParam("A", ParamType.INT32, 1), SimParam("CAL_ACC0_XOFF", ParamType.INT32, 2, volatile=True)]
+    assert command("save", put(PX4Vehicle(table=rows)), path, "--cache", cache).code == 0
+    path.unlink()
+    silent = PX4Vehicle(table=rows, dead=["CAL_ACC0_XOFF"])
+    saved = command("save", put(silent), path, "--cache", cache)
+    assert (saved.code, saved.out) == (1, "")
+    assert "1/1 is incomplete: 1 of 2 parameters did not come" in saved.err
+    assert not path.exists()

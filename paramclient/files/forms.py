@@ -84,8 +84,6 @@ def dumps(content: Content, *, form: FileForm | str | None = None, target: str =
         around = _as_file(content, form)
         sets = [each for each in around.sets if each]
         return _bytes(sets, form, around)
-    except FileError:
-        raise
     except UsageError as error:
         raise FileError(str(error), source=target) from error
 
