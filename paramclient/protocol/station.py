@@ -119,7 +119,7 @@ class Station:
             machine = self.components.get((system, component))
             if number == PARAM_VALUE_ID and machine is not None:  # the short way for what comes in thousands
                 self._peers[system] = peer
-                machine.receive(decode_param_value(payload), now, version=version)
+                machine.receive_value(decode_param_value(payload), now, version)
             else:
                 self._receive_other(frame, peer, now)
         if self._is_stream and not data:
