@@ -18,8 +18,11 @@ from paramclient.cache import (
 from paramclient.client import FetchedAll, ParamClient
 from paramclient.component import Component
 from paramclient.errors import (
+    AnotherVehicle,
     CacheError,
     ClientClosed,
+    CommandRefused,
+    CommandResult,
     FileError,
     FileErrorCode,
     FileTransferError,
@@ -52,12 +55,15 @@ from paramclient.values import Encoding, Param, ParamType, Trust
 from paramclient.version import __version__
 
 __all__ = [
+    "AnotherVehicle",
     "CacheError",
     "CachedComponent",
     "CachedVehicle",
     "Change",
     "Changes",
     "ClientClosed",
+    "CommandRefused",
+    "CommandResult",
     "Component",
     "ComponentTraffic",
     "DirectoryEntry",

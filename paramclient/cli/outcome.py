@@ -6,6 +6,7 @@ from enum import IntEnum
 from typing import Final
 
 from paramclient.errors import (
+    AnotherVehicle,
     CacheError,
     FileTransferError,
     LinkError,
@@ -63,6 +64,7 @@ _STATUSES: Final = {
     UnknownParameter: "unknown",
     TypeMismatch: "mismatch",
     ValueNotApplied: "not-applied",
+    AnotherVehicle: "another",
     NoReply: "no-reply",
     UsageError: "invalid",
     LinkError: "link",
