@@ -4,6 +4,7 @@ The tree says who is to blame::
 
     ParamClientError
     ├── UsageError(ValueError)        the caller: a name, value, link name or argument that cannot be right
+    │   ├── FileError                 a parameter file that cannot be read or written
     │   └── MetadataError             a description of parameters that is none
     ├── VehicleError                  the vehicle answered, and the answer is no
     │   ├── UnknownParameter          it has no parameter of that name or index
@@ -32,6 +33,7 @@ __all__ = [
     "ClientClosed",
     "CommandRefused",
     "CommandResult",
+    "FileError",
     "FileErrorCode",
     "FileTransferError",
     "LinkError",
@@ -125,6 +127,36 @@ class ParamClientError(Exception):
 
 class UsageError(ParamClientError, ValueError):
     """The caller asked for something that cannot be right. Nothing was sent."""
+
+
+class FileError(UsageError):
+    """A parameter file cannot be read or written; a file that was to be replaced is as it was before.
+
+    Its text has a line for each bad line of the file, `quad.param:17: expected …, found …`.
+
+    Attributes:
+        source: the file's name as it was given; "" for bytes without one.
+        line: the first bad line, from 1; None where it is not about a line.
+        expected: what should have stood there, in words; None where it is not about a line.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        source: str = "",
+        line: int | None = None,
+        expected: str | None = None,
+        more: tuple[str, ...] = (),
+    ) -> None:
+        if line is not None:
+            place = f"{source}:{line}: " if source else f"line {line}: "
+        else:
+            place = f"{source}: " if source else ""
+        super().__init__("\n".join((f"{place}{message}", *more)))
+        self.source = source
+        self.line = line
+        self.expected = expected
 
 
 class MetadataError(UsageError):

@@ -339,6 +339,16 @@ def test_show_of_a_whole_table_tells_meanings(command: Command, shown: tuple[obj
     assert "metadata" not in params["TST_LOG"]
 
 
+def test_show_of_a_parameter_file_has_no_names(command: Command, tmp_path: Path) -> None:
+    file = tmp_path / "quad.param"
+    file.write_text("FLTMODE1,5\n")
+    assert command("show", file).code == 0
+    for words in (["FLTMODE1"], ["--metadata", XML]):
+        done = command("show", file, *words)
+        assert (done.code, done.out) == (2, "")
+        assert "go with a vehicle in the cache" in done.err
+
+
 def test_show_speaks_to_no_vehicle(command: Command, shown: tuple[object, ...]) -> None:
     done = command("show", "--metadata", "vehicle", *shown)
     assert (done.code, done.out) == (2, "")

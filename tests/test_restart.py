@@ -82,6 +82,38 @@ class Exchanged(Tap):
         self._endpoint = endpoint
 
 
+class LateClock(Tap):
+    """An endpoint whose SYSTEM_TIME takes a longer way than all else.
+
+    Attributes:
+        by: seconds by which it is late.
+    """
+
+    by = 0.3
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        super().__init__(endpoint)
+        self._late: list[tuple[float, bytes]] = []
+
+    def next_deadline(self) -> float | None:
+        due = [when for when, _ in self._late[:1]]
+        own = super().next_deadline()
+        return min([*due, *([] if own is None else [own])], default=None)
+
+    def data_to_send(self) -> list[bytes]:
+        now = anyio.current_time()
+        sent: list[bytes] = []
+        for data in super().data_to_send():
+            is_clock = wire.decode(wire.Framer(wire.UNDERSTOOD, stream=False).receive(data)[0])
+            if isinstance(is_clock, wire.SystemTime):
+                self._late.append((now + self.by, data))
+            else:
+                sent.append(data)
+        sent += [data for when, data in self._late if when <= now]
+        self._late = [each for each in self._late if each[0] > now]
+        return sent
+
+
 # the way it goes
 
 
@@ -178,6 +210,20 @@ async def test_a_vehicle_without_a_clock(make: Make, down: float, longest: float
         began = anyio.current_time()
         await component.reboot()
         assert down < anyio.current_time() - began < longest
+        assert len(starts) == 1
+
+
+@pytest.mark.parametrize("down", [0.8, 1.0, 1.3, 2.0])
+@MAKES
+@swiftly
+async def test_a_clock_that_is_heard_after_the_heartbeat(make: Make, down: float) -> None:
+    """The first heartbeat of the new start is no reason to tell it again."""
+    vehicle = make(reboot_down=down, reboot_ack=False)
+    starts = counted(vehicle)
+    async with a_client(LateClock(vehicle)) as client:
+        component = await known(client)
+        await component.reboot()
+        await asyncio.sleep(5.0)
         assert len(starts) == 1
 
 
@@ -294,6 +340,34 @@ async def test_another_vehicle_is_told(before: Make, after: Make, ack: bool) -> 
         assert residue(component) == []
         # the one that is there now can be told, too
         assert await component.reboot() is component
+
+
+@swiftly
+async def test_another_one_is_told_as_soon_as_it_says_so() -> None:
+    place = Exchanged(generic(uid=1, reboot_down=math.inf))
+    async with a_client(place) as client:
+        component = await known(client)
+        asyncio.get_running_loop().call_later(10.0, place.exchange, Clockless(generic(uid=2)))
+        began = anyio.current_time()
+        assert isinstance(await outcome(component.reboot()), AnotherVehicle)
+        assert anyio.current_time() - began < 11.5
+
+
+@swiftly
+async def test_another_kind_is_told_though_its_first_heartbeat_is_lost() -> None:
+    class Beatless(Tap):
+        def data_to_send(self) -> list[bytes]:
+            sent = super().data_to_send()
+            return sent[1:] if anyio.current_time() < silent_until else sent
+
+    silent_until = math.inf
+    place = Exchanged(generic(uid=0, reboot_down=math.inf))
+    async with a_client(place) as client:
+        component = await known(client)
+        silent_until = anyio.current_time() + 4.5
+        after = Beatless(generic(uid=0, autopilot=wire.MAV_AUTOPILOT_PX4))
+        asyncio.get_running_loop().call_later(4.0, place.exchange, after)
+        assert isinstance(await outcome(component.reboot()), AnotherVehicle)
 
 
 @swiftly

@@ -189,6 +189,11 @@ def test_the_tables_of_real_ones_hold_the_system_id(make: Any, name: str) -> Non
     assert vehicle.system == 7
 
 
+def test_a_table_of_ones_own_says_the_system_id_too() -> None:
+    assert ArduPilotVehicle(system=7, table={"SYSID_THISMAV": 1}).param("SYSID_THISMAV").value == 7
+    assert PX4Vehicle(system=7, table={"A": 1}).values == {"A": 1}
+
+
 def test_sys_autoconfig_resets_what_it_does_not_keep() -> None:
     vehicle = PX4Vehicle(system=3)
     desk = Desk(vehicle)

@@ -234,7 +234,7 @@ class ComponentMachine(Parts):
         Raises:
             NoReply: the component is lost. Nothing was sent.
         """
-        if self.restart is None:
+        if self.restart is None or self.restart.done:
             self.check_present(f"the restart of {self.system}/{self.component}", now)
             self.restart = Restart(
                 (self.system, self.component),
@@ -255,7 +255,8 @@ class ComponentMachine(Parts):
         restart.waiters -= 1
         if not restart.waiters:
             restart.stop(now)
-            self.restart = None
+            if self.restart is restart:
+                self.restart = None
 
     def begin_fetch(
         self, now: float, *, refresh: bool = False, listed: bool = False, sampled: Sampled | None = None

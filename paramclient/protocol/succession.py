@@ -55,8 +55,6 @@ class Succession:
         found = components.get(self.address)
         if found is None or now - found.presence.heard_at > HUSH or not found.presence.has_beaten:
             return False
-        if found.who.is_asking or not found.who.settled:
-            return False
         identity = found.identity
         if found.who.was_away or (self._identity.uid is not None and identity.uid is None):
             self._ask_again(found, now)

@@ -43,7 +43,7 @@ class ArduPilotVehicle(Vehicle):
 
     Args:
         table: its parameters (see `Table`), in the order of their indices; None for those of a real quad,
-            `ardupilot_table()`, with its own system id.
+            `ardupilot_table()`. SYSID_THISMAV, where it is among them, says `system`.
         system, component: its own ids, 1 to 255.
         uid2: the hardware id that it reports, up to 18 bytes; by default its own for every system.
         groups: by the name of a switch in the table, the parameters that follow it while it is not 0.
@@ -88,7 +88,7 @@ class ArduPilotVehicle(Vehicle):
     ) -> None:
         if groups is None:
             groups = {"EK2_ENABLE": ek2_group()} if table is None else {}
-        rows = with_system_id(ardupilot_table(), _SYSTEM_ID, system) if table is None else as_table(table)
+        rows = with_system_id(ardupilot_table() if table is None else as_table(table), _SYSTEM_ID, system)
         members = {switch: as_table(group) for switch, group in groups.items()}
         if unknown := (members.keys() | frozenset(read_only)).difference(row.name for row in rows):
             raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")

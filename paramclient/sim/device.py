@@ -91,7 +91,8 @@ class Device(ABC):
         """Switch off at `now` and on again `down` seconds later, never if that is `math.inf`.
 
         All that was going on ends, and what is received while it is off is gone, as is what it had ready to
-        be fetched; the values stay. Without `now` it happens at the time that the vehicle was last given.
+        be fetched; the values stay, and those that wait for a start take effect. Without `now` it happens at
+        the time that the vehicle was last given.
         """
         if now is None:
             now = self._now

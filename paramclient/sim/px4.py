@@ -46,8 +46,8 @@ class PX4Vehicle(BytewiseVehicle):
       a real one.
 
     Args:
-        table: its parameters (see `Table`), in any order; None for those of a real quad, `px4_table()`, with
-            its own system id.
+        table: its parameters (see `Table`), in any order; None for those of a real quad, `px4_table()`.
+            MAV_SYS_ID, where it is among them, says `system`.
         system, component: its own ids, 1 to 255.
         uid: the hardware id that it reports; by default its own for every system.
         hash_check: whether it has `_HASH_CHECK` at all; the parameter MAV_HASH_CHK_EN at 0 also turns it off.
@@ -92,7 +92,7 @@ class PX4Vehicle(BytewiseVehicle):
         metadata: bool = False,
         **options: Unpack[VehicleOptions],
     ) -> None:
-        rows = with_system_id(px4_table(), "MAV_SYS_ID", system) if table is None else as_table(table)
+        rows = with_system_id(px4_table() if table is None else as_table(table), _SYSTEM_ID, system)
         if table is None and late_use is None:
             compass = _third_compass(rows)
             late_use = {"CAL_MAG2_ID": [row.name for row in compass]}
@@ -226,9 +226,9 @@ class PX4Vehicle(BytewiseVehicle):
                 if not entry.name.startswith(RESET_KEEPS):
                     entry.store(self._first_bits[entry.name])
             autoconfig.store(0)
-            if (system := self._find("MAV_SYS_ID")) is not None:
+            if (system := self._find(_SYSTEM_ID)) is not None:
                 system.store(1)
-        self._take_system_id(self._find("MAV_SYS_ID"))
+        self._take_system_id(self._find(_SYSTEM_ID))
 
     def _switch_on(self, at: float) -> None:
         self._unused = set(self._first_unused)
@@ -279,6 +279,7 @@ class PX4Vehicle(BytewiseVehicle):
             )
 
 
+_SYSTEM_ID = "MAV_SYS_ID"
 _QUADROTOR = 2
 _RELEASE = 17891392  # 1.17.0
 _MAIN = 0x01120000  # 1.18
