@@ -134,7 +134,7 @@ def test_without_a_zone_it_is_that_of_this_computer(monkeypatch: pytest.MonkeyPa
 # history
 
 
-HOUR_AGO = float(int(time.time()) - 3600)
+HOUR_AGO = float(int(time.time()) - 3600)  # when the tests were collected: what follows may take its time
 
 
 @pytest.fixture
@@ -163,7 +163,8 @@ def test_changes_are_told_as_in_the_cache_and_since_a_moment(command: Callable[.
         ["time", "component", "name", "old", "new", "by"],
         [first, "1", "A", "1", "2", "us"],
     ]
-    since = command("history", "1", "--since", "45 min ago", "--component", 1, "--json").json["history"]
+    second = time_text(HOUR_AGO + 900)
+    since = command("history", "1", "--since", second, "--component", 1, "--json").json["history"]
     assert [each["name"] for each in since] == ["B"]
     since = command("history", "1", "--since", first, "--limit", 3, "--json").json["history"]
     assert [each["name"] for each in since] == ["A", "B", "C"]
@@ -188,7 +189,7 @@ def test_snapshots_are_listed_with_their_numbers(command: Callable[..., Outcome]
         ["1", first, "1", "2", "before", "apply", "\\x1b[31m.parm"],
         ["2", second, "154", "1", "by", "hand", "(not", "complete)"],
     ]
-    for narrowed in (["--component", 154], ["--limit", 1], ["--since", "30 min ago"]):
+    for narrowed in (["--component", 154], ["--limit", 1], ["--since", time_text(HOUR_AGO + 1700)]):
         found = command("history", "1", "--snapshots", *narrowed, "--json").json["snapshots"]
         assert [each["id"] for each in found] == [2]
 
