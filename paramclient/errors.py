@@ -4,7 +4,8 @@ The tree says who is to blame::
 
     ParamClientError
     ├── UsageError(ValueError)        the caller: a name, value, link name or argument that cannot be right
-    │   └── FileError                 a parameter file that cannot be read or written
+    │   ├── FileError                 a parameter file that cannot be read or written
+    │   └── MetadataError             a description of parameters that is none
     ├── VehicleError                  the vehicle answered, and the answer is no
     │   ├── UnknownParameter          it has no parameter of that name or index
     │   ├── Refused                   it gave a reason: PARAM_ERROR, or ArduPilot's text
@@ -36,6 +37,7 @@ __all__ = [
     "FileErrorCode",
     "FileTransferError",
     "LinkError",
+    "MetadataError",
     "NoReply",
     "PackError",
     "ParamClientError",
@@ -155,6 +157,18 @@ class FileError(UsageError):
         self.source = source
         self.line = line
         self.expected = expected
+
+
+class MetadataError(UsageError):
+    """A file that should describe parameters does not, or lies where it is not fetched from.
+
+    Attributes:
+        source: the file or the place, in words.
+    """
+
+    def __init__(self, message: str, *, source: str) -> None:
+        super().__init__(message)
+        self.source = source
 
 
 class VehicleError(ParamClientError):

@@ -24,6 +24,7 @@ MAY_IMPORT = {
     "params": {"errors", "values"},
     "identity": {"errors", "values"},
     "paramset": {"errors", "values", "identity"},
+    "metadata.info": {"errors", "values"},
     "compare": {"errors", "values", "paramset"},
     "protocol.wire": {"errors", "values", "protocol.wire"},
     "protocol.ftp.packets": {"errors", "values"},

@@ -13,6 +13,7 @@ from paramclient.errors import (
     FileErrorCode,
     FileTransferError,
     LinkError,
+    MetadataError,
     NoReply,
     PackError,
     ParamClientError,
@@ -30,6 +31,7 @@ from paramclient.errors import (
     ("kind", "base"),
     [
         (UsageError, ValueError),
+        (MetadataError, UsageError),
         (FileError, UsageError),
         (UnknownParameter, VehicleError),
         (Refused, VehicleError),

@@ -156,8 +156,11 @@ _app.command(
 _app.command(
     set_,
     name="set",
-    usage="Usage: paramclient set [OPTIONS] URL NAME VALUE [NAME VALUE...]",
-    help_epilogue=_examples("set udpin:0.0.0.0:14550 MC_ROLL_P 6.5 MC_PITCH_P 6.5"),
+    usage="Usage: paramclient set [OPTIONS] URL NAME VALUE|NAME=VALUE [NAME VALUE|NAME=VALUE...]",
+    help_epilogue=_examples(
+        "set udpin:0.0.0.0:14550 MC_ROLL_P 6.5 MC_PITCH_P 6.5",
+        "set udpin:0.0.0.0:14550 FLTMODE1=Loiter --metadata apm.pdef.xml",
+    ),
 )
 _app.command(
     watch,
@@ -169,8 +172,8 @@ _app.command(
 )
 _app.command(
     show,
-    usage="Usage: paramclient show [OPTIONS] [VEHICLE|FILE]",
-    help_epilogue=_examples("show", "show 1", "show 00020000 --json", "show quad.params"),
+    usage="Usage: paramclient show [OPTIONS] [FILE|VEHICLE [NAME...]]",
+    help_epilogue=_examples("show", "show 1", "show 1 MC_ROLL_P", "show 00020000 --json", "show quad.params"),
 )
 _app.command(
     diff,

@@ -12,9 +12,11 @@ __all__ = [
     "CAPABILITY_FTP",
     "CAPABILITY_PARAM_ENCODE_BYTEWISE",
     "CAPABILITY_PARAM_ENCODE_C_CAST",
+    "COMPONENT_METADATA_ID",
     "COMP_ID_ALL",
     "CommandAck",
     "CommandLong",
+    "ComponentMetadata",
     "FileTransfer",
     "HASH_CHECK",
     "Heartbeat",
@@ -64,6 +66,7 @@ MAV_STATE_BOOT: Final = 1
 MAV_STATE_ACTIVE: Final = 4
 PARAM_VALUE_ID: Final = 22
 AUTOPILOT_VERSION_ID: Final = 148
+COMPONENT_METADATA_ID: Final = 397
 MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: Final = 246
 MAV_CMD_REQUEST_MESSAGE: Final = 512
 MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: Final = 520
@@ -197,6 +200,14 @@ class HighLatency2:
     autopilot: int
 
 
+@dataclass(frozen=True, slots=True)
+class ComponentMetadata:
+    """COMPONENT_METADATA: where the general metadata file lies, and its CRC-32; its time is not read."""
+
+    uri: str
+    file_crc: int
+
+
 Message: TypeAlias = (
     Heartbeat
     | AutopilotVersion
@@ -211,4 +222,5 @@ Message: TypeAlias = (
     | FileTransfer
     | SystemTime
     | HighLatency2
+    | ComponentMetadata
 )
