@@ -17,7 +17,7 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 TESTS ?=
 SESSIONS ?= 10000
 
-MEASURED = 'protocol/*' 'sim/*' 'cache/*' values.py errors.py identity.py params.py
+MEASURED = 'protocol/*' 'sim/*' 'cache/*' 'files/*' values.py errors.py identity.py params.py paramset.py
 # they start programs of their own, which are not measured, are about rooms that are not, or go where others have been
 UNMEASURED = $(addprefix --ignore=tests/test_,bench.py cli.py docs.py examples.py links.py machine.py packaging.py)
 
@@ -77,7 +77,7 @@ $(VENV)/made:
 
 $(VENV)/with-cli: pyproject.toml $(VENV)/made
 	@echo "Installing paramclient into $(VENV)"
-	@$(PIP) --editable '.[cli]'
+	@$(PIP) --editable '.[cli,serial]'
 	@touch $@
 
 # dependency groups need pip 25.1, and the pip of the environment is as old as its Python

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 import weakref
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Final
 
@@ -15,6 +13,7 @@ import anyio
 import anyio.abc
 
 from paramclient.cache import ParamCache
+from paramclient.carrier import Carrier
 from paramclient.component import PROGRESS_INTERVAL, Component
 from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
 from paramclient.events import Events, told
@@ -32,11 +31,12 @@ from paramclient.protocol.events import (
 )
 from paramclient.protocol.result import Policy, Progress
 from paramclient.protocol.station import Address, Station
+from paramclient.protocol.succession import SEARCH_PACE, Succession
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.traffic import TrafficReport
 from paramclient.together import FetchedAll, FetchTogether
 from paramclient.values import Encoding
-from paramclient.writethrough import FLUSH_INTERVAL, RETRY_INTERVAL, WriteThrough
+from paramclient.writethrough import WriteThrough
 
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint
@@ -47,21 +47,8 @@ HEARING_PATIENCE: Final = 10.0
 """Seconds to wait for a first component, unless the caller says otherwise."""
 LISTENING_TIME: Final = 1.2
 """Seconds from opening in which every component has been heard: each sends a heartbeat once a second."""
-REST: Final = 0.01
-"""Seconds for which the reader lets telemetry pile up while nobody waits for an answer: to take 20 datagrams
-at once costs a fifth of taking them one by one, and a change that comes meanwhile is told that much later."""
-MOST_PER_REST: Final = 64
-"""Datagrams that may come in one rest, at the rate of the last ones; on a busier link it is shorter. That is
-an eighth of what Linux' usual buffer holds (see `paramclient.links.udp`): a burst still finds room there."""
-LINK_PATIENCE: Final = 10.0
-"""Seconds that calls wait for a link to come back before they fail with its error."""
-FIRST_BACKOFF: Final = 0.25
-LONGEST_BACKOFF: Final = 5.0
-"""Seconds between two attempts to open a link again: doubled from the first to the longest."""
 CLOSING_PATIENCE: Final = 0.5
 """Seconds that closing waits for the hash after a write, where the next session could not do without it."""
-
-logger = logging.getLogger(__name__)
 
 
 class ParamClient:
@@ -72,10 +59,10 @@ class ParamClient:
     ClientClosed, what is new is written, and neither task nor socket nor thread remains. What the body
     raises comes out as it is.
 
-    A TCP connection that drops is opened again with back-off for as long as the client lives. Calls that wait
-    meanwhile go on when it is back: what had not been answered is asked for again. After `LINK_PATIENCE`
-    seconds without a link they raise LinkError, and new ones do so at once. A link that cannot come back
-    (a UDP socket that fails) ends every call with its LinkError.
+    A TCP connection that drops, or a serial port that is unplugged, is opened again with back-off for as long
+    as the client lives. Calls that wait meanwhile go on when it is back: what had not been answered is asked
+    for again. After `LINK_PATIENCE` seconds without a link they raise LinkError, and new ones do so at once.
+    A link that cannot come back (a UDP socket that fails) ends every call with its LinkError.
 
     Args:
         link: a link's name, such as `udpin:0.0.0.0:14550` (`paramclient.links.FORMS` says which there are), a
@@ -144,15 +131,9 @@ class ParamClient:
         self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self._components: dict[Address, Component] = {}
         self._tasks: anyio.abc.TaskGroup | None = None
-        self._something_to_send = anyio.Event()
-        self._something_to_write = anyio.Event()
-        self._sent = anyio.Event()  # set when anything is sent
-        self._news = anyio.Event()  # set, and replaced, when anything was received or the calls fail
+        self._carrier = Carrier(self._link, self._station, dispatch=self._dispatch, end=self._end)
         self._is_entered = False
         self._opened_at = -math.inf
-        self._is_away = False
-        self._broken: LinkError | None = None  # what calls raise now
-        self._ended: LinkError | None = None  # the same, for good
 
     @property
     def components(self) -> Mapping[Address, Component]:
@@ -175,8 +156,8 @@ class ParamClient:
         return self._station.bytes_sent
 
     def __repr__(self) -> str:
-        state = "closed" if self._tasks is None or self._ended is not None else "open"
-        if state == "open" and self._is_away:
+        state = "closed" if self._tasks is None or self._carrier.ended is not None else "open"
+        if state == "open" and self._carrier.is_away:
             state = "away"
         heard = len(self._components)
         return f"<ParamClient {self._link.name} {state}, {heard} component{'' if heard == 1 else 's'}>"
@@ -195,9 +176,9 @@ class ParamClient:
         await tasks.__aenter__()
         self._tasks = tasks
         self._opened_at = anyio.current_time()
-        tasks.start_soon(self._read, name="paramclient reader")
-        tasks.start_soon(self._send, name="paramclient sender")
-        tasks.start_soon(self._write, name="paramclient cache writer")
+        tasks.start_soon(self._carrier.read, name="paramclient reader")
+        tasks.start_soon(self._carrier.send, name="paramclient sender")
+        tasks.start_soon(self._writer.run, name="paramclient cache writer")
         return self
 
     async def __aexit__(
@@ -206,7 +187,7 @@ class ParamClient:
         tasks = self._tasks
         assert tasks is not None
         try:
-            if kind is None and self._broken is None:
+            if kind is None and self._carrier.broken is None:
                 await self._let_hashes_settle()
         finally:
             self._end(ClientClosed("the client was closed", link=self._link.name))
@@ -240,8 +221,8 @@ class ParamClient:
         """
         events = Events()
         self._subscriptions.add(events)
-        if self._ended is not None:
-            events.end(self._ended)
+        if self._carrier.ended is not None:
+            events.end(self._carrier.ended)
         return events
 
     def ftp(self, component: Component) -> Ftp:
@@ -274,13 +255,46 @@ class ParamClient:
         began = anyio.current_time()
         with anyio.move_on_after(timeout):
             while (found := self._find(system, component)) is None:
-                await self._news.wait()
+                await self._carrier.news.wait()
                 self._check_open()
             await found._wait_for_cache()
         if found is None:
             waited = anyio.current_time() - began
             raise NoReply(_wanted(system, component), attempts=0, waited=waited)
         return found
+
+    async def successor(
+        self, component: Component, system: int, *, timeout: float | None = HEARING_PATIENCE
+    ) -> Component:
+        """The same component of the same vehicle under another system id, as soon as it speaks under that.
+
+        For a vehicle whose system id was set: ArduPilot takes it at once (SYSID_THISMAV), PX4 when it starts
+        again (MAV_SYS_ID, see `Component.reboot`). That it is the same one is shown by its hardware id; where
+        there is none, by its autopilot and type, and by its silence under the id of before.
+
+        Args:
+            component: what it was before.
+            system: its new system id.
+            timeout: seconds; None waits for ever.
+
+        Raises:
+            AnotherVehicle: another vehicle has this system id.
+            NoReply: it was not heard under this id in time, or did not say who it is.
+            LinkError: the link failed, or the client was closed.
+        """
+        self._check_open()
+        began = anyio.current_time()
+        search = Succession(component._machine, (system, component.component))
+        with anyio.move_on_after(timeout):
+            while not search.look(self._station.components, anyio.current_time()):
+                self._wake()
+                with anyio.move_on_after(SEARCH_PACE):
+                    await self._carrier.news.wait()
+                self._check_open()
+            found = self._components[search.address]
+            await found._wait_for_cache()
+            return found
+        raise NoReply(search.awaited, attempts=0, waited=anyio.current_time() - began)
 
     async def fetch_all(
         self,
@@ -344,120 +358,41 @@ class ParamClient:
         self._check_open()
         return self._station.traffic.report(anyio.current_time())
 
-    # the tasks
-
-    async def _read(self) -> None:
-        before = anyio.current_time()
-        while True:
-            try:
-                chunks = await self._link.receive()
-            except LinkError as error:
-                if not self._link.reconnects:
-                    self._end(error)
-                    return
-                await self._reopen(error)
-                continue
-            now = anyio.current_time()
-            is_news = False
-            for peer, data in chunks:
-                is_news |= self._station.receive(data, peer, now)
-            if is_news:
-                self._dispatch()
-                self._tell()
-                self._wake()
-            elif not self._station.is_waiting:
-                await self._rest(min(REST, MOST_PER_REST * (now - before) / max(1, len(chunks))))
-            before = now
-
-    async def _rest(self, seconds: float) -> None:
-        """Leave what comes to the link for a while, unless something is sent that may be answered."""
-        self._sent = anyio.Event()
-        with anyio.move_on_after(seconds):
-            await self._sent.wait()
-
-    async def _reopen(self, error: LinkError) -> None:
-        """Open the link again, for as long as it takes."""
-        logger.warning("%s; trying to open it again", error)
-        self._is_away = True
-        self._station.pause()
-        patience_ends = anyio.current_time() + LINK_PATIENCE
-        backoff = FIRST_BACKOFF
-        while True:
-            patience = patience_ends - anyio.current_time()
-            await anyio.sleep(min(backoff, patience) if patience > 0 else backoff)
-            backoff = min(backoff * 2, LONGEST_BACKOFF)
-            try:
-                await self._link.open()
-            except LinkError as again:
-                if anyio.current_time() >= patience_ends:
-                    self._fail_calls(again)
-            else:
-                logger.info("%s: open again", self._link.name)
-                self._is_away = False
-                self._broken = None
-                self._station.resume(anyio.current_time())
-                self._wake()
-                return
-
-    async def _send(self) -> None:
-        station = self._station
-        while self._ended is None:
-            self._something_to_send = anyio.Event()
-            station.tick(anyio.current_time())
-            self._dispatch()
-            to_send = station.data_to_send()
-            if to_send:
-                self._sent.set()
-            for data, peer in to_send:
-                # a link that drops is the reader's business; what is not sent now is sent again in time
-                with suppress(LinkError):
-                    await self._link.send(data, peer)
-            wait = station.next_deadline() - anyio.current_time()
-            with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):
-                await self._something_to_send.wait()
-
-    async def _write(self) -> None:
-        while True:
-            await self._something_to_write.wait()
-            self._something_to_write = anyio.Event()
-            await anyio.sleep(FLUSH_INTERVAL)
-            if self._writer.is_held_back:
-                self._something_to_write.set()
-            if not await self._writer.flush():
-                await anyio.sleep(RETRY_INTERVAL)
-                self._something_to_write.set()
+    # what has happened
 
     async def _load(self, component: Component, identity: Identity) -> None:
         if await self._writer.bring(component._machine, identity):
             component._cache_is_read.set()
-            self._something_to_write.set()
+            self._writer.wake()
             self._dispatch()
 
     def _dispatch(self) -> None:
         """Hand out what has happened."""
+        is_to_be_written = False
         for event in self._station.events():
             machine = event.machine
             if isinstance(event, ParamChanged):
                 self._components[machine.system, machine.component]._publish(event.change)
-                self._something_to_write.set()
+                is_to_be_written = True
                 continue
             if isinstance(event, ComponentHeard):
                 self._meet(machine)
             elif isinstance(event, ComponentIdentified):
-                self._tell()
+                self._carrier.tell()
                 for component in self._components.values():
                     if component.system == machine.system:
                         self._read_cache(component)
             elif isinstance(event, Fetched) and event.result.complete and event.result.is_confirmed:
-                self._writer.synced(
-                    machine, is_whole=event.result.source != "cache" and not event.result.resumed
-                )
-                self._something_to_write.set()
+                is_whole = event.result.source != "cache" and not event.result.resumed
+                self._writer.synced(machine, is_whole=is_whole)
+                is_to_be_written = True
             elif isinstance(event, TableResynced):
                 self._writer.synced(machine, is_whole=False)
-                self._something_to_write.set()
+                is_to_be_written = True
             if self._subscriptions:
                 self._announce(event)
+        if is_to_be_written:
+            self._writer.wake()
 
     def _announce(self, event: Event) -> None:
         """Tell those who listen, if it is for them."""
@@ -483,34 +418,23 @@ class ParamClient:
         assert self._tasks is not None, "nothing is heard before"
         self._tasks.start_soon(self._load, component, identity)
 
-    def _tell(self) -> None:
-        news, self._news = self._news, anyio.Event()
-        news.set()
-
     def _wake(self) -> None:
-        self._something_to_send.set()
+        self._carrier.wake()
 
     # ends
 
     def _end(self, error: LinkError) -> None:
         """No call can be answered any more."""
         self._dispatch()
-        self._ended = error
-        self._fail_calls(error)
+        self._carrier.fail_for_good(error)
         for component in self._components.values():
             component._end(error)
         for events in list(self._subscriptions):
             events.end(error)
 
-    def _fail_calls(self, error: LinkError) -> None:
-        """Whoever waits gets this error, and so does every new call until the link is back."""
-        self._broken = error
-        self._station.fail_all(error, anyio.current_time())
-        self._tell()
-
     def _check_open(self) -> None:
-        if self._broken is not None:
-            raise self._broken.with_traceback(None)
+        if self._carrier.broken is not None:
+            raise self._carrier.broken.with_traceback(None)
         if self._tasks is None:
             raise ClientClosed("the client is not open; use it as `async with`", link=self._link.name)
 
@@ -521,7 +445,7 @@ class ParamClient:
                 machine.is_settling and machine.table.complete and not machine.table.volatile_known
                 for machine in self._station.components.values()
             ):
-                await self._news.wait()
+                await self._carrier.news.wait()
 
     def _may_be_cached(self, component: Component) -> bool:
         return self._writer.may_have(component.system, component.component)

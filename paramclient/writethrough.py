@@ -63,6 +63,7 @@ class WriteThrough:
         self._kept: dict[ComponentMachine, _Kept] = {}
         self._has_failed = False
         self._tables: dict[tuple[int, int], bool] = {}
+        self._something_to_write = anyio.Event()
 
     async def open(self) -> None:
         """Find out which components the cache knows."""
@@ -136,6 +137,22 @@ class WriteThrough:
     def is_held_back(self) -> bool:
         """Whether there is news of a component of which it is open who it is: it may be another vehicle."""
         return any(machine.table.dirty and self._is_doubted(machine) for machine in self._kept)
+
+    def wake(self) -> None:
+        """There may be something to write."""
+        self._something_to_write.set()
+
+    async def run(self) -> None:
+        """Write whatever is new, in batches, until cancelled."""
+        while True:
+            await self._something_to_write.wait()
+            self._something_to_write = anyio.Event()
+            await anyio.sleep(FLUSH_INTERVAL)
+            if self.is_held_back:
+                self._something_to_write.set()
+            if not await self.flush():
+                await anyio.sleep(RETRY_INTERVAL)
+                self._something_to_write.set()
 
     async def flush(self) -> bool:
         """Write what is new; false when the cache could not take it. Cancelled, it loses nothing."""

@@ -33,6 +33,7 @@ from paramclient import (
     UnknownParameter,
     UsageError,
     ValueNotApplied,
+    carrier,
 )
 from paramclient import client as client_module
 from paramclient.component import IDENTITY_PATIENCE
@@ -1157,7 +1158,7 @@ async def test_a_link_that_stays_away_fails_the_calls_and_not_the_client(
             error = await task
             assert type(error) is LinkError, name
             assert "refused" in str(error)
-            assert math.isclose(anyio.current_time() - went_away, client_module.LINK_PATIENCE, abs_tol=0.1)
+            assert math.isclose(anyio.current_time() - went_away, carrier.LINK_PATIENCE, abs_tol=0.1)
         for call in ("get", "set", "fetch_all", "client.component", "client.fetch_all"):
             with pytest.raises(LinkError, match="refused"):
                 await CALLS[call](client, component)
@@ -1267,9 +1268,9 @@ async def test_a_tcp_connection_that_breaks_during_a_download() -> None:
 
 @pytest.mark.asyncio
 async def test_a_tcp_server_that_stays_away(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client_module, "LINK_PATIENCE", 0.3)
-    monkeypatch.setattr(client_module, "FIRST_BACKOFF", 0.05)
-    monkeypatch.setattr(client_module, "LONGEST_BACKOFF", 0.1)
+    monkeypatch.setattr(carrier, "LINK_PATIENCE", 0.3)
+    monkeypatch.setattr(carrier, "FIRST_BACKOFF", 0.05)
+    monkeypatch.setattr(carrier, "LONGEST_BACKOFF", 0.1)
     served = Served(generic(stream=True), "tcpin")
     async with asyncio.timeout(PATIENCE), served, a_client(f"tcp:127.0.0.1:{served.port}") as client:
         component = await client.component()
@@ -1340,7 +1341,7 @@ async def test_telemetry_alone_lets_the_reader_rest() -> None:
         vehicle.portions.clear()
         await asyncio.sleep(1.0)
         assert sum(map(len, vehicle.portions)) >= 1950
-        assert len(vehicle.portions) < 1.2 / client_module.REST
+        assert len(vehicle.portions) < 1.2 / carrier.REST
 
 
 @swiftly
@@ -1396,7 +1397,7 @@ async def test_a_change_waits_for_the_end_of_a_rest_at_the_most() -> None:
             vehicle.say(wire.encode(message, system=1, component=1, sequence=0))
             with anyio.fail_after(1.0):
                 assert (await anext(changes)).name == "PARAM_01"
-            assert anyio.current_time() - began < client_module.REST + 0.001
+            assert anyio.current_time() - began < carrier.REST + 0.001
 
 
 @swiftly
@@ -1408,7 +1409,7 @@ async def test_a_busy_link_shortens_the_rests() -> None:
         vehicle.portions.clear()
         await asyncio.sleep(0.5)
         largest = max(map(len, vehicle.portions))
-    assert 0.9 * client_module.MOST_PER_REST < largest < 1.1 * client_module.MOST_PER_REST
+    assert 0.9 * carrier.MOST_PER_REST < largest < 1.1 * carrier.MOST_PER_REST
 
 
 @pytest.mark.parametrize("call", ["get", "set", "fetch_all", "client.fetch_all"])
@@ -1416,7 +1417,7 @@ async def test_a_busy_link_shortens_the_rests() -> None:
 async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyPatch) -> None:
     async def seconds(rest: float) -> float:
         """How long the call takes where a rest, once begun, would last until our next heartbeat."""
-        monkeypatch.setattr(client_module, "REST", rest)
+        monkeypatch.setattr(carrier, "REST", rest)
         vehicle = Chatter(small_px4(), 0.005)
         async with a_client(vehicle) as client:
             component = await known_component(client)
@@ -1427,15 +1428,15 @@ async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyP
             await CALLS[call](client, component)
             return anyio.current_time() - began
 
-    monkeypatch.setattr(client_module, "MOST_PER_REST", math.inf)
+    monkeypatch.setattr(carrier, "MOST_PER_REST", math.inf)
     with_rests, without = await seconds(60.0), await seconds(0.0)
     assert with_rests < without + 0.05
 
 
 @swiftly
 async def test_closing_does_not_wait_for_the_end_of_a_rest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(client_module, "REST", 60.0)
-    monkeypatch.setattr(client_module, "MOST_PER_REST", math.inf)
+    monkeypatch.setattr(carrier, "REST", 60.0)
+    monkeypatch.setattr(carrier, "MOST_PER_REST", math.inf)
     async with a_client(Chatter(generic(), 0.005)) as client:
         await known_component(client)
         await asyncio.sleep(1.0)

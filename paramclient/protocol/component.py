@@ -4,33 +4,26 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 from paramclient.errors import LinkError, NoReply
-from paramclient.identity import Identity, autopilot_name
+from paramclient.identity import autopilot_name
 from paramclient.protocol import events
-from paramclient.protocol.authors import Authors
-from paramclient.protocol.events import Event, ParamChanged
+from paramclient.protocol.events import ParamChanged
 from paramclient.protocol.fetch import Fetch
-from paramclient.protocol.fetches import Fetches
-from paramclient.protocol.ftp import FileTransfers
-from paramclient.protocol.identify import Identification
-from paramclient.protocol.presence import Presence
-from paramclient.protocol.reads import Key, Read, Reads
-from paramclient.protocol.refresh import Refresh
-from paramclient.protocol.result import Means, Policy, Sampled
-from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
-from paramclient.protocol.table import Change, Table
-from paramclient.protocol.timing import RoundTrip
-from paramclient.protocol.turns import Turns
+from paramclient.protocol.parts import Parts
+from paramclient.protocol.reads import Key, Read
+from paramclient.protocol.restart import SAVING_TIME, Restart
+from paramclient.protocol.result import FetchResult, Policy, Sampled
+from paramclient.protocol.table import Change
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
-    MAV_AUTOPILOT_PX4,
     NO_INDEX,
     AutopilotVersion,
     CommandAck,
+    ComponentMetadata,
     FileTransfer,
     Heartbeat,
     HighLatency2,
@@ -40,8 +33,8 @@ from paramclient.protocol.wire import (
     StatusText,
     SystemTime,
 )
-from paramclient.protocol.writes import Write, Writes
-from paramclient.values import Encoding, Param, Trust, Value, encode
+from paramclient.protocol.writes import Write
+from paramclient.values import Param, Trust, Value, encode
 
 __all__ = ["ComponentMachine"]
 
@@ -49,7 +42,7 @@ FRESH_IDENTITY: Final = 1.0
 """Seconds for which an AUTOPILOT_VERSION needs no other."""
 
 
-class ComponentMachine:
+class ComponentMachine(Parts):
     """Everything about one component that needs no clock and no socket.
 
     Args:
@@ -73,101 +66,21 @@ class ComponentMachine:
         presence: whether it is there.
         sync: whether the table is still the vehicle's.
         files: its files.
+        descriptions: where it says that what it has to say of itself lies.
+        commands: what it is told to do.
+        restart: the restart that it was told to make and that is under way, or None.
         fetches: what was and is being fetched.
     """
-
-    def __init__(
-        self,
-        system: int,
-        component: int,
-        *,
-        own: tuple[int, int],
-        link: str,
-        send: Callable[[Message], None],
-        emit: Callable[[Event], None],
-        encoding: Encoding | None = None,
-        upkeep: Upkeep | None = None,
-        is_link_busy: Callable[[], bool] = lambda: False,
-        is_vehicle_doubted: Callable[[], bool] = lambda: False,
-        another: Callable[[float], None] | None = None,
-        turns: Turns | None = None,
-    ) -> None:
-        target = (system, component)
-        upkeep = upkeep or Upkeep()
-        self.system = system
-        self.component = component
-        self.version = 1
-        self.round_trip = RoundTrip()
-        self.who = Identification(target, link, self.round_trip, send, encoding)
-        self.table = Table(self.who.encoding)
-        self.turns = Turns() if turns is None else turns
-        self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share)
-        self.writes = Writes(
-            target,
-            self.round_trip,
-            send,
-            self.reads,
-            self.table.params,
-            encoding=lambda: self.table.encoding,
-            is_certain=lambda: self.may_be_written,
-        )
-        self.presence = Presence()
-        self.sync = Sync(
-            self.reads,
-            self.table,
-            upkeep,
-            is_px4=lambda: self.who.autopilot == MAV_AUTOPILOT_PX4,
-            is_writing=lambda: len(self.writes) > 0,
-            is_fetching=lambda: self.fetch is not None,
-            is_busy=is_link_busy,
-            file_is_cheap=lambda interval: self.fetches.file_is_cheap(interval),
-            is_spared=lambda: self._is_spared,
-            is_doubted=lambda: self.who.is_doubted,
-            begin_fetch=lambda now, refresh: self.begin_fetch(now, refresh=refresh),
-            end_fetch=self.end_fetch,
-            resynced=lambda changed, confirmed: emit(events.TableResynced(self, changed, confirmed)),
-        )
-        self.files = FileTransfers(target, own, self.round_trip, send)
-        self.fetches = Fetches(
-            Means(
-                target,
-                self.round_trip,
-                send,
-                self.reads,
-                self.table,
-                self.turns,
-                self.files,
-                expects_hash=lambda: self.sync.expects_hash,
-                changed=self._moved,
-                doubt=self._doubt_identity,
-            ),
-            self.sync,
-            upkeep.policy,
-            says_file=lambda: self.who.says_file,
-            ended=lambda result: emit(events.Fetched(self, result)),
-        )
-        self._own = own
-        self._emit = emit
-        self._policy = upkeep.policy
-        self._another = another or self.become_another
-        self._is_vehicle_doubted = is_vehicle_doubted
-        self._known_as: str | None = None  # the key of the identity that was reported
-        self._may_write = False
-        self._authors = Authors()
 
     # what comes in
 
     def receive(self, message: Message, now: float, *, version: int = 2) -> None:
         """Take a message that this component sent."""
-        silence = self.presence.heard(now)
-        self.round_trip.heard_at = now
-        if silence >= self.presence.gap or self.presence.is_lost:
-            self._was_silent(silence, now)
-        if version > self.version:
-            self.version = version
         if isinstance(message, ParamValue):
-            self._receive_value(message, now)
-        elif isinstance(message, Heartbeat):
+            self.receive_value(message, now, version)
+            return
+        self._heard(now, version)
+        if isinstance(message, Heartbeat):
             self.who.heartbeat(message)
             if self.presence.heartbeat(message, now):
                 self._rebooted(now)
@@ -184,6 +97,8 @@ class ComponentMachine:
                 self.reads.refused(message, now)
         elif isinstance(message, CommandAck):
             self.who.acknowledged(message, now)
+            self.descriptions.acknowledged(message, now)
+            self.commands.acknowledged(message, now)
         elif isinstance(message, StatusText):
             denied = _WRITE_DENIED.search(message.text)
             if denied:
@@ -193,12 +108,51 @@ class ComponentMachine:
                 self._rebooted(now)
         elif isinstance(message, FileTransfer):
             self.files.heard(message, now)
+        elif isinstance(message, ComponentMetadata):
+            self.descriptions.heard(message, now)
         elif isinstance(message, HighLatency2):
             self.who.heartbeat(message)
             self.presence.high_latency()
         self.who.heard(now)
-        if not isinstance(message, ParamValue):  # a value tells nothing of who it is
-            self._follow_identity(now)
+        self._follow_identity(now)
+
+    def receive_value(self, message: ParamValue, now: float, version: int = 2) -> None:
+        """Take a PARAM_VALUE that it sent: for those who know that it is one."""
+        self._heard(now, version)
+        who = self.who
+        who.heard(now)
+        name, _, _, count, _ = message
+        if not name:
+            return
+        if name == HASH_CHECK:
+            announced = self.sync.hash_heard(message, now)
+            if self.fetch is not None:
+                self.fetch.announced(announced)
+            self.reads.heard(message, now)
+            return
+        if who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
+            name = name.upper()
+            message = message._replace(param_id=name)
+        table = self.table
+        if count != table.count and count != NO_INDEX:
+            self._count_moved(count, now)
+        authors = self._authors
+        writes = self.writes
+        is_ours = bool(writes.queues) and name in writes
+        by = "us" if is_ours else authors.of(name, now) if authors.foreign_sets else "vehicle"
+        change = table.hear(message, by, is_exact=is_ours and writes.wants(message))
+        if change is not None:
+            authors.changed(name, now, is_ours)
+            self.sync.changed(change)
+            self._emit(_new(ParamChanged, (self, change)))
+        elif name not in table.params:
+            return  # more names than there can be
+        fetch = self.fetches.current
+        if fetch is not None:
+            fetch.heard(message, now)
+        if writes.queues:
+            writes.heard(message, now)
+        self.reads.heard(message, now)
 
     def foreign_set(self, name: str, station: str, now: float) -> None:
         """Another station was heard setting a parameter of this component."""
@@ -267,8 +221,42 @@ class ComponentMachine:
         if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
             encode(value, known.type, self.table.encoding)
         write = self.writes.set(name, value, now)
-        write.on_done.append(lambda: self.sync.write_ended(write.ended_at))
+        write.on_done.append(lambda: self._write_ended(write.ended_at))
         return write
+
+    def begin_restart(self, now: float, *, returns: bool = True) -> Restart:
+        """Tell it to start again, or join the one under way; give it back with `end_restart`.
+
+        Args:
+            now: the time.
+            returns: whether it comes back under its address, see `Restart`.
+
+        Raises:
+            NoReply: the component is lost. Nothing was sent.
+        """
+        if self.restart is None or self.restart.done:
+            self.check_present(f"the restart of {self.system}/{self.component}", now)
+            self.restart = Restart(
+                (self.system, self.component),
+                self.commands,
+                self.who,
+                self.presence,
+                self.round_trip,
+                self._saved_at,
+                self._rebooted,
+                returns=returns,
+                now=now,
+            )
+        self.restart.waiters += 1
+        return self.restart
+
+    def end_restart(self, restart: Restart, now: float) -> None:
+        """Wait for it no longer. The last one who waited ends it; whether it is obeyed is then not known."""
+        restart.waiters -= 1
+        if not restart.waiters:
+            restart.stop(now)
+            if self.restart is restart:
+                self.restart = None
 
     def begin_fetch(
         self, now: float, *, refresh: bool = False, listed: bool = False, sampled: Sampled | None = None
@@ -311,9 +299,13 @@ class ComponentMachine:
         self.reads.tick(now)
         self.writes.tick(now)
         self.files.tick(now)
+        self.commands.tick(now)
+        if self.restart is not None:
+            self.restart.tick(now)
         if self.fetch is not None:
             self.fetch.tick(now)
         self.who.tick(now)
+        self.descriptions.tick(now)
         self._follow_identity(now)
         self.sync.tick(now)
         for name in self._authors.doubted(now):
@@ -326,8 +318,11 @@ class ComponentMachine:
             self.reads.next_deadline(),
             self.writes.next_deadline(),
             self.files.next_deadline(),
+            self.commands.next_deadline(),
+            math.inf if self.restart is None else self.restart.next_deadline(),
             math.inf if self.fetch is None else self.fetch.next_deadline(),
             self.who.next_deadline(),
+            self.descriptions.next_deadline(),
             self.sync.next_deadline(),
             self.presence.lost_at(),
             self._authors.next_deadline(),
@@ -344,6 +339,8 @@ class ComponentMachine:
         self.reads.resume(now)
         self.writes.resume(now)
         self.files.resume(now)
+        self.descriptions.resume(now)
+        self.commands.resume(now)
         if self.fetch is not None:
             self.fetch.resume(now)
 
@@ -355,6 +352,10 @@ class ComponentMachine:
         if self.sync.refresh is not None:
             self.sync.refresh.fail(error, now)
         self.files.fail_all(error, now)
+        self.descriptions.fail_all(error, now)
+        if self.restart is not None:
+            self.restart.fail(error, now)
+        self.commands.fail_all(error, now)
         self.writes.fail_all(error, now)
         self.reads.fail_all(error, now)
         self.sync.stop()
@@ -366,111 +367,32 @@ class ComponentMachine:
         self.sync.forget()
         self.fetches.forget()
         self._known_as = None
+        if self.restart is not None:
+            self.restart.another(now)
+        self.commands.lose(now, ": another vehicle answers there now")
         what = f"writes to {self.system}/{self.component}: another vehicle answers there now"
         self.writes.fail_all(NoReply(what, attempts=0, waited=0.0), now)
         if self.fetch is not None:
             self.fetch.restart(now)
 
-    @property
-    def identity(self) -> Identity:
-        """Who the vehicle is, as far as this component has said."""
-        return self.who.identity
-
-    @property
-    def may_be_written(self) -> bool:
-        """Whether it is certain whom a write reaches, and what it makes of it."""
-        return self.who.may_be_written and not self._is_vehicle_doubted()
-
-    @property
-    def state(self) -> str:
-        """The table's state in a word: new, cached, fetching, synced, partial, lost."""
-        if self.presence.is_lost:
-            return "lost"
-        if self.fetch is not None:
-            return "fetching"
-        if self.sync.synced:
-            return "synced"
-        if not self.table.params:
-            return "new"
-        return "cached" if self.table.complete else "partial"
-
-    @property
-    def fetch(self) -> Fetch | None:
-        """The fetch under way, or None."""
-        return self.fetches.current
-
-    @property
-    def sync_state(self) -> SyncState:
-        """How the table stands to the vehicle's."""
-        return SyncState.LOST if self.presence.is_lost else self.sync.state
-
-    @property
-    def refresh(self) -> Refresh | None:
-        """The reading of volatile values under way after a hash hit, or None."""
-        return self.sync.refresh
-
-    @property
-    def can_hit(self) -> bool:
-        """Whether the vehicle's hash may confirm the table as it stands."""
-        return self.table.complete and self.table.hash is not None
-
-    @property
-    def is_waiting(self) -> bool:
-        """Whether anything is awaited: an answer, a fetch, a file, or who it is."""
-        is_asked = len(self.reads) > 0 or len(self.writes) > 0 or not self.files.is_idle
-        return is_asked or self.fetch is not None or self.who.is_asking
-
-    @property
-    def is_settling(self) -> bool:
-        """Whether a write is under way, or the hash after one has not come yet."""
-        return len(self.writes) > 0 or self.sync.is_settling
-
     def __repr__(self) -> str:
         kind = "unknown" if self.who.autopilot is None else autopilot_name(self.who.autopilot)
         return f"<ComponentMachine {self.system}/{self.component} {kind} {self.state}>"
 
-    def _receive_value(self, message: ParamValue, now: float) -> None:
-        name, _, _, count, _ = message
-        if not name:
-            return
-        if name == HASH_CHECK:
-            announced = self.sync.hash_heard(message, now)
-            if self.fetch is not None:
-                self.fetch.announced(announced)
-            self.reads.heard(message, now)
-            return
-        if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
-            name = name.upper()
-            message = message._replace(param_id=name)
-        table = self.table
-        if count != table.count and count != NO_INDEX:
-            self._count_moved(count, now)
-        authors = self._authors
-        is_ours = bool(self.writes.queues) and name in self.writes
-        by = "us" if is_ours else authors.of(name, now) if authors.foreign_sets else "vehicle"
-        change = table.hear(message, by, is_exact=is_ours and self.writes.wants(message))
-        if change is not None:
-            authors.changed(name, now, is_ours)
-            self.sync.changed(change)
-            self._emit(_new(ParamChanged, (self, change)))
-        elif name not in table.params:
-            return  # more names than there can be
-        if self.fetch is not None:
-            self.fetch.heard(message, now)
-        if self.writes.queues:
-            self.writes.heard(message, now)
-        self.reads.heard(message, now)
+    def _heard(self, now: float, version: int) -> None:
+        """Anything has come."""
+        presence = self.presence
+        silence = presence.heard(now)
+        self.round_trip.heard_at = now
+        if silence >= presence.gap or presence.is_lost:
+            self._was_silent(silence, now)
+        if version > self.version:
+            self.version = version
 
     def _count_moved(self, count: int, now: float) -> None:
         if self.table.count is not None:
             self.sync.count_moved(now)
         self.table.move(count)
-
-    @property
-    def _is_spared(self) -> bool:
-        """Whether it is lost, or in a mode in which nothing is asked of it unasked."""
-        presence = self.presence
-        return presence.is_lost or presence.is_high_latency or self.reads.pace.gap >= LOW_BANDWIDTH_GAP
 
     def _doubt(self) -> None:
         """What is known may be of the past: it counts again when the vehicle has confirmed it."""
@@ -485,6 +407,8 @@ class ComponentMachine:
         self.writes.lose(now)
         self.reads.lose(now)
         self.files.lose(now)
+        self.descriptions.lose(now)
+        self.commands.lose(now)
         self._doubt()
 
     def _was_silent(self, silence: float, now: float) -> None:
@@ -498,6 +422,8 @@ class ComponentMachine:
             self.who.doubt(now)
         elif presence.was_away(silence) and silence < math.inf:
             self.who.doubt(now)
+        if self.restart is not None:
+            self.restart.silent(silence, now)
         if presence.has_beaten:  # else nothing says when it should have been heard
             self.sync.silence(now)
 
@@ -508,14 +434,10 @@ class ComponentMachine:
         self._authors.clear()
         self.sync.check(now)
         self.who.doubt(now)
+        if self.restart is not None:
+            self.restart.rebooted(now)
         if self.fetch is not None and self.fetch.is_under_way:
             self.fetch.restart(now)
-
-    def _is_known(self, key: Key) -> bool:
-        """Whether anything speaks for such a parameter."""
-        if isinstance(key, str):
-            return key in self.table.params
-        return self.table.count is None or key < self.table.count
 
     def _follow_identity(self, now: float) -> None:
         """What the identification has come to know takes effect."""
@@ -540,6 +462,16 @@ class ComponentMachine:
         for change in changes:
             self.sync.changed(change)
         self._report(changes)
+
+    def _write_ended(self, now: float) -> None:
+        self._saved_at = now + SAVING_TIME
+        self.sync.write_ended(now)
+
+    def _resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
+        self._emit(events.TableResynced(self, changed, confirmed))
+
+    def _fetched(self, result: FetchResult) -> None:
+        self._emit(events.Fetched(self, result))
 
     def _report(self, changes: list[Change]) -> None:
         for change in changes:

@@ -211,10 +211,12 @@ class Download(Operation[None]):
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
         name, _, _, count, index = message
-        if index == NO_INDEX and self.count is not None and count != NO_INDEX:
-            # pushed, or an answer by name: it goes by the count of now, where ArduPilot's stream does not
-            self._other_count = None if count == self.count else count
-        if index == NO_INDEX or count == NO_INDEX or index >= count or self.done:
+        if index >= count or count == NO_INDEX:
+            if index == NO_INDEX and self.count is not None and count != NO_INDEX:
+                # pushed, or an answer by name: it goes by the count of now, where ArduPilot's stream does not
+                self._other_count = None if count == self.count else count
+            return
+        if self.done:
             return
         self._is_heard = True
         if self.count is None:
@@ -230,11 +232,18 @@ class Download(Operation[None]):
             self._start_over(count)
         if index >= self.count:
             return
-        if index in self._asked:
-            self._take(index, name)
-        else:
-            self._follow(index, name, now)
-        if (self._stream.holes and self.held_since is None) or self._asked or not self._is_streaming:
+        names, holes = self.names, self._stream.holes
+        is_repeated = index in names
+        if is_repeated:
+            self.repeated += 1
+        names[index] = name
+        if holes:
+            holes.pop(index, None)
+        if self.given_up:
+            self.given_up.discard(index)
+        if index not in self._asked:
+            self._follow(index, is_repeated, now)
+        if (holes and self.held_since is None) or self._asked or not self._is_streaming:
             self._ask_for_gaps(now)
             self._finish_if_complete(now)
 
@@ -346,9 +355,9 @@ class Download(Operation[None]):
         self._is_streaming = self._reads.list_runs_again = True
         self._ask_for_turn(now)
 
-    def _follow(self, index: int, name: str, now: float) -> None:
+    def _follow(self, index: int, is_repeated: bool, now: float) -> None:
         """The stream has brought an index, or the vehicle has pushed a change into it."""
-        if self._take(index, name):
+        if is_repeated:
             self._vain += 1
         else:
             self._vain = self._vain_passes = 0
@@ -367,18 +376,6 @@ class Download(Operation[None]):
             # others begin the list anew again and again: leave it to them, and read what is missing
             self._passes = MOST_PASSES
             self._stream_ends()
-
-    def _take(self, index: int, name: str) -> bool:
-        """Keep a name; tell whether one had come before."""
-        is_repeated = index in self.names
-        if is_repeated:
-            self.repeated += 1
-        self.names[index] = name
-        if self._stream.holes:
-            self._stream.holes.pop(index, None)
-        if self.given_up:
-            self.given_up.discard(index)
-        return is_repeated
 
     def _learn_pace(self) -> None:
         """What the stream has told of the link so far: worked out when it is needed, not for each value."""

@@ -132,8 +132,8 @@ class Fetch(Operation[FetchResult]):
             if self._first_value_at > now:
                 self._first_value_at = now
             download.heard(message, now)
-            is_heard = self._proof.before is not None or self._was_asked_meanwhile
-            if not is_heard and self._expects_hash() and not self.done:
+            is_unheard = self._proof.before is None and not self._was_asked_meanwhile
+            if is_unheard and self._expects_hash() and not self.done:
                 # the one at the head of the list was lost; asked for now, it need not be waited for later
                 self._was_asked_meanwhile = True
                 self._ask_hash(self._hash_came_meanwhile, now)

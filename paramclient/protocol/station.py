@@ -49,7 +49,7 @@ MOST_COMPONENTS: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each have. Further ones are not heard."""
 MOST_PEERS: Final = 256
 """Stream peers whose unfinished frames are kept."""
-HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345})
+HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
 """The message ids that matter here: HEARTBEAT, SYSTEM_TIME, PARAM_VALUE, PARAM_SET (of others), COMMAND_ACK,
 FILE_TRANSFER_PROTOCOL, AUTOPILOT_VERSION, HIGH_LATENCY2, STATUSTEXT, PARAM_ERROR."""
 
@@ -119,7 +119,7 @@ class Station:
             machine = self.components.get((system, component))
             if number == PARAM_VALUE_ID and machine is not None:  # the short way for what comes in thousands
                 self._peers[system] = peer
-                machine.receive(decode_param_value(payload), now, version=version)
+                machine.receive_value(decode_param_value(payload), now, version)
             else:
                 self._receive_other(frame, peer, now)
         if self._is_stream and not data:

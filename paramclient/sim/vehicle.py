@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import math
-import struct
-from abc import ABC, abstractmethod
-from collections import Counter
+from abc import abstractmethod
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import replace
 from typing import TypedDict
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.protocol import wire
 from paramclient.protocol.pack import PackedParam
-from paramclient.sim.air import OUT_LIMIT
+from paramclient.sim.device import Device
 from paramclient.sim.ftp import FileServer
 from paramclient.sim.table import Entry, SimParam
 from paramclient.values import Encoding, Param, Value, bits_of
@@ -34,9 +31,12 @@ class VehicleOptions(TypedDict, total=False):
     list_stops: float
     repeated_names: bool
     high_latency: bool
+    armed: bool
+    reboot_ack: bool
+    reboot_down: float
 
 
-class Vehicle(ABC):
+class Vehicle(Device):
     """A simulated component that speaks the parameter protocol in bytes; an `Endpoint`.
 
     It does no input or output and reads no clock. What it is asked at `now` it answers in its own time;
@@ -44,6 +44,7 @@ class Vehicle(ABC):
 
     Attributes:
         system, component: its own ids.
+        armed: whether its heartbeat says so; it does not start again then. Can be set in flight.
         requests: how many messages of each kind were received that were for this vehicle, by their MAVLink
             names (`requests["PARAM_REQUEST_READ"]`).
 
@@ -63,15 +64,15 @@ class Vehicle(ABC):
         list_stops: how many lists that happens to; `math.inf` for all.
         repeated_names: whether a name may stand in the table more than once, as it does where names are cut
             at 16 bytes. Each has its index; by name the first is meant.
-        high_latency: see the attribute.
+        high_latency, armed: see the attributes.
+        reboot_ack: whether it acknowledges the command to start again before it does.
+        reboot_down: seconds for which it is off then.
     """
 
     _ftp: FileServer | None = None
-    _ack_first = True  # whether COMMAND_ACK comes before what the command asked for
     _position: int | None  # where the list stands, None while it is not being sent
     _last_listed: Entry | None  # what it sent last
     _list_sent: int  # values since its start
-    _next_telemetry: float
     _next_burst: float
 
     def __init__(
@@ -95,32 +96,23 @@ class Vehicle(ABC):
         list_stops: float = 1,
         repeated_names: bool = False,
         high_latency: bool = False,
+        armed: bool = False,
+        reboot_ack: bool = True,
+        reboot_down: float = 1.0,
     ) -> None:
         rows = tuple(table)
         if not repeated_names and len({row.name for row in rows}) < len(rows):
             raise UsageError("a parameter name stands twice in the table")
         if len(rows) > _LONGEST:
             raise UsageError(f"a table holds at most {_LONGEST} parameters, not {len(rows)}")
-        for what, number in (("system", system), ("component", component)):
-            if not 1 <= number <= 255:
-                raise UsageError(f"{what} is a number from 1 to 255, not {number}")
-        if mavlink_version not in (1, 2):
-            raise UsageError(f"mavlink_version is 1 or 2, not {mavlink_version}")
         if param_error and mavlink_version == 1:
             raise UsageError("PARAM_ERROR does not exist in MAVLink 1")
         if burst < 1 or not (math.isfinite(period) and period > 0.0):
             raise UsageError("burst is a number from 1 up, and period a number of seconds above 0")
-        if not boot_time >= 0.0:
-            raise UsageError(f"boot_time is a number of seconds from 0 up, not {boot_time}")
-        if not 0.0 <= telemetry <= 10_000.0:
-            raise UsageError(f"telemetry is a number of messages per second from 0 to 10000, not {telemetry}")
         if list_stops_at is not None and list_stops_at < 0:
             raise UsageError(f"list_stops_at is a number of values from 0 up, not {list_stops_at}")
         if not list_stops >= 0:
             raise UsageError(f"list_stops is a number of lists from 0 up, not {list_stops}")
-        self.system = system
-        self.component = component
-        self.requests: Counter[str] = Counter()
         self._entries = [Entry(row, order, encoding) for order, row in enumerate(rows)]
         self._by_name = {self._key(entry.name): entry for entry in reversed(self._entries)}
         self._listed: list[Entry] = []
@@ -132,21 +124,23 @@ class Vehicle(ABC):
         self._list_stops_at = math.inf if list_stops_at is None else list_stops_at
         self._list_stops = list_stops
         self._when_listed: dict[int, list[Callable[[], object]]] = {}
-        self._high_latency = high_latency
-        self._heartbeat = heartbeat
-        self._version = version
         self._burst = burst
         self._period = period
-        self._boot_time = boot_time
         self._param_error = param_error
-        self._telemetry_period = 1.0 / telemetry if telemetry else math.inf
-        self._mavlink_version = mavlink_version
-        self._framer = wire.Framer(wire.UNDERSTOOD, stream=stream)
-        self._sequence = 0
-        self._out: list[bytes] = []
-        self._started = False
-        self._now = -math.inf
-        self._switch_on(math.inf)
+        super().__init__(
+            system=system,
+            component=component,
+            heartbeat=heartbeat,
+            version=version,
+            boot_time=boot_time,
+            telemetry=telemetry,
+            mavlink_version=mavlink_version,
+            stream=stream,
+            high_latency=high_latency,
+            armed=armed,
+            reboot_ack=reboot_ack,
+            reboot_down=reboot_down,
+        )
 
     # The public face
 
@@ -178,22 +172,6 @@ class Vehicle(ABC):
     def values(self) -> dict[str, Value]:
         """The listed values by name, as `params`."""
         return {name: param.value for name, param in self.params.items()}
-
-    @property
-    def high_latency(self) -> bool:
-        """Whether it speaks as on a satellite link (PX4's `MAVLINK_MODE_IRIDIUM`); can be set in flight.
-
-        HIGH_LATENCY2 every 5 s then stands in for heartbeat and telemetry; lists, files and pushes wait.
-        """
-        return self._high_latency
-
-    @high_latency.setter
-    def high_latency(self, is_on: bool) -> None:
-        if is_on != self._high_latency:
-            self._high_latency = is_on
-            self._next_heartbeat = max(self._now, self._on_at)
-            self._next_telemetry = max(self._now, self._next_telemetry)
-            self._next_burst = max(self._now, self._next_burst)
 
     def when_listed(self, count: int, do: Callable[[], object]) -> None:
         """Call something once, as soon as a list has sent so many values since its start.
@@ -234,52 +212,6 @@ class Vehicle(ABC):
         entry = self._entry(name)
         self._write(entry, bits_of(value, entry.type))
 
-    def reboot(self, now: float | None = None, *, down: float = 0.0) -> None:
-        """Switch off at `now` and on again `down` seconds later, never if that is `math.inf`.
-
-        All that was going on ends, and what is received while it is off is gone, as is what it had ready to
-        be fetched; the values stay. Without `now` it happens at the time that the vehicle was last given.
-        """
-        if now is None:
-            now = self._now
-        self._out.clear()
-        self._framer.flush()
-        self._started = True
-        self._switch_on(now + down)
-        self.tick(now)
-
-    def receive(self, data: bytes, now: float) -> None:
-        """Take what the link delivered at `now`."""
-        self.tick(now)
-        if now >= self._on_at:
-            for frame in self._framer.receive(data):
-                self._take(frame)
-            self._work(now)
-
-    def tick(self, now: float) -> None:
-        """Do what has become due by `now`."""
-        self._now = now
-        if not self._started:
-            self._started = True
-            self._switch_on(now)
-        if now >= self._on_at:
-            self._work(now)
-
-    def next_deadline(self) -> float | None:
-        """When `tick` is wanted next; None before the first call and when switched off for good."""
-        if self._now < self._on_at:
-            return None if self._on_at == math.inf else self._on_at
-        due = [self._next_heartbeat, *self._timers()]
-        if self._high_latency:
-            return min(due)
-        files = math.inf if self._ftp is None else self._ftp.next_deadline()
-        return min(self._next_telemetry, self._next_burst, files, *due)
-
-    def data_to_send(self) -> list[bytes]:
-        """Hand over the frames to send, and forget them."""
-        out, self._out = self._out, []
-        return out
-
     # What a kind of vehicle does in its own way
 
     @abstractmethod
@@ -303,19 +235,12 @@ class Vehicle(ABC):
         if param.type == entry.type:
             self._write(entry, param.bits)
 
-    def _answers_system(self, target: int) -> bool:
-        return target in (0, self.system)
-
     def _is_listed(self, entry: Entry) -> bool:
         return True
 
     def _key(self, name: str) -> str:
         """What two names have in common that mean one parameter."""
         return name
-
-    def _timers(self) -> tuple[float, ...]:
-        """Deadlines besides those of the heartbeat, the telemetry and the list."""
-        return ()
 
     def _next_place(self, position: int) -> int:
         """Which of the listed comes at this position of the list that is being sent."""
@@ -353,12 +278,25 @@ class Vehicle(ABC):
     def _is_dead(self, entry: Entry) -> bool:
         return bool(self._dead) and (entry.index in self._dead or entry.name in self._dead)
 
+    def _on_request(self, message: wire.Message, sender: wire.Frame) -> None:
+        if isinstance(message, wire.ParamRequestRead):
+            self._on_read(message, sender)
+        elif isinstance(message, wire.ParamRequestList):
+            self._on_list()
+        elif isinstance(message, wire.ParamSet):
+            self._on_set(message, sender)
+        elif isinstance(message, wire.FileTransfer) and self._ftp is not None:
+            self._ftp.receive(message.payload, (sender.system, sender.component), self._now)
+
+    def _next_transmission(self) -> float:
+        files = math.inf if self._ftp is None else self._ftp.next_deadline()
+        return min(super()._next_transmission(), self._next_burst, files)
+
+    def _skip_what_was_left_out(self) -> None:
+        super()._skip_what_was_left_out()
+        self._next_burst = max(self._now, self._next_burst)
+
     def _switch_on(self, at: float) -> None:
-        """Begin anew, with nothing going on, at the time `at`; `math.inf` leaves it off."""
-        self._on_at = at
-        self._sequence = 0
-        self._next_heartbeat = at
-        self._next_telemetry = at + self._telemetry_period
         self._next_burst = math.inf
         self._position = None
         self._last_listed = None
@@ -366,24 +304,12 @@ class Vehicle(ABC):
         if self._ftp is not None:
             self._ftp.reset()
         self._relist()
+        super()._switch_on(at)
 
     def _work(self, now: float) -> None:
-        """Do what is due, each thing at its own pace; of what repeats for ever, a late call skips some."""
-        if self._next_heartbeat <= now:
-            pause = _HIGH_LATENCY_PAUSE if self._high_latency else 1.0
-            self._send_signs_of_life(now)
-            self._next_heartbeat += pause
-            if self._next_heartbeat <= now:
-                self._next_heartbeat = now + pause
+        super()._work(now)
         if self._high_latency:
             return
-        if self._next_telemetry <= now:
-            late = now - self._next_telemetry
-            for _ in range(int(min(late, 1.0) / self._telemetry_period) + 1):
-                self._send_attitude(now)
-            self._next_telemetry += (int(late / self._telemetry_period) + 1) * self._telemetry_period
-            if self._next_telemetry <= now:
-                self._next_telemetry = now + self._telemetry_period
         while self._next_burst <= now:
             self._next_burst += self._period
             for _ in range(self._burst):
@@ -406,6 +332,11 @@ class Vehicle(ABC):
             entry = self._find(param.name)
             if entry is not None:
                 self._set_from_file(entry, param)
+
+    def _take_system_id(self, entry: Entry | None) -> None:
+        """Speak under the system id that a parameter says, if it is there and can be one."""
+        if entry is not None and isinstance(entry.value, int) and 1 <= entry.value <= 255:
+            self.system = entry.value
 
     def _start_list(self, at: float) -> None:
         """Send the list from its start, from `at` on, and not before the vehicle has booted."""
@@ -451,100 +382,5 @@ class Vehicle(ABC):
             name = request.param_id if index < 0 else ""
             self._send(wire.ParamError(sender.system, sender.component, name, index, code))
 
-    def _send(self, message: wire.Message) -> None:
-        self._queue(
-            wire.encode(
-                message,
-                system=self.system,
-                component=self.component,
-                sequence=self._sequence,
-                version=self._mavlink_version,
-            )
-        )
 
-    # The rest
-
-    def _send_signs_of_life(self, now: float) -> None:
-        beat = self._heartbeat
-        if self._high_latency:
-            self._send(wire.HighLatency2(beat.type, beat.autopilot))
-            return
-        is_booting = now < self._on_at + self._boot_time
-        self._send(replace(beat, system_status=wire.MAV_STATE_BOOT) if is_booting else beat)
-        self._send(wire.SystemTime(0, self._time_boot_ms(now)))
-
-    def _time_boot_ms(self, now: float) -> int:
-        """Since it was switched on, as it is sent: in 32 bits."""
-        return int((now - self._on_at) * 1000.0) & 0xFFFFFFFF
-
-    def _send_attitude(self, now: float) -> None:
-        self._queue(
-            wire.build_frame(
-                _ATTITUDE,
-                self._time_boot_ms(now).to_bytes(4, "little") + _LEVEL_FLIGHT,
-                system=self.system,
-                component=self.component,
-                sequence=self._sequence,
-                version=self._mavlink_version,
-            )
-        )
-
-    def _queue(self, frame: bytes) -> None:
-        self._sequence = (self._sequence + 1) & 0xFF
-        if len(self._out) < OUT_LIMIT:
-            self._out.append(frame)
-
-    def _take(self, frame: wire.Frame) -> None:
-        message = wire.decode(frame)
-        if isinstance(message, wire.Heartbeat):
-            self.requests["HEARTBEAT"] += 1
-            return
-        if not isinstance(
-            message,
-            wire.ParamRequestRead
-            | wire.ParamRequestList
-            | wire.ParamSet
-            | wire.CommandLong
-            | wire.FileTransfer,
-        ):
-            return
-        if not self._answers_system(message.target_system):
-            return
-        if message.target_component not in (wire.COMP_ID_ALL, self.component):
-            return
-        self.requests[_NAMES[type(message)]] += 1
-        if isinstance(message, wire.ParamRequestRead):
-            self._on_read(message, frame)
-        elif isinstance(message, wire.ParamRequestList):
-            self._on_list()
-        elif isinstance(message, wire.ParamSet):
-            self._on_set(message, frame)
-        elif isinstance(message, wire.FileTransfer):
-            if self._ftp is not None:
-                self._ftp.receive(message.payload, (frame.system, frame.component), self._now)
-        else:
-            self._on_command(message, frame)
-
-    def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
-        wanted = request.command == wire.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES or (
-            request.command == wire.MAV_CMD_REQUEST_MESSAGE and request.params[0] == _AUTOPILOT_VERSION
-        )
-        result = wire.MAV_RESULT_ACCEPTED if wanted else wire.MAV_RESULT_UNSUPPORTED
-        ack = wire.CommandAck(request.command, result, sender.system, sender.component)
-        answers: list[wire.Message] = [ack, self._version] if wanted else [ack]
-        for answer in answers if self._ack_first else reversed(answers):
-            self._send(answer)
-
-
-_NAMES = {
-    wire.ParamRequestRead: "PARAM_REQUEST_READ",
-    wire.ParamRequestList: "PARAM_REQUEST_LIST",
-    wire.ParamSet: "PARAM_SET",
-    wire.CommandLong: "COMMAND_LONG",
-    wire.FileTransfer: "FILE_TRANSFER_PROTOCOL",
-}
-_AUTOPILOT_VERSION = 148
-_ATTITUDE = 30
-_LEVEL_FLIGHT = struct.pack("<6f", 0.0, 0.0, 0.5, 0.0, 0.0, 0.01)
-_HIGH_LATENCY_PAUSE = 5.0
 _LONGEST = 65535  # param_count has 16 bits, and index 65535 means none

@@ -12,10 +12,12 @@ from typing import Final
 
 from paramclient.protocol.wire.frames import Frame, build_frame
 from paramclient.protocol.wire.messages import (
+    COMPONENT_METADATA_ID,
     PARAM_VALUE_ID,
     AutopilotVersion,
     CommandAck,
     CommandLong,
+    ComponentMetadata,
     FileTransfer,
     Heartbeat,
     HighLatency2,
@@ -90,6 +92,7 @@ _PARAM_ERROR = struct.Struct("<hBB16sB")
 _FILE_TRANSFER = struct.Struct("<BBB251s")
 _SYSTEM_TIME = struct.Struct("<QI")
 _HIGH_LATENCY2 = struct.Struct("<24xBB16x")
+_COMPONENT_METADATA = struct.Struct("<4xI100s")
 _V1_LENGTHS = {77: 3, 148: 60}  # extension fields exist in MAVLink 2 only
 
 
@@ -157,6 +160,11 @@ def _decode_high_latency2(payload: bytes) -> HighLatency2:
     return HighLatency2(*_fields(_HIGH_LATENCY2, payload))
 
 
+def _decode_component_metadata(payload: bytes) -> ComponentMetadata:
+    crc, uri = _fields(_COMPONENT_METADATA, payload)
+    return ComponentMetadata(text_of(uri), crc)
+
+
 _DECODERS: dict[int, Callable[[bytes], Message]] = {
     0: _decode_heartbeat,
     2: _decode_system_time,
@@ -171,6 +179,7 @@ _DECODERS: dict[int, Callable[[bytes], Message]] = {
     235: _decode_high_latency2,
     253: _decode_statustext,
     345: _decode_param_error,
+    COMPONENT_METADATA_ID: _decode_component_metadata,
 }
 
 UNDERSTOOD: Final = frozenset(_DECODERS)
@@ -235,4 +244,8 @@ _ENCODERS: dict[type, Callable[..., tuple[int, bytes]]] = {
     ),
     SystemTime: lambda m: (2, _SYSTEM_TIME.pack(m.time_unix_usec, m.time_boot_ms)),
     HighLatency2: lambda m: (235, _HIGH_LATENCY2.pack(m.type, m.autopilot)),
+    ComponentMetadata: lambda m: (
+        COMPONENT_METADATA_ID,
+        _COMPONENT_METADATA.pack(m.file_crc, m.uri.encode("latin-1")),
+    ),
 }

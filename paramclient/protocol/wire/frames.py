@@ -68,7 +68,7 @@ class Framer:
 
     def __init__(self, wanted: Collection[int] | None = None, *, stream: bool = True) -> None:
         ids = _CRC_EXTRA if wanted is None else wanted
-        self._wanted = {number.to_bytes(3, "little"): number for number in ids}
+        self._number_of = {number.to_bytes(3, "little"): number for number in ids}.get
         self._stream = stream
         self._tail = b""
         self.frames = 0
@@ -86,7 +86,7 @@ class Framer:
             data = self._tail + data
         may_go_on = self._stream and not final
         found: list[Frame] = []
-        number_of = self._wanted.get
+        number_of = self._number_of
         extra_of = _EXTRA_BY_ID_BYTES.get
         length = len(data)
         padded = data + _PADDING
@@ -132,7 +132,8 @@ class Framer:
             skipped += next_at - at
             at = next_at
         self.frames += good
-        self.skipped += skipped
+        if skipped:
+            self.skipped += skipped
         self._tail = data[at:]
         return found
 
@@ -169,7 +170,7 @@ def checksum(message_id: int, body: bytes) -> int | None:
 def message_name(message_id: int) -> str:
     """`HEARTBEAT` for 0, and so on; `UNKNOWN_4711` for an id that the dialect does not have."""
     known = dialect.mavlink_map.get(message_id)
-    return f"UNKNOWN_{message_id}" if known is None else str(known.msgname)
+    return _MISSING_NAMES.get(message_id, f"UNKNOWN_{message_id}") if known is None else str(known.msgname)
 
 
 def enum_word(enum: str, number: int) -> str:
@@ -180,5 +181,10 @@ def enum_word(enum: str, number: int) -> str:
     )
 
 
-_CRC_EXTRA: dict[int, int] = {number: message.crc_extra for number, message in dialect.mavlink_map.items()}
+# of MAVLink's common set, which pymavlink 2.4.50 has without its unfinished messages
+_MISSING_NAMES = {397: "COMPONENT_METADATA"}
+_MISSING_EXTRA = {397: 182}
+_CRC_EXTRA: dict[int, int] = _MISSING_EXTRA | {
+    number: message.crc_extra for number, message in dialect.mavlink_map.items()
+}
 _EXTRA_BY_ID_BYTES = {number.to_bytes(3, "little"): bytes((extra,)) for number, extra in _CRC_EXTRA.items()}

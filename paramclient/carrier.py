@@ -1,0 +1,162 @@
+"""What moves the bytes of a client: the reader, the sender, and the return of a link that drops."""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable
+from contextlib import suppress
+from typing import Final
+
+import anyio
+
+from paramclient.errors import LinkError
+from paramclient.links import Link
+from paramclient.protocol.station import Station
+
+__all__ = ["Carrier"]
+
+REST: Final = 0.02
+"""Seconds for which the reader lets telemetry pile up while nobody waits for an answer: to take 20 datagrams
+at once costs a fifth of taking them one by one, and a change that comes meanwhile is told that much later."""
+MOST_PER_REST: Final = 64
+"""Datagrams that may come in one rest, at the rate of the last ones; on a busier link it is shorter. That is
+an eighth of what Linux' usual buffer holds (see `paramclient.links.udp`): a burst still finds room there."""
+LINK_PATIENCE: Final = 10.0
+"""Seconds that calls wait for a link to come back before they fail with its error."""
+FIRST_BACKOFF: Final = 0.25
+LONGEST_BACKOFF: Final = 5.0
+"""Seconds between two attempts to open a link again: doubled from the first to the longest."""
+
+logger = logging.getLogger(__name__)
+
+
+class Carrier:
+    """Carries what a link delivers to a station, and what that wants sent to the link.
+
+    `read` and `send` run side by side for as long as the client is open. A link that drops and can come back
+    is opened again; meanwhile time stands still for the station.
+
+    Args:
+        link: an open one.
+        station: the core.
+        dispatch: hands out what has happened, after each time that something may have.
+        end: takes the error of a link that has failed for good, and calls `fail_for_good`.
+
+    Attributes:
+        is_away: whether the link is away and being opened again.
+        broken: what calls raise now, or None.
+        ended: the same, for good.
+        news: is set, and replaced, when anything was received or the calls fail.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        station: Station,
+        *,
+        dispatch: Callable[[], None],
+        end: Callable[[LinkError], None],
+    ) -> None:
+        self.is_away = False
+        self.broken: LinkError | None = None
+        self.ended: LinkError | None = None
+        self.news = anyio.Event()
+        self._link = link
+        self._station = station
+        self._dispatch = dispatch
+        self._end = end
+        self._something_to_send = anyio.Event()
+        self._sent = anyio.Event()  # set when anything is sent
+
+    async def read(self) -> None:
+        """Take what comes, until the link fails for good."""
+        before = anyio.current_time()
+        while True:
+            try:
+                chunks = await self._link.receive()
+            except LinkError as error:
+                if not self._link.reconnects:
+                    self._end(error)
+                    return
+                await self._reopen(error)
+                continue
+            now = anyio.current_time()
+            is_news = False
+            for peer, data in chunks:
+                is_news |= self._station.receive(data, peer, now)
+            if is_news:
+                self._dispatch()
+                self.tell()
+                self.wake()
+            elif not self._station.is_waiting:
+                await self._rest(min(REST, MOST_PER_REST * (now - before) / max(1, len(chunks))))
+            before = now
+
+    async def send(self) -> None:
+        """Send what is to be sent, and do what is due, until the calls have failed for good."""
+        station = self._station
+        while self.ended is None:
+            self._something_to_send = anyio.Event()
+            station.tick(anyio.current_time())
+            self._dispatch()
+            to_send = station.data_to_send()
+            if to_send:
+                self._sent.set()
+            for data, peer in to_send:
+                # a link that drops is the reader's business; what is not sent now is sent again in time
+                with suppress(LinkError):
+                    await self._link.send(data, peer)
+            wait = station.next_deadline() - anyio.current_time()
+            with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):
+                await self._something_to_send.wait()
+
+    def wake(self) -> None:
+        """There may be something to send, or another deadline."""
+        self._something_to_send.set()
+
+    def tell(self) -> None:
+        """There is news for those who wait for `news`."""
+        news, self.news = self.news, anyio.Event()
+        news.set()
+
+    def fail_for_good(self, error: LinkError) -> None:
+        """No call can be answered any more."""
+        self.ended = error
+        self._fail_calls(error)
+
+    async def _rest(self, seconds: float) -> None:
+        """Leave what comes to the link for a while, unless something is sent that may be answered."""
+        self._sent = anyio.Event()
+        with anyio.move_on_after(seconds):
+            await self._sent.wait()
+
+    async def _reopen(self, error: LinkError) -> None:
+        """Open the link again, for as long as it takes."""
+        logger.warning("%s; trying to open it again", error)
+        self.is_away = True
+        self._station.pause()
+        patience_ends = anyio.current_time() + LINK_PATIENCE
+        backoff = FIRST_BACKOFF
+        while True:
+            patience = patience_ends - anyio.current_time()
+            await anyio.sleep(min(backoff, patience) if patience > 0 else backoff)
+            backoff = min(backoff * 2, LONGEST_BACKOFF)
+            try:
+                await self._link.open()
+            except LinkError as again:
+                if anyio.current_time() >= patience_ends:
+                    self._fail_calls(again)
+            else:
+                logger.info("%s: open again", self._link.name)
+                self.is_away = False
+                self.broken = None
+                self._station.resume(anyio.current_time())
+                self.wake()
+                return
+
+    def _fail_calls(self, error: LinkError) -> None:
+        """Whoever waits gets this error, and so does every new call until the link is back."""
+        self.broken = error
+        self._station.fail_all(error, anyio.current_time())
+        self.tell()

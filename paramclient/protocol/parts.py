@@ -1,0 +1,220 @@
+"""The machines that one component consists of, joined with each other, and how it stands by them."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+
+from paramclient.identity import Identity
+from paramclient.protocol.authors import Authors
+from paramclient.protocol.commands import Commands
+from paramclient.protocol.descriptions import Descriptions
+from paramclient.protocol.events import Event
+from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.fetches import Fetches
+from paramclient.protocol.ftp import FileTransfers
+from paramclient.protocol.identify import Identification
+from paramclient.protocol.presence import Presence
+from paramclient.protocol.reads import Key, Reads
+from paramclient.protocol.refresh import Refresh
+from paramclient.protocol.restart import Restart
+from paramclient.protocol.result import FetchResult, Means, Sampled
+from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
+from paramclient.protocol.table import Change, Table
+from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.turns import Turns
+from paramclient.protocol.wire import MAV_AUTOPILOT_PX4, Message
+from paramclient.protocol.writes import Writes
+from paramclient.values import Encoding
+
+__all__ = ["Parts"]
+
+
+class Parts(ABC):
+    """What one component consists of. `ComponentMachine` says what happens to it; arguments and attributes
+    are described there.
+    """
+
+    def __init__(
+        self,
+        system: int,
+        component: int,
+        *,
+        own: tuple[int, int],
+        link: str,
+        send: Callable[[Message], None],
+        emit: Callable[[Event], None],
+        encoding: Encoding | None = None,
+        upkeep: Upkeep | None = None,
+        is_link_busy: Callable[[], bool] = lambda: False,
+        is_vehicle_doubted: Callable[[], bool] = lambda: False,
+        another: Callable[[float], None] | None = None,
+        turns: Turns | None = None,
+    ) -> None:
+        target = (system, component)
+        upkeep = upkeep or Upkeep()
+        self.system = system
+        self.component = component
+        self.version = 1
+        self.round_trip = RoundTrip()
+        self.who = Identification(target, link, self.round_trip, send, encoding)
+        self.table = Table(self.who.encoding)
+        self.turns = Turns() if turns is None else turns
+        self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share)
+        self.writes = Writes(
+            target,
+            self.round_trip,
+            send,
+            self.reads,
+            self.table.params,
+            encoding=lambda: self.table.encoding,
+            is_certain=lambda: self.may_be_written,
+        )
+        self.presence = Presence()
+        self.sync = Sync(
+            self.reads,
+            self.table,
+            upkeep,
+            is_px4=lambda: self.who.autopilot == MAV_AUTOPILOT_PX4,
+            is_writing=lambda: len(self.writes) > 0,
+            is_fetching=lambda: self.fetch is not None,
+            is_busy=is_link_busy,
+            file_is_cheap=lambda interval: self.fetches.file_is_cheap(interval),
+            is_spared=lambda: self._is_spared,
+            is_doubted=lambda: self.who.is_doubted,
+            begin_fetch=lambda now, refresh: self.begin_fetch(now, refresh=refresh),
+            end_fetch=self.end_fetch,
+            resynced=self._resynced,
+        )
+        self.descriptions = Descriptions(
+            target, own, self.round_trip, send, is_identifying=lambda: self.who.is_asking
+        )
+        self.commands = Commands(target, own, self.round_trip, send)
+        self.restart: Restart | None = None
+        self.files = FileTransfers(target, own, self.round_trip, send)
+        self.fetches = Fetches(
+            Means(
+                target,
+                self.round_trip,
+                send,
+                self.reads,
+                self.table,
+                self.turns,
+                self.files,
+                expects_hash=lambda: self.sync.expects_hash,
+                changed=self._moved,
+                doubt=self._doubt_identity,
+            ),
+            self.sync,
+            upkeep.policy,
+            says_file=lambda: self.who.says_file,
+            ended=self._fetched,
+        )
+        self._own = own
+        self._emit = emit
+        self._policy = upkeep.policy
+        self._another = another or self.become_another
+        self._is_vehicle_doubted = is_vehicle_doubted
+        self._known_as: str | None = None  # the key of the identity that was reported
+        self._may_write = False
+        self._saved_at = -math.inf  # when all that we have written will have been saved
+        self._authors = Authors()
+
+    @abstractmethod
+    def begin_fetch(
+        self, now: float, *, refresh: bool = False, listed: bool = False, sampled: Sampled | None = None
+    ) -> Fetch:
+        """Begin a fetch, or join the one under way; give it back with `end_fetch`."""
+
+    @abstractmethod
+    def end_fetch(self, fetch: Fetch, now: float) -> None:
+        """Wait for it no longer."""
+
+    @abstractmethod
+    def become_another(self, now: float) -> None:
+        """Another vehicle has taken this system id."""
+
+    @property
+    def identity(self) -> Identity:
+        """Who the vehicle is, as far as this component has said."""
+        return self.who.identity
+
+    @property
+    def may_be_written(self) -> bool:
+        """Whether it is certain whom a write reaches, and what it makes of it."""
+        return self.who.may_be_written and not self._is_vehicle_doubted()
+
+    @property
+    def state(self) -> str:
+        """The table's state in a word: new, cached, fetching, synced, partial, lost."""
+        if self.presence.is_lost:
+            return "lost"
+        if self.fetch is not None:
+            return "fetching"
+        if self.sync.synced:
+            return "synced"
+        if not self.table.params:
+            return "new"
+        return "cached" if self.table.complete else "partial"
+
+    @property
+    def fetch(self) -> Fetch | None:
+        """The fetch under way, or None."""
+        return self.fetches.current
+
+    @property
+    def sync_state(self) -> SyncState:
+        """How the table stands to the vehicle's."""
+        return SyncState.LOST if self.presence.is_lost else self.sync.state
+
+    @property
+    def refresh(self) -> Refresh | None:
+        """The reading of volatile values under way after a hash hit, or None."""
+        return self.sync.refresh
+
+    @property
+    def can_hit(self) -> bool:
+        """Whether the vehicle's hash may confirm the table as it stands."""
+        return self.table.complete and self.table.hash is not None
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether anything is awaited: an answer, a fetch, a file, or who it is."""
+        is_asked = len(self.reads) > 0 or len(self.writes) > 0 or not self.files.is_idle
+        is_asked = is_asked or len(self.commands) > 0 or self.restart is not None
+        is_asked = is_asked or self.descriptions.is_asking
+        return is_asked or self.fetch is not None or self.who.is_asking
+
+    @property
+    def is_settling(self) -> bool:
+        """Whether a write is under way, or the hash after one has not come yet."""
+        return len(self.writes) > 0 or self.sync.is_settling
+
+    @property
+    def _is_spared(self) -> bool:
+        """Whether it is lost, or in a mode in which nothing is asked of it unasked."""
+        presence = self.presence
+        return presence.is_lost or presence.is_high_latency or self.reads.pace.gap >= LOW_BANDWIDTH_GAP
+
+    def _is_known(self, key: Key) -> bool:
+        """Whether anything speaks for such a parameter."""
+        if isinstance(key, str):
+            return key in self.table.params
+        return self.table.count is None or key < self.table.count
+
+    @abstractmethod
+    def _moved(self, changes: list[Change]) -> None:
+        """A fetch has found out something otherwise than by a PARAM_VALUE."""
+
+    @abstractmethod
+    def _doubt_identity(self, now: float) -> None:
+        """A fetch has found out that the table is not what it was."""
+
+    @abstractmethod
+    def _resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
+        """The table agrees with the vehicle's again."""
+
+    @abstractmethod
+    def _fetched(self, result: FetchResult) -> None:
+        """A fetch has ended with a result."""

@@ -1,0 +1,300 @@
+"""What a simulated component does besides parameters: power, frames in and out, signs of life, commands."""
+
+from __future__ import annotations
+
+import math
+import struct
+from abc import ABC, abstractmethod
+from collections import Counter
+from dataclasses import replace
+
+from paramclient.errors import UsageError
+from paramclient.protocol import wire
+from paramclient.sim.air import OUT_LIMIT
+
+__all__ = ["Device"]
+
+
+class Device(ABC):
+    """A simulated component that is switched on and off, sends signs of life, and obeys commands.
+
+    `Vehicle` adds the parameters, and says what the arguments and attributes are.
+    """
+
+    _ack_first = True  # whether COMMAND_ACK comes before what the command asked for
+    _restart_delay = 0.3  # seconds from accepting to start again until it is off
+    _armed_result = wire.MAV_RESULT_DENIED  # what becomes of a restart while it is armed
+    _next_telemetry: float
+
+    def __init__(
+        self,
+        *,
+        system: int,
+        component: int,
+        heartbeat: wire.Heartbeat,
+        version: wire.AutopilotVersion,
+        boot_time: float,
+        telemetry: float,
+        mavlink_version: int,
+        stream: bool,
+        high_latency: bool,
+        armed: bool,
+        reboot_ack: bool,
+        reboot_down: float,
+    ) -> None:
+        for what, number in (("system", system), ("component", component)):
+            if not 1 <= number <= 255:
+                raise UsageError(f"{what} is a number from 1 to 255, not {number}")
+        if mavlink_version not in (1, 2):
+            raise UsageError(f"mavlink_version is 1 or 2, not {mavlink_version}")
+        if not boot_time >= 0.0:
+            raise UsageError(f"boot_time is a number of seconds from 0 up, not {boot_time}")
+        if not 0.0 <= telemetry <= 10_000.0:
+            raise UsageError(f"telemetry is a number of messages per second from 0 to 10000, not {telemetry}")
+        if not reboot_down >= 0.0:
+            raise UsageError(f"reboot_down is a number of seconds from 0 up, not {reboot_down}")
+        self.armed = armed
+        self.system = system
+        self.component = component
+        self.requests: Counter[str] = Counter()
+        self._high_latency = high_latency
+        self._reboot_ack = reboot_ack
+        self._reboot_down = reboot_down
+        self._heartbeat = heartbeat
+        self._version = version
+        self._boot_time = boot_time
+        self._telemetry_period = 1.0 / telemetry if telemetry else math.inf
+        self._mavlink_version = mavlink_version
+        self._framer = wire.Framer(wire.UNDERSTOOD, stream=stream)
+        self._sequence = 0
+        self._out: list[bytes] = []
+        self._started = False
+        self._now = -math.inf
+        self._switch_on(math.inf)
+
+    @property
+    def high_latency(self) -> bool:
+        """Whether it speaks as on a satellite link (PX4's `MAVLINK_MODE_IRIDIUM`); can be set in flight.
+
+        HIGH_LATENCY2 every 5 s then stands in for heartbeat and telemetry; lists, files and pushes wait.
+        """
+        return self._high_latency
+
+    @high_latency.setter
+    def high_latency(self, is_on: bool) -> None:
+        if is_on != self._high_latency:
+            self._high_latency = is_on
+            self._next_heartbeat = max(self._now, self._on_at)
+            self._skip_what_was_left_out()
+
+    def reboot(self, now: float | None = None, *, down: float = 0.0) -> None:
+        """Switch off at `now` and on again `down` seconds later, never if that is `math.inf`.
+
+        All that was going on ends, and what is received while it is off is gone, as is what it had ready to
+        be fetched; the values stay, and those that wait for a start take effect. Without `now` it happens at
+        the time that the vehicle was last given.
+        """
+        if now is None:
+            now = self._now
+        self._started = True
+        self._end_all()
+        self._switch_on(now + down)
+        self.tick(now)
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take what the link delivered at `now`."""
+        self.tick(now)
+        if now >= self._on_at:
+            for frame in self._framer.receive(data):
+                self._take(frame)
+            self._work(now)
+
+    def tick(self, now: float) -> None:
+        """Do what has become due by `now`."""
+        self._now = now
+        if not self._started:
+            self._started = True
+            self._switch_on(now)
+        if self._restart_at <= now:
+            self.reboot(self._restart_at, down=self._reboot_down)
+            self._now = now
+        if now >= self._on_at:
+            self._work(now)
+
+    def next_deadline(self) -> float | None:
+        """When `tick` is wanted next; None before the first call and when switched off for good."""
+        if self._now < self._on_at:
+            return None if self._on_at == math.inf else self._on_at
+        due = [self._next_heartbeat, self._restart_at, *self._timers()]
+        return min(due) if self._high_latency else min(self._next_transmission(), *due)
+
+    def data_to_send(self) -> list[bytes]:
+        """Hand over the frames to send, and forget them."""
+        out, self._out = self._out, []
+        return out
+
+    # What a kind of component does in its own way
+
+    @abstractmethod
+    def _on_request(self, message: wire.Message, sender: wire.Frame) -> None:
+        """A request for it has come that is no command."""
+
+    def _answers_system(self, target: int) -> bool:
+        return target in (0, self.system)
+
+    def _timers(self) -> tuple[float, ...]:
+        """Deadlines besides those of the heartbeat, the telemetry and the list."""
+        return ()
+
+    def _next_transmission(self) -> float:
+        """When something is due that high latency leaves out."""
+        return self._next_telemetry
+
+    def _end_all(self) -> None:
+        """Going off ends what was under way; see to what takes effect with the next start."""
+        self._out.clear()
+        self._framer.flush()
+
+    def _may_restart(self, mode: int) -> int:
+        """The MAV_RESULT for MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN with this as its first parameter."""
+        if self.armed:
+            return self._armed_result
+        return wire.MAV_RESULT_ACCEPTED if mode == _REBOOT else wire.MAV_RESULT_UNSUPPORTED
+
+    def _skip_what_was_left_out(self) -> None:
+        """What became due while high latency left it out is due from now on, once."""
+        self._next_telemetry = max(self._now, self._next_telemetry)
+
+    def _switch_on(self, at: float) -> None:
+        """Begin anew, with nothing going on, at the time `at`; `math.inf` leaves it off."""
+        self._on_at = at
+        self._sequence = 0
+        self._restart_at = math.inf
+        self._next_heartbeat = at
+        self._next_telemetry = at + self._telemetry_period
+
+    def _work(self, now: float) -> None:
+        """Do what is due, each thing at its own pace; of what repeats for ever, a late call skips some."""
+        if self._next_heartbeat <= now:
+            pause = _HIGH_LATENCY_PAUSE if self._high_latency else 1.0
+            self._send_signs_of_life(now)
+            self._next_heartbeat += pause
+            if self._next_heartbeat <= now:
+                self._next_heartbeat = now + pause
+        if self._high_latency:
+            return
+        if self._next_telemetry <= now:
+            late = now - self._next_telemetry
+            for _ in range(int(min(late, 1.0) / self._telemetry_period) + 1):
+                self._send_attitude(now)
+            self._next_telemetry += (int(late / self._telemetry_period) + 1) * self._telemetry_period
+            if self._next_telemetry <= now:
+                self._next_telemetry = now + self._telemetry_period
+
+    # Tools for the kinds
+
+    def _send(self, message: wire.Message) -> None:
+        self._queue(
+            wire.encode(
+                message,
+                system=self.system,
+                component=self.component,
+                sequence=self._sequence,
+                version=self._mavlink_version,
+            )
+        )
+
+    # The rest
+
+    def _send_signs_of_life(self, now: float) -> None:
+        beat = self._heartbeat
+        if self._high_latency:
+            self._send(wire.HighLatency2(beat.type, beat.autopilot))
+            return
+        if now < self._on_at + self._boot_time:
+            beat = replace(beat, system_status=wire.MAV_STATE_BOOT)
+        if self.armed:
+            beat = replace(beat, base_mode=beat.base_mode | wire.MAV_MODE_FLAG_SAFETY_ARMED)
+        self._send(beat)
+        self._send(wire.SystemTime(0, self._time_boot_ms(now)))
+
+    def _time_boot_ms(self, now: float) -> int:
+        """Since it was switched on, as it is sent: in 32 bits."""
+        return int((now - self._on_at) * 1000.0) & 0xFFFFFFFF
+
+    def _send_attitude(self, now: float) -> None:
+        self._queue(
+            wire.build_frame(
+                _ATTITUDE,
+                self._time_boot_ms(now).to_bytes(4, "little") + _LEVEL_FLIGHT,
+                system=self.system,
+                component=self.component,
+                sequence=self._sequence,
+                version=self._mavlink_version,
+            )
+        )
+
+    def _queue(self, frame: bytes) -> None:
+        self._sequence = (self._sequence + 1) & 0xFF
+        if len(self._out) < OUT_LIMIT:
+            self._out.append(frame)
+
+    def _take(self, frame: wire.Frame) -> None:
+        message = wire.decode(frame)
+        if isinstance(message, wire.Heartbeat):
+            self.requests["HEARTBEAT"] += 1
+            return
+        if not isinstance(
+            message,
+            wire.ParamRequestRead
+            | wire.ParamRequestList
+            | wire.ParamSet
+            | wire.CommandLong
+            | wire.FileTransfer,
+        ):
+            return
+        if not self._answers_system(message.target_system):
+            return
+        if message.target_component not in (wire.COMP_ID_ALL, self.component):
+            return
+        self.requests[_NAMES[type(message)]] += 1
+        if isinstance(message, wire.CommandLong):
+            self._on_command(message, frame)
+        else:
+            self._on_request(message, frame)
+
+    def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
+        if request.command == wire.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN:
+            self._on_restart_command(int(request.params[0]), sender)
+            return
+        wanted = request.command == wire.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES or (
+            request.command == wire.MAV_CMD_REQUEST_MESSAGE and request.params[0] == _AUTOPILOT_VERSION
+        )
+        result = wire.MAV_RESULT_ACCEPTED if wanted else wire.MAV_RESULT_UNSUPPORTED
+        ack = wire.CommandAck(request.command, result, sender.system, sender.component)
+        answers: list[wire.Message] = [ack, self._version] if wanted else [ack]
+        for answer in answers if self._ack_first else reversed(answers):
+            self._send(answer)
+
+    def _on_restart_command(self, mode: int, sender: wire.Frame) -> None:
+        result = self._may_restart(mode)
+        is_obeyed = result == wire.MAV_RESULT_ACCEPTED and mode == _REBOOT
+        if is_obeyed:
+            self._restart_at = min(self._restart_at, self._now + self._restart_delay)
+        if self._reboot_ack or not is_obeyed:
+            command = wire.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+            self._send(wire.CommandAck(command, result, sender.system, sender.component))
+
+
+_NAMES = {
+    wire.ParamRequestRead: "PARAM_REQUEST_READ",
+    wire.ParamRequestList: "PARAM_REQUEST_LIST",
+    wire.ParamSet: "PARAM_SET",
+    wire.CommandLong: "COMMAND_LONG",
+    wire.FileTransfer: "FILE_TRANSFER_PROTOCOL",
+}
+_REBOOT = 1  # of the autopilot; others shut down, or stay in the bootloader
+_AUTOPILOT_VERSION = 148
+_ATTITUDE = 30
+_LEVEL_FLIGHT = struct.pack("<6f", 0.0, 0.0, 0.5, 0.0, 0.0, 0.01)
+_HIGH_LATENCY_PAUSE = 5.0
