@@ -2,8 +2,19 @@
 
 from __future__ import annotations
 
+from paramclient.provision.applying import apply, restore
 from paramclient.provision.cautions import CATEGORIES
-from paramclient.provision.plan import (
+from paramclient.provision.fleet import apply_all, verify_all
+from paramclient.provision.looking import prepare, verify
+from paramclient.provision.outcome import (
+    ApplyProgress,
+    ApplyResult,
+    ApplyRow,
+    ApplyStatus,
+    FleetApplied,
+    FleetVerified,
+)
+from paramclient.provision.planning import (
     MISSING,
     WRONG,
     ParamInfo,
@@ -20,12 +31,24 @@ __all__ = [
     "CATEGORIES",
     "MISSING",
     "WRONG",
+    "ApplyProgress",
+    "ApplyResult",
+    "ApplyRow",
+    "ApplyStatus",
+    "FleetApplied",
+    "FleetVerified",
     "ParamInfo",
     "Plan",
     "PlanRow",
     "PlanStatus",
     "Stage",
     "Step",
+    "apply",
+    "apply_all",
     "overlay",
     "plan",
+    "prepare",
+    "restore",
+    "verify",
+    "verify_all",
 ]

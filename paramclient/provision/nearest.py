@@ -24,4 +24,11 @@ def nearest_names(name: str, names: Iterable[str]) -> tuple[str, ...]:
         for other in sorted(names)
         if other[:SHARED_END] == wanted[:SHARED_END] or other[-SHARED_END:] == wanted[-SHARED_END:]
     ]
-    return tuple(difflib.get_close_matches(wanted, likely, MOST_NAMES, LIKENESS))
+    matcher = difflib.SequenceMatcher(autojunk=False)
+    matcher.set_seq2(wanted)
+    scored = []
+    for other in likely:
+        matcher.set_seq1(other)
+        if matcher.real_quick_ratio() >= LIKENESS and matcher.quick_ratio() >= LIKENESS:
+            scored.append((-matcher.ratio(), other))
+    return tuple(other for score, other in sorted(scored)[:MOST_NAMES] if -score >= LIKENESS)

@@ -149,12 +149,14 @@ class Stage:
         reveals: whether other parameters may appear afterwards.
         reboot_first: whether the vehicle has to start again before the next stage: what is set before that
             would be lost, or is not there yet.
+        is_last: whether these may end the conversation. They are done one after another instead.
     """
 
     purpose: str
     steps: tuple[Step, ...]
     reveals: bool = False
     reboot_first: bool = False
+    is_last: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -170,6 +172,8 @@ class Plan:
         extra: names that the vehicle has and `wanted` does not; they stay as they are.
         include: what was asked for although the list leaves it out.
         identity: whose plan it is, where `current` said so.
+        unstarted: switches that are on already, and whose group is not there: as they count from the next
+            start of the vehicle on, it may not have started since they were set.
     """
 
     wanted: ParamSet
@@ -178,6 +182,7 @@ class Plan:
     extra: tuple[str, ...] = ()
     include: tuple[str, ...] = ()
     identity: Identity | None = None
+    unstarted: tuple[str, ...] = ()
 
     @property
     def steps(self) -> list[Step]:
@@ -255,9 +260,10 @@ def plan(
     planner = _Planner(current, cautions_for(autopilot or ""), Choice(given), info or {}, encoding)
     rows = {name: planner.row(each) for name, each in wanted.items()}
     stages = planner.stages(rows)
+    unstarted = planner.unstarted(rows)
     rows = planner.settle_missing(rows, stages)
     extra = tuple(name for name in current if name not in wanted)
-    return Plan(wanted, rows, stages, extra, given, identity)
+    return Plan(wanted, rows, stages, extra, given, identity, unstarted)
 
 
 def overlay(base: ParamSet, over: ParamSet) -> ParamSet:
@@ -325,7 +331,7 @@ class _Planner:
         info = self._info.get(name)
         if info is not None and info.is_read_only and not self._choice.has(name, READ_ONLY):
             return verdict(PlanStatus.SKIPPED, READ_ONLY, "left out: it can only be read")
-        wrong = self._wrong(wanted.value, kind, info)
+        wrong = self._wrong(name, wanted.value, kind, info)
         if wrong is None or (wrong[0] == OUT_OF_RANGE and self._choice.has(name, OUT_OF_RANGE)):
             return verdict(PlanStatus.SET)
         return verdict(PlanStatus.INVALID, *wrong)
@@ -351,8 +357,22 @@ class _Planner:
         if turned_off:
             stages.append(Stage("what is turned off", tuple(turned_off)))
         if last:
-            stages.append(Stage("what may end the conversation", tuple(last)))
+            last.sort(key=lambda step: self._cautions.is_system_id(step.name))
+            stages.append(Stage("what may end the conversation", tuple(last), is_last=True))
         return tuple(stages)
+
+    def unstarted(self, rows: Mapping[str, PlanRow]) -> tuple[str, ...]:
+        """Switches that may only wait for a start of the vehicle to show what is missing."""
+        missing = [name for name, row in rows.items() if row.status is PlanStatus.LATER]
+        return tuple(
+            name
+            for name, row in rows.items()
+            if row.status is PlanStatus.UNCHANGED
+            and row.before != 0
+            and (self._cautions.reveals(name) or self._cautions.chooses_frame(name))
+            and self._needs_reboot(name)
+            and any(each.startswith(name.rpartition("_")[0] + "_") for each in missing)
+        )
 
     def settle_missing(self, rows: Mapping[str, PlanRow], stages: Sequence[Stage]) -> dict[str, PlanRow]:
         """What is missing, and nothing in the plan could bring to light, is skipped; similar names."""
@@ -375,9 +395,11 @@ class _Planner:
         return settled
 
     def _wrong(
-        self, value: Value, kind: ParamType | int | None, info: ParamInfo | None
+        self, name: str, value: Value, kind: ParamType | int | None, info: ParamInfo | None
     ) -> tuple[str, str] | None:
         """What is wrong with a value: the category, and a sentence."""
+        if self._cautions.is_system_id(name) and (isinstance(value, bytes) or not 1 <= value <= 255):
+            return WRONG, "a system id is a number from 1 to 255"
         if kind is not None:
             try:
                 encode(value, kind, self._encoding)
@@ -402,15 +424,11 @@ class _Planner:
     def _step(self, row: PlanRow) -> Step:
         assert row.before is not None, "only what the vehicle has is set"
         kind = ParamType.REAL32 if row.type is None else row.type
-        info = self._info.get(row.name)
-        needs_reboot = info.reboot_required if info is not None else False
-        return Step(
-            row.name,
-            row.wanted.value,
-            kind,
-            row.before,
-            needs_reboot or self._cautions.needs_reboot(row.name),
-        )
+        return Step(row.name, row.wanted.value, kind, row.before, self._needs_reboot(row.name))
+
+    def _needs_reboot(self, name: str) -> bool:
+        info = self._info.get(name)
+        return (info is not None and info.reboot_required) or self._cautions.needs_reboot(name)
 
 
 def _taken(steps: list[Step], fits: Callable[[Step], bool]) -> list[Step]:

@@ -13,7 +13,7 @@ from paramclient.identity import Identity
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.provision import CATEGORIES, MISSING, WRONG, Plan, PlanStatus, overlay, plan
 from paramclient.provision.cautions import OUT_OF_RANGE, READ_ONLY, Caution, cautions_for
-from paramclient.provision.plan import MOST_SUGGESTED
+from paramclient.provision.planning import MOST_SUGGESTED
 from paramclient.sim.table import SimParam, ardupilot_table, ek2_group, px4_table
 from paramclient.values import Encoding, Param, ParamType, Value, bits_of, from_bits
 
@@ -244,6 +244,12 @@ def test_a_snapshot_without_types_is_compared_as_numbers() -> None:
     assert [step.type for step in plan(current, written(A=0.2, B=16777216)).steps] == [ParamType.REAL32] * 2
 
 
+def test_a_system_id_is_one_that_can_be() -> None:
+    for value in (0, 256, b"abcd"):
+        made = plan(held(MAV_SYS_ID=1), written(MAV_SYS_ID=value), autopilot="px4", include="identity")
+        assert only_row(made) == (PlanStatus.INVALID, WRONG, "a system id is a number from 1 to 255")
+
+
 def test_raw_bytes_are_compared_with_raw_bytes() -> None:
     table = held(ODD=(77, b"\x01\x02\x03\x04"))
     assert plan(table, written(ODD=b"\x01\x02\x03\x04")).is_met
@@ -280,7 +286,7 @@ def test_the_order_is_one_that_works_on_ardupilot() -> None:
         ["GPS1_TYPE", "EK2_ENABLE"],
         ["WPNAV_SPEED"],
         ["FENCE_ENABLE"],
-        ["SYSID_THISMAV", "SYSID_ENFORCE"],
+        ["SYSID_ENFORCE", "SYSID_THISMAV"],
     ]
     assert [stage.reveals for stage in made.stages] == [True, True, False, False, False]
     assert not any(stage.reboot_first for stage in made.stages)
