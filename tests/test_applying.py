@@ -801,12 +801,15 @@ async def test_what_the_cache_believes_is_not_taken_for_what_the_vehicle_has(tmp
 @swiftly
 async def test_the_state_before_is_all_of_it_what_no_hash_covers_too(tmp_path: Path) -> None:
     vehicle = px4(uid=77)
-    for believed in (0.25, 0.75):
-        vehicle.set_param("CAL_ACC0_XOFF", believed)
-        async with ParamClient(vehicle, cache=tmp_path / "cache.sqlite3") as client:
-            result = await apply(await client.component(), written({"TUNE_01": believed}))
-        assert result.before["CAL_ACC0_XOFF"].value == believed
-        vehicle.set_param("TUNE_01", 0.25)
+    path = tmp_path / "cache.sqlite3"
+    async with ParamClient(vehicle, cache=path) as client:
+        assert (await apply(await client.component(), written({"TUNE_01": 0.25}))).complete
+    vehicle.set_param("CAL_ACC0_XOFF", 0.75)
+    vehicle.reboot()  # so that it does not tell by itself
+    async with ParamClient(vehicle, cache=path) as client:
+        result = await apply(await client.component(), written({"TUNE_01": 0.25}))
+    assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
+    assert result.before["CAL_ACC0_XOFF"].value == 0.75
 
 
 @swiftly

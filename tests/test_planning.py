@@ -10,6 +10,7 @@ import pytest
 
 from paramclient.errors import UsageError
 from paramclient.identity import Identity
+from paramclient.metadata import Metadata, ParamInfo
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.provision import CATEGORIES, MISSING, WRONG, Plan, PlanStatus, overlay, plan
 from paramclient.provision.cautions import OUT_OF_RANGE, READ_ONLY, Caution, cautions_for
@@ -212,6 +213,7 @@ def test_the_range_counts_where_metadata_is_there() -> None:
         assert plan(table, written(P=value)).steps
     for value in (0.1, 2, 0.10000000149011612):
         assert plan(table, written(P=value), info=info).steps
+    assert plan(table, written(P=3.0), info={"P": Info(minimum=-1e300, maximum=1e300)}).steps
     # what the vehicle has already is no mistake of the file
     assert only_row(plan(table, written(Q=7), info=info))[0] is PlanStatus.UNCHANGED
 
@@ -230,6 +232,19 @@ def test_metadata_knows_what_can_only_be_read_and_what_needs_a_reboot() -> None:
     assert (made.rows["A"].status, made.rows["A"].category) == (PlanStatus.SKIPPED, READ_ONLY)
     assert made.reboot_for == ("B",)
     assert order(plan(held(A=1), written(A=2), info=info, include=READ_ONLY)) == [["A"]]
+
+
+def test_what_a_firmware_says_of_its_parameters_is_such_metadata() -> None:
+    described = Metadata.of(
+        [
+            ParamInfo("P", minimum=0, maximum=1, reboot_required=True),
+            ParamInfo("SERVO{n}_MIN", minimum=500),
+        ]
+    )
+    made = plan(held(P=0.5, SERVO3_MIN=1000, Q=1), written(P=1, SERVO3_MIN=100, Q=2), info=described)
+    assert made.reboot_for == ("P",)
+    assert made.rows["SERVO3_MIN"].reason == "100 is below its minimum, 500"
+    assert made.rows["Q"].status is PlanStatus.SET
 
 
 def test_values_are_compared_in_the_type_that_the_vehicle_gives_them() -> None:
