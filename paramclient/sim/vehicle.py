@@ -31,6 +31,9 @@ class VehicleOptions(TypedDict, total=False):
     list_stops: float
     repeated_names: bool
     high_latency: bool
+    signing_key: wire.SigningKey | None
+    signing_timestamp: int
+    usb: bool
 
 
 class Vehicle(Device):
@@ -61,6 +64,11 @@ class Vehicle(Device):
         repeated_names: whether a name may stand in the table more than once, as it does where names are cut
             at 16 bytes. Each has its index; by name the first is meant.
         high_latency: see the attribute.
+        signing_key: with which it signs what it sends; it takes only frames signed with it, and RADIO_STATUS.
+            None: neither, until SETUP_SIGNING brings a key. Of a sender's frames it takes those with a
+            rising timestamp, from at most 16 senders and links, until it is switched off.
+        signing_timestamp: where its timestamps begin; it has no other clock. They go on from those it hears.
+        usb: whether the link counts as safe: it takes whatever comes, as ArduPilot does over USB.
     """
 
     _ftp: FileServer | None = None
@@ -90,6 +98,9 @@ class Vehicle(Device):
         list_stops: float = 1,
         repeated_names: bool = False,
         high_latency: bool = False,
+        signing_key: wire.SigningKey | None = None,
+        signing_timestamp: int = 0,
+        usb: bool = False,
     ) -> None:
         rows = tuple(table)
         if not repeated_names and len({row.name for row in rows}) < len(rows):
@@ -128,6 +139,9 @@ class Vehicle(Device):
             mavlink_version=mavlink_version,
             stream=stream,
             high_latency=high_latency,
+            signing_key=signing_key,
+            signing_timestamp=signing_timestamp,
+            usb=usb,
         )
 
     # The public face

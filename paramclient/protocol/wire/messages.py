@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeAlias
 
+from paramclient.protocol.wire.signing import SigningKey
+
 __all__ = [
     "AUTOPILOT_COMPONENT",
     "AUTOPILOT_VERSION_ID",
@@ -38,6 +40,7 @@ __all__ = [
     "ParamRequestRead",
     "ParamSet",
     "ParamValue",
+    "SetupSigning",
     "StatusText",
     "SystemTime",
 ]
@@ -189,6 +192,19 @@ class HighLatency2:
     autopilot: int
 
 
+@dataclass(frozen=True, slots=True)
+class SetupSigning:
+    """SETUP_SIGNING: gives a vehicle its key, in clear; without one (zeros) it signs no more.
+
+    There is no answer to it. It exists in MAVLink 2 alone.
+    """
+
+    target_system: int
+    target_component: int
+    key: SigningKey | None
+    initial_timestamp: int
+
+
 Message: TypeAlias = (
     Heartbeat
     | AutopilotVersion
@@ -203,4 +219,5 @@ Message: TypeAlias = (
     | FileTransfer
     | SystemTime
     | HighLatency2
+    | SetupSigning
 )
