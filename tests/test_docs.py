@@ -68,7 +68,7 @@ def run(*arguments: str, **environment: str) -> str:
 
 @pytest.mark.parametrize("program", [*programs()])
 def test_a_program_runs(program: str, tmp_path: Path) -> None:
-    run("-W", "error", "-c", program, XDG_CACHE_HOME=str(tmp_path))
+    run("-W", "error", "-c", program, XDG_CACHE_HOME=str(tmp_path), XDG_STATE_HOME=str(tmp_path))
 
 
 def test_the_first_example_runs(tmp_path: Path) -> None:
@@ -146,13 +146,14 @@ def help_of(*words: str) -> str:
 
 
 def subcommand(words: list[str]) -> list[str]:
-    return words[:2] if words[0] == "cache" else words[:1]
+    return words[:2] if words[0] in ("cache", "signing") else words[:1]
 
 
 def test_every_command_is_shown_and_exists() -> None:
     used = {tuple(subcommand(words)) for words in commands()}
     cache = {("cache", verb) for verb in ("list", "history", "path", "remove")}
-    assert used == {("fetch",), ("get",), ("set",), ("watch",), ("link",), ("show",), ("sim",)} | cache
+    keys = {("signing", verb) for verb in ("setup", "disable")}
+    assert used == {("fetch",), ("get",), ("set",), ("watch",), ("link",), ("show",), ("sim",)} | cache | keys
     for words in used:
         assert words[-1] in help_of(*words)
 
@@ -169,6 +170,8 @@ def test_the_page_of_the_command_names_every_option() -> None:
     offered = set()
     for command in ("fetch", "get", "set", "watch", "link", "show", "sim"):
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of(command)))
+    for verb in ("setup", "disable"):
+        offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("signing", verb)))
     for verb in ("list", "history", "path", "remove"):
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("cache", verb)))
     named = set(re.findall(r"`(--[a-z][a-z-]+)", page))
