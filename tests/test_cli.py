@@ -1053,7 +1053,6 @@ def test_a_vehicle_can_be_forgotten(command: Command, warm: Path) -> None:
         (["set", "sim:px4", "A"], "pairs"),
         (["set", "sim:px4"], "pairs"),
         (["watch", "sim:px4", "ÄÖÜ"], "ASCII"),
-        (["fetch", "serial:/dev/ttyACM0", "--no-cache"], "serial"),
         (["sim", "px5"], "px4"),
         (["sim", "px4", "--link", "sim:px4"], "vehicle itself"),
         (["sim", "px4", "--loss", "2", "--link", "tcp:127.0.0.1:1"], "loss"),

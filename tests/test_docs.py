@@ -152,8 +152,9 @@ def subcommand(words: list[str]) -> list[str]:
 def test_every_command_is_shown_and_exists() -> None:
     used = {tuple(subcommand(words)) for words in commands()}
     cache = {("cache", verb) for verb in ("list", "history", "path", "remove")}
-    keys = {("signing", verb) for verb in ("setup", "disable")}
-    assert used == {("fetch",), ("get",), ("set",), ("watch",), ("link",), ("show",), ("sim",)} | cache | keys
+    signing = {("signing", verb) for verb in ("setup", "disable")}
+    single = ("fetch", "get", "set", "watch", "link", "ports", "show", "sim")
+    assert used == {(each,) for each in single} | cache | signing
     for words in used:
         assert words[-1] in help_of(*words)
 
@@ -168,7 +169,7 @@ def test_options_in_examples_exist() -> None:
 def test_the_page_of_the_command_names_every_option() -> None:
     page = (DOCS / "command.md").read_text(encoding="utf-8")
     offered = set()
-    for command in ("fetch", "get", "set", "watch", "link", "show", "sim"):
+    for command in ("fetch", "get", "set", "watch", "link", "ports", "show", "sim"):
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of(command)))
     for verb in ("setup", "disable"):
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("signing", verb)))

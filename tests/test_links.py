@@ -15,6 +15,7 @@ from collections.abc import AsyncIterator, Callable, Iterator
 from contextlib import ExitStack, asynccontextmanager, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import anyio
@@ -39,6 +40,7 @@ from paramclient.links import (
 )
 from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from tests.cable import Cable
 
 HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
 PATIENCE = 20.0  # seconds after which a test gives up; nothing waits that long when all is well
@@ -158,6 +160,10 @@ async def connected(kind: str) -> AsyncIterator[tuple[Any, Any]]:
             link = create_link(f"udpout:127.0.0.1:{far.getsockname()[1]}")
             await link.open()
             far.connect(link.address)
+        elif kind == "serial":
+            far = stack.enter_context(Cable(Path(stack.enter_context(TemporaryDirectory()))))
+            link = create_link(far.link)
+            await link.open()
         elif kind == "tcp":
             listener = stack.enter_context(tcp_listener())
             link = create_link(f"tcp:127.0.0.1:{listener.getsockname()[1]}")
@@ -175,7 +181,7 @@ async def connected(kind: str) -> AsyncIterator[tuple[Any, Any]]:
             await link.close()
 
 
-KINDS = ["udpin", "udpout", "tcp", "tcpin", "sim"]
+KINDS = ["udpin", "udpout", "tcp", "tcpin", "serial", "sim"]
 
 
 def answer_with(patch: pytest.MonkeyPatch, *addresses: tuple[socket.AddressFamily, str, int]) -> None:
@@ -229,6 +235,21 @@ def answer_with(patch: pytest.MonkeyPatch, *addresses: tuple[socket.AddressFamil
         ("/dev/by-path/pci-0000:00:14.0-usb,921600", "serial:/dev/by-path/pci-0000:00:14.0-usb:921600"),
         ("com5:115200", "serial:COM5:115200"),
         ("serial:COM5,115200", "serial:COM5:115200"),
+        ("serial:///dev/ttyUSB0,9600", "serial:/dev/ttyUSB0:9600"),
+        ("/dev/cu.usbmodem14101", "serial:/dev/cu.usbmodem14101:57600"),
+        ("/dev/cu.usbserial-D307:57600", "serial:/dev/cu.usbserial-D307:57600"),
+        (
+            "/dev/serial/by-id/usb-Hex_ProfiCNC_CubeOrange_2E-if00:921600",
+            "serial:/dev/serial/by-id/usb-Hex_ProfiCNC_CubeOrange_2E-if00:921600",
+        ),
+        (
+            "/dev/serial/by-path/pci-0000:00:14.0-usb-0:1:1.0",
+            "serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:1:1.0:57600",
+        ),
+        (
+            "serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:1:1.0-port0:115200",
+            "serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:1:1.0-port0:115200",
+        ),
         ("sim:px4", "sim:px4"),
         ("sim:px4?", "sim:px4"),
         ("sim://ArduPilot", "sim:ardupilot"),
@@ -289,7 +310,9 @@ def test_a_spec_tells_what_the_name_says() -> None:
         ("udpin:0.0.0.0:14550/", "is no port"),
         ("serial:ttyACM0:57600", "a device and a baud rate"),
         ("serial:/dev/tty ACM0", "a device and a baud rate"),
-        ("/dev/ttyACM0:0", "above 0"),
+        ("/dev/ttyACM0:0", "from 300 to 20000000"),
+        ("/dev/ttyUSB0,57", "from 300 .* not 57"),
+        ("COM3:99999999", "from 300 to 20000000"),
         ("sim:", "px4 and ardupilot"),
         ("sim:ardupilot4", "px4 and ardupilot"),
         ("sim:px4?loss", "NAME=VALUE"),
@@ -360,6 +383,7 @@ def test_what_is_a_link_already_is_taken_as_it_is() -> None:
         ("udpout:127.0.0.1:14550", False, False),
         ("tcp:127.0.0.1:5760", True, True),
         ("tcpin:127.0.0.1:0", True, False),
+        ("serial:/dev/ttyACM0:57600", True, True),
         ("sim:px4", False, False),
     ],
 )
@@ -367,11 +391,6 @@ def test_a_link_tells_its_kind(name: str, is_stream: bool, reconnects: bool) -> 
     link = create_link(name)
     assert (link.name, link.is_stream, link.reconnects) == (name, is_stream, reconnects)
     assert repr(link).endswith(f"{name} closed>")
-
-
-def test_a_serial_link_is_understood_but_cannot_be_made() -> None:
-    with pytest.raises(UsageError, match="serial links are not part of this version"):
-        create_link("/dev/ttyACM0,57600")
 
 
 def test_the_simulators_are_imported_only_for_sim_links() -> None:

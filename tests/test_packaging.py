@@ -96,8 +96,10 @@ def test_what_an_installation_brings(metadata: Message) -> None:
     requirements = metadata.get_all("Requires-Dist", [])
     always = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra ==" not in each}
     command = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra == 'cli'" in each}
+    serial = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra == 'serial'" in each}
     assert always == {"anyio", "fastcrc", "platformdirs", "pydantic", "pymavlink"}
     assert command == {"cyclopts", "rich"}
+    assert serial == {"serialx"}
     assert metadata["Requires-Python"] == ">=3.11"
 
 

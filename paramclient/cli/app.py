@@ -18,6 +18,7 @@ from paramclient.cli.link import link
 from paramclient.cli.offline import cache_history, cache_list, cache_path, cache_remove, show
 from paramclient.cli.outcome import ExitCode, code_of
 from paramclient.cli.output import report
+from paramclient.cli.ports import ports
 from paramclient.cli.signing import disable, setup
 from paramclient.cli.simulate import sim
 from paramclient.cli.vehicle import fetch, get, set_, watch
@@ -174,6 +175,7 @@ _app.command(
     help_epilogue=_examples("show", "show 1", "show 00020000 --json"),
 )
 _app.command(_cache)
+_app.command(ports, help_epilogue=_examples("ports", "ports --json"))
 _app.command(
     sim,
     help_epilogue=_examples(

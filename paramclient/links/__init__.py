@@ -1,4 +1,4 @@
-"""Bytes in and out: UDP, TCP, and simulated vehicles in this process.
+"""Bytes in and out: UDP, TCP, serial ports, and simulated vehicles in this process.
 
 A link is named as in pymavlink, MAVProxy and MAVSDK; `parse_link` reads the name, `create_link` makes the
 link. Every kind offers the same five things, see `Link`; a program can bring one of its own.
@@ -12,6 +12,8 @@ from typing import TYPE_CHECKING
 from paramclient.errors import UsageError
 from paramclient.links.base import Link, Peer
 from paramclient.links.names import FORMS, LinkKind, LinkSpec, parse_link
+from paramclient.links.ports import SerialPort, list_ports
+from paramclient.links.serial import SerialLink
 from paramclient.links.sim import SimLink, serve_endpoint, simulated
 from paramclient.links.tcp import TcpIn, TcpOut
 from paramclient.links.udp import UdpIn, UdpOut
@@ -25,8 +27,10 @@ __all__ = [
     "LinkKind",
     "LinkSpec",
     "Peer",
+    "SerialPort",
     "SimLink",
     "create_link",
+    "list_ports",
     "parse_link",
     "serve_endpoint",
 ]
@@ -40,13 +44,11 @@ def create_link(link: str | LinkSpec | Link | Endpoint) -> Link:
             which is given back as it is.
 
     Raises:
-        UsageError: it is none of these, or names a serial link, which this version cannot open.
+        UsageError: it is none of these, or a serial link, and the extra `serial` is not installed.
     """
     if isinstance(link, str):
         link = parse_link(link)
     if isinstance(link, LinkSpec):
-        if link.kind is LinkKind.SERIAL:
-            raise UsageError(f"{link.name}: serial links are not part of this version")
         return _MAKERS[link.kind](link)
     if isinstance(link, Link):
         return link
@@ -60,5 +62,6 @@ _MAKERS: dict[LinkKind, Callable[[LinkSpec], Link]] = {
     LinkKind.UDPOUT: UdpOut,
     LinkKind.TCP: TcpOut,
     LinkKind.TCPIN: TcpIn,
+    LinkKind.SERIAL: SerialLink,
     LinkKind.SIM: simulated,
 }

@@ -30,7 +30,13 @@ FORMS: Final = """\
 """The accepted forms, for people."""
 
 DEFAULT_BAUD: Final = 57600
-"""For a serial device without a rate: the rate of telemetry radios, and MAVSDK's default."""
+"""For a serial device without a rate: the rate of telemetry radios, and MAVSDK's and MAVProxy's default. A
+device that is USB itself takes any."""
+
+SLOWEST_BAUD: Final = 300
+FASTEST_BAUD: Final = 20_000_000
+"""Baud rates that a name may have. Below are no links but ArduPilot's abbreviations, as 57 for 57600; above
+is more than USB of full speed carries."""
 
 
 class LinkKind(StrEnum):
@@ -174,8 +180,8 @@ def _serial(rest: str) -> LinkSpec:
         _fail("a serial link is a device and a baud rate")
     device, digits = parts.groups()
     baud = int(digits) if digits else DEFAULT_BAUD
-    if not baud:
-        _fail("a baud rate is above 0")
+    if not SLOWEST_BAUD <= baud <= FASTEST_BAUD:
+        _fail(f"a baud rate goes from {SLOWEST_BAUD} to {FASTEST_BAUD}, as 57600 or 115200 do, not {baud}")
     return LinkSpec(LinkKind.SERIAL, device if device.startswith("/") else device.upper(), baud)
 
 

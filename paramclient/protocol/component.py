@@ -71,15 +71,11 @@ class ComponentMachine(Parts):
 
     def receive(self, message: Message, now: float, *, version: int = 2) -> None:
         """Take a message that this component sent."""
-        silence = self.presence.heard(now)
-        self.round_trip.heard_at = now
-        if silence >= self.presence.gap or self.presence.is_lost:
-            self._was_silent(silence, now)
-        if version > self.version:
-            self.version = version
         if isinstance(message, ParamValue):
-            self._receive_value(message, now)
-        elif isinstance(message, Heartbeat):
+            self.receive_value(message, now, version)
+            return
+        self._heard(now, version)
+        if isinstance(message, Heartbeat):
             self.who.heartbeat(message)
             if self.presence.heartbeat(message, now):
                 self._rebooted(now)
@@ -109,8 +105,45 @@ class ComponentMachine(Parts):
             self.who.heartbeat(message)
             self.presence.high_latency()
         self.who.heard(now)
-        if not isinstance(message, ParamValue):  # a value tells nothing of who it is
-            self._follow_identity(now)
+        self._follow_identity(now)
+
+    def receive_value(self, message: ParamValue, now: float, version: int = 2) -> None:
+        """Take a PARAM_VALUE that it sent: for those who know that it is one."""
+        self._heard(now, version)
+        who = self.who
+        who.heard(now)
+        name, _, _, count, _ = message
+        if not name:
+            return
+        if name == HASH_CHECK:
+            announced = self.sync.hash_heard(message, now)
+            if self.fetch is not None:
+                self.fetch.announced(announced)
+            self.reads.heard(message, now)
+            return
+        if who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
+            name = name.upper()
+            message = message._replace(param_id=name)
+        table = self.table
+        if count != table.count and count != NO_INDEX:
+            self._count_moved(count, now)
+        authors = self._authors
+        writes = self.writes
+        is_ours = bool(writes.queues) and name in writes
+        by = "us" if is_ours else authors.of(name, now) if authors.foreign_sets else "vehicle"
+        change = table.hear(message, by, is_exact=is_ours and writes.wants(message))
+        if change is not None:
+            authors.changed(name, now, is_ours)
+            self.sync.changed(change)
+            self._emit(_new(ParamChanged, (self, change)))
+        elif name not in table.params:
+            return  # more names than there can be
+        fetch = self.fetches.current
+        if fetch is not None:
+            fetch.heard(message, now)
+        if writes.queues:
+            writes.heard(message, now)
+        self.reads.heard(message, now)
 
     def foreign_set(self, name: str, station: str, now: float) -> None:
         """Another station was heard setting a parameter of this component."""
@@ -287,37 +320,15 @@ class ComponentMachine(Parts):
         kind = "unknown" if self.who.autopilot is None else autopilot_name(self.who.autopilot)
         return f"<ComponentMachine {self.system}/{self.component} {kind} {self.state}>"
 
-    def _receive_value(self, message: ParamValue, now: float) -> None:
-        name, _, _, count, _ = message
-        if not name:
-            return
-        if name == HASH_CHECK:
-            announced = self.sync.hash_heard(message, now)
-            if self.fetch is not None:
-                self.fetch.announced(announced)
-            self.reads.heard(message, now)
-            return
-        if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
-            name = name.upper()
-            message = message._replace(param_id=name)
-        table = self.table
-        if count != table.count and count != NO_INDEX:
-            self._count_moved(count, now)
-        authors = self._authors
-        is_ours = bool(self.writes.queues) and name in self.writes
-        by = "us" if is_ours else authors.of(name, now) if authors.foreign_sets else "vehicle"
-        change = table.hear(message, by, is_exact=is_ours and self.writes.wants(message))
-        if change is not None:
-            authors.changed(name, now, is_ours)
-            self.sync.changed(change)
-            self._emit(_new(ParamChanged, (self, change)))
-        elif name not in table.params:
-            return  # more names than there can be
-        if self.fetch is not None:
-            self.fetch.heard(message, now)
-        if self.writes.queues:
-            self.writes.heard(message, now)
-        self.reads.heard(message, now)
+    def _heard(self, now: float, version: int) -> None:
+        """Anything has come."""
+        presence = self.presence
+        silence = presence.heard(now)
+        self.round_trip.heard_at = now
+        if silence >= presence.gap or presence.is_lost:
+            self._was_silent(silence, now)
+        if version > self.version:
+            self.version = version
 
     def _count_moved(self, count: int, now: float) -> None:
         if self.table.count is not None:

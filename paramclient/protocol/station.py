@@ -108,6 +108,7 @@ class Station:
         self._events: list[Event] = []
         self._sequence = 0
         self._signer: Signer | None = None
+        self._is_watched = counts_traffic  # one look in the hot path for both
         self.verifier: Verifier | None = None
         self._heartbeat_at = -math.inf
         self._is_paused = False
@@ -116,6 +117,7 @@ class Station:
     def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
         """From now on sign what is sent and take what the verifier accepts; before anything has come."""
         self._signer = signer
+        self._is_watched = True
         self.verifier = verifier
         self._framer.guard = verifier.accepts
 
@@ -129,17 +131,15 @@ class Station:
         Gives whether there was anything of interest in it; all that is not telemetry is.
         """
         self.bytes_received += len(data)
-        if self._signer is not None:
-            self._signer.advance(now)
-        if self.traffic is not None:
-            self.traffic.receive(data, peer, now)
+        if self._is_watched:
+            self._watch(data, peer, now)
         frames = self._cut_stream(data, peer) if self._is_stream else self._framer.receive(data)
         for frame in frames:
             number, system, component, _, payload, version = frame
             machine = self.components.get((system, component))
             if number == PARAM_VALUE_ID and machine is not None:  # the short way for what comes in thousands
                 self._peers[system] = peer
-                machine.receive(decode_param_value(payload), now, version=version)
+                machine.receive_value(decode_param_value(payload), now, version)
             else:
                 self._receive_other(frame, peer, now)
         if self._is_stream and not data:
@@ -263,6 +263,13 @@ class Station:
                 self._send(ParamRequestList(system, COMP_ID_ALL), system, version)
                 return [machine.begin_fetch(now, refresh=refresh, listed=True) for machine in machines]
         return [machine.begin_fetch(now, refresh=refresh) for machine in machines]
+
+    def _watch(self, data: bytes, peer: Peer, now: float) -> None:
+        """What somebody wants done with everything that comes, before it is looked into."""
+        if self._signer is not None:
+            self._signer.advance(now)
+        if self.traffic is not None:
+            self.traffic.receive(data, peer, now)
 
     def _cut_stream(self, data: bytes, peer: Peer) -> list[Frame]:
         """The frames that a chunk of a peer's stream completes, or that its end leaves."""

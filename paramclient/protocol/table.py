@@ -121,17 +121,18 @@ class Table:
         index: int | None = given
         if self.passed_over and given in self.passed_over.get(name, ()):
             return None
-        old = self.params.get(name)
+        params = self.params
+        old = params.get(name)
         if given == NO_INDEX:
             index = None if old is None else old.index
         elif count == NO_INDEX or given >= count:
             index = None
         if old is None:
-            if len(self.params) >= MOST_NAMES:
+            if len(params) >= MOST_NAMES:
                 return None
         elif old.type == number and self._wire.get(name) == raw and not is_exact:
             if old.index != index:
-                self.params[name] = Param(name, old.value, old.type, index, old.bits, Trust.LIVE, old.default)
+                params[name] = Param(name, old.value, old.type, index, old.bits, Trust.LIVE, old.default)
                 self.dirty.setdefault(name, by)
             return None
         value, bits = decode(raw, number, self._encoding)
@@ -144,7 +145,7 @@ class Table:
             value, bits = old.value, old.bits
         elif self._filed:
             self._filed.discard(name)
-        new = self.params[name] = Param(name, value, _KNOWN_TYPES[number], index, bits, _LIVE, default)
+        new = params[name] = Param(name, value, _KNOWN_TYPES[number], index, bits, _LIVE, default)
         self._wire[name] = raw
         if old is not None and old.same_value(new):
             if old.index != index:

@@ -105,7 +105,6 @@ class Framer:
         may_go_on = self._stream and not final
         found: list[Frame] = []
         number_of = self._number_of
-        guard = self._guard
         extra_of = _EXTRA_BY_ID_BYTES.get
         length = len(data)
         padded = data + _PADDING
@@ -133,8 +132,8 @@ class Framer:
                 header_is_cut = crc_at - size > length
                 if may_go_on and (header_is_cut or extra is not None):
                     break
-                if guard is not None and extra is not None and _is_whole(data[at:], crc_at - at, extra):
-                    guard(data[at:])
+                if self._guard is not None and extra is not None:
+                    self._show_if_cut_off(data[at:], crc_at - at, extra)
             elif extra is not None and _CRC_AT(data, crc_at)[0] == mcrf4xx(data[at + 1 : crc_at] + extra):
                 good += 1
                 number = number_of(key)
@@ -146,7 +145,7 @@ class Framer:
                         sequence, system, component = data[at + 2 : at + 5]
                         payload = data[at + 6 : crc_at]
                         found.append(Frame(number, system, component, sequence, payload, 1))
-                elif guard is not None and guard(data[at:end]):
+                elif self._guard is not None and self._guard(data[at:end]):
                     number = self._numbers.get(key)
                     if number is not None:
                         found.append(_frame_of(number, data[at:crc_at]))
@@ -165,6 +164,12 @@ class Framer:
     def flush(self) -> list[Frame]:
         """The stream has ended or was interrupted: give what stands behind the unfinished candidate."""
         return self.receive(b"", final=True)
+
+    def _show_if_cut_off(self, data: bytes, crc_at: int, extra: bytes) -> None:
+        """Let the guard see a frame of which a part of the signature alone is missing."""
+        is_proven = crc_at + 2 <= len(data) and _CRC_AT(data, crc_at)[0] == mcrf4xx(data[1:crc_at] + extra)
+        if self._guard is not None and is_proven:
+            self._guard(data)
 
 
 def build_frame(
@@ -213,11 +218,6 @@ def enum_word(enum: str, number: int) -> str:
     return (
         str(number) if entry is None else str(entry.name.removeprefix(f"{enum}_").lower().replace("_", " "))
     )
-
-
-def _is_whole(data: bytes, crc_at: int, extra: bytes) -> bool:
-    """Whether a frame is there up to its checksum, and that is right."""
-    return crc_at + 2 <= len(data) and bool(_CRC_AT(data, crc_at)[0] == mcrf4xx(data[1:crc_at] + extra))
 
 
 def _frame_of(number: int, data: bytes) -> Frame:

@@ -1,0 +1,354 @@
+"""Links over serial ports: an autopilot on USB, a telemetry radio, a UART.
+
+The library serialx, which the extra `serial` installs, opens and sets up the port: 8 data bits, no parity,
+one stop bit, no flow control. On POSIX systems bytes then go through its file descriptor, which never blocks,
+as through the sockets of other links, on every event loop that anyio knows. Windows has no such descriptors:
+there serialx's own transport moves the bytes, which only asyncio can run.
+
+The port is ours alone while it is open: two programs on one port would each get a part of the bytes. DTR and
+RTS are raised on opening, and lowered when the last program closes the port. Linux does that by itself, and
+pyserial does it, so pymavlink and MAVProxy too: a board is reset by it no more often than by those.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Final, NamedTuple, NoReturn, Protocol, TypeVar
+
+import anyio
+import anyio.from_thread
+import anyio.lowlevel
+
+from paramclient.errors import LinkError, UsageError
+from paramclient.links.base import OPEN_TIMEOUT, Peer, reason
+from paramclient.links.names import LinkSpec
+
+if sys.platform != "win32":
+    import fcntl
+    import termios
+
+if TYPE_CHECKING:
+    import serialx
+
+__all__ = ["Device", "SerialLink", "need_serialx"]
+
+T = TypeVar("T")
+
+READ_SIZE: Final = 65536
+"""Bytes that are read at once. Linux holds 4,095 for a reader, and what comes meanwhile in the driver."""
+
+STALL_TIMEOUT: Final = 5.0
+"""Seconds, beyond those that a full buffer takes at the port's rate, that a device may take nothing."""
+
+SYSTEM_BUFFER: Final = 4096
+"""Bytes that may wait in the system for a UART (Linux, UART_XMIT_SIZE)."""
+
+BITS_PER_BYTE: Final = 10
+"""With start and stop bit."""
+
+CLOSE_TIMEOUT: Final = 2.0
+"""Seconds that closing waits for a driver. What had not gone out is dropped before, so few ever wait."""
+
+
+class Device(NamedTuple):
+    """A serial port as a peer. The number makes it another one after each opening: half a frame that came
+    before it was unplugged is not continued by what comes after."""
+
+    number: int
+    path: str
+
+
+class SerialLink:
+    """`serial`: one serial port; `open` makes it work again after it was unplugged.
+
+    Nothing is queued here. A frame that finds the system's buffer full waits for room, so a slow port sets
+    the pace of what is sent. One that takes nothing for `STALL_TIMEOUT` counts as lost: it can neither fill
+    the memory nor hold up calls, the user is told, and opening it again empties the buffer.
+
+    Attributes:
+        name: the canonical name.
+        device: the path, or the name on Windows.
+        baud: bits a second; without meaning to devices that are USB themselves.
+
+    Raises:
+        UsageError: the extra `serial` is not installed.
+    """
+
+    is_stream = True
+    reconnects = True
+
+    def __init__(self, spec: LinkSpec) -> None:
+        need_serialx(spec.name)
+        self.name = spec.name
+        self.device = spec.host
+        self.baud = spec.port
+        self._port: _Port | None = None
+        self._far = Device(0, spec.host)
+        self._openings = 0
+        self._end: tuple[str, OSError | None] = ("closed", None)
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name} {'closed' if self._port is None else 'open'}>"
+
+    async def open(self) -> None:
+        """See `Link.open`; a link that is open is closed first.
+
+        Raises:
+            UsageError: this system knows no such baud rate.
+        """
+        await self._discard("closed")
+        opening = self._openings
+        try:
+            with anyio.fail_after(OPEN_TIMEOUT):
+                port = await _open_port(self.device, self.baud)
+        except OSError as error:
+            self._check(opening)
+            raise self._error(_refusal(self.device, self.baud, error)) from error
+        if opening != self._openings:
+            await port.close()
+        self._check(opening)
+        self._port = port
+        self._far = self._far._replace(number=self._far.number + 1)
+
+    async def receive(self) -> list[tuple[Peer, bytes]]:
+        """See `Link.receive`: one chunk of up to `READ_SIZE` bytes."""
+        port, opening = self._opened(), self._openings
+        try:
+            data = await port.read()
+        except OSError as error:
+            await self._fail(opening, f"lost {self.device}: unplugged, or reset ({reason(error)})", error)
+        if not data:
+            await self._fail(opening, f"lost {self.device}: unplugged, or hung up")
+        return [(self._far, data)]
+
+    async def send(self, data: bytes, peer: Peer | None) -> None:
+        """See `Link.send`. Waits for room as long as the class says; then the port counts as lost.
+
+        Cancelled, it may have sent a part.
+        """
+        await anyio.lowlevel.checkpoint()
+        port, opening = self._opened(), self._openings
+        if peer is not None and peer != self._far:
+            return
+        patience = STALL_TIMEOUT + SYSTEM_BUFFER * BITS_PER_BYTE / self.baud
+        with anyio.move_on_after(patience) as wait:
+            try:
+                await port.write(data)
+            except OSError as error:
+                await self._fail(opening, f"lost {self.device}: unplugged, or reset ({reason(error)})", error)
+        if wait.cancelled_caught:
+            await self._fail(opening, f"{self.device} has taken nothing for {patience:.0f} s")
+        self._check(opening)
+
+    async def close(self) -> None:
+        """See `Link.close`. What the device had not taken is dropped."""
+        await self._discard("closed")
+
+    async def _discard(self, problem: str, cause: OSError | None = None) -> None:
+        """Close what is open and wake who waits for it. From here on an `open` under way comes too late."""
+        self._openings += 1
+        self._end = (problem, cause)
+        port, self._port = self._port, None
+        if port is not None:
+            await port.close()
+
+    async def _fail(self, opening: int, problem: str, cause: OSError | None = None) -> NoReturn:
+        """Close the link because of a fault, unless that has been done; who waits gets the same LinkError."""
+        self._check(opening)
+        await self._discard(problem, cause)
+        raise self._error(problem) from cause
+
+    def _check(self, opening: int) -> None:
+        """LinkError when the link has been closed since it was opened as `opening`."""
+        if opening != self._openings:
+            problem, cause = self._end
+            raise self._error(problem) from cause
+
+    def _opened(self) -> _Port:
+        if self._port is None:
+            raise self._error("not open")
+        return self._port
+
+    def _error(self, problem: str) -> LinkError:
+        return LinkError(f"{self.name}: {problem}", link=self.name)
+
+
+def need_serialx(what: str) -> None:
+    """UsageError with the command that installs the extra, where it is missing."""
+    if find_spec("serialx") is None:
+        raise UsageError(f"{what} needs serialx: pip install 'paramclient[serial]'")
+
+
+class _Port(Protocol):
+    """An open port."""
+
+    async def read(self) -> bytes:
+        """Wait for bytes; none at all when the port has hung up, or is closed meanwhile."""
+
+    async def write(self, data: bytes) -> None:
+        """Wait until the system has taken everything, or the port is closed."""
+
+    async def close(self) -> None:
+        """Wake who waits, drop what is unsent, close. Not to be cancelled, and not for long."""
+
+
+async def _open_port(device: str, baud: int) -> _Port:
+    if sys.platform == "win32":
+        from paramclient.links.transport import Transport  # only here: brings asyncio along
+
+        return await Transport.opened(device, baud)
+    return await _Descriptor.opened(device, baud)
+
+
+if sys.platform != "win32":
+
+    class _Descriptor:
+        """A port as a file descriptor that never blocks."""
+
+        def __init__(self, serial: serialx.BaseSerial) -> None:
+            self._serial = serial
+            self._file = serial.fileno()
+
+        @classmethod
+        async def opened(cls, device: str, baud: int) -> _Descriptor:
+            """Open a port in a thread. One that comes when nobody waits for it any more is closed."""
+            return await _in_thread(lambda: cls._open(device, baud), undo=cls._release, grace=CLOSE_TIMEOUT)
+
+        async def read(self) -> bytes:
+            with suppress(anyio.ClosedResourceError):
+                while True:
+                    await anyio.wait_readable(self._file)
+                    with suppress(BlockingIOError):
+                        return os.read(self._file, READ_SIZE)
+            return b""
+
+        async def write(self, data: bytes) -> None:
+            view = memoryview(data)
+            with suppress(anyio.ClosedResourceError):
+                while view:
+                    try:
+                        view = view[os.write(self._file, view) :]
+                    except BlockingIOError:
+                        await anyio.wait_writable(self._file)
+
+        async def close(self) -> None:
+            anyio.notify_closing(self._file)
+            with anyio.move_on_after(CLOSE_TIMEOUT, shield=True):
+                await _in_thread(self._release, undo=_nothing, grace=0)
+
+        @classmethod
+        def _open(cls, device: str, baud: int) -> _Descriptor:
+            import serialx  # only here: most links need none, and it takes longer than a loop should wait
+
+            serial = serialx.serial_for_url(device, baud)
+            try:
+                serial.open()
+            except serialx.UnsupportedSetting as error:
+                raise UsageError(f"{device}: no serial port of this system has {baud} baud") from error
+            except RuntimeError as error:  # of drivers that do not tell their rate back
+                raise OSError(errno.EINVAL, os.strerror(errno.EINVAL)) from error
+            try:
+                # serialx's own lock is one that only those heed who ask for it
+                fcntl.ioctl(serial.fileno(), termios.TIOCEXCL)
+            except OSError:
+                serial.close()
+                raise
+            return cls(serial)
+
+        def _release(self) -> None:
+            with suppress(OSError, termios.error):  # it may have gone
+                termios.tcflush(self._file, termios.TCOFLUSH)  # else close waits for it, 30 s on Linux
+                fcntl.ioctl(self._file, termios.TIOCNXCL)  # a pseudo-terminal would stay closed to others
+            with suppress(OSError):
+                self._serial.close()
+
+
+async def _in_thread(work: Callable[[], T], *, undo: Callable[[T], object], grace: float) -> T:
+    """Do it in a thread of its own, which ends with it.
+
+    Cancelled, it is undone, also when it is done late; that is waited for `grace` seconds at most.
+    """
+    ended = anyio.Event()
+    token = anyio.lowlevel.current_token()
+    lock = threading.Lock()
+    is_wanted = True
+    results: list[T] = []
+    failures: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            result = work()
+            with lock:
+                results.append(result)
+                if is_wanted:
+                    return
+            undo(result)
+        except BaseException as error:
+            failures.append(error)
+        finally:
+            with suppress(anyio.RunFinishedError):
+                anyio.from_thread.run_sync(ended.set, token=token)
+
+    thread = threading.Thread(target=run, name="paramclient serial", daemon=True)
+    thread.start()
+    try:
+        await ended.wait()
+    except BaseException:
+        with lock:
+            is_wanted = False
+            came_too_early = bool(results)
+        with anyio.move_on_after(grace, shield=True):
+            await ended.wait()
+            thread.join()
+        if came_too_early:
+            undo(results[0])
+        raise
+    thread.join()
+    if failures:
+        raise failures[0]
+    return results[0]
+
+
+def _nothing(_: None) -> None:
+    return
+
+
+def _refusal(device: str, baud: int, error: OSError) -> str:
+    """Why a port cannot be opened, and what helps."""
+    if isinstance(error, TimeoutError):
+        return f"{device} did not open within {OPEN_TIMEOUT:g} s"
+    if error.errno in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
+        return f"there is no {device}; 'paramclient ports' lists the ports that there are"
+    if error.errno == errno.EBUSY or (sys.platform == "win32" and error.errno == errno.EACCES):
+        return f"{device} is in use by another program"
+    if error.errno in (errno.EACCES, errno.EPERM):
+        return f"no permission to open {device}{_who_may(device)}"
+    if error.errno in (errno.ENOTTY, errno.EISDIR):
+        return f"{device} is no serial port"
+    if error.errno == errno.EINVAL:
+        return f"{device} cannot be set to {baud} baud"
+    return f"cannot open {device}: {reason(error)}"
+
+
+def _who_may(device: str) -> str:
+    """The group that may open a port, and how to join it, where a group is what is missing."""
+    if sys.platform != "linux":
+        return ""
+    import grp  # only here: POSIX has it, and only this needs it
+
+    try:
+        info = Path(device).stat()
+        group = grp.getgrgid(info.st_gid).gr_name
+    except (OSError, KeyError):
+        return ""
+    if not info.st_mode & stat.S_IWGRP or info.st_gid in (0, *os.getgroups()):
+        return ""
+    return f", which is for the group {group}: sudo usermod -aG {group} $USER, then log in again"

@@ -1,0 +1,108 @@
+"""A serial port behind serialx's asyncio transport: for Windows, where a port is no file descriptor."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+from collections import deque
+from typing import Final
+
+import anyio
+import serialx
+
+from paramclient.errors import UsageError
+
+__all__ = ["Transport"]
+
+CLOSE_TIMEOUT: Final = 2.0
+"""Seconds that closing waits for the driver."""
+
+UNREAD_LIMIT: Final = 65536
+"""Bytes that may come before they are read; the transport is then told to wait, and the system loses them."""
+
+
+class Transport(asyncio.Protocol):
+    """An open port, as `paramclient.links.serial` wants it.
+
+    Bytes are taken from the system as they come, up to `UNREAD_LIMIT` of them; what is to be sent waits here
+    for the system, one frame at a time.
+    """
+
+    def __init__(self) -> None:
+        self._chunks: deque[bytes] = deque()
+        self._unread = 0
+        self._news = anyio.Event()
+        self._may_write = anyio.Event()
+        self._may_write.set()
+        self._is_closed = False
+        self._loss: OSError | None = None
+        self._transport: serialx.BaseSerialTransport
+
+    @classmethod
+    async def opened(cls, device: str, baud: int) -> Transport:
+        """Open a port. OSError when it cannot be; UsageError on other event loops than asyncio's own."""
+        port = cls()
+        try:
+            loop = asyncio.get_running_loop()
+            port._transport, _ = await serialx.create_serial_connection(loop, lambda: port, device, baud)
+        except serialx.UnsupportedSetting as error:
+            raise UsageError(f"{device}: no serial port of this system has {baud} baud") from error
+        except RuntimeError as error:  # trio, or a loop that is not for pipes
+            raise UsageError(f"{device}: on Windows serial ports need asyncio's own event loop") from error
+        port._transport.set_write_buffer_limits(high=0)
+        return port
+
+    async def read(self) -> bytes:
+        """Wait for bytes; none at all when the port is closed meanwhile."""
+        while not self._chunks and not self._is_closed:
+            self._news = anyio.Event()
+            await self._news.wait()
+        if not self._chunks and self._loss is not None:
+            raise self._loss
+        data = b"".join(self._chunks)
+        self._chunks.clear()
+        self._unread = 0
+        self._transport.resume_reading()
+        return data
+
+    async def write(self, data: bytes) -> None:
+        """Wait until the system has taken everything, or the port is closed."""
+        await self._may_write.wait()
+        if not self._is_closed:
+            self._transport.write(data)
+            await self._may_write.wait()
+        if self._loss is not None:
+            raise self._loss
+
+    async def close(self) -> None:
+        """Wake who waits, drop what is unsent, close."""
+        self._finish(None)
+        with anyio.move_on_after(CLOSE_TIMEOUT, shield=True):
+            self._transport.abort()
+            await self._transport.wait_closed()
+
+    # what the transport calls
+
+    def data_received(self, data: bytes) -> None:
+        self._chunks.append(data)
+        self._unread += len(data)
+        if self._unread >= UNREAD_LIMIT:
+            self._transport.pause_reading()
+        self._news.set()
+
+    def pause_writing(self) -> None:
+        self._may_write = anyio.Event()
+
+    def resume_writing(self) -> None:
+        self._may_write.set()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._finish(exc if isinstance(exc, OSError) else OSError(errno.EIO, os.strerror(errno.EIO)))
+
+    def _finish(self, loss: OSError | None) -> None:
+        if not self._is_closed:
+            self._is_closed = True
+            self._loss = loss
+        self._news.set()
+        self._may_write.set()

@@ -1,0 +1,163 @@
+"""The list of serial ports: what is marked as an autopilot, and what the command prints."""
+
+from __future__ import annotations
+
+import json
+import sys
+from typing import Any
+
+import pytest
+import serialx
+
+from paramclient.cli import run
+from paramclient.links import SerialPort, create_link, list_ports
+
+BY_ID = "/dev/serial/by-id/usb-Hex_ProfiCNC_CubeOrange_2E0045-if00"
+
+
+def info(device: str, **known: Any) -> serialx.SerialPortInfo:
+    """A port as serialx tells of it."""
+    texts = ("serial_number", "manufacturer", "product", "interface_description")
+    fields: dict[str, Any] = dict.fromkeys(("vid", "pid", "bcd_device", "interface_num", *texts))
+    fields |= {"device": device, "resolved_device": device}
+    return serialx.SerialPortInfo(**fields | known)
+
+
+@pytest.fixture
+def plugged(monkeypatch: pytest.MonkeyPatch) -> list[serialx.SerialPortInfo]:
+    """What the system tells."""
+    ports: list[serialx.SerialPortInfo] = []
+    monkeypatch.setattr(serialx, "list_serial_ports", lambda: ports)
+    return ports
+
+
+def a_few() -> list[serialx.SerialPortInfo]:
+    return [
+        info("/dev/ttyS0"),
+        info("/dev/ttyUSB10", vid=0x0403, pid=0x6001, manufacturer="FTDI", product="FT232R USB UART"),
+        info("/dev/ttyUSB9", vid=0x10C4, pid=0xEA60, product="CP2102\x1b[31m", serial_number="0001"),
+        info(
+            BY_ID,
+            resolved_device="/dev/ttyACM1",
+            vid=0x2DAE,
+            pid=0x1016,
+            manufacturer="Hex/ProfiCNC",
+            product="CubeOrange",
+            serial_number="2E0045",
+            interface_num=0,
+        ),
+    ]
+
+
+def test_autopilots_come_first_then_what_is_on_usb(plugged: list[serialx.SerialPortInfo]) -> None:
+    plugged += a_few()
+    found = list_ports()
+    assert [port.device for port in found] == ["/dev/ttyACM1", "/dev/ttyUSB9", "/dev/ttyUSB10", "/dev/ttyS0"]
+    assert found[0] == SerialPort(
+        "/dev/ttyACM1", BY_ID, 0x2DAE, 0x1016, "Hex/ProfiCNC", "CubeOrange", "2E0045", 0
+    )
+    assert [port.autopilot for port in found] == ["CubePilot", None, None, None]
+    assert found[-1] == SerialPort("/dev/ttyS0")
+
+
+def test_the_link_is_by_the_name_that_stays_the_same(plugged: list[serialx.SerialPortInfo]) -> None:
+    plugged += a_few()
+    for port in list_ports():
+        assert create_link(port.link).name == port.link
+    assert list_ports()[0].link == f"serial:{BY_ID}:57600"
+    assert list_ports()[1].link == "serial:/dev/ttyUSB9:57600"
+
+
+@pytest.mark.parametrize(
+    ("vendor", "product", "manufacturer", "autopilot"),
+    [
+        (0x26AC, 0x0011, "3D Robotics", "Pixhawk"),
+        (0x26AC, 0x0032, None, "Pixhawk"),
+        (0x26AC, 0x0015, "3D Robotics", None),
+        (0x3185, 0x0035, "Auterion", "Pixhawk"),
+        (0x2DAE, 0x1058, "CubePilot", "CubePilot"),
+        (0x3162, 0x0050, "Holybro", "Holybro"),
+        (0x27AC, 0x1154, "Laser Navigation", "VRBrain"),
+        (0x1209, 0x5740, "ArduPilot", "ArduPilot"),
+        (0x1209, 0x5741, "Matek", "ArduPilot"),
+        (0x1209, 0x0001, "somebody else with a code of theirs", None),
+        (0x0483, 0x5740, "ArduPilot", "ArduPilot"),
+        (0x0483, 0x5740, "mRo", "mRo"),
+        (0x0483, 0x5740, "STMicroelectronics", None),
+        (0x0483, 0x5740, None, None),
+        (0x10C4, 0xEA60, "Silicon Labs", None),
+        (None, None, None, None),
+    ],
+)
+def test_what_is_an_autopilot(
+    vendor: int | None, product: int | None, manufacturer: str | None, autopilot: str | None
+) -> None:
+    port = SerialPort("COM5", vendor_id=vendor, product_id=product, manufacturer=manufacturer)
+    assert port.autopilot == autopilot
+
+
+def test_the_command_prints_a_table(
+    plugged: list[serialx.SerialPortInfo], capsys: pytest.CaptureFixture[str]
+) -> None:
+    plugged += a_few()
+    assert run(["ports"]) == 0
+    head, cube, radio, *_, uart = capsys.readouterr().out.splitlines()
+    assert head.split() == ["device", "autopilot", "product", "manufacturer", "usb", "id", "link"]
+    assert cube.split() == [
+        *("/dev/ttyACM1", "CubePilot", "CubeOrange", "Hex/ProfiCNC", "2dae:1016", f"serial:{BY_ID}:57600")
+    ]
+    assert r"CP2102\x1b[31m" in radio
+    assert uart.split() == ["/dev/ttyS0", "serial:/dev/ttyS0:57600"]
+
+
+def test_the_command_prints_json(
+    plugged: list[serialx.SerialPortInfo], capsys: pytest.CaptureFixture[str]
+) -> None:
+    plugged += a_few()
+    assert run(["ports", "--json"]) == 0
+    ports = json.loads(capsys.readouterr().out)["ports"]
+    assert ports[0] == {
+        "device": "/dev/ttyACM1",
+        "by_id": BY_ID,
+        "link": f"serial:{BY_ID}:57600",
+        "autopilot": "CubePilot",
+        "vendor_id": "2dae",
+        "product_id": "1016",
+        "manufacturer": "Hex/ProfiCNC",
+        "product": "CubeOrange",
+        "serial_number": "2E0045",
+        "interface": 0,
+    }
+    assert ports[3]["by_id"] is ports[3]["autopilot"] is ports[3]["vendor_id"] is None
+
+
+def test_no_ports_at_all(plugged: list[serialx.SerialPortInfo], capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["ports"]) == 0
+    assert tuple(capsys.readouterr()) == ("", "there are no serial ports\n")
+    assert run(["ports", "--json"]) == 0
+    assert capsys.readouterr().out == '{"ports": []}\n'
+
+
+def test_the_ports_of_this_computer() -> None:
+    assert all(create_link(port.link).name == port.link for port in list_ports())
+
+
+@pytest.mark.parametrize("arguments", [["ports"], ["fetch", "/dev/ttyACM0", "--no-cache"]])
+def test_without_the_extra_the_command_says_what_to_install(
+    arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "serialx", None)
+    assert run(arguments) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert err.startswith("paramclient: ")
+    assert err.endswith(" needs serialx: pip install 'paramclient[serial]'\n")
+    assert err.count("\n") == 1
+
+
+def test_a_port_that_is_not_there_is_code_4(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["fetch", "/dev/nowhere,115200", "--no-cache"]) == 4
+    assert capsys.readouterr().err == (
+        "paramclient: serial:/dev/nowhere:115200: there is no /dev/nowhere; "
+        "'paramclient ports' lists the ports that there are\n"
+    )
