@@ -491,6 +491,17 @@ def test_a_vehicle_that_starts_again_is_heard_again() -> None:
     assert simulation.set("PARAM_04", 5).actual == 5
 
 
+def test_a_vehicle_that_has_lost_its_time_is_heard_again() -> None:
+    """PX4 keeps the timestamp of its set-up alone, and begins there after each start."""
+    simulation = Simulation(small_px4(signing_key=KEY, signing_timestamp=NOW), station=a_station())
+    simulation.fetch()
+    simulation.air = Air([small_px4(signing_key=KEY, signing_timestamp=NOW - 2 * MOST_BEHIND)])
+    simulation.run(6.0)
+    assert simulation.set("PARAM_04", 5).actual == 5
+    assert simulation.station.verifier is not None
+    assert simulation.station.verifier.report().refused.keys() == {Refusal.REPLAYED}
+
+
 def test_what_is_recorded_and_sent_again_changes_nothing() -> None:
     vehicle = ArduPilotVehicle(table=VALUES, ftp=False, signing_key=KEY)
     simulation = Simulation(vehicle, station=a_station())
