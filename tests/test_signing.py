@@ -576,6 +576,14 @@ def test_a_vehicle_obeys_setup_signing(make: Any) -> None:
     assert simulation.fetch().complete
 
 
+def test_an_armed_vehicle_keeps_its_key() -> None:
+    vehicle = small_px4(armed=True)
+    simulation = Simulation(vehicle, station=a_station(None))
+    simulation.station.send_setup_signing(1, 1, KEY, NOW)
+    simulation.run(1.0)
+    assert is_unsigned(vehicle)
+
+
 def is_unsigned(vehicle: Vehicle) -> bool:
     return vehicle.signing_key is None and vehicle.signing_report is None
 

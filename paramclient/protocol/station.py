@@ -54,7 +54,7 @@ MOST_COMPONENTS: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each have. Further ones are not heard."""
 MOST_PEERS: Final = 256
 """Stream peers whose unfinished frames are kept."""
-HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345})
+HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
 """The message ids that matter here: HEARTBEAT, SYSTEM_TIME, PARAM_VALUE, PARAM_SET (of others), COMMAND_ACK,
 FILE_TRANSFER_PROTOCOL, AUTOPILOT_VERSION, HIGH_LATENCY2, STATUSTEXT, PARAM_ERROR."""
 

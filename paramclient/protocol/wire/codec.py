@@ -12,10 +12,12 @@ from typing import Final
 
 from paramclient.protocol.wire.frames import Frame, build_frame
 from paramclient.protocol.wire.messages import (
+    COMPONENT_METADATA_ID,
     PARAM_VALUE_ID,
     AutopilotVersion,
     CommandAck,
     CommandLong,
+    ComponentMetadata,
     FileTransfer,
     Heartbeat,
     HighLatency2,
@@ -93,6 +95,7 @@ _FILE_TRANSFER = struct.Struct("<BBB251s")
 _SYSTEM_TIME = struct.Struct("<QI")
 _HIGH_LATENCY2 = struct.Struct("<24xBB16x")
 _SETUP_SIGNING = struct.Struct("<QBB32s")
+_COMPONENT_METADATA = struct.Struct("<4xI100s")
 _V1_LENGTHS = {77: 3, 148: 60}  # extension fields exist in MAVLink 2 only
 
 
@@ -166,6 +169,11 @@ def _decode_setup_signing(payload: bytes) -> SetupSigning:
     return SetupSigning(system, component, key, timestamp)
 
 
+def _decode_component_metadata(payload: bytes) -> ComponentMetadata:
+    crc, uri = _fields(_COMPONENT_METADATA, payload)
+    return ComponentMetadata(text_of(uri), crc)
+
+
 _DECODERS: dict[int, Callable[[bytes], Message]] = {
     0: _decode_heartbeat,
     2: _decode_system_time,
@@ -181,6 +189,7 @@ _DECODERS: dict[int, Callable[[bytes], Message]] = {
     253: _decode_statustext,
     256: _decode_setup_signing,
     345: _decode_param_error,
+    COMPONENT_METADATA_ID: _decode_component_metadata,
 }
 
 UNDERSTOOD: Final = frozenset(_DECODERS)
@@ -250,5 +259,9 @@ _ENCODERS: dict[type, Callable[..., tuple[int, bytes]]] = {
         _SETUP_SIGNING.pack(
             m.initial_timestamp, m.target_system, m.target_component, b"" if m.key is None else m.key.secret
         ),
+    ),
+    ComponentMetadata: lambda m: (
+        COMPONENT_METADATA_ID,
+        _COMPONENT_METADATA.pack(m.file_crc, m.uri.encode("latin-1")),
     ),
 }

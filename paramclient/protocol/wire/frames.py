@@ -209,7 +209,7 @@ def checksum(message_id: int, body: bytes) -> int | None:
 def message_name(message_id: int) -> str:
     """`HEARTBEAT` for 0, and so on; `UNKNOWN_4711` for an id that the dialect does not have."""
     known = dialect.mavlink_map.get(message_id)
-    return f"UNKNOWN_{message_id}" if known is None else str(known.msgname)
+    return _MISSING_NAMES.get(message_id, f"UNKNOWN_{message_id}") if known is None else str(known.msgname)
 
 
 def enum_word(enum: str, number: int) -> str:
@@ -228,5 +228,10 @@ def _frame_of(number: int, data: bytes) -> Frame:
 
 
 _NO_NUMBERS: dict[bytes, int] = {}
-_CRC_EXTRA: dict[int, int] = {number: message.crc_extra for number, message in dialect.mavlink_map.items()}
+# of MAVLink's common set, which pymavlink 2.4.50 has without its unfinished messages
+_MISSING_NAMES = {397: "COMPONENT_METADATA"}
+_MISSING_EXTRA = {397: 182}
+_CRC_EXTRA: dict[int, int] = _MISSING_EXTRA | {
+    number: message.crc_extra for number, message in dialect.mavlink_map.items()
+}
 _EXTRA_BY_ID_BYTES = {number.to_bytes(3, "little"): bytes((extra,)) for number, extra in _CRC_EXTRA.items()}
