@@ -17,6 +17,7 @@ import pytest
 import paramclient
 import paramclient.links
 import paramclient.metadata
+import paramclient.provision
 import paramclient.sim
 
 ROOT = Path(__file__).parent.parent
@@ -109,7 +110,7 @@ def test_every_page_is_in_the_table_of_contents() -> None:
 
 @pytest.mark.parametrize(
     "module",
-    [paramclient, paramclient.links, paramclient.metadata, paramclient.sim],
+    [paramclient, paramclient.links, paramclient.metadata, paramclient.provision, paramclient.sim],
     ids=lambda m: m.__name__,
 )
 def test_every_public_name_is_in_the_pages(module: ModuleType) -> None:
