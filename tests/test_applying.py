@@ -213,6 +213,63 @@ async def test_the_proof_is_asked_for_after_the_last_write(make: Callable[[], An
         assert {message.param_id for message in hashes} == {wire.HASH_CHECK}
 
 
+@swiftly
+async def test_a_value_that_the_last_list_leaves_out_is_not_proven() -> None:
+    vehicle = ardupilot(ftp=False)
+
+    def lose(progress: ApplyProgress) -> None:
+        if progress.row is not None and progress.row.name == "TUNE_02":
+            vehicle.when_listed(1, lambda: vehicle._entry("TUNE_01").store(0))
+            vehicle.when_listed(1, lambda: vehicle._dead.add("TUNE_01"))
+
+    async with a_client(vehicle) as client:
+        result = await apply(await client.component(), written(another("TUNE_01", "TUNE_02")), progress=lose)
+    assert statuses(result) == {"TUNE_01": "unproven", "TUNE_02": "set"}
+    assert "does not tell" in str(result.rows["TUNE_01"])
+    assert not result.complete
+
+
+@swiftly
+async def test_what_no_hash_covers_is_read_again_for_the_proof() -> None:
+    vehicle = px4()
+
+    def learn(progress: ApplyProgress) -> None:
+        if progress.phase == "reading":  # in flight, without a word
+            vehicle._entry("CAL_ACC0_XOFF").store(bits_of(0.75, ParamType.REAL32))
+
+    wanted = written({"TUNE_01": 9.5, "CAL_ACC0_XOFF": 0.5})
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        await component.fetch_all()
+        result = await apply(component, wanted, include="calibration", progress=learn)
+    assert result.before["CAL_ACC0_XOFF"].value == 0.75
+    assert statuses(result) == {"TUNE_01": "set", "CAL_ACC0_XOFF": "failed"}
+    assert result.rows["CAL_ACC0_XOFF"].actual == 0.75
+
+
+@EVERY_KIND
+@pytest.mark.parametrize("policy", ["hash-only", "cache-only"])
+@swiftly
+async def test_a_policy_that_allows_no_download_does_not_spare_the_proof(
+    make: Callable[[], Any], policy: str, tmp_path: Path
+) -> None:
+    vehicle = make()
+    with ParamCache(tmp_path / "cache.sqlite3") as cache:
+        async with ParamClient(vehicle, cache=cache) as client:
+            await (await client.component()).fetch_all()
+        tap = Tap(vehicle)
+        async with ParamClient(tap, cache=cache, policy=policy) as client:
+            result = await apply(await client.component(), written(another("TUNE_01", "TUNE_04")))
+        assert result.complete
+        (kept,) = cache.snapshots(cache.vehicles()[0].key)
+    messages = [message for _, _, message in tap.heard]
+    last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSet))
+    asked = {each.param_id for each in messages[last + 1 :] if isinstance(each, wire.ParamRequestRead)}
+    by_hash = make is px4 and policy == "hash-only"
+    assert asked == ({wire.HASH_CHECK} if by_hash else {"TUNE_01", "TUNE_04"})
+    assert not kept.complete  # what was only believed is not in it
+
+
 @EVERY_KIND
 @swiftly
 async def test_where_there_is_nothing_to_do_nothing_is_written_or_read_again(make: Callable[[], Any]) -> None:

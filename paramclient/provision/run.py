@@ -223,7 +223,7 @@ class Run:
     async def _look(self) -> None:
         self._tell("reading")
         absent = self.seen.absent if self._first is not None else frozenset[str]()
-        self.seen = await look(self._component, self._wanted, absent)
+        self.seen = await look(self._component, self._wanted, absent, whole=self._first is None)
         self._check_it_is_the_same()
         self.plan = plan_for(self._component, self.seen.table, self._wanted, self._include, self._info)
         self._is_proven = True
@@ -434,6 +434,10 @@ class Run:
             return row(ApplyStatus.SET if name in self.sent else ApplyStatus.UNCHANGED)
         if (settled := self.rows.get(name)) is not None:
             return replace(settled, actual=actual) if self._is_proven else settled
+        answered = "acknowledged" if name in self.written else "sent, not acknowledged"
+        if name in self.sent and actual is None:
+            reason = f"{answered}, and the vehicle does not tell it any more"
+            return replace(row(ApplyStatus.UNPROVEN, reason), nearest=())
         if planned.status in (PlanStatus.SKIPPED, PlanStatus.INVALID):
             return row(ApplyStatus.SKIPPED, planned.reason, planned.category)
         if planned.status is PlanStatus.LATER:
@@ -441,7 +445,6 @@ class Run:
         if name not in self.sent:
             return row(ApplyStatus.FAILED, "not reached")
         if not self._is_proven:
-            answered = "acknowledged" if name in self.written else "sent, not acknowledged"
             return row(ApplyStatus.UNPROVEN, f"{answered}, and not read back")
         if self._is_action(name):
             return row(ApplyStatus.SET, "done by the vehicle")
