@@ -332,6 +332,8 @@ class _Planner:
         if info is not None and info.is_read_only and not self._choice.has(name, READ_ONLY):
             return verdict(PlanStatus.SKIPPED, READ_ONLY, "left out: it can only be read")
         wrong = self._wrong(name, wanted.value, kind, info)
+        if wrong is None and isinstance(wanted.value, bytes) and not isinstance(before, bytes):
+            wrong = WRONG, f"{format_value(wanted.value)} are raw bytes, and the vehicle gives a number"
         if wrong is None or (wrong[0] == OUT_OF_RANGE and self._choice.has(name, OUT_OF_RANGE)):
             return verdict(PlanStatus.SET)
         return verdict(PlanStatus.INVALID, *wrong)
