@@ -17,6 +17,7 @@ import pytest
 import paramclient
 import paramclient.links
 import paramclient.sim
+import paramclient.testing
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -104,7 +105,7 @@ def test_every_page_is_in_the_table_of_contents() -> None:
 
 @pytest.mark.parametrize(
     "module",
-    [paramclient, paramclient.links, paramclient.sim],
+    [paramclient, paramclient.links, paramclient.sim, paramclient.testing],
     ids=lambda m: m.__name__,
 )
 def test_every_public_name_is_in_the_pages(module: ModuleType) -> None:

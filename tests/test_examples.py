@@ -36,10 +36,7 @@ PRINTED = {
         r"wrong: +1\.5 is not a whole number",
         r"refused: .*NO_SUCH",
     ],
-    "test_your_program": [
-        r"passed: test_works_on_a_bad_radio",
-        r"passed: test_refuses_other_autopilots",
-    ],
+    "test_your_program": [r"changed: \['MPC_XY_VEL_MAX', 'MPC_Z_VEL_MAX_UP'\]"],
     "two_vehicles": [
         r"<FetchResult 1/1 903 params from stream in ",
         r"<FetchResult 2/1 903 params from stream in ",
@@ -99,4 +96,6 @@ def test_takes_a_link(name: str, arguments: list[str], line: str, tmp_path: Path
 
 def test_pytest_finds_the_tests_of_your_program(tmp_path: Path) -> None:
     example = EXAMPLES / "test_your_program.py"
-    assert "4 passed" in run("-m", "pytest", "-p", "no:cacheprovider", example, cache=tmp_path)
+    plugins = ["-p", "no:cacheprovider", "-p", "pytest_paramclient"]
+    assert "4 passed" in run("-m", "pytest", *plugins, example, cache=tmp_path)
+    assert not list(tmp_path.rglob("parameters.sqlite3")), "the tests used the user's cache"
