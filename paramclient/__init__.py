@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
-from paramclient.cache import CachedComponent, CachedVehicle, HistoryEntry, ParamCache
+from paramclient.cache import (
+    CachedComponent,
+    CachedVehicle,
+    FleetDiff,
+    FleetValue,
+    FleetVehicle,
+    HistoryEntry,
+    Holder,
+    NameSpread,
+    ParamCache,
+    Snapshot,
+    SnapshotSummary,
+)
 from paramclient.client import FetchedAll, ParamClient
 from paramclient.component import Component
 from paramclient.errors import (
+    AnotherVehicle,
     CacheError,
     ClientClosed,
+    CommandRefused,
+    CommandResult,
+    FileError,
     FileErrorCode,
     FileTransferError,
     LinkError,
@@ -23,9 +39,11 @@ from paramclient.errors import (
     VehicleError,
 )
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
+from paramclient.files import FileForm, ParamFile, read_file, write_file
 from paramclient.ftp import Ftp
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
+from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.protocol.ftp import DirectoryEntry
 from paramclient.protocol.result import FetchResult, Policy, Progress
 from paramclient.protocol.sampling import Sample
@@ -37,12 +55,15 @@ from paramclient.values import Encoding, Param, ParamType, Trust
 from paramclient.version import __version__
 
 __all__ = [
+    "AnotherVehicle",
     "CacheError",
     "CachedComponent",
     "CachedVehicle",
     "Change",
     "Changes",
     "ClientClosed",
+    "CommandRefused",
+    "CommandResult",
     "Component",
     "ComponentTraffic",
     "DirectoryEntry",
@@ -51,16 +72,23 @@ __all__ = [
     "Events",
     "FetchResult",
     "FetchedAll",
+    "FileError",
     "FileErrorCode",
+    "FileForm",
     "FileTransferError",
+    "FleetDiff",
+    "FleetValue",
+    "FleetVehicle",
     "Found",
     "Ftp",
     "Heard",
     "HistoryEntry",
+    "Holder",
     "Identity",
     "LinkError",
     "Lost",
     "MessageTraffic",
+    "NameSpread",
     "NoReply",
     "PackError",
     "Param",
@@ -68,7 +96,9 @@ __all__ = [
     "ParamClient",
     "ParamClientError",
     "ParamErrorCode",
+    "ParamFile",
     "ParamMap",
+    "ParamSet",
     "ParamType",
     "Policy",
     "Progress",
@@ -78,6 +108,8 @@ __all__ = [
     "Resynced",
     "Sample",
     "SetResult",
+    "Snapshot",
+    "SnapshotSummary",
     "SyncState",
     "TrafficReport",
     "Trust",
@@ -86,5 +118,8 @@ __all__ = [
     "UsageError",
     "ValueNotApplied",
     "VehicleError",
+    "WrittenParam",
     "__version__",
+    "read_file",
+    "write_file",
 ]

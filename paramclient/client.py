@@ -31,6 +31,7 @@ from paramclient.protocol.events import (
 )
 from paramclient.protocol.result import Policy, Progress
 from paramclient.protocol.station import Address, Station
+from paramclient.protocol.succession import SEARCH_PACE, Succession
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.traffic import TrafficReport
 from paramclient.together import FetchedAll, FetchTogether
@@ -261,6 +262,39 @@ class ParamClient:
             waited = anyio.current_time() - began
             raise NoReply(_wanted(system, component), attempts=0, waited=waited)
         return found
+
+    async def successor(
+        self, component: Component, system: int, *, timeout: float | None = HEARING_PATIENCE
+    ) -> Component:
+        """The same component of the same vehicle under another system id, as soon as it speaks under that.
+
+        For a vehicle whose system id was set: ArduPilot takes it at once (SYSID_THISMAV), PX4 when it starts
+        again (MAV_SYS_ID, see `Component.reboot`). That it is the same one is shown by its hardware id; where
+        there is none, by its autopilot and type, and by its silence under the id of before.
+
+        Args:
+            component: what it was before.
+            system: its new system id.
+            timeout: seconds; None waits for ever.
+
+        Raises:
+            AnotherVehicle: another vehicle has this system id.
+            NoReply: it was not heard under this id in time, or did not say who it is.
+            LinkError: the link failed, or the client was closed.
+        """
+        self._check_open()
+        began = anyio.current_time()
+        search = Succession(component._machine, (system, component.component))
+        with anyio.move_on_after(timeout):
+            while not search.look(self._station.components, anyio.current_time()):
+                self._wake()
+                with anyio.move_on_after(SEARCH_PACE):
+                    await self._carrier.news.wait()
+                self._check_open()
+            found = self._components[search.address]
+            await found._wait_for_cache()
+            return found
+        raise NoReply(search.awaited, attempts=0, waited=anyio.current_time() - began)
 
     async def fetch_all(
         self,

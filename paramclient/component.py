@@ -22,7 +22,7 @@ from paramclient.protocol.result import FetchResult, Progress, Sampled
 from paramclient.protocol.sampling import SAMPLE_SIZE
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
-from paramclient.protocol.wire import HASH_CHECK, NO_INDEX, ParamValue
+from paramclient.protocol.wire import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, NO_INDEX, ParamValue
 from paramclient.protocol.writes import SetResult
 from paramclient.values import Encoding, Param, check_name, check_value, decode, known_type
 
@@ -33,6 +33,9 @@ __all__ = ["Component"]
 
 Result = TypeVar("Result")
 
+REBOOT_PATIENCE = 60.0
+"""Seconds for a vehicle to start again and say who it is, unless the caller says otherwise: autopilots on
+small boards take up to half a minute, and those that calibrate sensors first a little longer."""
 PROGRESS_INTERVAL = 0.1
 """Seconds between two calls of a progress callback."""
 IDENTITY_PATIENCE = 1.5
@@ -107,6 +110,18 @@ class Component:
     def sync_state(self) -> SyncState:
         """How the table stands to the vehicle's: up to date, or what is done about it."""
         return self._machine.sync_state
+
+    @property
+    def is_armed(self) -> bool | None:
+        """Whether its motors may turn, by its last heartbeat.
+
+        None where that is not known: before a heartbeat, while it is lost, and in high-latency mode, in which
+        it sends none.
+        """
+        presence = self._machine.presence
+        if presence.base_mode is None or presence.is_lost:
+            return None
+        return bool(presence.base_mode & MAV_MODE_FLAG_SAFETY_ARMED)
 
     @property
     def silence(self) -> float:
@@ -277,6 +292,46 @@ class Component:
         refresh = self._machine.refresh
         if refresh is not None:
             await self._wait(refresh, timeout, lambda: ("the values that no hash covers", 0))
+
+    async def reboot(self, *, system: int | None = None, timeout: float | None = None) -> Component:
+        """Let the vehicle start again, and wait until the same one is back.
+
+        It is told to when what was written through this client has had the time to be saved (2.5 s after the
+        last write). That it has started again is seen by its clock, its heartbeat or its silence, so an
+        acknowledgement may be lost. Then its hardware id is asked for, or where it has none, its heartbeat
+        must name the same autopilot and type. Its table is *cached* afterwards until it is confirmed, as
+        after any start; parameters may be others now.
+
+        Calls at the same time share one restart. When the call is cancelled, the vehicle may start again all
+        the same.
+
+        Args:
+            system: the system id that it takes with the start, where another one was set (MAV_SYS_ID of PX4);
+                then `ParamClient.successor` finds it there.
+            timeout: seconds until giving up; None for `REBOOT_PATIENCE`.
+
+        Returns:
+            The component that it is now: this one, or the one with the other system id.
+
+        Raises:
+            CommandRefused: it does not want to, most likely because it is armed.
+            AnotherVehicle: another vehicle answers under its system id.
+            NoReply: it does not answer, or did not come back in time.
+            LinkError: the link failed, or the client was closed.
+        """
+        self._client._check_open()
+        moves = system is not None and system != self.system
+        deadline = anyio.current_time() + (REBOOT_PATIENCE if timeout is None else timeout)
+        machine = self._machine
+        restart = machine.begin_restart(anyio.current_time(), returns=not moves)
+        try:
+            left = deadline - anyio.current_time()
+            await self._wait(restart, left, lambda: (restart.stage, restart.attempts))
+        finally:
+            machine.end_restart(restart, anyio.current_time())
+        if system is None or not moves:
+            return self
+        return await self._client.successor(self, system, timeout=deadline - anyio.current_time())
 
     def changes(self) -> Changes:
         """What changes from now on: `async for change in component.changes()`.

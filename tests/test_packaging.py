@@ -130,7 +130,7 @@ def test_what_an_installation_brings(metadata: Message) -> None:
     command = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra == 'cli'" in each}
     serial = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra == 'serial'" in each}
     assert always == {"anyio", "fastcrc", "platformdirs", "pydantic", "pymavlink"}
-    assert command == {"cyclopts", "rich"}
+    assert command == {"cyclopts", "rich", "pyyaml"}
     assert serial == {"serialx"}
     assert metadata["Requires-Python"] == ">=3.11"
 

@@ -13,6 +13,7 @@ from dataclasses import fields
 from types import MappingProxyType
 from typing import Final
 
+from paramclient.cache import earlier
 from paramclient.cache.database import Damaged
 from paramclient.cache.records import (
     BY_VEHICLE,
@@ -28,7 +29,18 @@ from paramclient.cache.rows import Row, cells, checksum, identity_cells, read_id
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
 
-__all__ = ["HISTORY_LINES", "component", "history", "remove", "save", "summaries", "vehicles"]
+__all__ = [
+    "HISTORY_LINES",
+    "component",
+    "history",
+    "make",
+    "owner_of",
+    "remove",
+    "save",
+    "stored_rows",
+    "summaries",
+    "vehicles",
+]
 
 HISTORY_LINES: Final = 10_000
 """Lines of history kept for each table, the newest ones: about a megabyte, and years of tuning by hand. Each
@@ -46,14 +58,18 @@ def save(connection: sqlite3.Connection, updates: Iterable[TableUpdate]) -> None
     """Write what was learnt, in the order given."""
     for update in updates:
         _forget_other_firmware(connection, update.identity)
-        owner = _owner(connection, update)
-        before = _rows(connection, owner)
-        after, lines = _applied(update, before)
+        earlier.watch_clock(connection, update.identity.key, update.component, time_cell(update.at))
+        owner = make(connection, update)
+        before = stored_rows(connection, owner)
+        after, lines, births = _applied(update, before)
         if after != before:
             _write_rows(connection, owner, before, after)
+        earlier.write_births(connection, owner, births)
         _write_history(connection, owner, lines)
         if update.table is not None:
             _write_state(connection, owner, update.table)
+            if update.table.complete:
+                earlier.begin(connection, owner, update.at)
         elif _hashed(before) != _hashed(after):
             connection.execute("UPDATE component SET hash = NULL WHERE id = ?", (owner,))
 
@@ -107,7 +123,7 @@ def component(
 ) -> CachedComponent | None:
     """One table with its parameters, or None."""
     for owner, summary in summaries(connection, key, number):
-        rows = _rows(connection, owner)
+        rows = stored_rows(connection, owner)
         return CachedComponent(
             **{field.name: getattr(summary, field.name) for field in fields(summary)},
             params=ParamMap(
@@ -124,34 +140,33 @@ def component(
 
 
 def history(
-    connection: sqlite3.Connection, key: str, component: int | None, name: str | None, limit: int | None
+    connection: sqlite3.Connection,
+    key: str,
+    component: int | None,
+    name: str | None,
+    limit: int | None,
+    since: float | None = None,
 ) -> list[HistoryEntry]:
     """The changes of a vehicle's values, newest last."""
     rows = connection.execute(
         "SELECT at, component, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
         " FROM history h JOIN component c ON c.id = owner"
         " WHERE vehicle = ? AND component = ifnull(?, component) AND name = ifnull(?, name)"
-        " ORDER BY h.id DESC LIMIT ?",
-        (key, component, name, -1 if limit is None else limit),
+        " AND at >= ifnull(?, at) ORDER BY h.id DESC LIMIT ?",
+        (key, component, name, since, -1 if limit is None else limit),
     ).fetchall()
     return [_entry(row) for row in reversed(rows)]
 
 
-def _forget_other_firmware(connection: sqlite3.Connection, identity: Identity) -> None:
-    """Where a vehicle has another firmware than before: drop what was true of that one only."""
-    updated = connection.execute(
-        "SELECT c.id FROM vehicle JOIN component c ON vehicle = key"
-        " WHERE key = ? AND (firmware, git_hash) != (?, ?)",
-        (identity.key, identity.firmware, identity.git_hash),
-    ).fetchall()
-    for (owner,) in updated:
-        before = _rows(connection, owner)
-        after = {name: row._replace(default_bits=None) for name, row in before.items()}
-        _write_rows(connection, owner, before, after)
-        connection.execute("UPDATE component SET file_works = NULL WHERE id = ?", (owner,))
+def owner_of(connection: sqlite3.Connection, key: str, component: int) -> int | None:
+    """The id of a table in the database, or None where there is none."""
+    found = connection.execute(
+        "SELECT id FROM component WHERE vehicle = ? AND component = ?", (key, component)
+    ).fetchone()
+    return None if found is None else int(found[0])
 
 
-def _owner(connection: sqlite3.Connection, update: TableUpdate) -> int:
+def make(connection: sqlite3.Connection, update: TableUpdate) -> int:
     """Write whose table it is; give the id of the table, which is made where there is none."""
     at = time_cell(update.at)
     key = update.identity.key
@@ -175,11 +190,41 @@ def _owner(connection: sqlite3.Connection, update: TableUpdate) -> int:
     return int(owner)
 
 
+def stored_rows(connection: sqlite3.Connection, owner: int) -> dict[str, Row]:
+    """A table's parameters by index, then name, those without an index last; `Damaged` where one changed."""
+    found = connection.execute(
+        "SELECT name, type, bits, is_raw, param_index, volatile, heard_at, default_bits"
+        " FROM param WHERE owner = ?"
+        " ORDER BY param_index IS NULL, param_index, name",
+        (owner,),
+    )
+    rows = {name: Row(*row) for name, *row in (cells(row, "siiiIifI") for row in found)}
+    [(expected,)] = connection.execute("SELECT checksum FROM component WHERE id = ?", (owner,))
+    if checksum(rows) != expected:
+        raise Damaged("a table is not what was written")
+    return rows
+
+
+def _forget_other_firmware(connection: sqlite3.Connection, identity: Identity) -> None:
+    """Where a vehicle has another firmware than before: drop what was true of that one only."""
+    updated = connection.execute(
+        "SELECT c.id FROM vehicle JOIN component c ON vehicle = key"
+        " WHERE key = ? AND (firmware, git_hash) != (?, ?)",
+        (identity.key, identity.firmware, identity.git_hash),
+    ).fetchall()
+    for (owner,) in updated:
+        before = stored_rows(connection, owner)
+        after = {name: row._replace(default_bits=None) for name, row in before.items()}
+        _write_rows(connection, owner, before, after)
+        connection.execute("UPDATE component SET file_works = NULL WHERE id = ?", (owner,))
+
+
 def _applied(
     update: TableUpdate, before: Mapping[str, Row]
-) -> tuple[dict[str, Row], list[tuple[object, ...]]]:
-    """The rows after an update, and the lines of history that it causes."""
+) -> tuple[dict[str, Row], list[tuple[object, ...]], list[tuple[str, float]]]:
+    """The rows after an update, the lines of history that it causes, and the new names with their times."""
     after = dict(before)
+    births: list[tuple[str, float]] = []
     heard = {item.param.name for item in update.params}
     lines: list[tuple[object, ...]] = [
         (update.at, name, BY_VEHICLE, *after.pop(name).value, None, None, None)
@@ -190,9 +235,11 @@ def _applied(
         name = item.param.name
         old = after.get(name)
         new = after[name] = _merged(item, old, whole=update.replace)
-        if old and not old.same_value(new):
+        if not old:
+            births.append((name, new.heard_at))
+        elif not old.same_value(new):
             lines.append((new.heard_at, name, item.by, *old.value, *new.value))
-    return after, lines
+    return after, lines, births
 
 
 def _merged(item: StoredParam, old: Row | None, *, whole: bool) -> Row:
@@ -233,11 +280,12 @@ def _write_history(connection: sqlite3.Connection, owner: int, lines: Sequence[t
         " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [(owner, *line) for line in lines],
     )
-    connection.execute(
-        "DELETE FROM history WHERE owner = ?1 AND id <="
-        " (SELECT id FROM history WHERE owner = ?1 ORDER BY id DESC LIMIT 1 OFFSET ?2)",
-        (owner, HISTORY_LINES),
-    )
+    for (last,) in connection.execute(
+        "SELECT id FROM history WHERE owner = ? ORDER BY id DESC LIMIT 1 OFFSET ?", (owner, HISTORY_LINES)
+    ).fetchall():
+        [(at,)] = connection.execute("SELECT max(at) FROM history WHERE owner = ? AND id <= ?", (owner, last))
+        connection.execute("DELETE FROM history WHERE owner = ? AND id <= ?", (owner, last))
+        earlier.forget(connection, owner, at)
 
 
 def _write_state(connection: sqlite3.Connection, owner: int, state: TableState) -> None:
@@ -248,21 +296,6 @@ def _write_state(connection: sqlite3.Connection, owner: int, state: TableState) 
         " WHERE id = ?",
         (state.hash, state.count, state.complete, state.volatile_known, synced, state.file_works, owner),
     )
-
-
-def _rows(connection: sqlite3.Connection, owner: int) -> dict[str, Row]:
-    """A table's parameters by index, then name, those without an index last; `Damaged` where one changed."""
-    found = connection.execute(
-        "SELECT name, type, bits, is_raw, param_index, volatile, heard_at, default_bits"
-        " FROM param WHERE owner = ?"
-        " ORDER BY param_index IS NULL, param_index, name",
-        (owner,),
-    )
-    rows = {name: Row(*row) for name, *row in (cells(row, "siiiIifI") for row in found)}
-    [(expected,)] = connection.execute("SELECT checksum FROM component WHERE id = ?", (owner,))
-    if checksum(rows) != expected:
-        raise Damaged("a table is not what was written")
-    return rows
 
 
 def _summary(row: Sequence[object]) -> tuple[int, CachedSummary]:

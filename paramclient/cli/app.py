@@ -14,11 +14,15 @@ from typing import Final
 import anyio
 from cyclopts import App, CycloptsError, Parameter
 
+from paramclient.cli.diff import diff
+from paramclient.cli.fleet import fleet_diff
+from paramclient.cli.history import history
 from paramclient.cli.link import link
-from paramclient.cli.offline import cache_history, cache_list, cache_path, cache_remove, show
+from paramclient.cli.offline import cache_list, cache_path, cache_remove, show
 from paramclient.cli.outcome import ExitCode, code_of
 from paramclient.cli.output import report
 from paramclient.cli.ports import ports
+from paramclient.cli.save import save
 from paramclient.cli.simulate import sim
 from paramclient.cli.vehicle import fetch, get, set_, watch
 from paramclient.errors import ParamClientError
@@ -109,7 +113,7 @@ def _examples(*lines: str) -> str:
 
 _EXIT_CODES: Final = """
 
-Exit codes: 0 done; 1 refused or incomplete; 2 usage; 3 no vehicle or no answer; 4 link; 5 cache."""
+Exit codes: 0 done; 1 refused, incomplete, different; 2 usage; 3 no vehicle or no answer; 4 link; 5 cache."""
 
 _app: Final = App(
     name="paramclient",
@@ -130,6 +134,12 @@ _cache: Final = App(
     name="cache",
     help="Look into the cache, with no link.",
     help_epilogue=_examples("cache list", "cache history 1 MC_ROLL_P", "cache path", "cache remove 1"),
+)
+
+_fleet: Final = App(
+    name="fleet",
+    help="Compare the vehicles in the cache, with no link.",
+    help_epilogue=_examples("fleet diff BAT1_N_CELLS 'COM_ARM_*'", "fleet diff quad.params"),
 )
 
 _app.command(
@@ -159,8 +169,32 @@ _app.command(
 )
 _app.command(
     show,
-    usage="Usage: paramclient show [OPTIONS] [VEHICLE]",
-    help_epilogue=_examples("show", "show 1", "show 00020000 --json"),
+    usage="Usage: paramclient show [OPTIONS] [VEHICLE|FILE]",
+    help_epilogue=_examples("show", "show 1", "show 00020000 --json", "show quad.params"),
+)
+_app.command(
+    diff,
+    usage="Usage: paramclient diff [OPTIONS] A B",
+    help_epilogue=_examples(
+        "diff before.params after.params",
+        "diff quad.param udpin:0.0.0.0:14550 --only 'MC_*'",
+        "diff 1 2 --base defaults",
+    ),
+)
+_app.command(
+    history,
+    usage="Usage: paramclient history [OPTIONS] VEHICLE [NAME]",
+    help_epilogue=_examples("history 1 MC_ROLL_P", "history 1 --since '2h ago'", "history 1 --snapshots"),
+)
+_app.command(_fleet)
+_app.command(
+    save,
+    usage="Usage: paramclient save [OPTIONS] URL|VEHICLE FILE",
+    help_epilogue=_examples(
+        "save udpin:0.0.0.0:14550 quad.yaml",
+        "save sim:ardupilot tuned.param --changed",
+        "save 1 before.params --all",
+    ),
 )
 _app.command(_cache)
 _app.command(ports, help_epilogue=_examples("ports", "ports --json"))
@@ -171,8 +205,12 @@ _app.command(
     ),
 )
 _cache.command(cache_list, name="list")
-_cache.command(
-    cache_history, name="history", usage="Usage: paramclient cache history [OPTIONS] VEHICLE [NAME]"
-)
+_cache.command(history, name="history", usage="Usage: paramclient cache history [OPTIONS] VEHICLE [NAME]")
 _cache.command(cache_path, name="path")
 _cache.command(cache_remove, name="remove")
+_fleet.command(
+    fleet_diff,
+    name="diff",
+    usage="Usage: paramclient fleet diff [OPTIONS] NAME...|FILE",
+    help_epilogue=_examples("fleet diff BAT1_N_CELLS 'COM_ARM_*'", "fleet diff quad.params --json"),
+)

@@ -1,14 +1,11 @@
-"""The commands that need no link: show, cache list, cache history, cache path, cache remove."""
+"""The commands that need no link: show, cache list, cache path, cache remove."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Any, Final
+from typing import Any, Final
 
-from cyclopts import Parameter
-from cyclopts.validators import Number
-
-from paramclient.cache import CachedComponent, CachedSummary, HistoryEntry, ParamCache
+from paramclient.cache import CachedComponent, CachedSummary, ParamCache
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import (
@@ -24,13 +21,14 @@ from paramclient.cli.output import (
     report,
     say,
     time_text,
-    value_json,
 )
+from paramclient.cli.sources import is_file, open_file, vehicle_key
+from paramclient.cli.written import show_file
 from paramclient.errors import CacheError
 from paramclient.identity import autopilot_name
-from paramclient.values import Param, check_name, format_value, type_name
+from paramclient.values import Param, format_value, type_name
 
-__all__ = ["cache_history", "cache_list", "cache_path", "cache_remove", "show"]
+__all__ = ["cache_list", "cache_path", "cache_remove", "show", "tables_of"]
 
 _DEFAULTS: Final = CacheOptions()
 
@@ -43,15 +41,18 @@ def show(
     changed: bool = False,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Print what was last known of a vehicle, with no link.
+    """Print what was last known of a vehicle, or what a parameter file holds, with no link.
 
     With --changed, exit code 1 says that the firmware's defaults are not known.
 
     Args:
-        vehicle: Its system id, the beginning of its hardware id, or its key in the cache.
+        vehicle: A parameter file; else a vehicle's system id, the beginning of its hardware id, its key in
+            the cache, or cache: and one of these.
         component: This component only.
         changed: Only what differs from the firmware's defaults.
     """
+    if vehicle is not None and is_file(vehicle):
+        return show_file(open_file(vehicle), component, changed=changed, json=options.json)
     with _open(options) as cache:
         summaries = _choose(cache, vehicle, component)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
@@ -84,33 +85,6 @@ def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     return ExitCode.DONE
 
 
-def cache_history(
-    vehicle: str,
-    name: str | None = None,
-    /,
-    *,
-    component: Id = None,
-    limit: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
-    options: CacheOptions = _DEFAULTS,
-) -> ExitCode:
-    """Print how the values of a vehicle have changed: when, from, to, and by whom. The newest comes last.
-
-    Args:
-        vehicle: Its system id, the beginning of its hardware id, or its key in the cache.
-        name: This parameter only.
-        component: This component only.
-        limit: The newest so many only.
-    """
-    with _open(options) as cache:
-        key = _key(cache, vehicle)
-        entries = cache.history(key, component, None if name is None else check_name(name), limit)
-    if options.json:
-        print_json({"history": [_entry_json(entry) for entry in entries]})
-    else:
-        print_table(["time", "component", "name", "old", "new", "by"], map(_entry_cells, entries))
-    return ExitCode.DONE
-
-
 def cache_path(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     """Print where the cache is kept."""
     with _open(options) as cache:
@@ -131,7 +105,7 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
     """
     with _open(options) as cache:
         _choose(cache, vehicle, component)
-        key = _key(cache, vehicle)
+        key = vehicle_key(cache, vehicle)
         removed = cache.remove(key, component)
     if options.json:
         print_json({"key": key, "removed": removed})
@@ -140,24 +114,18 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
     return ExitCode.DONE
 
 
-def _open(options: CacheOptions) -> ParamCache:
-    return ParamCache(options.cache)
-
-
-def _key(cache: ParamCache, vehicle: str) -> str:
-    """The key of the vehicle that the user means.
+def tables_of(options: CacheOptions, vehicle: str, component: int | None) -> list[CachedComponent]:
+    """The cached tables of a vehicle, or that of one of its components.
 
     Raises:
-        CacheError: none fits, or more than one.
+        CacheError: there is none, more than one vehicle fits, or the cache cannot be read.
     """
-    if vehicle.isdecimal():
-        fits = [known for known in cache.vehicles() if str(known.identity.system) == vehicle]
-        if len(fits) > 1:
-            listed = "; ".join(map(str, fits))
-            raise CacheError(f"system {vehicle} fits more than one vehicle in the cache: {listed}")
-        if fits:
-            return fits[0].key
-    return cache.components(vehicle)[0].key
+    with _open(options) as cache:
+        return _load(cache, _choose(cache, vehicle, component))
+
+
+def _open(options: CacheOptions) -> ParamCache:
+    return ParamCache(options.cache)
 
 
 def _choose(cache: ParamCache, vehicle: str | None, component: int | None) -> list[CachedSummary]:
@@ -166,7 +134,7 @@ def _choose(cache: ParamCache, vehicle: str | None, component: int | None) -> li
     Raises:
         CacheError: a vehicle was named and there is none such, or more than one; or it has no such component.
     """
-    summaries = cache.components(None if vehicle is None else _key(cache, vehicle))
+    summaries = cache.components(None if vehicle is None else vehicle_key(cache, vehicle))
     chosen = [each for each in summaries if component in (None, each.component)]
     if not chosen and (summaries or vehicle is not None):
         known = ", ".join(f"{each.system}/{each.component}" for each in summaries)
@@ -209,23 +177,6 @@ def _summary_json(summary: CachedSummary) -> dict[str, Any]:
         "synced_at": _time(summary.synced_at),
         "updated_at": _time(summary.updated_at),
     }
-
-
-def _entry_json(entry: HistoryEntry) -> dict[str, Any]:
-    new = entry.new
-    return {
-        "time": time_text(entry.at),
-        "component": entry.component,
-        "name": entry.name,
-        "old": value_json(entry.old.value, entry.old.type),
-        "new": None if new is None else value_json(new.value, new.type),
-        "by": entry.by,
-    }
-
-
-def _entry_cells(entry: HistoryEntry) -> tuple[object, ...]:
-    new = None if entry.new is None else _value(entry.new)
-    return time_text(entry.at), entry.component, entry.name, _value(entry.old), new, entry.by
 
 
 def _print_summaries(summaries: Sequence[CachedSummary]) -> None:

@@ -79,8 +79,11 @@ class Misfortunes:
     reboot_at: int | None = None
     """After how many values of a list it starts anew, once. Without it, never."""
 
-    reboot_down: float = 0.0
-    """Seconds for which it is off then."""
+    reboot_down: float = 1.0
+    """Seconds for which it is off then, and when it was told to start again."""
+
+    armed: bool = False
+    """Say that it is armed: then it does not start again when it is told to."""
 
     high_latency: bool = False
     """Speak as on a satellite link: HIGH_LATENCY2 every 5 s, and no list."""
@@ -97,6 +100,8 @@ class Misfortunes:
             "list_stops": self.list_stops,
             "boot_time": self.boot_time,
             "high_latency": self.high_latency,
+            "armed": self.armed,
+            "reboot_down": self.reboot_down,
         }
 
     def befall(self, vehicle: Vehicle) -> list[OtherStation]:

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Unpack
+from typing import Final, Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.protocol import wire
 from paramclient.sim.ftp import FileServer
 from paramclient.sim.generic import BytewiseVehicle
-from paramclient.sim.table import Entry, SimParam, Table, as_table, px4_table
+from paramclient.sim.table import Entry, SimParam, Table, as_table, px4_table, with_system_id
 from paramclient.sim.vehicle import VehicleOptions
 from paramclient.values import Encoding, ParamType, px4_hash
 
 __all__ = ["PX4Vehicle"]
+
+RESET_KEEPS: Final = (
+    *("SYS_AUTOSTART", "SYS_PARAM_VER", "RC", "CAL_", "COM_FLTMODE", "LND_FLIGHT", "TC_", "COM_FLIGHT"),
+)
+"""How the names begin that SYS_AUTOCONFIG leaves alone (the start script `rcS` of PX4 1.16)."""
 
 
 class PX4Vehicle(BytewiseVehicle):
@@ -32,9 +37,14 @@ class PX4Vehicle(BytewiseVehicle):
       nor in the hash.
     - MAVFTP serves `files` and, if `ftp` is on as in the newest ones, `@PARAM/param.pck` (see `FileServer`).
     - It answers to its own system only, and to component 0.
+    - Told to start again it acknowledges, and goes off 0.4 s later; armed it denies that. With the start,
+      MAV_SYS_ID takes effect, and SYS_AUTOCONFIG above 0 has brought what it resets (see `RESET_KEEPS`) to
+      the values of the table, MAV_SYS_ID to 1. Values that it has not saved are not lost, as they may be with
+      a real one.
 
     Args:
         table: its parameters (see `Table`), in any order; None for those of a real quad, `px4_table()`.
+            MAV_SYS_ID, where it is among them, says `system`.
         system, component: its own ids, 1 to 255.
         uid: the hardware id that it reports; by default its own for every system.
         hash_check: whether it has `_HASH_CHECK` at all; the parameter MAV_HASH_CHK_EN at 0 also turns it off.
@@ -55,6 +65,7 @@ class PX4Vehicle(BytewiseVehicle):
     """
 
     _ack_first = False
+    _restart_delay = 0.4
     _push_at: float
     _save_at: float
 
@@ -76,7 +87,7 @@ class PX4Vehicle(BytewiseVehicle):
         ftp_rate: float = 48_500.0,
         **options: Unpack[VehicleOptions],
     ) -> None:
-        rows = px4_table() if table is None else as_table(table)
+        rows = with_system_id(px4_table() if table is None else as_table(table), _SYSTEM_ID, system)
         if table is None and late_use is None:
             compass = _third_compass(rows)
             late_use = {"CAL_MAG2_ID": [row.name for row in compass]}
@@ -96,6 +107,7 @@ class PX4Vehicle(BytewiseVehicle):
             numbers_sessions=True,
             burst_blocks=_BURST_BLOCKS,
         )
+        self._first_bits = {row.name: row.bits for row in rows}
         self._hash: int | None = None
         self._hash_check = hash_check
         self._autosave = autosave
@@ -180,6 +192,23 @@ class PX4Vehicle(BytewiseVehicle):
         super()._relist()
         self._hash = None
 
+    def _may_restart(self, mode: int) -> int:
+        if mode == 0:
+            return wire.MAV_RESULT_ACCEPTED  # and nothing happens
+        return super()._may_restart(mode) if mode == 1 else wire.MAV_RESULT_DENIED
+
+    def _end_all(self) -> None:
+        super()._end_all()
+        autoconfig = self._find("SYS_AUTOCONFIG")
+        if autoconfig is not None and autoconfig.bits != 0:
+            for entry in self._entries:
+                if not entry.name.startswith(RESET_KEEPS):
+                    entry.store(self._first_bits[entry.name])
+            autoconfig.store(0)
+            if (system := self._find(_SYSTEM_ID)) is not None:
+                system.store(1)
+        self._take_system_id(self._find(_SYSTEM_ID))
+
     def _switch_on(self, at: float) -> None:
         self._unused = set(self._first_unused)
         self._unsaved = set(self._first_unsaved)
@@ -229,6 +258,7 @@ class PX4Vehicle(BytewiseVehicle):
             )
 
 
+_SYSTEM_ID = "MAV_SYS_ID"
 _QUADROTOR = 2
 _RELEASE = 17891392  # 1.17.0
 _MAIN = 0x01120000  # 1.18
