@@ -26,7 +26,9 @@ from paramclient.errors import (
     FileError,
     FileErrorCode,
     FileTransferError,
+    InvalidParameters,
     LinkError,
+    MetadataError,
     NoReply,
     PackError,
     ParamClientError,
@@ -36,6 +38,7 @@ from paramclient.errors import (
     UnknownParameter,
     UsageError,
     ValueNotApplied,
+    VehicleArmed,
     VehicleError,
 )
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
@@ -50,7 +53,9 @@ from paramclient.protocol.sampling import Sample
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
 from paramclient.protocol.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport
+from paramclient.protocol.wire import Refusal, SigningKey, SigningPolicy, SigningReport, SigningStream
 from paramclient.protocol.writes import SetResult
+from paramclient.signing import Signing, key_from_environment, read_key
 from paramclient.values import Encoding, Param, ParamType, Trust
 from paramclient.version import __version__
 
@@ -85,9 +90,11 @@ __all__ = [
     "HistoryEntry",
     "Holder",
     "Identity",
+    "InvalidParameters",
     "LinkError",
     "Lost",
     "MessageTraffic",
+    "MetadataError",
     "NameSpread",
     "NoReply",
     "PackError",
@@ -104,10 +111,16 @@ __all__ = [
     "Progress",
     "Rebooted",
     "RadioStatus",
+    "Refusal",
     "Refused",
     "Resynced",
     "Sample",
     "SetResult",
+    "Signing",
+    "SigningKey",
+    "SigningPolicy",
+    "SigningReport",
+    "SigningStream",
     "Snapshot",
     "SnapshotSummary",
     "SyncState",
@@ -117,9 +130,12 @@ __all__ = [
     "UnknownParameter",
     "UsageError",
     "ValueNotApplied",
+    "VehicleArmed",
     "VehicleError",
     "WrittenParam",
     "__version__",
+    "key_from_environment",
+    "read_key",
     "read_file",
     "write_file",
 ]

@@ -12,7 +12,9 @@ from paramclient.errors import (
     FileError,
     FileErrorCode,
     FileTransferError,
+    InvalidParameters,
     LinkError,
+    MetadataError,
     NoReply,
     PackError,
     ParamClientError,
@@ -22,6 +24,7 @@ from paramclient.errors import (
     UnknownParameter,
     UsageError,
     ValueNotApplied,
+    VehicleArmed,
     VehicleError,
 )
 
@@ -30,6 +33,7 @@ from paramclient.errors import (
     ("kind", "base"),
     [
         (UsageError, ValueError),
+        (MetadataError, UsageError),
         (FileError, UsageError),
         (UnknownParameter, VehicleError),
         (Refused, VehicleError),
@@ -39,6 +43,8 @@ from paramclient.errors import (
         (NoReply, TimeoutError),
         (LinkError, OSError),
         (ClientClosed, LinkError),
+        (InvalidParameters, UsageError),
+        (VehicleArmed, VehicleError),
         (PackError, ParamClientError),
         (CacheError, ParamClientError),
     ],

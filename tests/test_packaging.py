@@ -50,7 +50,8 @@ def metadata(wheel: dict[str, bytes]) -> Message:
 
 def test_the_wheel_has_the_package_and_nothing_else(wheel: dict[str, bytes]) -> None:
     shipped = {name for name in wheel if ".dist-info/" not in name}
-    assert shipped == SOURCES | TABLES | {"paramclient/py.typed", PLUGIN}
+    data = {"paramclient/py.typed", "paramclient/provision/cautions.toml"}
+    assert shipped == SOURCES | TABLES | data | {PLUGIN}
     assert len(TABLES) >= 3
 
 

@@ -2,15 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Any, Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
+from paramclient.cli.metadata import (
+    DESCRIBED_COLUMNS,
+    MetadataChoice,
+    described_cells,
+    described_json,
+    from_file,
+    known_of_table,
+    print_descriptions,
+)
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import (
     NO_DEFAULTS,
-    as_json,
     by_index,
     default_text,
     hash_text,
@@ -24,9 +33,10 @@ from paramclient.cli.output import (
 )
 from paramclient.cli.sources import is_file, open_file, vehicle_key
 from paramclient.cli.written import show_file
-from paramclient.errors import CacheError
+from paramclient.errors import CacheError, UsageError
 from paramclient.identity import autopilot_name
-from paramclient.values import Param, format_value, type_name
+from paramclient.metadata import Metadata
+from paramclient.values import Param, check_name, format_value, type_name
 
 __all__ = ["cache_list", "cache_path", "cache_remove", "show", "tables_of"]
 
@@ -36,9 +46,10 @@ _DEFAULTS: Final = CacheOptions()
 def show(
     vehicle: str | None = None,
     /,
-    *,
+    *names: str,
     component: Id = None,
     changed: bool = False,
+    metadata: MetadataChoice = None,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
     """Print what was last known of a vehicle, or what a parameter file holds, with no link.
@@ -50,22 +61,31 @@ def show(
             the cache, or cache: and one of these.
         component: This component only.
         changed: Only what differs from the firmware's defaults.
+        names: These parameters of a vehicle only, with what is known of them.
+        metadata: A file that describes parameters. Without it, what is kept of the vehicle's firmware.
     """
     if vehicle is not None and is_file(vehicle):
+        if names or metadata is not None:
+            raise UsageError("names and --metadata go with a vehicle in the cache, not with a parameter file")
         return show_file(open_file(vehicle), component, changed=changed, json=options.json)
+    wanted = tuple(check_name(name) for name in dict.fromkeys(names))
+    described = from_file(metadata, offline=True)
     with _open(options) as cache:
         summaries = _choose(cache, vehicle, component)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
         tables = [] if is_list else _load(cache, summaries)
+    views = [_View.of(table, wanted, described, cache, changed=changed) for table in tables]
+    if unknown := [name for name in wanted if not any(name in table.params for table in tables)]:
+        raise CacheError(f"not among the cached parameters: {', '.join(unknown)}")
     if options.json:
-        print_json({"components": [_table_json(table, changed=changed) for table in tables]})
+        print_json({"components": [_table_json(view) for view in views]})
     elif is_list:
         _print_summaries(summaries)
         say("paramclient show VEHICLE shows one of them: by its system id, or the beginning of its key")
     elif not summaries:
         say(f"the cache {printable(str(cache.path))} is empty")
-    for table in [] if options.json else tables:
-        _print_table(table, changed=changed)
+    for view in [] if options.json else views:
+        _print_table(view)
     if changed and tables and not any(_has_defaults(table) for table in tables):
         report(NO_DEFAULTS)
         return ExitCode.INCOMPLETE
@@ -151,7 +171,43 @@ def _has_defaults(table: CachedComponent) -> bool:
     return any(param.default is not None for param in table.params.values())
 
 
-def _table_json(table: CachedComponent, *, changed: bool) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class _View:
+    """What is to be shown of a table.
+
+    Attributes:
+        table: the table.
+        names: the parameters that were named, or none for all.
+        metadata: what is known of them, or None.
+        changed: only what differs from the defaults.
+    """
+
+    table: CachedComponent
+    names: tuple[str, ...]
+    metadata: Metadata | None
+    changed: bool
+
+    @classmethod
+    def of(
+        cls,
+        table: CachedComponent,
+        names: tuple[str, ...],
+        metadata: Metadata | None,
+        cache: ParamCache,
+        *,
+        changed: bool,
+    ) -> _View:
+        known = known_of_table(cache.path, table) if metadata is None else metadata
+        return cls(table, tuple(name for name in names if name in table.params), known, changed)
+
+    @property
+    def params(self) -> Iterable[Param]:
+        params = self.table.params.changed() if self.changed else self.table.params
+        return [params[name] for name in self.names if name in params] if self.names else params.values()
+
+
+def _table_json(view: _View) -> dict[str, Any]:
+    table = view.table
     return {
         "system": table.system,
         "component": table.component,
@@ -159,7 +215,7 @@ def _table_json(table: CachedComponent, *, changed: bool) -> dict[str, Any]:
         "uid": table.identity.uid,
         "hash": hash_text(table.hash),
         "synced_at": _time(table.synced_at),
-        "params": as_json((table.params.changed() if changed else table.params).values()),
+        "params": described_json(view.params, view.metadata, whole=bool(view.names)),
     }
 
 
@@ -194,19 +250,27 @@ def _print_summaries(summaries: Sequence[CachedSummary]) -> None:
     print_table(["component", "autopilot", "params", "hash", "synced", "key"], rows, right="params")
 
 
-def _print_table(table: CachedComponent, *, changed: bool) -> None:
+def _print_table(view: _View) -> None:
+    table, changed, metadata = view.table, view.changed, view.metadata
     if changed and not _has_defaults(table):
         return
-    params = by_index((table.params.changed() if changed else table.params).values())
+    params = by_index(view.params)
     rows = (
         (
             *(param.name, _value(param), *([default_text(param)] if changed else [])),
             *(type_name(param.type), param.index, time_text(table.heard_at[param.name])),
+            *(() if metadata is None else described_cells(metadata, param)),
         )
         for param in params
     )
     default = ["default"] if changed else []
-    print_table(["name", "value", *default, "type", "index", "heard"], rows, right="value default index")
+    more = [] if metadata is None else DESCRIBED_COLUMNS
+    columns = ["name", "value", *default, "type", "index", "heard", *more]
+    print_table(columns, rows, right="value default index")
+    if metadata is not None:
+        print_descriptions(view.names, metadata)
+    if view.names:
+        return
     synced = "never complete" if table.synced_at is None else f"synced {time_text(table.synced_at)}"
     crc = "" if table.hash is None else f"; hash {hash_text(table.hash)}"
     who = f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"

@@ -23,6 +23,7 @@ from paramclient.protocol.wire import (
     NO_INDEX,
     AutopilotVersion,
     CommandAck,
+    ComponentMetadata,
     FileTransfer,
     Heartbeat,
     HighLatency2,
@@ -65,6 +66,7 @@ class ComponentMachine(Parts):
         presence: whether it is there.
         sync: whether the table is still the vehicle's.
         files: its files.
+        descriptions: where it says that what it has to say of itself lies.
         commands: what it is told to do.
         restart: the restart that it was told to make and that is under way, or None.
         fetches: what was and is being fetched.
@@ -95,6 +97,7 @@ class ComponentMachine(Parts):
                 self.reads.refused(message, now)
         elif isinstance(message, CommandAck):
             self.who.acknowledged(message, now)
+            self.descriptions.acknowledged(message, now)
             self.commands.acknowledged(message, now)
         elif isinstance(message, StatusText):
             denied = _WRITE_DENIED.search(message.text)
@@ -105,6 +108,8 @@ class ComponentMachine(Parts):
                 self._rebooted(now)
         elif isinstance(message, FileTransfer):
             self.files.heard(message, now)
+        elif isinstance(message, ComponentMetadata):
+            self.descriptions.heard(message, now)
         elif isinstance(message, HighLatency2):
             self.who.heartbeat(message)
             self.presence.high_latency()
@@ -300,6 +305,7 @@ class ComponentMachine(Parts):
         if self.fetch is not None:
             self.fetch.tick(now)
         self.who.tick(now)
+        self.descriptions.tick(now)
         self._follow_identity(now)
         self.sync.tick(now)
         for name in self._authors.doubted(now):
@@ -316,6 +322,7 @@ class ComponentMachine(Parts):
             math.inf if self.restart is None else self.restart.next_deadline(),
             math.inf if self.fetch is None else self.fetch.next_deadline(),
             self.who.next_deadline(),
+            self.descriptions.next_deadline(),
             self.sync.next_deadline(),
             self.presence.lost_at(),
             self._authors.next_deadline(),
@@ -332,6 +339,7 @@ class ComponentMachine(Parts):
         self.reads.resume(now)
         self.writes.resume(now)
         self.files.resume(now)
+        self.descriptions.resume(now)
         self.commands.resume(now)
         if self.fetch is not None:
             self.fetch.resume(now)
@@ -344,6 +352,7 @@ class ComponentMachine(Parts):
         if self.sync.refresh is not None:
             self.sync.refresh.fail(error, now)
         self.files.fail_all(error, now)
+        self.descriptions.fail_all(error, now)
         if self.restart is not None:
             self.restart.fail(error, now)
         self.commands.fail_all(error, now)
@@ -398,6 +407,7 @@ class ComponentMachine(Parts):
         self.writes.lose(now)
         self.reads.lose(now)
         self.files.lose(now)
+        self.descriptions.lose(now)
         self.commands.lose(now)
         self._doubt()
 

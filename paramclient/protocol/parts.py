@@ -9,6 +9,7 @@ from collections.abc import Callable
 from paramclient.identity import Identity
 from paramclient.protocol.authors import Authors
 from paramclient.protocol.commands import Commands
+from paramclient.protocol.descriptions import Descriptions
 from paramclient.protocol.events import Event
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.fetches import Fetches
@@ -85,6 +86,9 @@ class Parts(ABC):
             begin_fetch=lambda now, refresh: self.begin_fetch(now, refresh=refresh),
             end_fetch=self.end_fetch,
             resynced=self._resynced,
+        )
+        self.descriptions = Descriptions(
+            target, own, self.round_trip, send, is_identifying=lambda: self.who.is_asking
         )
         self.commands = Commands(target, own, self.round_trip, send)
         self.restart: Restart | None = None
@@ -179,6 +183,7 @@ class Parts(ABC):
         """Whether anything is awaited: an answer, a fetch, a file, or who it is."""
         is_asked = len(self.reads) > 0 or len(self.writes) > 0 or not self.files.is_idle
         is_asked = is_asked or len(self.commands) > 0 or self.restart is not None
+        is_asked = is_asked or self.descriptions.is_asking
         return is_asked or self.fetch is not None or self.who.is_asking
 
     @property

@@ -10,9 +10,10 @@ from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.protocol import wire
 from paramclient.sim.ftp import FileServer
 from paramclient.sim.generic import BytewiseVehicle
+from paramclient.sim.metadata import GENERAL_FILE, metadata_files
 from paramclient.sim.table import Entry, SimParam, Table, as_table, px4_table, with_system_id
 from paramclient.sim.vehicle import VehicleOptions
-from paramclient.values import Encoding, ParamType, px4_hash
+from paramclient.values import Encoding, ParamType, crc32_px4, px4_hash
 
 __all__ = ["PX4Vehicle"]
 
@@ -35,6 +36,8 @@ class PX4Vehicle(BytewiseVehicle):
     - A wrong type, an unknown name and an unknown index are met with silence.
     - A parameter that is not in use can be read and set by name (index 65535) and is neither in the list
       nor in the hash.
+    - With `metadata`, COMPONENT_METADATA names a general file among `files`, and that one with descriptions
+      of the parameters.
     - MAVFTP serves `files` and, if `ftp` is on as in the newest ones, `@PARAM/param.pck` (see `FileServer`).
     - It answers to its own system only, and to component 0.
     - Told to start again it acknowledges, and goes off 0.4 s later; armed it denies that. With the start,
@@ -58,6 +61,7 @@ class PX4Vehicle(BytewiseVehicle):
             every 0.125 s.
         ftp: whether there is a param.pck, as after 1.17; otherwise it is said not to be found.
         ftp_rate: bytes per second of a burst of MAVFTP.
+        metadata: whether it describes its parameters, as those with enough memory do.
         options: those of every `Vehicle`. A list that is asked for within its `boot_time` starts then.
 
     Raises:
@@ -85,6 +89,7 @@ class PX4Vehicle(BytewiseVehicle):
         period: float = 0.020,
         ftp: bool = False,
         ftp_rate: float = 48_500.0,
+        metadata: bool = False,
         **options: Unpack[VehicleOptions],
     ) -> None:
         rows = with_system_id(px4_table() if table is None else as_table(table), _SYSTEM_ID, system)
@@ -107,6 +112,11 @@ class PX4Vehicle(BytewiseVehicle):
             numbers_sessions=True,
             burst_blocks=_BURST_BLOCKS,
         )
+        self._has_metadata = metadata
+        if metadata:
+            if options.get("mavlink_version") == 1:
+                raise UsageError("COMPONENT_METADATA does not exist in MAVLink 1")
+            self._ftp.files |= metadata_files(rows)
         self._first_bits = {row.name: row.bits for row in rows}
         self._hash: int | None = None
         self._hash_check = hash_check
@@ -161,6 +171,17 @@ class PX4Vehicle(BytewiseVehicle):
     def _on_list(self) -> None:
         self._hash_next = self._position is None and self.announced_hash() is not None
         self._start_list(self._now)
+
+    def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
+        general = self.files.get(GENERAL_FILE) if self._has_metadata else None
+        is_message = request.command == wire.MAV_CMD_REQUEST_MESSAGE
+        if general is None or not is_message or request.params[0] != wire.COMPONENT_METADATA_ID:
+            super()._on_command(request, sender)
+            return
+        self._send(wire.ComponentMetadata(f"mftp://{GENERAL_FILE}", crc32_px4(general)))
+        self._send(
+            wire.CommandAck(request.command, wire.MAV_RESULT_ACCEPTED, sender.system, sender.component)
+        )
 
     def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
         if request.param_index < 0 and request.param_id == wire.HASH_CHECK:
