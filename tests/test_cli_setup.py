@@ -254,6 +254,10 @@ def test_armed_vehicles_are_left_alone(
     assert (outcome.code, outcome.out) == (1, "")
     assert "armed" in outcome.err
     assert vehicle.requests["PARAM_SET"] == 0
+    would = command("apply", put(vehicle), file(), "--dry-run")
+    assert would.code == 1
+    assert "1/1 ardupilot is armed" in would.err
+    assert command("apply", put(vehicle), file(), "--dry-run", "--allow-armed").code == 0
     assert command("apply", put(vehicle), file(), "--allow-armed").code == 0
 
 
@@ -305,6 +309,7 @@ def test_somebody_at_a_terminal_is_asked(
         assert "go on? [y/N]" in outcome.err
         assert ["1", "RTL_ALT", "1500", "2500", "set", "the others"] in outcome.rows
         assert vehicle.requests["PARAM_SET"] == sets
+        assert "go on?" not in command("apply", put(copter()), file(), "--json").err
         assert "go on?" not in command("apply", put(vehicle), file(), "--yes").err
         assert "go on?" not in command("apply", put(vehicle), file()).err, "there is nothing to ask about"
 
@@ -581,7 +586,7 @@ def test_whoever_ends_it_learns_what_was_set(
     else:
         assert 0 < len(outcome.rows) - 1 <= done
         assert outcome.rows[1][4:] == ["unproven", "acknowledged, and not read back"]
-        assert re.search(r"interrupted: \d+ values sent so far, not proven; run it again", outcome.err)
+        assert re.search(r"interrupted: \d+ values? acknowledged, not proven, .*; run it again", outcome.err)
     again = command("apply", put(vehicle), wanted)
     assert again.code == 0
     assert set(vehicle.values.values()) == {2}
@@ -604,3 +609,26 @@ def test_a_vehicle_that_falls_silent_is_told_with_what_was_set(
     assert outcome.json["error"]
     assert outcome.json["counts"]["unproven"] + outcome.json["counts"]["failed"] > 0
     assert "run it again" in command("apply", put(Dying(dict.fromkeys(names, 1))), wanted).err
+
+
+# what firmwares say of their parameters
+
+
+def test_metadata_says_what_is_out_of_range_and_what_needs_a_start(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    vehicle = copter()
+    described = [
+        {"name": "RTL_ALT", "type": "Int32", "min": 30, "max": 2000},
+        {"name": "WPNAV_SPEED", "type": "Float", "rebootRequired": True},
+    ]
+    metadata = file(json.dumps({"version": 1, "parameters": described}), "parameters.json")
+    outcome = command("apply", put(vehicle), file(), "--metadata", metadata)
+    assert outcome.code == 2
+    assert "RTL_ALT: 2500 is above its maximum, 2000" in outcome.err
+    assert vehicle.requests["PARAM_SET"] == 0
+    options = ("--metadata", metadata, "--include", "out-of-range")
+    outcome = command("apply", put(vehicle), file(), *options)
+    assert outcome.code == 0
+    assert "counts only from the next start of the vehicle on: WPNAV_SPEED" in outcome.err
+    assert command("verify", put(vehicle), file(), "--metadata", metadata).code == 0

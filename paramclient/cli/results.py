@@ -81,9 +81,11 @@ def show_interrupted(rows: Mapping[Vehicle, Sequence[ApplyRow]]) -> None:
         ["name", "before", "wanted", "now", "status", "reason"],
         {vehicle: map(_applied_cells, each) for vehicle, each in rows.items()},
     )
-    sent = sum(map(len, rows.values()))
-    so_far = f"{_number(sent, 'value')} sent so far, not proven" if sent else "nothing was sent"
-    say(f"interrupted: {so_far}; run it again to go on from what the vehicle has")
+    taken = sum(row.status is ApplyStatus.UNPROVEN for each in rows.values() for row in each)
+    say(
+        f"interrupted: {_number(taken, 'value')} acknowledged, not proven, and others may be on their way; "
+        "run it again to go on from what the vehicle has"
+    )
 
 
 def applied_code(result: ApplyResult) -> ExitCode:

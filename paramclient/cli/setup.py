@@ -67,6 +67,9 @@ Count: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=2
 Result = TypeVar("Result")
 Found = TypeVar("Found")
 
+RATE_AFTER: Final = 0.5
+"""Seconds of writing after which it is worth telling how fast it goes."""
+
 _OPTIONS: Final = LinkOptions()
 
 
@@ -130,8 +133,9 @@ async def apply(
             return show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors)
 
         if dry_run:
-            return show.planned(*await plans(), reboot=reboot, skip_invalid=skip_invalid)
-        if not yes and _is_asked() and not await _agrees(*await plans(), reboot=reboot, full=full):
+            code = show.planned(*await plans(), reboot=reboot, skip_invalid=skip_invalid)
+            return max(code, _armed(found, allow_armed=allow_armed))
+        if not yes and _is_asked(options) and not await _agrees(*await plans(), reboot=reboot, full=full):
             return ExitCode.INCOMPLETE
         if options.no_cache and backup is None and not url.startswith("sim:"):
             say("what the vehicle has before is kept nowhere: --no-cache, and no --backup")
@@ -238,8 +242,9 @@ async def restore(
             return show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors)
 
         if dry_run:
-            return show.planned(*await plans(), reboot=reboot, skip_invalid=True)
-        if not yes and _is_asked() and not await _agrees(*await plans(), reboot=reboot, full=full):
+            code = show.planned(*await plans(), reboot=reboot, skip_invalid=True)
+            return max(code, _armed(found, allow_armed=allow_armed))
+        if not yes and _is_asked(options) and not await _agrees(*await plans(), reboot=reboot, full=full):
             return ExitCode.INCOMPLETE
         with show.ended_by_somebody(f"restoring {_title(found)}") as tell:
             result = await restore_to(
@@ -313,9 +318,17 @@ async def _within(found: Targets, work: Awaitable[Result]) -> Result:
     raise NoReply(f"the parameters of {_title(found)}", attempts=0, waited=left or 0.0)
 
 
-def _is_asked() -> bool:
+def _armed(found: Targets, *, allow_armed: bool) -> ExitCode:
+    """Tell of vehicles on which nothing would be set for now."""
+    armed = [] if allow_armed else [each for each in found.vehicles if each.is_armed]
+    for vehicle in armed:
+        report(f"{who(vehicle)} is armed; nothing would be set now without --allow-armed")
+    return ExitCode.INCOMPLETE if armed else ExitCode.DONE
+
+
+def _is_asked(options: LinkOptions) -> bool:
     """Whether there is somebody to ask."""
-    return sys.stdin.isatty() and sys.stderr.isatty()
+    return not options.json and sys.stdin.isatty() and sys.stderr.isatty()
 
 
 async def _agrees(
@@ -327,7 +340,8 @@ async def _agrees(
     if not any(plan.steps or (reboot and plan.unstarted) for plan in plans.values()):
         return True
     show_planned(plans, reboot=reboot, full=full)
-    print("go on? [y/N] ", end="", file=sys.stderr, flush=True)  # noqa: T201  # a question has no end of line
+    sys.stderr.write("go on? [y/N] ")
+    sys.stderr.flush()
     await anyio.wait_readable(sys.stdin)  # a thread that reads could not be ended by Ctrl-C
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
@@ -388,18 +402,21 @@ class _Show:
         """What is to be told how far it is; it draws that, and tells what became of it on Ctrl-C."""
         rows: dict[Vehicle, dict[str, ApplyRow]] = {}
         steps: dict[Vehicle, tuple[int, int]] = {}
-        began = anyio.current_time()
+        began = 0.0
         try:
             with progress_bar(title) as draw:
 
                 def tell(component: Component, how_far: ApplyProgress) -> None:
+                    nonlocal began
                     vehicle = self._vehicles[component.system, component.component]
                     steps[vehicle] = (how_far.done, how_far.total)
                     if how_far.row is not None:
                         rows.setdefault(vehicle, {})[how_far.row.name] = _so_far(how_far.row)
-                    if draw is not None:
+                        began = began or anyio.current_time()
+                    if draw is not None and began:
                         done, total = (sum(numbers) for numbers in zip(*steps.values(), strict=True))
-                        rate = done / max(anyio.current_time() - began, 1e-3)
+                        seconds = anyio.current_time() - began
+                        rate = done / seconds if seconds > RATE_AFTER else 0.0
                         draw(Progress(done, total, rate, (total - done) / rate if rate else None))
 
                 yield tell
