@@ -53,8 +53,6 @@ RESET_SYSTEM: Final = 1
 """The system id that a PX4 has after SYS_AUTOCONFIG: MAV_SYS_ID is not among what its start script keeps."""
 FOLLOW_PATIENCE: Final = 10.0
 """Seconds for a vehicle to be heard under its new system id; ArduPilot sends its next heartbeat under it."""
-REASON: Final = "before apply"
-"""What a snapshot of the state before says it is for."""
 
 
 class Run:
@@ -84,6 +82,7 @@ class Run:
         skip_invalid: bool,
         backup: str | os.PathLike[str] | None,
         progress: Callable[[ApplyProgress], None] | None,
+        reason: str,
     ) -> None:
         self._component = component
         self._planned_for: Identity | None = None
@@ -99,6 +98,7 @@ class Run:
         self._skip_invalid = skip_invalid
         self._backup = backup
         self._progress = progress
+        self._reason = reason
         self._cautions = cautions_for("")
         self._began = anyio.current_time()
         self.rows: dict[str, ApplyRow] = {}
@@ -373,7 +373,7 @@ class Run:
                     component.identity,
                     component.component,
                     seen.table,
-                    reason=REASON,
+                    reason=self._reason,
                     hash=seen.hash,
                     complete=seen.complete,
                 )
