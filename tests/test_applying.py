@@ -1022,3 +1022,20 @@ def test_wherever_it_ends_the_next_one_brings_exactly_what_is_wanted(
                 assert all(old != new for old, new in steps)
 
     told()
+
+
+@EVERY_KIND
+@swiftly
+async def test_a_file_of_another_autopilot_is_refused_before_the_vehicle_is_asked(
+    make: Callable[[], Any],
+) -> None:
+    tap = Tap(make())
+    other = written(another(), identity=Identity(1, "sim:", autopilot=12 if make is ardupilot else 3))
+    async with a_client(tap) as client:
+        component = await client.component()
+        for call in (prepare, verify, apply):
+            with pytest.raises(UsageError, match="are those of a vehicle with"):
+                await call(component, other)
+    assert not {wire.ParamSet, wire.ParamRequestRead, wire.ParamRequestList} & {
+        type(message) for _, _, message in tap.heard
+    }

@@ -397,6 +397,18 @@ def test_a_file_of_another_component_is_none_of_this_one() -> None:
         overlay(camera, autopilot)
 
 
+def test_a_file_of_another_autopilot_is_none_of_this_one() -> None:
+    for own, other, number in (("px4", "ardupilot", 3), ("ardupilot", "px4", 12)):
+        wanted = ParamSet(
+            {"A": WrittenParam("A", 2)}, identity=Identity(1, "sim:", autopilot=number), source="f"
+        )
+        with pytest.raises(UsageError, match=f"of f are those of a vehicle with {other}, not with {own}"):
+            plan(held(A=1), wanted, autopilot=own)
+        assert plan(held(A=1), wanted, autopilot=other).steps
+        assert plan(held(A=1), wanted, autopilot="generic").steps
+        assert plan(held(A=1), wanted).steps
+
+
 def test_one_set_lies_over_another() -> None:
     base = ParamSet({name: WrittenParam(name, 1) for name in "ABC"}, component=1, source="base")
     over = ParamSet({"B": WrittenParam("B", 2), "D": WrittenParam("D", 3)}, system=7, source="over")

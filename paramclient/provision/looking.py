@@ -119,7 +119,8 @@ async def prepare(
     """
     check_component(wanted, component.component)
     given = (include,) if isinstance(include, str) else tuple(include)
-    plan({}, wanted, include=given)  # what cannot be right is told before the vehicle is asked
+    # what cannot be right is told before the vehicle is asked
+    plan({}, wanted, include=given, autopilot=component.autopilot)
     await identified(component)
     seen = await look(component, wanted)
     return plan_for(component, seen.table, wanted, given, info)

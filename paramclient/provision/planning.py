@@ -246,7 +246,8 @@ def plan(
         encoding: how values are sent; None: as the autopilot does.
 
     Raises:
-        UsageError: `include` names no category and is no glob, or the two are of different components.
+        UsageError: `include` names no category and is no glob, or the two are of different components or
+            autopilots.
     """
     identity = None
     if isinstance(current, ParamSet):
@@ -254,6 +255,7 @@ def plan(
         if autopilot is None and identity is not None:
             autopilot = autopilot_name(identity.autopilot)
         check_component(wanted, current.component)
+    _check_autopilot(wanted, autopilot)
     given = (include,) if isinstance(include, str) else tuple(include)
     if encoding is None:
         encoding = Encoding.C_CAST if autopilot == "ardupilot" else Encoding.BYTEWISE
@@ -293,6 +295,22 @@ def check_component(wanted: ParamSet, component: int | None) -> None:
         raise UsageError(
             f"the parameters{f' of {wanted.source}' if wanted.source else ''} are those of component "
             f"{wanted.component}, not of component {component}"
+        )
+
+
+def _check_autopilot(wanted: ParamSet, autopilot: str | None) -> None:
+    """See that parameters are not those of another autopilot: many share a name, and mean something else.
+
+    Raises:
+        UsageError: they say that they are.
+    """
+    if wanted.identity is None:
+        return
+    meant = autopilot_name(wanted.identity.autopilot)
+    if {meant, autopilot} == {"px4", "ardupilot"}:
+        raise UsageError(
+            f"the parameters{f' of {wanted.source}' if wanted.source else ''} are those of a vehicle with "
+            f"{meant}, not with {autopilot}"
         )
 
 

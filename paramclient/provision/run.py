@@ -116,7 +116,7 @@ class Run:
     async def prepare(self) -> None:
         """Look at the vehicle, plan, and store what it has. Nothing is written if that fails."""
         check_component(self._wanted, self._component.component)
-        plan({}, self._wanted, include=self._include)
+        plan({}, self._wanted, include=self._include, autopilot=self._component.autopilot)
         await identified(self._component)
         self._cautions = cautions_for(self._component.autopilot)
         whose, own = self._planned_for, self._component.identity
