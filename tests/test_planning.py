@@ -140,6 +140,7 @@ def test_the_file_of_another_vehicle_is_not_taken_for_mistyped() -> None:
         ("px4", "CAL_MAG0_XOFF", "calibration"),
         ("px4", "SENS_BOARD_X_OFF", "calibration"),
         ("px4", "LND_FLIGHT_T_LO", "counter"),
+        ("px4", "_HASH_CHECK", "counter"),
         ("px4", "SYS_AUTOCONFIG", "action"),
     ],
 )
