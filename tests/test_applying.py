@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from paramclient import ParamCache, ParamClient, read_file
+from paramclient import Component, ParamCache, ParamClient, read_file
 from paramclient.errors import (
     AnotherVehicle,
     CacheError,
@@ -43,7 +43,7 @@ from paramclient.provision import (
     verify_all,
 )
 from paramclient.provision.run import Run
-from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, SimParam
+from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, PX4Vehicle, SimParam
 from paramclient.sim.table import Entry
 from paramclient.values import ParamType, Value, bits_of, from_bits
 from tests.shell import FlakyLink, Tap, a_client, residue, swiftly
@@ -647,6 +647,33 @@ async def test_an_armed_vehicle_is_left_alone_unless_told_otherwise(make: Callab
         if make is ardupilot:
             assert isinstance(result.error, CommandRefused)
             assert statuses(result) == {"FRAME_CLASS": "set"}
+
+
+@swiftly
+async def test_so_is_another_part_of_an_armed_vehicle() -> None:
+    for system in (1, 2):
+        camera = GenericVehicle({"TUNE_01": 0.25}, system=1, component=100)
+        air = Air.symmetric([camera, ardupilot(armed=True, system=system)])
+        async with a_client(air) as client:
+            await client.component(system=system, component=1)
+            component = await client.component(system=1, component=100)
+            if system == 1:
+                with pytest.raises(VehicleArmed, match="1/100 is armed"):
+                    await apply(component, written({"TUNE_01": 1.5}))
+            assert (await apply(component, written({"TUNE_01": 1.5}), allow_armed=system == 1)).complete
+
+
+@swiftly
+async def test_who_does_not_say_whether_it_is_armed_may_be() -> None:
+    vehicle = ardupilot()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        with (
+            mock.patch.object(Component, "is_armed", None),
+            pytest.raises(VehicleArmed, match="1/1 does not say whether it is armed"),
+        ):
+            await apply(component, written(another()))
+        assert vehicle.requests["PARAM_SET"] == 0
 
 
 @swiftly

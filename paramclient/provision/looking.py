@@ -16,12 +16,12 @@ from paramclient.protocol.result import FetchResult
 from paramclient.provision.planning import ParamInfo, Plan, check_component, plan
 from paramclient.values import Param, Trust
 
-__all__ = ["Seen", "identified", "look", "plan_for", "prepare", "verify"]
+__all__ = ["LOOKING_PACE", "Seen", "identified", "look", "plan_for", "prepare", "verify"]
 
 IDENTITY_PATIENCE: Final = 10.0
 """Seconds for a vehicle to say who it is. It is asked a few times, and mostly given up sooner."""
 LOOKING_PACE: Final = 0.05
-"""Seconds between two looks whether it has."""
+"""Seconds between two looks whether a vehicle has said something of itself."""
 
 
 @dataclass(frozen=True, slots=True)
