@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Final
+from typing import Final, Protocol
 
 import anyio
 
 from paramclient.errors import LinkError
-from paramclient.links import Link
+from paramclient.links import Link, Peer
 from paramclient.protocol.station import Station
 
-__all__ = ["Carrier"]
+__all__ = ["Carrier", "Tap"]
 
 REST: Final = 0.02
 """Seconds for which the reader lets telemetry pile up while nobody waits for an answer: to take 20 datagrams
@@ -31,6 +31,19 @@ LONGEST_BACKOFF: Final = 5.0
 logger = logging.getLogger(__name__)
 
 
+class Tap(Protocol):
+    """Somebody who is told of everything that goes over the link. None of the calls may block or raise."""
+
+    def received(self, data: bytes, peer: Peer) -> None:
+        """This has come; an empty chunk says that the peer's stream has ended."""
+
+    def sent(self, data: bytes) -> None:
+        """This frame was given to the link to be sent."""
+
+    def pause(self) -> None:
+        """The link is away: what was cut off by that is not continued."""
+
+
 class Carrier:
     """Carries what a link delivers to a station, and what that wants sent to the link.
 
@@ -42,6 +55,7 @@ class Carrier:
         station: the core.
         dispatch: hands out what has happened, after each time that something may have.
         end: takes the error of a link that has failed for good, and calls `fail_for_good`.
+        taps: who is told of everything that goes over the link.
 
     Attributes:
         is_away: whether the link is away and being opened again.
@@ -57,6 +71,7 @@ class Carrier:
         *,
         dispatch: Callable[[], None],
         end: Callable[[LinkError], None],
+        taps: Sequence[Tap] = (),
     ) -> None:
         self.is_away = False
         self.broken: LinkError | None = None
@@ -66,6 +81,7 @@ class Carrier:
         self._station = station
         self._dispatch = dispatch
         self._end = end
+        self._taps = taps
         self._something_to_send = anyio.Event()
         self._sent = anyio.Event()  # set when anything is sent
 
@@ -85,6 +101,8 @@ class Carrier:
             is_news = False
             for peer, data in chunks:
                 is_news |= self._station.receive(data, peer, now)
+                for tap in self._taps:
+                    tap.received(data, peer)
             if is_news:
                 self._dispatch()
                 self.tell()
@@ -104,6 +122,8 @@ class Carrier:
             if to_send:
                 self._sent.set()
             for data, peer in to_send:
+                for tap in self._taps:
+                    tap.sent(data)
                 # a link that drops is the reader's business; what is not sent now is sent again in time
                 with suppress(LinkError):
                     await self._link.send(data, peer)
@@ -136,6 +156,8 @@ class Carrier:
         logger.warning("%s; trying to open it again", error)
         self.is_away = True
         self._station.pause()
+        for tap in self._taps:
+            tap.pause()
         patience_ends = anyio.current_time() + LINK_PATIENCE
         backoff = FIRST_BACKOFF
         while True:

@@ -13,6 +13,7 @@ import anyio
 import anyio.abc
 
 from paramclient.cache import ParamCache
+from paramclient.capture import Capture
 from paramclient.carrier import Carrier
 from paramclient.component import PROGRESS_INTERVAL, Component
 from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
@@ -80,13 +81,16 @@ class ParamClient:
             same.
         traffic: whether to count everything that is heard, for `traffic_report`. That takes time for each
             frame, also of those that a client otherwise steps over.
+        tlog: a telemetry log to be made: every frame on the link, both ways, in the form that other programs
+            read too. One that exists is not written over. A disk that is full ends it with a warning in the
+            log of the program, and nothing else.
 
     Attributes:
         cache: where tables are kept, or None.
 
     Raises:
         UsageError: no such link, ids outside 1 to 255, or an interval or policy that cannot be; on entering:
-            for the second time.
+            for the second time, or the telemetry log exists or cannot be made.
         LinkError: on entering: the link cannot be opened.
     """
 
@@ -101,6 +105,7 @@ class ParamClient:
         watch_interval: float | None = None,
         policy: Policy | str = Policy.AUTO,
         traffic: bool = False,
+        tlog: str | os.PathLike[str] | None = None,
     ) -> None:
         for number in (system, component):
             if not 1 <= number <= 255:
@@ -130,7 +135,14 @@ class ParamClient:
         self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self._components: dict[Address, Component] = {}
         self._tasks: anyio.abc.TaskGroup | None = None
-        self._carrier = Carrier(self._link, self._station, dispatch=self._dispatch, end=self._end)
+        self._capture = None if tlog is None else Capture(tlog, is_stream=self._link.is_stream)
+        self._carrier = Carrier(
+            self._link,
+            self._station,
+            dispatch=self._dispatch,
+            end=self._end,
+            taps=[self._capture] if self._capture else [],
+        )
         self._is_entered = False
         self._opened_at = -math.inf
 
@@ -168,6 +180,8 @@ class ParamClient:
         try:
             await self._link.open()
             await self._writer.open()
+            if self._capture is not None:
+                await self._capture.open()
         except BaseException:
             await self._release()
             raise
@@ -178,6 +192,8 @@ class ParamClient:
         tasks.start_soon(self._carrier.read, name="paramclient reader")
         tasks.start_soon(self._carrier.send, name="paramclient sender")
         tasks.start_soon(self._writer.run, name="paramclient cache writer")
+        if self._capture is not None:
+            tasks.start_soon(self._capture.run, name="paramclient tlog writer")
         return self
 
     async def __aexit__(
@@ -205,7 +221,11 @@ class ParamClient:
                 for machine in self._station.components.values():
                     await self._writer.keep_late(machine)
             finally:
-                await self._writer.close()
+                try:
+                    await self._writer.close()
+                finally:
+                    if self._capture is not None:
+                        await self._capture.close()
 
     def events(self) -> Events:
         """What happens to components from now on: `async for event in client.events()`.

@@ -66,6 +66,9 @@ class LinkOptions:
     no_cache: bool = False
     """Neither read nor write a cache."""
 
+    tlog: Path | None = None
+    """Write everything on the link, both ways, to this telemetry log, which must not exist yet."""
+
     @property
     def place(self) -> Path | bool:
         """Where tables are kept, as `ParamClient` takes it.

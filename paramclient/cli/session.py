@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Final
 
 import anyio
@@ -63,12 +64,14 @@ async def connect(url: str, options: LinkOptions, *, policy: Policy = Policy.AUT
         LinkError: the link cannot be opened, or failed.
     """
     deadline = Deadline(options.timeout)
-    async with ParamClient(url, cache=options.place, encoding=options.encoding, policy=policy) as client:
+    async with ParamClient(
+        url, cache=options.place, encoding=options.encoding, policy=policy, tlog=options.tlog
+    ) as client:
         patience = HEARING_PATIENCE if options.timeout is None else deadline.left()
         component = await client.component(options.system, options.component, timeout=patience)
         yield Session(client, component, deadline)
 
 
-def listen(url: str) -> ParamClient:
+def listen(url: str, *, tlog: Path | None = None) -> ParamClient:
     """A client that counts everything it hears, and neither reads nor writes a cache."""
-    return ParamClient(url, cache=False, traffic=True)
+    return ParamClient(url, cache=False, traffic=True, tlog=tlog)
