@@ -15,7 +15,7 @@ import anyio.abc
 from paramclient.cache import ParamCache
 from paramclient.capture import Capture
 from paramclient.carrier import Carrier
-from paramclient.component import PROGRESS_INTERVAL, Component
+from paramclient.component import PROGRESS_INTERVAL, Component, patience_of
 from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
 from paramclient.events import Events, told
 from paramclient.ftp import Ftp
@@ -81,6 +81,9 @@ class ParamClient:
             same.
         traffic: whether to count everything that is heard, for `traffic_report`. That takes time for each
             frame, also of those that a client otherwise steps over.
+        listen_only: never send a byte, not even a heartbeat. Tables still fill, by what others on the link
+            ask for, and may be confirmed by a hash that others ask for; `get`, `set` and whatever else asks
+            the vehicle raise UsageError; `fetch_all` waits for a list that others ask for.
         tlog: a telemetry log to be made: every frame on the link, both ways, in the form that other programs
             read too. One that exists is not written over. A disk that is full ends it with a warning in the
             log of the program, and nothing else.
@@ -105,6 +108,7 @@ class ParamClient:
         watch_interval: float | None = None,
         policy: Policy | str = Policy.AUTO,
         traffic: bool = False,
+        listen_only: bool = False,
         tlog: str | os.PathLike[str] | None = None,
     ) -> None:
         for number in (system, component):
@@ -123,7 +127,7 @@ class ParamClient:
             system=system,
             component=component,
             encoding=encoding,
-            upkeep=Upkeep.chosen(watch_interval, policy),
+            upkeep=self._upkeep(watch_interval, policy, listen_only=listen_only),
             counts_traffic=traffic,
         )
         self._writer = WriteThrough(
@@ -145,6 +149,14 @@ class ParamClient:
         )
         self._is_entered = False
         self._opened_at = -math.inf
+
+    def _upkeep(self, interval: float | None, policy: Policy | str, *, listen_only: bool) -> Upkeep:
+        chosen = Upkeep.chosen(interval, policy)
+        if not listen_only:
+            return chosen
+        if interval or policy != Policy.AUTO:
+            raise UsageError("watch_interval and policy say what may be asked: with listen_only, nothing is")
+        return Upkeep.of_listener(is_log=False)
 
     @property
     def components(self) -> Mapping[Address, Component]:
@@ -309,6 +321,7 @@ class ParamClient:
             LinkError: the link failed, or the client was closed.
         """
         self._station.check_refresh(refresh)
+        timeout = patience_of(self._station, timeout)
         began = anyio.current_time()
         deadline = math.inf if timeout is None else began + timeout
         hear_until = began + HEARING_PATIENCE if timeout is None else deadline

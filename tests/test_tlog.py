@@ -19,6 +19,7 @@ import pytest
 
 from paramclient import ParamClient, UsageError, capture
 from paramclient.capture import Capture
+from paramclient.cli import run
 from paramclient.links.tlog import Record, packed_time, read_records
 from paramclient.protocol import wire
 from paramclient.protocol.sniff import MOST_PEERS, FrameCutter
@@ -151,6 +152,16 @@ print(json.dumps(found))
     assert names.count("PARAM_VALUE") >= 1382
     # its last two bits of the time are the number of a link
     assert [at for _, _, at in theirs] == pytest.approx([each.at for each in ours], abs=5e-6)
+
+
+def test_the_command_writes_logs_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "flight.tlog"
+    assert run(["get", "sim:px4", "MC_ROLL_P", "--no-cache", "--tlog", str(path)]) == 0
+    assert [each.param_id for each in messages(path) if isinstance(each, wire.ParamValue)] == ["MC_ROLL_P"]
+    assert run(["get", "sim:px4", "MC_ROLL_P", "--no-cache", "--tlog", str(path)]) == 2
+    assert "flight.tlog exists" in capsys.readouterr().err
+    assert run(["link", "sim:px4", "--seconds", "0.1", "--tlog", str(tmp_path / "link.tlog")]) == 0
+    assert messages(tmp_path / "link.tlog")
 
 
 @swiftly

@@ -37,7 +37,15 @@ together take less of the link than our heartbeats."""
 NO_AUTOPILOT: Final = ("unknown", autopilot_name(MAV_AUTOPILOT_INVALID))
 
 
-async def link(url: str, /, *, seconds: Seconds = None, json: bool = False, tlog: Path | None = None) -> int:
+async def link(
+    url: str,
+    /,
+    *,
+    seconds: Seconds = None,
+    json: bool = False,
+    listen_only: bool = False,
+    tlog: Path | None = None,
+) -> int:
     """Print who is heard on a link, how much comes, and what is lost on the way.
 
     On a terminal the table is live until Ctrl-C. Elsewhere, and with --json, it is printed once, after
@@ -47,11 +55,12 @@ async def link(url: str, /, *, seconds: Seconds = None, json: bool = False, tlog
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
         seconds: How long to listen.
         json: Print JSON, for programs.
+        listen_only: Send nothing, so that no round trip is measured.
         tlog: Write everything on the link, both ways, to this telemetry log, which must not exist yet.
     """
     is_live = sys.stdout.isatty() and not json
     deadline = Deadline(seconds if is_live or seconds is not None else LISTENING_TIME)
-    async with listen(url, tlog=tlog) as client:
+    async with listen(url, listen_only=listen_only, tlog=tlog) as client:
         report = await _while_measuring(client, _show if is_live else _listen, deadline)
     if not report.frames:
         noise = f" (but {report.bytes_received:,} other bytes)" if report.bytes_received else ""

@@ -66,6 +66,9 @@ class LinkOptions:
     no_cache: bool = False
     """Neither read nor write a cache."""
 
+    listen_only: bool = False
+    """Send nothing, and take what others on the link ask for."""
+
     tlog: Path | None = None
     """Write everything on the link, both ways, to this telemetry log, which must not exist yet."""
 

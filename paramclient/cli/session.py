@@ -65,13 +65,18 @@ async def connect(url: str, options: LinkOptions, *, policy: Policy = Policy.AUT
     """
     deadline = Deadline(options.timeout)
     async with ParamClient(
-        url, cache=options.place, encoding=options.encoding, policy=policy, tlog=options.tlog
+        url,
+        cache=options.place,
+        encoding=options.encoding,
+        policy=policy,
+        listen_only=options.listen_only,
+        tlog=options.tlog,
     ) as client:
         patience = HEARING_PATIENCE if options.timeout is None else deadline.left()
         component = await client.component(options.system, options.component, timeout=patience)
         yield Session(client, component, deadline)
 
 
-def listen(url: str, *, tlog: Path | None = None) -> ParamClient:
+def listen(url: str, *, listen_only: bool = False, tlog: Path | None = None) -> ParamClient:
     """A client that counts everything it hears, and neither reads nor writes a cache."""
-    return ParamClient(url, cache=False, traffic=True, tlog=tlog)
+    return ParamClient(url, cache=False, traffic=True, listen_only=listen_only, tlog=tlog)

@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Final
 
-from paramclient.errors import LinkError, NoReply
+from paramclient.errors import LinkError, NoReply, UsageError
 from paramclient.identity import autopilot_name
 from paramclient.protocol import events
 from paramclient.protocol.events import ParamChanged
@@ -119,6 +119,8 @@ class ComponentMachine(Parts):
             announced = self.sync.hash_heard(message, now)
             if self.fetch is not None:
                 self.fetch.announced(announced)
+            if self.fetches.overheard is not None:
+                self.fetches.overheard.announced(announced, now)
             self.reads.heard(message, now)
             return
         if who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
@@ -141,6 +143,8 @@ class ComponentMachine(Parts):
         fetch = self.fetches.current
         if fetch is not None:
             fetch.heard(message, now)
+        if self.fetches.overheard is not None:
+            self.fetches.overheard.heard(message, now)
         if writes.queues:
             writes.heard(message, now)
         self.reads.heard(message, now)
@@ -242,7 +246,16 @@ class ComponentMachine(Parts):
         return name.upper() if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA else name
 
     def check_present(self, what: str, now: float) -> None:
-        """See whether it can be asked for something; NoReply is raised where it is lost."""
+        """See whether it can be asked for something.
+
+        Raises:
+            UsageError: nothing may be sent.
+            NoReply: it is lost.
+        """
+        if self._listens_only:
+            raise UsageError(
+                f"{what} cannot be asked for where nothing is sent; what has been heard is in `params`"
+            )
         if self.presence.is_lost:
             silence = now - self.presence.heard_at
             raise NoReply(f"{what} (lost)", attempts=0, waited=silence)
@@ -339,6 +352,8 @@ class ComponentMachine(Parts):
         """What is known may be of the past: it counts again when the vehicle has confirmed it."""
         self.table.doubt(Trust.LIVE, Trust.VERIFIED)
         self.sync.doubt()
+        if self.fetches.overheard is not None:
+            self.fetches.overheard.forget()
 
     def _lose(self, now: float) -> None:
         """It is not heard any more. A fetch goes on for a while: it may only be starting again."""

@@ -54,7 +54,9 @@ class Parts(ABC):
         self.component = component
         self.version = 1
         self.round_trip = RoundTrip()
-        self.who = Identification(target, link, self.round_trip, send, encoding)
+        self.who = Identification(
+            target, link, self.round_trip, send, encoding, may_ask=not upkeep.listens_only
+        )
         self.table = Table(self.who.encoding)
         self.turns = Turns() if turns is None else turns
         self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share)
@@ -98,13 +100,14 @@ class Parts(ABC):
                 doubt=self._doubt_identity,
             ),
             self.sync,
-            upkeep.policy,
+            upkeep,
             says_file=lambda: self.who.says_file,
             ended=self._fetched,
         )
         self._own = own
         self._emit = emit
         self._policy = upkeep.policy
+        self._listens_only = upkeep.listens_only
         self._another = another or self.become_another
         self._is_vehicle_doubted = is_vehicle_doubted
         self._known_as: str | None = None  # the key of the identity that was reported

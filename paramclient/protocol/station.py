@@ -45,6 +45,8 @@ Peer: TypeAlias = Hashable
 """Who sent something, as the link tells them apart."""
 
 HEARTBEAT_INTERVAL: Final = 1.0
+NOBODY: Final = (0, 0)
+"""Who we are where we only listen: then whoever has our ids is somebody else."""
 MOST_COMPONENTS: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each have. Further ones are not heard."""
 MOST_PEERS: Final = 256
@@ -72,6 +74,9 @@ class Station:
         bytes_received, bytes_sent: on this link, by this station.
         traffic: the counts, or None where they are not wanted.
         policy: what may be asked to bring tables up to date.
+        listens_only: whether nothing is ever sent.
+        is_log: whether the link is a log, which ends.
+        is_over: whether nothing more will come, as at the end of a log.
     """
 
     def __init__(
@@ -87,7 +92,10 @@ class Station:
     ) -> None:
         self.traffic = Traffic(is_stream=is_stream) if counts_traffic else None
         self.link = link
-        self.own: Address = (system, component)
+        self.listens_only = upkeep is not None and upkeep.listens_only
+        self.is_log = upkeep is not None and upkeep.is_log
+        self.is_over = False
+        self.own: Address = NOBODY if self.listens_only else (system, component)
         self.components: dict[Address, ComponentMachine] = {}
         self.bytes_received = 0
         self.bytes_sent = 0
@@ -101,7 +109,7 @@ class Station:
         self._outbox: list[tuple[bytes, Peer | None]] = []
         self._events: list[Event] = []
         self._sequence = 0
-        self._heartbeat_at = -math.inf
+        self._heartbeat_at = math.inf if self.listens_only else -math.inf
         self._is_paused = False
         self._turns = Turns()
 
@@ -128,7 +136,7 @@ class Station:
 
     def tick(self, now: float) -> None:
         """Do what is due: our heartbeat, and every component's time-outs."""
-        if self._is_paused:
+        if self._is_paused or self.is_over:
             return
         if self._heartbeat_at <= now:
             self._heartbeat_at = now + HEARTBEAT_INTERVAL
@@ -142,8 +150,8 @@ class Station:
             self.traffic.sent(self.bytes_sent, now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity while the link is away."""
-        if self._is_paused:
+        """When `tick` has something to do, or infinity while the link is away, or over."""
+        if self._is_paused or self.is_over:
             return math.inf
         turns_at = self._turns.next_deadline()
         return min(
@@ -173,10 +181,17 @@ class Station:
     def resume(self, now: float) -> None:
         """The link is back: our heartbeat goes out, and whatever waits is asked for again."""
         self._is_paused = False
-        self._heartbeat_at = now
+        if not self.listens_only:
+            self._heartbeat_at = now
         self._turns.resume(now)
         for machine in self.components.values():
             machine.resume(now)
+
+    def over(self, now: float) -> None:
+        """Nothing more will come: whoever waits gets what there is, and time stands still."""
+        self.is_over = True
+        for machine in self.components.values():
+            machine.fetches.over(now)
 
     @property
     def is_waiting(self) -> bool:
@@ -216,8 +231,10 @@ class Station:
         """See whether a fetch may download what the cache has.
 
         Raises:
-            UsageError: the policy says no.
+            UsageError: the policy says no, or nothing is sent at all.
         """
+        if refresh and self.listens_only:
+            raise UsageError("nothing can be downloaded where nothing is sent, so not with refresh")
         if refresh and self.policy is not Policy.AUTO:
             raise UsageError(f"the policy is {self.policy}: nothing may be downloaded, so not with refresh")
 
@@ -314,6 +331,8 @@ class Station:
                 machine.foreign_set(message.param_id, station, now)
 
     def _send(self, message: Message, system: int | None, version: int) -> None:
+        if self.listens_only:
+            return
         own_system, own_component = self.own
         data = encode(
             message, system=own_system, component=own_component, sequence=self._sequence, version=version

@@ -63,11 +63,20 @@ class Upkeep:
         without_hash: whether that goes for every vehicle without a hash too: its whole table is then fetched.
             It goes anyway for those that give it as a file in no time.
         policy: what may be asked.
+        listens_only: nothing is sent at all, for whatever reason; the policy is then "cache-only".
+        is_log: the link is a log, in which nobody can be asked and which ends.
     """
 
     interval: float = math.inf
     without_hash: bool = False
     policy: Policy = Policy.AUTO
+    listens_only: bool = False
+    is_log: bool = False
+
+    @classmethod
+    def of_listener(cls, *, is_log: bool) -> Upkeep:
+        """What is done where nothing may be sent: nothing."""
+        return cls(policy=Policy.CACHE_ONLY, listens_only=True, is_log=is_log)
 
     @classmethod
     def chosen(cls, interval: float | None, policy: Policy | str) -> Upkeep:
@@ -255,6 +264,10 @@ class Sync:
         if result.hash is not None:
             self._read_unhashed(result.hash, now)
         return True
+
+    def contradicted(self) -> None:
+        """A hash has come that is not the table's, and nothing can be done about it."""
+        self._not_confirmed()
 
     def forget(self) -> None:
         """Another vehicle has taken the address: nothing that is known is about it."""
