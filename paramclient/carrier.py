@@ -98,7 +98,9 @@ class Carrier:
                 await self._reopen(error)
                 continue
             now = anyio.current_time()
-            is_news = False
+            is_news = not chunks
+            if not chunks:
+                self._station.over(now)
             for peer, data in chunks:
                 is_news |= self._station.receive(data, peer, now)
                 for tap in self._taps:

@@ -20,7 +20,7 @@ from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
 from paramclient.events import Events, told
 from paramclient.ftp import Ftp
 from paramclient.identity import Identity
-from paramclient.links import Link, create_link
+from paramclient.links import Link, ReplayLink, create_link
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import (
     ComponentHeard,
@@ -68,7 +68,7 @@ class ParamClient:
         link: a link's name, such as `udpin:0.0.0.0:14550` (`paramclient.links.FORMS` says which there are), a
             link object, or a simulated vehicle.
         cache: where tables are kept: None for the user's cache, a path, a `ParamCache` (which stays open), or
-            False for none.
+            False for none. A log that is replayed neither reads nor writes one.
         system, component: who we are on the link.
         encoding: how all components lay out values, for those who know better than the evidence.
         watch_interval: seconds after which it is looked again whether a table that was fetched still is the
@@ -115,9 +115,12 @@ class ParamClient:
             if not 1 <= number <= 255:
                 raise UsageError(f"our own system and component ids are 1 to 255, not {number}")
         self._link = create_link(link)
+        is_log = isinstance(self._link, ReplayLink)
+        if is_log and cache not in (None, True, False):
+            raise UsageError("what a log holds is of the past: `paramclient import` brings it into a cache")
         if isinstance(cache, ParamCache):
             self.cache: ParamCache | None = cache
-        elif cache is False:
+        elif cache is False or is_log:
             self.cache = None
         else:
             self.cache = ParamCache(None if cache is None or cache is True else cache)
@@ -127,7 +130,7 @@ class ParamClient:
             system=system,
             component=component,
             encoding=encoding,
-            upkeep=self._upkeep(watch_interval, policy, listen_only=listen_only),
+            upkeep=self._upkeep(watch_interval, policy, listen_only=listen_only, is_log=is_log),
             counts_traffic=traffic,
         )
         self._writer = WriteThrough(
@@ -150,13 +153,15 @@ class ParamClient:
         self._is_entered = False
         self._opened_at = -math.inf
 
-    def _upkeep(self, interval: float | None, policy: Policy | str, *, listen_only: bool) -> Upkeep:
+    def _upkeep(
+        self, interval: float | None, policy: Policy | str, *, listen_only: bool, is_log: bool
+    ) -> Upkeep:
         chosen = Upkeep.chosen(interval, policy)
-        if not listen_only:
+        if not (listen_only or is_log):
             return chosen
         if interval or policy != Policy.AUTO:
             raise UsageError("watch_interval and policy say what may be asked: with listen_only, nothing is")
-        return Upkeep.of_listener(is_log=False)
+        return Upkeep.of_listener(is_log=is_log)
 
     @property
     def components(self) -> Mapping[Address, Component]:
@@ -285,10 +290,11 @@ class ParamClient:
         self._check_open()
         began = anyio.current_time()
         with anyio.move_on_after(timeout):
-            while (found := self._find(system, component)) is None:
+            while (found := self._find(system, component)) is None and not self._station.is_over:
                 await self._carrier.news.wait()
                 self._check_open()
-            await found._wait_for_cache()
+            if found is not None:
+                await found._wait_for_cache()
         if found is None:
             waited = anyio.current_time() - began
             raise NoReply(_wanted(system, component), attempts=0, waited=waited)

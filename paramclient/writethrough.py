@@ -40,6 +40,8 @@ class WriteThrough:
         owned: whether `close` closes it.
         identity_of: says who the vehicle is that a component belongs to; None while that is open.
         is_doubted: says whether another vehicle may have taken its place by now.
+        clock: the time in unix seconds.
+        now: the time of the components.
     """
 
     def __init__(
@@ -49,10 +51,14 @@ class WriteThrough:
         owned: bool,
         identity_of: Callable[[ComponentMachine], Identity | None],
         is_doubted: Callable[[ComponentMachine], bool],
+        clock: Callable[[], float] = time.time,
+        now: Callable[[], float] = anyio.current_time,
     ) -> None:
         self._cache = cache
         self._identity_of = identity_of
         self._is_doubted = is_doubted
+        self._clock = clock
+        self._now = now
         self._owned = owned
         self._worker = Worker("paramclient cache")
         self._kept: dict[ComponentMachine, _Kept] = {}
@@ -125,7 +131,7 @@ class WriteThrough:
         """The table was proven to be the vehicle's just now; `is_whole` by a download of all of it."""
         kept = self._kept.get(machine)
         if kept is not None:
-            kept.synced_at = time.time()
+            kept.synced_at = self._clock()
             kept.is_whole |= is_whole
 
     @property
@@ -157,7 +163,7 @@ class WriteThrough:
             return True
         is_written = False
         try:
-            is_written = await self._run(partial(_save, cache, [new.update for new in news])) is not None
+            is_written = await self._save(cache, [new.update for new in news])
         finally:
             for new in news:
                 if not is_written and self._kept.get(new.kept.machine) is new.kept:
@@ -165,6 +171,9 @@ class WriteThrough:
         if is_written:
             self._has_failed = False
         return is_written
+
+    async def _save(self, cache: ParamCache, updates: list[TableUpdate]) -> bool:
+        return await self._run(partial(_save, cache, updates)) is not None
 
     async def _load(self, machine: ComponentMachine, identity: Identity) -> CachedComponent | None:
         if self._cache is None:
@@ -181,7 +190,7 @@ class WriteThrough:
             is_same = identity.uid is not None and _firmware(cached.identity) == _firmware(identity)
             machine.use_cached(
                 _of_firmware(cached, identity),
-                anyio.current_time(),
+                self._now(),
                 count=cached.count,
                 confirmed=cached.hash,
                 complete=cached.complete,
@@ -195,7 +204,7 @@ class WriteThrough:
             kept.synced_at = cached.synced_at
             kept.state = None if table.is_displaced else self._state(machine, kept)
         if machine.sync.synced:
-            kept.synced_at = time.time()
+            kept.synced_at = self._clock()
 
     def _news_of(self, kept: _Kept) -> list[_News]:
         """What the cache does not know of a table yet; it counts as written from now on."""
@@ -208,7 +217,7 @@ class WriteThrough:
         dirty = table.take_dirty()
         is_whole, kept.is_whole = kept.is_whole, False
         kept.state = state
-        now = time.time()
+        now = self._clock()
         knows_volatile = bool(table.volatile) or table.volatile_known
         update = TableUpdate(
             identity=kept.identity,

@@ -154,7 +154,18 @@ def test_every_command_is_shown_and_exists() -> None:
     cache = {("cache", verb) for verb in ("list", "history", "path", "remove")}
     assert (
         used
-        == {("fetch",), ("get",), ("set",), ("watch",), ("link",), ("ports",), ("show",), ("sim",)} | cache
+        == {
+            ("fetch",),
+            ("get",),
+            ("set",),
+            ("watch",),
+            ("link",),
+            ("ports",),
+            ("show",),
+            ("sim",),
+            ("import",),
+        }
+        | cache
     )
     for words in used:
         assert words[-1] in help_of(*words)
@@ -170,7 +181,7 @@ def test_options_in_examples_exist() -> None:
 def test_the_page_of_the_command_names_every_option() -> None:
     page = (DOCS / "command.md").read_text(encoding="utf-8")
     offered = set()
-    for command in ("fetch", "get", "set", "watch", "link", "ports", "show", "sim"):
+    for command in ("fetch", "get", "set", "watch", "link", "ports", "show", "sim", "import"):
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of(command)))
     for verb in ("list", "history", "path", "remove"):
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("cache", verb)))

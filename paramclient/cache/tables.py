@@ -28,7 +28,20 @@ from paramclient.cache.rows import Row, cells, checksum, identity_cells, read_id
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
 
-__all__ = ["HISTORY_LINES", "component", "history", "remove", "save", "summaries", "vehicles"]
+__all__ = [
+    "HISTORY_LINES",
+    "applied",
+    "component",
+    "hashed",
+    "history",
+    "remove",
+    "rows_of",
+    "save",
+    "summaries",
+    "vehicles",
+    "write_history",
+    "write_rows",
+]
 
 HISTORY_LINES: Final = 10_000
 """Lines of history kept for each table, the newest ones: about a megabyte, and years of tuning by hand. Each
@@ -47,14 +60,14 @@ def save(connection: sqlite3.Connection, updates: Iterable[TableUpdate]) -> None
     for update in updates:
         _forget_other_firmware(connection, update.identity)
         owner = _owner(connection, update)
-        before = _rows(connection, owner)
-        after, lines = _applied(update, before)
+        before = rows_of(connection, owner)
+        after, lines = applied(update, before)
         if after != before:
-            _write_rows(connection, owner, before, after)
-        _write_history(connection, owner, lines)
+            write_rows(connection, owner, before, after)
+        write_history(connection, owner, lines)
         if update.table is not None:
             _write_state(connection, owner, update.table)
-        elif _hashed(before) != _hashed(after):
+        elif hashed(before) != hashed(after):
             connection.execute("UPDATE component SET hash = NULL WHERE id = ?", (owner,))
 
 
@@ -107,7 +120,7 @@ def component(
 ) -> CachedComponent | None:
     """One table with its parameters, or None."""
     for owner, summary in summaries(connection, key, number):
-        rows = _rows(connection, owner)
+        rows = rows_of(connection, owner)
         return CachedComponent(
             **{field.name: getattr(summary, field.name) for field in fields(summary)},
             params=ParamMap(
@@ -145,9 +158,9 @@ def _forget_other_firmware(connection: sqlite3.Connection, identity: Identity) -
         (identity.key, identity.firmware, identity.git_hash),
     ).fetchall()
     for (owner,) in updated:
-        before = _rows(connection, owner)
+        before = rows_of(connection, owner)
         after = {name: row._replace(default_bits=None) for name, row in before.items()}
-        _write_rows(connection, owner, before, after)
+        write_rows(connection, owner, before, after)
         connection.execute("UPDATE component SET file_works = NULL WHERE id = ?", (owner,))
 
 
@@ -175,7 +188,7 @@ def _owner(connection: sqlite3.Connection, update: TableUpdate) -> int:
     return int(owner)
 
 
-def _applied(
+def applied(
     update: TableUpdate, before: Mapping[str, Row]
 ) -> tuple[dict[str, Row], list[tuple[object, ...]]]:
     """The rows after an update, and the lines of history that it causes."""
@@ -204,14 +217,15 @@ def _merged(item: StoredParam, old: Row | None, *, whole: bool) -> Row:
     return Row.of(item.param, index, volatile, item.heard_at)
 
 
-def _hashed(rows: Mapping[str, Row]) -> dict[str, tuple[int, int, int]]:
+def hashed(rows: Mapping[str, Row]) -> dict[str, tuple[int, int, int]]:
     """What the vehicle's hash covers of a table."""
     return {name: row.hashed for name, row in rows.items() if row.hashed is not None}
 
 
-def _write_rows(
+def write_rows(
     connection: sqlite3.Connection, owner: int, before: Mapping[str, Row], after: Mapping[str, Row]
 ) -> None:
+    """Make the stored rows of a table the ones after an update."""
     connection.executemany(
         "DELETE FROM param WHERE owner = ? AND name = ?",
         [(owner, name) for name in before.keys() - after.keys()],
@@ -224,7 +238,8 @@ def _write_rows(
     connection.execute("UPDATE component SET checksum = ? WHERE id = ?", (checksum(after), owner))
 
 
-def _write_history(connection: sqlite3.Connection, owner: int, lines: Sequence[tuple[object, ...]]) -> None:
+def write_history(connection: sqlite3.Connection, owner: int, lines: Sequence[tuple[object, ...]]) -> None:
+    """Write lines of history: at, name, by, old value, new value; the oldest go when they are too many."""
     if not lines:
         return
     connection.executemany(
@@ -250,7 +265,7 @@ def _write_state(connection: sqlite3.Connection, owner: int, state: TableState) 
     )
 
 
-def _rows(connection: sqlite3.Connection, owner: int) -> dict[str, Row]:
+def rows_of(connection: sqlite3.Connection, owner: int) -> dict[str, Row]:
     """A table's parameters by index, then name, those without an index last; `Damaged` where one changed."""
     found = connection.execute(
         "SELECT name, type, bits, is_raw, param_index, volatile, heard_at, default_bits"

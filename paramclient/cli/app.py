@@ -15,6 +15,7 @@ import anyio
 from cyclopts import App, CycloptsError, Parameter
 
 from paramclient.cli.link import link
+from paramclient.cli.logs import import_
 from paramclient.cli.offline import cache_history, cache_list, cache_path, cache_remove, show
 from paramclient.cli.outcome import ExitCode, code_of
 from paramclient.cli.output import report
@@ -161,6 +162,12 @@ _app.command(
     show,
     usage="Usage: paramclient show [OPTIONS] [VEHICLE]",
     help_epilogue=_examples("show", "show 1", "show 00020000 --json"),
+)
+_app.command(
+    import_,
+    name="import",
+    usage="Usage: paramclient import [OPTIONS] FILE [FILE...]",
+    help_epilogue=_examples("import flight.tlog", "import logs/*.tlog --json"),
 )
 _app.command(_cache)
 _app.command(ports, help_epilogue=_examples("ports", "ports --json"))

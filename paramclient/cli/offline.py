@@ -9,6 +9,7 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.cache import CachedComponent, CachedSummary, HistoryEntry, ParamCache
+from paramclient.cli.logs import cache_of_log
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import (
@@ -43,17 +44,18 @@ def show(
     changed: bool = False,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Print what was last known of a vehicle, with no link.
+    """Print what was last known of a vehicle, with no link, or what a telemetry log holds.
 
     With --changed, exit code 1 says that the firmware's defaults are not known.
 
     Args:
-        vehicle: Its system id, the beginning of its hardware id, or its key in the cache.
+        vehicle: Its system id, the beginning of its hardware id, or its key in the cache; or replay:FILE.
         component: This component only.
         changed: Only what differs from the firmware's defaults.
     """
-    with _open(options) as cache:
-        summaries = _choose(cache, vehicle, component)
+    is_log = vehicle is not None and vehicle.lower().startswith("replay:")
+    with _open(options) if not is_log or vehicle is None else cache_of_log(vehicle) as cache:
+        summaries = _choose(cache, None if is_log else vehicle, component)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
         tables = [] if is_list else _load(cache, summaries)
     if options.json:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -13,6 +13,7 @@ import anyio
 from paramclient.cli.options import LinkOptions
 from paramclient.client import ParamClient
 from paramclient.component import Component
+from paramclient.links import LinkKind, LinkSpec, create_link, parse_link
 from paramclient.protocol.result import Policy
 
 __all__ = ["Deadline", "Session", "connect", "listen"]
@@ -55,8 +56,12 @@ class Session:
 
 
 @asynccontextmanager
-async def connect(url: str, options: LinkOptions, *, policy: Policy = Policy.AUTO) -> AsyncIterator[Session]:
+async def connect(
+    url: str, options: LinkOptions, *, policy: Policy = Policy.AUTO, is_live: bool = False
+) -> AsyncIterator[Session]:
     """Open a link and wait for the component that the options name.
+
+    A log is read as fast as it goes, unless its name says otherwise or somebody looks on live.
 
     Raises:
         UsageError: no such link, or options that exclude each other.
@@ -65,7 +70,7 @@ async def connect(url: str, options: LinkOptions, *, policy: Policy = Policy.AUT
     """
     deadline = Deadline(options.timeout)
     async with ParamClient(
-        url,
+        create_link(url if is_live else _at_once(url)),
         cache=options.place,
         encoding=options.encoding,
         policy=policy,
@@ -80,3 +85,9 @@ async def connect(url: str, options: LinkOptions, *, policy: Policy = Policy.AUT
 def listen(url: str, *, listen_only: bool = False, tlog: Path | None = None) -> ParamClient:
     """A client that counts everything it hears, and neither reads nor writes a cache."""
     return ParamClient(url, cache=False, traffic=True, listen_only=listen_only, tlog=tlog)
+
+
+def _at_once(url: str) -> str | LinkSpec:
+    spec = parse_link(url)
+    is_log = spec.kind is LinkKind.REPLAY and not spec.options
+    return replace(spec, options=(("speed", 0.0),)) if is_log else url

@@ -183,7 +183,7 @@ async def watch(
         policy: What the vehicle may be asked beside NAMES: whatever is needed, only for its hash, or nothing.
     """
     wanted = [check_name(each) for each in dict.fromkeys(names)]
-    async with connect(url, options, policy=policy) as session:
+    async with connect(url, options, policy=policy, is_live=True) as session:
         changes, events = session.component.changes(), session.client.events()
         if wanted:
             _, errors = await _get_all(session, wanted)

@@ -7,9 +7,12 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Iterator
+from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
-__all__ = ["Record", "packed_time", "read_records"]
+from paramclient.errors import LinkError
+
+__all__ = ["Record", "open_log", "packed_time", "read_records"]
 
 BLOCK: Final = 65536
 """Bytes that are read at once."""
@@ -41,6 +44,32 @@ class Record(NamedTuple):
 def packed_time(at: float) -> bytes:
     """A time, in unix seconds, as it stands in a log."""
     return _TIME.pack(round(at * 1e6))
+
+
+def open_log(path: str, name: str) -> BinaryIO:
+    """Open a log.
+
+    Args:
+        path: the file.
+        name: of the link, for the error.
+
+    Raises:
+        LinkError: it cannot be read, or is no log.
+    """
+    try:
+        file = Path(path).open("rb")  # noqa: SIM115 - the caller closes it
+    except OSError as error:
+        raise LinkError(f"{name}: cannot open {path}: {error.strerror}", link=name) from error
+    try:
+        if next(read_records(file), None) is None:
+            raise LinkError(f"{name}: {path} is no telemetry log, or holds no frame", link=name)
+        file.seek(0)
+    except OSError as error:
+        file.close()
+        if isinstance(error, LinkError):
+            raise
+        raise LinkError(f"{name}: cannot read {path}: {error.strerror}", link=name) from error
+    return file
 
 
 def read_records(file: BinaryIO) -> Iterator[Record]:

@@ -75,7 +75,7 @@ class Station:
         traffic: the counts, or None where they are not wanted.
         policy: what may be asked to bring tables up to date.
         listens_only: whether nothing is ever sent.
-        is_log: whether the link is a log, which ends.
+        is_log: whether the link is a log, which ends: then no time-out means anything, and nobody is lost.
         is_over: whether nothing more will come, as at the end of a log.
     """
 
@@ -136,7 +136,7 @@ class Station:
 
     def tick(self, now: float) -> None:
         """Do what is due: our heartbeat, and every component's time-outs."""
-        if self._is_paused or self.is_over:
+        if self._is_paused or self.is_log:
             return
         if self._heartbeat_at <= now:
             self._heartbeat_at = now + HEARTBEAT_INTERVAL
@@ -150,8 +150,8 @@ class Station:
             self.traffic.sent(self.bytes_sent, now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity while the link is away, or over."""
-        if self._is_paused or self.is_over:
+        """When `tick` has something to do, or infinity while the link is away, and in a log."""
+        if self._is_paused or self.is_log:
             return math.inf
         turns_at = self._turns.next_deadline()
         return min(
@@ -188,7 +188,7 @@ class Station:
             machine.resume(now)
 
     def over(self, now: float) -> None:
-        """Nothing more will come: whoever waits gets what there is, and time stands still."""
+        """Nothing more will come: whoever waits gets what there is."""
         self.is_over = True
         for machine in self.components.values():
             machine.fetches.over(now)
