@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import math
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Final, Protocol
@@ -27,6 +28,10 @@ LINK_PATIENCE: Final = 10.0
 FIRST_BACKOFF: Final = 0.25
 LONGEST_BACKOFF: Final = 5.0
 """Seconds between two attempts to open a link again: doubled from the first to the longest."""
+OTHERS_PER_TURN: Final = 16
+MOST_OF_OTHERS: Final = 1_000
+"""Frames of another program that are sent before our own have their turn again, and that may wait: a mission
+of a thousand items. On a slow link the rest is lost, as it would be with a link of its own."""
 
 logger = logging.getLogger(__name__)
 
@@ -56,6 +61,7 @@ class Carrier:
         dispatch: hands out what has happened, after each time that something may have.
         end: takes the error of a link that has failed for good, and calls `fail_for_good`.
         taps: who is told of everything that goes over the link.
+        may_rest: whether telemetry may be left to the link for a while: not where somebody else waits for it.
 
     Attributes:
         is_away: whether the link is away and being opened again.
@@ -72,6 +78,7 @@ class Carrier:
         dispatch: Callable[[], None],
         end: Callable[[LinkError], None],
         taps: Sequence[Tap] = (),
+        may_rest: bool = True,
     ) -> None:
         self.is_away = False
         self.broken: LinkError | None = None
@@ -82,6 +89,8 @@ class Carrier:
         self._dispatch = dispatch
         self._end = end
         self._taps = taps
+        self._may_rest = may_rest
+        self._of_others: deque[bytes] = deque()
         self._something_to_send = anyio.Event()
         self._sent = anyio.Event()  # set when anything is sent
 
@@ -109,7 +118,7 @@ class Carrier:
                 self._dispatch()
                 self.tell()
                 self.wake()
-            elif not self._station.is_waiting:
+            elif self._may_rest and not self._station.is_waiting:
                 await self._rest(min(REST, MOST_PER_REST * (now - before) / max(1, len(chunks))))
             before = now
 
@@ -124,14 +133,21 @@ class Carrier:
             if to_send:
                 self._sent.set()
             for data, peer in to_send:
-                for tap in self._taps:
-                    tap.sent(data)
-                # a link that drops is the reader's business; what is not sent now is sent again in time
-                with suppress(LinkError):
-                    await self._link.send(data, peer)
+                await self._transmit(data, peer)
+            for _ in range(min(len(self._of_others), OTHERS_PER_TURN)):
+                await self._transmit(self._of_others.popleft(), None)
+            if self._of_others:
+                continue
             wait = station.next_deadline() - anyio.current_time()
             with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):
                 await self._something_to_send.wait()
+
+    def send_for_another(self, frame: bytes) -> None:
+        """Send a frame of another program to every peer, in its turn; it is lost where too many wait."""
+        if len(self._of_others) < MOST_OF_OTHERS and not self.is_away:
+            self._of_others.append(frame)
+            self._station.overhear(frame, anyio.current_time())
+            self.wake()
 
     def wake(self) -> None:
         """There may be something to send, or another deadline."""
@@ -147,6 +163,13 @@ class Carrier:
         self.ended = error
         self._fail_calls(error)
 
+    async def _transmit(self, data: bytes, peer: Peer | None) -> None:
+        for tap in self._taps:
+            tap.sent(data)
+        # a link that drops is the reader's business; what is not sent now is sent again in time
+        with suppress(LinkError):
+            await self._link.send(data, peer)
+
     async def _rest(self, seconds: float) -> None:
         """Leave what comes to the link for a while, unless something is sent that may be answered."""
         self._sent = anyio.Event()
@@ -157,6 +180,7 @@ class Carrier:
         """Open the link again, for as long as it takes."""
         logger.warning("%s; trying to open it again", error)
         self.is_away = True
+        self._of_others.clear()
         self._station.pause()
         for tap in self._taps:
             tap.pause()

@@ -18,6 +18,7 @@ from paramclient.carrier import Carrier
 from paramclient.component import PROGRESS_INTERVAL, Component, patience_of
 from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
 from paramclient.events import Events, told
+from paramclient.forward import Forwarder
 from paramclient.ftp import Ftp
 from paramclient.identity import Identity
 from paramclient.links import Link, ReplayLink, create_link
@@ -84,6 +85,9 @@ class ParamClient:
         listen_only: never send a byte, not even a heartbeat. Tables still fill, by what others on the link
             ask for, and may be confirmed by a hash that others ask for; `get`, `set` and whatever else asks
             the vehicle raise UsageError; `fetch_all` waits for a list that others ask for.
+        forward: the link to one other program, by its name or as an object, such as
+            `udpout:127.0.0.1:14551`: it gets every frame that comes, and what it sends goes to the vehicles;
+            with `listen_only` it is not. A program that is slow or absent holds nothing up.
         tlog: a telemetry log to be made: every frame on the link, both ways, in the form that other programs
             read too. One that exists is not written over. A disk that is full ends it with a warning in the
             log of the program, and nothing else.
@@ -94,7 +98,7 @@ class ParamClient:
     Raises:
         UsageError: no such link, ids outside 1 to 255, or an interval or policy that cannot be; on entering:
             for the second time, or the telemetry log exists or cannot be made.
-        LinkError: on entering: the link cannot be opened.
+        LinkError: on entering: the link, or the one to the other program, cannot be opened.
     """
 
     def __init__(
@@ -109,6 +113,7 @@ class ParamClient:
         policy: Policy | str = Policy.AUTO,
         traffic: bool = False,
         listen_only: bool = False,
+        forward: str | Link | None = None,
         tlog: str | os.PathLike[str] | None = None,
     ) -> None:
         for number in (system, component):
@@ -143,12 +148,20 @@ class ParamClient:
         self._components: dict[Address, Component] = {}
         self._tasks: anyio.abc.TaskGroup | None = None
         self._capture = None if tlog is None else Capture(tlog, is_stream=self._link.is_stream)
+        self._forwarder: Forwarder | None = None
+        if forward is not None:
+            self._forwarder = Forwarder(
+                create_link(forward),
+                is_stream=self._link.is_stream,
+                to_vehicle=None if self._station.listens_only else self._send_for_another,
+            )
         self._carrier = Carrier(
             self._link,
             self._station,
             dispatch=self._dispatch,
             end=self._end,
-            taps=[self._capture] if self._capture else [],
+            taps=[tap for tap in (self._capture, self._forwarder) if tap is not None],
+            may_rest=self._forwarder is None,
         )
         self._is_entered = False
         self._opened_at = -math.inf
@@ -197,6 +210,8 @@ class ParamClient:
         try:
             await self._link.open()
             await self._writer.open()
+            if self._forwarder is not None:
+                await self._forwarder.open()
             if self._capture is not None:
                 await self._capture.open()
         except BaseException:
@@ -209,6 +224,9 @@ class ParamClient:
         tasks.start_soon(self._carrier.read, name="paramclient reader")
         tasks.start_soon(self._carrier.send, name="paramclient sender")
         tasks.start_soon(self._writer.run, name="paramclient cache writer")
+        if self._forwarder is not None:
+            tasks.start_soon(self._forwarder.read, name="paramclient forward reader")
+            tasks.start_soon(self._forwarder.send, name="paramclient forward sender")
         if self._capture is not None:
             tasks.start_soon(self._capture.run, name="paramclient tlog writer")
         return self
@@ -234,6 +252,8 @@ class ParamClient:
         """Give back the link and the cache, also when cancelled."""
         with anyio.CancelScope(shield=True):
             try:
+                if self._forwarder is not None:
+                    await self._forwarder.close()
                 await self._link.close()
                 for machine in self._station.components.values():
                     await self._writer.keep_late(machine)
@@ -422,6 +442,9 @@ class ParamClient:
             return
         assert self._tasks is not None, "nothing is heard before"
         self._tasks.start_soon(self._load, component, identity)
+
+    def _send_for_another(self, frame: bytes) -> None:
+        self._carrier.send_for_another(frame)
 
     def _wake(self) -> None:
         self._carrier.wake()

@@ -69,6 +69,9 @@ class LinkOptions:
     listen_only: bool = False
     """Send nothing, and take what others on the link ask for."""
 
+    forward: str | None = None
+    """The link to one other program, such as udpout:127.0.0.1:14551, that is to share the vehicle's."""
+
     tlog: Path | None = None
     """Write everything on the link, both ways, to this telemetry log, which must not exist yet."""
 

@@ -75,6 +75,7 @@ async def connect(
         encoding=options.encoding,
         policy=policy,
         listen_only=options.listen_only,
+        forward=options.forward,
         tlog=options.tlog,
     ) as client:
         patience = HEARING_PATIENCE if options.timeout is None else deadline.left()

@@ -54,6 +54,7 @@ MOST_PEERS: Final = 256
 HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345})
 """The message ids that matter here: HEARTBEAT, SYSTEM_TIME, PARAM_VALUE, PARAM_SET (of others), COMMAND_ACK,
 FILE_TRANSFER_PROTOCOL, AUTOPILOT_VERSION, HIGH_LATENCY2, STATUSTEXT, PARAM_ERROR."""
+_SETS: Final = frozenset({23})
 
 
 class Station:
@@ -133,6 +134,13 @@ class Station:
         if self._is_stream and not data:
             self._peers = {system: each for system, each in self._peers.items() if each != peer}
         return bool(frames)
+
+    def overhear(self, data: bytes, now: float) -> None:
+        """Take note of a frame that another program sends to the vehicles over this link: who sets what."""
+        for frame in Framer(_SETS, stream=False).receive(data):
+            message = decode(frame)
+            if isinstance(message, ParamSet):
+                self._receive_foreign_set(message, (frame.system, frame.component), now)
 
     def tick(self, now: float) -> None:
         """Do what is due: our heartbeat, and every component's time-outs."""
