@@ -33,6 +33,7 @@ from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
 from paramclient.protocol.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport
 from paramclient.protocol.writes import SetResult
+from paramclient.stats import ClientStats
 from paramclient.values import Encoding, Param, ParamType, Trust
 from paramclient.version import __version__
 
@@ -43,6 +44,7 @@ __all__ = [
     "Change",
     "Changes",
     "ClientClosed",
+    "ClientStats",
     "Component",
     "ComponentTraffic",
     "DirectoryEntry",

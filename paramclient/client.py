@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import weakref
@@ -35,6 +36,7 @@ from paramclient.protocol.result import Policy, Progress
 from paramclient.protocol.station import Address, Station
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.traffic import TrafficReport
+from paramclient.stats import ClientStats
 from paramclient.together import FetchedAll, FetchTogether
 from paramclient.values import Encoding
 from paramclient.writethrough import WriteThrough
@@ -50,6 +52,10 @@ LISTENING_TIME: Final = 1.2
 """Seconds from opening in which every component has been heard: each sends a heartbeat once a second."""
 CLOSING_PATIENCE: Final = 0.5
 """Seconds that closing waits for the hash after a write, where the next session could not do without it."""
+
+
+logger = logging.getLogger(__name__)
+protocol_logger = logging.getLogger("paramclient.protocol")
 
 
 class ParamClient:
@@ -137,6 +143,7 @@ class ParamClient:
             encoding=encoding,
             upkeep=self._upkeep(watch_interval, policy, listen_only=listen_only, is_log=is_log),
             counts_traffic=traffic,
+            trace=protocol_logger.debug,
         )
         self._writer = WriteThrough(
             self.cache,
@@ -163,6 +170,7 @@ class ParamClient:
             taps=[tap for tap in (self._capture, self._forwarder) if tap is not None],
             may_rest=self._forwarder is None,
         )
+        self._downloads = self._cache_hits = 0
         self._is_entered = False
         self._opened_at = -math.inf
 
@@ -196,6 +204,11 @@ class ParamClient:
         """Bytes of the frames that were sent, our heartbeats among them."""
         return self._station.bytes_sent
 
+    @property
+    def stats(self) -> ClientStats:
+        """What it has done so far, in numbers; also when it is closed."""
+        return ClientStats.of(self._station, downloads=self._downloads, cache_hits=self._cache_hits)
+
     def __repr__(self) -> str:
         state = "closed" if self._tasks is None or self._carrier.ended is not None else "open"
         if state == "open" and self._carrier.is_away:
@@ -217,6 +230,7 @@ class ParamClient:
         except BaseException:
             await self._release()
             raise
+        logger.debug("%s: open", self._link.name)
         tasks = anyio.create_task_group()
         await tasks.__aenter__()
         self._tasks = tasks
@@ -250,6 +264,7 @@ class ParamClient:
 
     async def _release(self) -> None:
         """Give back the link and the cache, also when cancelled."""
+        logger.debug("%s: closing", self._link.name)
         with anyio.CancelScope(shield=True):
             try:
                 if self._forwarder is not None:
@@ -400,6 +415,10 @@ class ParamClient:
                 self._components[machine.system, machine.component]._publish(event.change)
                 is_to_be_written = True
                 continue
+            logger.debug("%s", event)
+            if isinstance(event, Fetched):
+                self._cache_hits += event.result.source == "cache"
+                self._downloads += event.result.source != "cache" and event.result.complete
             if isinstance(event, ComponentHeard):
                 self._meet(machine)
             elif isinstance(event, ComponentIdentified):

@@ -109,6 +109,7 @@ class WriteThrough:
         False where it was overtaken meanwhile: by another vehicle, or by the same call for another reason.
         """
         cached = await self._load(machine, identity)
+        logger.debug("cached under %s/%s: %s", identity.key, machine.component, cached or "nothing")
         current = self._identity_of(machine)
         if current is None or current.key != identity.key or self.follow(machine, current):
             return False
@@ -170,6 +171,7 @@ class WriteThrough:
                     new.take_back()
         if is_written:
             self._has_failed = False
+            logger.debug("written: %s values", sum(len(new.update.params) for new in news))
         return is_written
 
     async def _save(self, cache: ParamCache, updates: list[TableUpdate]) -> bool:

@@ -7,9 +7,10 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any, Final
+from typing import Annotated, Any, Final
 
 import anyio
+from cyclopts import Parameter
 
 from paramclient.cli.options import Seconds
 from paramclient.cli.outcome import ExitCode
@@ -45,6 +46,7 @@ async def link(
     json: bool = False,
     listen_only: bool = False,
     tlog: Path | None = None,
+    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False,
 ) -> int:
     """Print who is heard on a link, how much comes, and what is lost on the way.
 
@@ -57,6 +59,7 @@ async def link(
         json: Print JSON, for programs.
         listen_only: Send nothing, so that no round trip is measured.
         tlog: Write everything on the link, both ways, to this telemetry log, which must not exist yet.
+        verbose: Tell on stderr what is done, step by step.
     """
     is_live = sys.stdout.isatty() and not json
     deadline = Deadline(seconds if is_live or seconds is not None else LISTENING_TIME)

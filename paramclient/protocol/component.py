@@ -55,6 +55,7 @@ class ComponentMachine(Parts):
         is_vehicle_doubted: whether it is open which vehicle its autopilot belongs to.
         another: is told that another vehicle has taken the system id; by default `become_another`.
         turns: those of the lists on the link; None for a link that it has for itself.
+        trace: is told of each step.
 
     Attributes:
         version: the MAVLink version that it speaks, as far as heard.
@@ -143,11 +144,9 @@ class ComponentMachine(Parts):
         fetch = self.fetches.current
         if fetch is not None:
             fetch.heard(message, now)
-        if self.fetches.overheard is not None:
-            self.fetches.overheard.heard(message, now)
         if writes.queues:
             writes.heard(message, now)
-        self.reads.heard(message, now)
+        self._value_heard(message, now)
 
     def foreign_set(self, name: str, station: str, now: float) -> None:
         """Another station was heard setting a parameter of this component."""

@@ -151,6 +151,7 @@ class Fetches:
 
     def _fetch_ended(self, fetch: Fetch) -> None:
         self.current = None
+        self._means.trace("%s/%s: %r", *self._means.target, fetch.result or fetch.error)
         if fetch.file_failed is not None:
             self.file_works = not fetch.file_failed
         result = fetch.result

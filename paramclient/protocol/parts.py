@@ -19,6 +19,7 @@ from paramclient.protocol.result import FetchResult, Means, Sampled
 from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.trace import Trace, silent
 from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import MAV_AUTOPILOT_PX4, Message
 from paramclient.protocol.writes import Writes
@@ -47,6 +48,7 @@ class Parts(ABC):
         is_vehicle_doubted: Callable[[], bool] = lambda: False,
         another: Callable[[float], None] | None = None,
         turns: Turns | None = None,
+        trace: Trace = silent,
     ) -> None:
         target = (system, component)
         upkeep = upkeep or Upkeep()
@@ -59,7 +61,7 @@ class Parts(ABC):
         )
         self.table = Table(self.who.encoding)
         self.turns = Turns() if turns is None else turns
-        self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share)
+        self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share, trace)
         self.writes = Writes(
             target,
             self.round_trip,
@@ -68,6 +70,7 @@ class Parts(ABC):
             self.table.params,
             encoding=lambda: self.table.encoding,
             is_certain=lambda: self.may_be_written,
+            trace=trace,
         )
         self.presence = Presence()
         self.sync = Sync(
@@ -98,12 +101,16 @@ class Parts(ABC):
                 expects_hash=lambda: self.sync.expects_hash,
                 changed=self._moved,
                 doubt=self._doubt_identity,
+                trace=trace,
             ),
             self.sync,
             upkeep,
             says_file=lambda: self.who.says_file,
             ended=self._fetched,
         )
+        # where nothing is asked there are no reads: what others ask for is heard in their place
+        overheard = self.fetches.overheard
+        self._value_heard = self.reads.heard if overheard is None else overheard.heard
         self._own = own
         self._emit = emit
         self._policy = upkeep.policy

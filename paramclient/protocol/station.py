@@ -14,6 +14,7 @@ from paramclient.protocol.events import ComponentHeard, Event
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.result import Policy
 from paramclient.protocol.sync import Upkeep
+from paramclient.protocol.trace import Told, Trace, silent
 from paramclient.protocol.traffic import Traffic
 from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import (
@@ -69,10 +70,11 @@ class Station:
         encoding: for all components, where the user knows better; None: judged by the evidence.
         upkeep: what is done for tables without being asked; by default nothing.
         counts_traffic: whether everything on the link is counted, which takes time for each frame.
+        trace: is told of each step.
 
     Attributes:
         components: every component heard, by (system, component).
-        bytes_received, bytes_sent: on this link, by this station.
+        bytes_received, bytes_sent, frames_sent: on this link, by this station.
         traffic: the counts, or None where they are not wanted.
         policy: what may be asked to bring tables up to date.
         listens_only: whether nothing is ever sent.
@@ -90,6 +92,7 @@ class Station:
         encoding: Encoding | None = None,
         upkeep: Upkeep | None = None,
         counts_traffic: bool = False,
+        trace: Trace = silent,
     ) -> None:
         self.traffic = Traffic(is_stream=is_stream) if counts_traffic else None
         self.link = link
@@ -99,7 +102,9 @@ class Station:
         self.own: Address = NOBODY if self.listens_only else (system, component)
         self.components: dict[Address, ComponentMachine] = {}
         self.bytes_received = 0
-        self.bytes_sent = 0
+        self.bytes_sent = self.frames_sent = 0
+        self._trace = trace
+        self._frames = self._skipped = self._damaged = 0  # of framers that are gone
         self._is_stream = is_stream
         self._encoding = encoding
         self.policy = Policy.AUTO if upkeep is None else upkeep.policy
@@ -181,7 +186,8 @@ class Station:
         """The link is away: time stands still for whatever waits."""
         self._is_paused = True
         self._outbox.clear()
-        self._framers.clear()
+        for peer in list(self._framers):
+            self._retire(peer)
         if self.traffic is not None:
             self.traffic.pause()
         self._peers.clear()  # the link that comes back has others
@@ -200,6 +206,16 @@ class Station:
         self.is_over = True
         for machine in self.components.values():
             machine.fetches.over(now)
+
+    @property
+    def framing(self) -> tuple[int, int, int]:
+        """Frames that came, bytes that belonged to none, and frames with a wrong checksum among these."""
+        framers = [self._framer, *self._framers.values()]
+        return (
+            self._frames + sum(framer.frames for framer in framers),
+            self._skipped + sum(framer.skipped for framer in framers),
+            self._damaged + sum(framer.damaged for framer in framers),
+        )
 
     @property
     def is_waiting(self) -> bool:
@@ -273,11 +289,19 @@ class Station:
         if framer is None:
             framer = self._framers[peer] = Framer(HEARD)
             if len(self._framers) > MOST_PEERS:
-                del self._framers[next(iter(self._framers))]
+                self._retire(next(iter(self._framers)))
         if data:
             return framer.receive(data)
-        self._framers.pop(peer, None)
-        return framer.flush()
+        frames = framer.flush()
+        self._retire(peer)
+        return frames
+
+    def _retire(self, peer: Peer) -> None:
+        """Part with the framer of a peer, and keep what it has counted."""
+        framer = self._framers.pop(peer)
+        self._frames += framer.frames
+        self._skipped += framer.skipped
+        self._damaged += framer.damaged
 
     def _receive_other(self, frame: Frame, peer: Peer, now: float) -> None:
         """Take a frame that is no value of a known component."""
@@ -316,6 +340,7 @@ class Station:
             is_vehicle_doubted=lambda: self._autopilot_is_doubted(system),
             another=lambda now: self._become_another(system, now),
             turns=self._turns,
+            trace=self._trace,
         )
         self.components[sender] = machine
         self._events.append(ComponentHeard(machine))
@@ -347,4 +372,7 @@ class Station:
         )
         self._sequence = (self._sequence + 1) & 0xFF
         self.bytes_sent += len(data)
+        self.frames_sent += 1
+        if system is not None:
+            self._trace("to system %s: %s", system, Told(message))
         self._outbox.append((data, None if system is None else self._peers.get(system)))

@@ -64,6 +64,7 @@ class Framer:
     Attributes:
         frames: frames that were found whole, wanted or not.
         skipped: bytes that belonged to no such frame.
+        damaged: what looked like a frame of a known id and had a wrong checksum.
     """
 
     def __init__(self, wanted: Collection[int] | None = None, *, stream: bool = True) -> None:
@@ -73,6 +74,7 @@ class Framer:
         self._tail = b""
         self.frames = 0
         self.skipped = 0
+        self.damaged = 0
 
     def receive(self, data: bytes, *, final: bool = False) -> list[Frame]:
         """Take bytes from the link; give the frames that are complete now, in order.
@@ -127,6 +129,8 @@ class Framer:
                         found.append(Frame(number, system, component, sequence, payload, 1))
                 at = end
                 continue
+            if extra is not None and end <= length:
+                self.damaged += 1
             candidate = _MAGIC(data, at + 1)
             next_at = candidate.start() if candidate else length
             skipped += next_at - at
