@@ -284,7 +284,7 @@ class ParamClient:
 
         The events are those of `paramclient.events`: Heard, Lost, Found, Rebooted, Resynced. An absence of
         the link does not end it; it ends when nobody holds it any more. Whoever is very slow to ask misses
-        the oldest ones.
+        the oldest ones. In a log it ends with that.
 
         Raises:
             LinkError: while waiting, when the link failed for good or the client was closed. What had come
@@ -292,7 +292,7 @@ class ParamClient:
         """
         events = Events()
         self._subscriptions.add(events)
-        if self._carrier.ended is not None:
+        if self._is_over:
             events.end(self._carrier.ended)
         return events
 
@@ -437,6 +437,8 @@ class ParamClient:
                 self._announce(event)
         if is_to_be_written:
             self._writer.wake()
+        if self._station.is_over:
+            self._end_feeds(None)
 
     def _announce(self, event: Event) -> None:
         """Tell those who listen, if it is for them."""
@@ -475,9 +477,19 @@ class ParamClient:
         self._dispatch()
         self._carrier.fail_for_good(error)
         for component in self._components.values():
+            component._cache_is_read.set()
+        self._end_feeds(error)
+
+    def _end_feeds(self, error: LinkError | None) -> None:
+        for component in self._components.values():
             component._end(error)
         for events in list(self._subscriptions):
             events.end(error)
+
+    @property
+    def _is_over(self) -> bool:
+        """Whether nothing more will happen."""
+        return self._station.is_over or self._carrier.ended is not None
 
     def _check_open(self) -> None:
         if self._carrier.broken is not None:

@@ -292,7 +292,7 @@ class Component:
         Each change names the parameter, what was known before and what is known now. A value that is heard
         for the first time is one too. Whoever is slow to ask gets several changes of one parameter as one,
         so what waits is never more than one change for each parameter. An absence of the link does not end
-        it; it ends when nobody holds it any more.
+        it; it ends when nobody holds it any more. In a log it ends with that.
 
         Raises:
             LinkError: while waiting, when the link failed for good or the client was closed. What had come
@@ -300,7 +300,7 @@ class Component:
         """
         changes = Changes()
         self._subscriptions.add(changes)
-        if self._client._carrier.ended is not None:
+        if self._client._is_over:
             changes.end(self._client._carrier.ended)
         return changes
 
@@ -325,9 +325,8 @@ class Component:
         for changes in list(self._subscriptions):
             changes.push(change)
 
-    def _end(self, error: ParamClientError) -> None:
+    def _end(self, error: ParamClientError | None) -> None:
         """Nothing will come any more."""
-        self._cache_is_read.set()
         for changes in list(self._subscriptions):
             changes.end(error)
 

@@ -211,7 +211,13 @@ async def test_the_last_word_counts(tmp_path: Path) -> None:
     log = whole(A=1, B=2).wait(5.0).set("A", 7).wait(5.0)
     async with a_replay(log.write(tmp_path / "flight.tlog")) as client:
         component = await client.component()
+        changes, events = component.changes(), client.events()
         assert (await component.fetch_all()).params["A"].value == 7
+        # both end with the log, also for those who come late
+        assert [(each.name, each.by) async for each in changes] == [("A", "station 255/190")]
+        assert [each async for each in events] == []
+        assert [each async for each in component.changes()] == []
+        assert [each async for each in client.events()] == []
 
 
 @swiftly
@@ -439,7 +445,13 @@ def test_the_command_reads_logs(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert (table["uid"], table["params"]["B"]["value"]) == (UID, 4)
     assert run(["get", f"replay:{path}", "A"]) == 2
     assert "where nothing is sent" in capsys.readouterr().err
-    assert run(["watch", f"replay:{path}?speed=0", "--timeout", "0.2"]) == 0
+    capsys.readouterr()
+    for names in ([], ["B"]):
+        assert run(["watch", f"replay:{path}?speed=100", *names]) == 0  # it ends with the log
+        told = capsys.readouterr().out.splitlines()
+        assert [line.partition("  ")[2] for line in told] == ["B  2 -> 4  (vehicle)"]
+    assert run(["watch", f"replay:{path}?speed=100", "A"]) == 0
+    assert capsys.readouterr().out == ""
     assert run(["show", f"replay:{path}.gone"]) == 4
     assert "cannot open" in capsys.readouterr().err
 
