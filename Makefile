@@ -17,7 +17,7 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 TESTS ?=
 SESSIONS ?= 10000
 
-MEASURED = 'protocol/*' 'sim/*' 'cache/*' values.py errors.py identity.py params.py
+MEASURED = 'protocol/*' 'sim/*' 'cache/*' 'files/*' values.py errors.py identity.py params.py paramset.py
 # they start programs of their own, which are not measured, are about rooms that are not, or go where others have been
 UNMEASURED = $(addprefix --ignore=tests/test_,bench.py cli.py docs.py examples.py links.py machine.py packaging.py)
 

@@ -2,15 +2,33 @@
 
 from __future__ import annotations
 
-from paramclient.cache import CachedComponent, CachedVehicle, HistoryEntry, ParamCache
+from paramclient.cache import (
+    CachedComponent,
+    CachedVehicle,
+    FleetDiff,
+    FleetValue,
+    FleetVehicle,
+    HistoryEntry,
+    Holder,
+    NameSpread,
+    ParamCache,
+    Snapshot,
+    SnapshotSummary,
+)
 from paramclient.client import FetchedAll, ParamClient
 from paramclient.component import Component
 from paramclient.errors import (
+    AnotherVehicle,
     CacheError,
     ClientClosed,
+    CommandRefused,
+    CommandResult,
+    FileError,
     FileErrorCode,
     FileTransferError,
+    InvalidParameters,
     LinkError,
+    MetadataError,
     NoReply,
     PackError,
     ParamClientError,
@@ -20,24 +38,30 @@ from paramclient.errors import (
     UnknownParameter,
     UsageError,
     ValueNotApplied,
+    VehicleArmed,
     VehicleError,
 )
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
+from paramclient.files import FileForm, ParamFile, read_file, write_file
 from paramclient.ftp import Ftp
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
+from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.protocol.ftp import DirectoryEntry
 from paramclient.protocol.result import FetchResult, Policy, Progress
 from paramclient.protocol.sampling import Sample
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
 from paramclient.protocol.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport
+from paramclient.protocol.wire import Refusal, SigningKey, SigningPolicy, SigningReport, SigningStream
 from paramclient.protocol.writes import SetResult
+from paramclient.signing import Signing, key_from_environment, read_key
 from paramclient.stats import ClientStats
 from paramclient.values import Encoding, Param, ParamType, Trust
 from paramclient.version import __version__
 
 __all__ = [
+    "AnotherVehicle",
     "CacheError",
     "CachedComponent",
     "CachedVehicle",
@@ -45,6 +69,8 @@ __all__ = [
     "Changes",
     "ClientClosed",
     "ClientStats",
+    "CommandRefused",
+    "CommandResult",
     "Component",
     "ComponentTraffic",
     "DirectoryEntry",
@@ -53,16 +79,25 @@ __all__ = [
     "Events",
     "FetchResult",
     "FetchedAll",
+    "FileError",
     "FileErrorCode",
+    "FileForm",
     "FileTransferError",
+    "FleetDiff",
+    "FleetValue",
+    "FleetVehicle",
     "Found",
     "Ftp",
     "Heard",
     "HistoryEntry",
+    "Holder",
     "Identity",
+    "InvalidParameters",
     "LinkError",
     "Lost",
     "MessageTraffic",
+    "MetadataError",
+    "NameSpread",
     "NoReply",
     "PackError",
     "Param",
@@ -70,16 +105,26 @@ __all__ = [
     "ParamClient",
     "ParamClientError",
     "ParamErrorCode",
+    "ParamFile",
     "ParamMap",
+    "ParamSet",
     "ParamType",
     "Policy",
     "Progress",
     "Rebooted",
     "RadioStatus",
+    "Refusal",
     "Refused",
     "Resynced",
     "Sample",
     "SetResult",
+    "Signing",
+    "SigningKey",
+    "SigningPolicy",
+    "SigningReport",
+    "SigningStream",
+    "Snapshot",
+    "SnapshotSummary",
     "SyncState",
     "TrafficReport",
     "Trust",
@@ -87,6 +132,12 @@ __all__ = [
     "UnknownParameter",
     "UsageError",
     "ValueNotApplied",
+    "VehicleArmed",
     "VehicleError",
+    "WrittenParam",
     "__version__",
+    "key_from_environment",
+    "read_key",
+    "read_file",
+    "write_file",
 ]

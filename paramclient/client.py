@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING, Final
 import anyio
 import anyio.abc
 
+from paramclient.beside import Beside
 from paramclient.cache import ParamCache
-from paramclient.capture import Capture
 from paramclient.carrier import Carrier
-from paramclient.component import PROGRESS_INTERVAL, Component, patience_of
+from paramclient.component import PROGRESS_INTERVAL, Component, address_in_words, patience_of
 from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
 from paramclient.events import Events, told
-from paramclient.forward import Forwarder
 from paramclient.ftp import Ftp
 from paramclient.identity import Identity
 from paramclient.links import Link, ReplayLink, create_link
@@ -34,12 +33,16 @@ from paramclient.protocol.events import (
 )
 from paramclient.protocol.result import Policy, Progress
 from paramclient.protocol.station import Address, Station
+from paramclient.protocol.succession import SEARCH_PACE, Succession
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.traffic import TrafficReport
+from paramclient.protocol.wire import SigningKey, SigningReport
+from paramclient.signing import Signing, refused_in_words
 from paramclient.stats import ClientStats
+from paramclient.timestamps import TimestampKeeper
 from paramclient.together import FetchedAll, FetchTogether
 from paramclient.values import Encoding
-from paramclient.writethrough import WriteThrough
+from paramclient.writethrough import WriteThrough, chosen_cache
 
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint
@@ -88,15 +91,15 @@ class ParamClient:
             same.
         traffic: whether to count everything that is heard, for `traffic_report`. That takes time for each
             frame, also of those that a client otherwise steps over.
-        listen_only: never send a byte, not even a heartbeat. Tables still fill, by what others on the link
-            ask for, and may be confirmed by a hash that others ask for; `get`, `set` and whatever else asks
-            the vehicle raise UsageError; `fetch_all` waits for a list that others ask for.
+        listen_only: never send a byte, not even a heartbeat. Tables fill by what others on the link ask for;
+            `fetch_all` waits for their list, and `get`, `set` and the like raise UsageError.
         forward: the link to one other program, by its name or as an object, such as
             `udpout:127.0.0.1:14551`: it gets every frame that comes, and what it sends goes to the vehicles;
             with `listen_only` it is not. A program that is slow or absent holds nothing up.
-        tlog: a telemetry log to be made: every frame on the link, both ways, in the form that other programs
-            read too. One that exists is not written over. A disk that is full ends it with a warning in the
-            log of the program, and nothing else.
+        tlog: a telemetry log to be made, of every frame on the link, both ways. One that exists is not
+            written over; a full disk ends it with a warning, and nothing else.
+        signing: the key with which what is sent is signed and what comes is checked, or a `Signing`, which
+            says more. None: nothing is signed, and signatures count for nothing.
 
     Attributes:
         cache: where tables are kept, or None.
@@ -121,27 +124,21 @@ class ParamClient:
         listen_only: bool = False,
         forward: str | Link | None = None,
         tlog: str | os.PathLike[str] | None = None,
+        signing: Signing | SigningKey | None = None,
     ) -> None:
         for number in (system, component):
             if not 1 <= number <= 255:
                 raise UsageError(f"our own system and component ids are 1 to 255, not {number}")
         self._link = create_link(link)
         is_log = isinstance(self._link, ReplayLink)
-        if is_log and cache not in (None, True, False):
-            raise UsageError("what a log holds is of the past: `paramclient import` brings it into a cache")
-        if isinstance(cache, ParamCache):
-            self.cache: ParamCache | None = cache
-        elif cache is False or is_log:
-            self.cache = None
-        else:
-            self.cache = ParamCache(None if cache is None or cache is True else cache)
+        self.cache = chosen_cache(cache, is_log=is_log)
         self._station = Station(
             link=self._link.name,
             is_stream=self._link.is_stream,
             system=system,
             component=component,
             encoding=encoding,
-            upkeep=self._upkeep(watch_interval, policy, listen_only=listen_only, is_log=is_log),
+            upkeep=Upkeep.chosen(watch_interval, policy, listen_only=listen_only, is_log=is_log),
             counts_traffic=traffic,
             trace=protocol_logger.debug,
         )
@@ -154,35 +151,23 @@ class ParamClient:
         self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self._components: dict[Address, Component] = {}
         self._tasks: anyio.abc.TaskGroup | None = None
-        self._capture = None if tlog is None else Capture(tlog, is_stream=self._link.is_stream)
-        self._forwarder: Forwarder | None = None
-        if forward is not None:
-            self._forwarder = Forwarder(
-                create_link(forward),
-                is_stream=self._link.is_stream,
-                to_vehicle=None if self._station.listens_only else self._send_for_another,
-            )
+        self._beside = Beside(tlog, forward, is_stream=self._link.is_stream)
         self._carrier = Carrier(
             self._link,
             self._station,
             dispatch=self._dispatch,
             end=self._end,
-            taps=[tap for tap in (self._capture, self._forwarder) if tap is not None],
-            may_rest=self._forwarder is None,
+            taps=self._beside.taps,
+            may_rest=self._beside.forwarder is None,
         )
+        if not self.listens_only:
+            self._beside.share(self._carrier.send_for_another)
         self._downloads = self._cache_hits = 0
+        if isinstance(signing, SigningKey):
+            signing = Signing(signing)
+        self._keeper = None if signing is None else TimestampKeeper(signing)
         self._is_entered = False
         self._opened_at = -math.inf
-
-    def _upkeep(
-        self, interval: float | None, policy: Policy | str, *, listen_only: bool, is_log: bool
-    ) -> Upkeep:
-        chosen = Upkeep.chosen(interval, policy)
-        if not (listen_only or is_log):
-            return chosen
-        if interval or policy != Policy.AUTO:
-            raise UsageError("watch_interval and policy say what may be asked: with listen_only, nothing is")
-        return Upkeep.of_listener(is_log=is_log)
 
     @property
     def components(self) -> Mapping[Address, Component]:
@@ -190,9 +175,21 @@ class ParamClient:
         return MappingProxyType(self._components)
 
     @property
+    def autopilots(self) -> list[Component]:
+        """The autopilot of each system heard so far, by system id: vehicles, without what they carry."""
+        systems = sorted({system for system, _ in self._components})
+        found = [self._find(system, None) for system in systems]
+        return [component for component in found if component is not None]
+
+    @property
     def link(self) -> Link:
         """The link."""
         return self._link
+
+    @property
+    def listens_only(self) -> bool:
+        """Whether nothing is ever sent: by choice, or as the link is a log."""
+        return self._station.listens_only
 
     @property
     def bytes_received(self) -> int:
@@ -223,10 +220,9 @@ class ParamClient:
         try:
             await self._link.open()
             await self._writer.open()
-            if self._forwarder is not None:
-                await self._forwarder.open()
-            if self._capture is not None:
-                await self._capture.open()
+            await self._beside.open()
+            if self._keeper is not None:
+                self._station.begin_signing(*await self._keeper.open())
         except BaseException:
             await self._release()
             raise
@@ -238,11 +234,9 @@ class ParamClient:
         tasks.start_soon(self._carrier.read, name="paramclient reader")
         tasks.start_soon(self._carrier.send, name="paramclient sender")
         tasks.start_soon(self._writer.run, name="paramclient cache writer")
-        if self._forwarder is not None:
-            tasks.start_soon(self._forwarder.read, name="paramclient forward reader")
-            tasks.start_soon(self._forwarder.send, name="paramclient forward sender")
-        if self._capture is not None:
-            tasks.start_soon(self._capture.run, name="paramclient tlog writer")
+        self._beside.start(tasks)
+        if self._keeper is not None:
+            tasks.start_soon(self._keeper.run, name="paramclient timestamp keeper")
         return self
 
     async def __aexit__(
@@ -267,8 +261,6 @@ class ParamClient:
         logger.debug("%s: closing", self._link.name)
         with anyio.CancelScope(shield=True):
             try:
-                if self._forwarder is not None:
-                    await self._forwarder.close()
                 await self._link.close()
                 for machine in self._station.components.values():
                     await self._writer.keep_late(machine)
@@ -276,8 +268,11 @@ class ParamClient:
                 try:
                     await self._writer.close()
                 finally:
-                    if self._capture is not None:
-                        await self._capture.close()
+                    try:
+                        if self._keeper is not None:
+                            await self._keeper.close()
+                    finally:
+                        await self._beside.close()
 
     def events(self) -> Events:
         """What happens to components from now on: `async for event in client.events()`.
@@ -332,8 +327,42 @@ class ParamClient:
                 await found._wait_for_cache()
         if found is None:
             waited = anyio.current_time() - began
-            raise NoReply(_wanted(system, component), attempts=0, waited=waited)
+            wanted = address_in_words(system, component) + refused_in_words(self.signing_report())
+            raise NoReply(wanted, attempts=0, waited=waited)
         return found
+
+    async def successor(
+        self, component: Component, system: int, *, timeout: float | None = HEARING_PATIENCE
+    ) -> Component:
+        """The same component of the same vehicle under another system id, as soon as it speaks under that.
+
+        For a vehicle whose system id was set: ArduPilot takes it at once (SYSID_THISMAV), PX4 when it starts
+        again (MAV_SYS_ID, see `Component.reboot`). That it is the same one is shown by its hardware id; where
+        there is none, by its autopilot and type, and by its silence under the id of before.
+
+        Args:
+            component: what it was before.
+            system: its new system id.
+            timeout: seconds; None waits for ever.
+
+        Raises:
+            AnotherVehicle: another vehicle has this system id.
+            NoReply: it was not heard under this id in time, or did not say who it is.
+            LinkError: the link failed, or the client was closed.
+        """
+        self._check_open()
+        began = anyio.current_time()
+        search = Succession(component._machine, (system, component.component))
+        with anyio.move_on_after(timeout):
+            while not search.look(self._station.components, anyio.current_time()):
+                self._wake()
+                with anyio.move_on_after(SEARCH_PACE):
+                    await self._carrier.news.wait()
+                self._check_open()
+            found = self._components[search.address]
+            await found._wait_for_cache()
+            return found
+        raise NoReply(search.awaited, attempts=0, waited=anyio.current_time() - began)
 
     async def fetch_all(
         self,
@@ -397,6 +426,13 @@ class ParamClient:
             raise UsageError("nothing is counted; use ParamClient(..., traffic=True)")
         self._check_open()
         return self._station.traffic.report(anyio.current_time())
+
+    def signing_report(self) -> SigningReport | None:
+        """How the signatures on the link stand: what came signed, what was refused and why.
+
+        None where the client has no key.
+        """
+        return None if self._station.verifier is None else self._station.verifier.report()
 
     # what has happened
 
@@ -464,9 +500,6 @@ class ParamClient:
         assert self._tasks is not None, "nothing is heard before"
         self._tasks.start_soon(self._load, component, identity)
 
-    def _send_for_another(self, frame: bytes) -> None:
-        self._carrier.send_for_another(frame)
-
     def _wake(self) -> None:
         self._carrier.wake()
 
@@ -513,20 +546,5 @@ class ParamClient:
         return self._station.identity_of(machine)
 
     def _find(self, system: int | None, component: int | None) -> Component | None:
-        if component is None:
-            for machine in self._station.components.values():
-                if system in (None, machine.system) and machine.who.is_autopilot:
-                    autopilot = self._station.autopilot_of(machine.system) or machine
-                    return self._components[autopilot.system, autopilot.component]
-            return None
-        for address, found in self._components.items():
-            if address[1] == component and system in (None, address[0]) and found._machine.who.has_spoken:
-                return found
-        return None
-
-
-def _wanted(system: int | None, component: int | None) -> str:
-    """What was looked for, in words."""
-    if component is None:
-        return "an autopilot" if system is None else f"an autopilot with system id {system}"
-    return f"component {'*' if system is None else system}/{component}"
+        found = self._station.find(system, component)
+        return None if found is None else self._components[found.system, found.component]

@@ -24,21 +24,28 @@ from paramclient.protocol.sampling import SAMPLE_SIZE
 from paramclient.protocol.station import Station
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
-from paramclient.protocol.wire import HASH_CHECK, NO_INDEX, ParamValue
+from paramclient.protocol.wire import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, NO_INDEX, ParamValue, SigningKey
 from paramclient.protocol.writes import SetResult
+from paramclient.signing import timestamp_now
 from paramclient.values import Encoding, Param, check_name, check_value, decode, known_type
 
 if TYPE_CHECKING:
     from paramclient.client import ParamClient
 
-__all__ = ["Component", "patience_of"]
+__all__ = ["Component", "address_in_words", "patience_of"]
 
 Result = TypeVar("Result")
 
+REBOOT_PATIENCE = 60.0
+"""Seconds for a vehicle to start again and say who it is, unless the caller says otherwise: autopilots on
+small boards take up to half a minute, and those that calibrate sensors first a little longer."""
 PROGRESS_INTERVAL = 0.1
 """Seconds between two calls of a progress callback."""
 IDENTITY_PATIENCE = 1.5
 """Seconds to wait for a component to say who it is before its cached table is done without."""
+SETUP_TRIES = 3
+SETUP_PAUSE = 0.1
+"""How often SETUP_SIGNING is sent, and the seconds after each: nothing answers it, and frames get lost."""
 TIME_IS_OVER = "The time given for the fetch was over."
 """Why a result is partial that a time limit ended."""
 
@@ -109,6 +116,18 @@ class Component:
     def sync_state(self) -> SyncState:
         """How the table stands to the vehicle's: up to date, or what is done about it."""
         return self._machine.sync_state
+
+    @property
+    def is_armed(self) -> bool | None:
+        """Whether its motors may turn, by its last heartbeat.
+
+        None where that is not known: before a heartbeat, while it is lost, and in high-latency mode, in which
+        it sends none.
+        """
+        presence = self._machine.presence
+        if presence.base_mode is None or presence.is_lost:
+            return None
+        return bool(presence.base_mode & MAV_MODE_FLAG_SAFETY_ARMED)
 
     @property
     def silence(self) -> float:
@@ -286,6 +305,75 @@ class Component:
         if refresh is not None:
             await self._wait(refresh, timeout, lambda: ("the values that no hash covers", 0))
 
+    async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
+        """Give a vehicle its signing key, or with None take it away, by SETUP_SIGNING.
+
+        The key goes over the link in clear, so only where nobody listens: over a USB cable, a wire. Nothing
+        answers it; whether the vehicle has obeyed shows in a session with the new key. This one goes on with
+        its own, which must be the vehicle's until then, unless that trusts the link (ArduPilot trusts USB).
+
+        Args:
+            key: its new key.
+            link_is_safe: that the user has said so.
+
+        Raises:
+            UsageError: nobody has said that the link is safe, or the component speaks MAVLink 1.
+            LinkError: the link failed, or the client was closed.
+        """
+        if not link_is_safe:
+            raise UsageError(
+                "SETUP_SIGNING carries the key in clear: only over a link on which nobody else can listen, "
+                "and with link_is_safe=True"
+            )
+        if self._machine.version == 1:
+            raise UsageError(f"{self.system}/{self.component} speaks MAVLink 1, which knows no signatures")
+        for _ in range(SETUP_TRIES):
+            self._client._check_open()
+            timestamp = 0 if key is None else timestamp_now()
+            self._client._station.send_setup_signing(self.system, self.component, key, timestamp)
+            self._client._wake()
+            await anyio.sleep(SETUP_PAUSE)
+
+    async def reboot(self, *, system: int | None = None, timeout: float | None = None) -> Component:
+        """Let the vehicle start again, and wait until the same one is back.
+
+        It is told to when what was written through this client has had the time to be saved (2.5 s after the
+        last write). That it has started again is seen by its clock, its heartbeat or its silence, so an
+        acknowledgement may be lost. Then its hardware id is asked for, or where it has none, its heartbeat
+        must name the same autopilot and type. Its table is *cached* afterwards until it is confirmed, as
+        after any start; parameters may be others now.
+
+        Calls at the same time share one restart. When the call is cancelled, the vehicle may start again all
+        the same.
+
+        Args:
+            system: the system id that it takes with the start, where another one was set (MAV_SYS_ID of PX4);
+                then `ParamClient.successor` finds it there.
+            timeout: seconds until giving up; None for `REBOOT_PATIENCE`.
+
+        Returns:
+            The component that it is now: this one, or the one with the other system id.
+
+        Raises:
+            CommandRefused: it does not want to, most likely because it is armed.
+            AnotherVehicle: another vehicle answers under its system id.
+            NoReply: it does not answer, or did not come back in time.
+            LinkError: the link failed, or the client was closed.
+        """
+        self._client._check_open()
+        moves = system is not None and system != self.system
+        deadline = anyio.current_time() + (REBOOT_PATIENCE if timeout is None else timeout)
+        machine = self._machine
+        restart = machine.begin_restart(anyio.current_time(), returns=not moves)
+        try:
+            left = deadline - anyio.current_time()
+            await self._wait(restart, left, lambda: (restart.stage, restart.attempts))
+        finally:
+            machine.end_restart(restart, anyio.current_time())
+        if system is None or not moves:
+            return self
+        return await self._client.successor(self, system, timeout=deadline - anyio.current_time())
+
     def changes(self) -> Changes:
         """What changes from now on: `async for change in component.changes()`.
 
@@ -407,3 +495,10 @@ def _param_of(message: ParamValue, encoding: Encoding) -> Param:
 def _read_of(machine: ComponentMachine, name: str | int) -> str:
     what = name if isinstance(name, str) else f"parameter {name}"
     return f"{what} of {machine.system}/{machine.component}"
+
+
+def address_in_words(system: int | None, component: int | None) -> str:
+    """What is looked for on a link, in words."""
+    if component is None:
+        return "an autopilot" if system is None else f"an autopilot with system id {system}"
+    return f"component {'*' if system is None else system}/{component}"

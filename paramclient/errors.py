@@ -4,12 +4,18 @@ The tree says who is to blame::
 
     ParamClientError
     ├── UsageError(ValueError)        the caller: a name, value, link name or argument that cannot be right
+    │   ├── FileError                 a parameter file that cannot be read or written
+    │   ├── InvalidParameters         values that are to be set, and cannot be right
+    │   └── MetadataError             a description of parameters that is none
     ├── VehicleError                  the vehicle answered, and the answer is no
     │   ├── UnknownParameter          it has no parameter of that name or index
     │   ├── Refused                   it gave a reason: PARAM_ERROR, or ArduPilot's text
+    │   │   └── CommandRefused        the same for a command: MAV_RESULT
     │   ├── TypeMismatch              it holds the parameter in a type that the value cannot take
     │   ├── ValueNotApplied           it kept another value and gave no reason
-    │   └── FileTransferError         it did not do what was asked with a file
+    │   ├── VehicleArmed              it is armed, and nothing is set then unless told otherwise
+    │   ├── FileTransferError         it did not do what was asked with a file
+    │   └── AnotherVehicle            it is not the one that was meant
     ├── NoReply(TimeoutError)         nobody answered in time
     ├── LinkError(OSError)            the socket or the device
     │   └── ClientClosed              the client was closed while a call waited, or is not open
@@ -21,14 +27,21 @@ Each carries what is known as attributes, so that a program need not read its te
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import IntEnum
 
 __all__ = [
+    "AnotherVehicle",
     "CacheError",
     "ClientClosed",
+    "CommandRefused",
+    "CommandResult",
+    "FileError",
     "FileErrorCode",
     "FileTransferError",
+    "InvalidParameters",
     "LinkError",
+    "MetadataError",
     "NoReply",
     "PackError",
     "ParamClientError",
@@ -38,6 +51,7 @@ __all__ = [
     "UnknownParameter",
     "UsageError",
     "ValueNotApplied",
+    "VehicleArmed",
     "VehicleError",
 ]
 
@@ -62,6 +76,30 @@ class ParamErrorCode(IntEnum):
             return ParamErrorCode(code).name.lower().replace("_", " ")
         except ValueError:
             return f"error code {code}"
+
+
+class CommandResult(IntEnum):
+    """MAV_RESULT: what a COMMAND_ACK can say (MAVLink common message set)."""
+
+    ACCEPTED = 0
+    TEMPORARILY_REJECTED = 1
+    DENIED = 2
+    UNSUPPORTED = 3
+    FAILED = 4
+    IN_PROGRESS = 5
+    CANCELLED = 6
+    COMMAND_LONG_ONLY = 7
+    COMMAND_INT_ONLY = 8
+    COMMAND_UNSUPPORTED_MAV_FRAME = 9
+    NOT_IN_CONTROL = 10
+
+    @staticmethod
+    def name_of(code: int) -> str:
+        """The result in words; one that this version does not know is kept as its number."""
+        try:
+            return CommandResult(code).name.lower().replace("_", " ")
+        except ValueError:
+            return f"result {code}"
 
 
 class FileErrorCode(IntEnum):
@@ -94,6 +132,61 @@ class ParamClientError(Exception):
 
 class UsageError(ParamClientError, ValueError):
     """The caller asked for something that cannot be right. Nothing was sent."""
+
+
+class InvalidParameters(UsageError):
+    """Values that are to be set cannot be right.
+
+    Attributes:
+        problems: by parameter name, what is wrong with its value, as a sentence.
+    """
+
+    def __init__(self, problems: Mapping[str, str]) -> None:
+        lines = [f"{name}: {problem}" for name, problem in problems.items()]
+        super().__init__("nothing was sent, as values cannot be right:\n" + "\n".join(lines))
+        self.problems = problems
+
+
+class FileError(UsageError):
+    """A parameter file cannot be read or written; a file that was to be replaced is as it was before.
+
+    Its text has a line for each bad line of the file, `quad.param:17: expected …, found …`.
+
+    Attributes:
+        source: the file's name as it was given; "" for bytes without one.
+        line: the first bad line, from 1; None where it is not about a line.
+        expected: what should have stood there, in words; None where it is not about a line.
+    """
+
+    def __init__(
+        self,
+        message: str,
+        *,
+        source: str = "",
+        line: int | None = None,
+        expected: str | None = None,
+        more: tuple[str, ...] = (),
+    ) -> None:
+        if line is not None:
+            place = f"{source}:{line}: " if source else f"line {line}: "
+        else:
+            place = f"{source}: " if source else ""
+        super().__init__("\n".join((f"{place}{message}", *more)))
+        self.source = source
+        self.line = line
+        self.expected = expected
+
+
+class MetadataError(UsageError):
+    """A file that should describe parameters does not, or lies where it is not fetched from.
+
+    Attributes:
+        source: the file or the place, in words.
+    """
+
+    def __init__(self, message: str, *, source: str) -> None:
+        super().__init__(message)
+        self.source = source
 
 
 class VehicleError(ParamClientError):
@@ -143,6 +236,23 @@ class Refused(VehicleError):
         self.reason = ParamErrorCode.name_of(code)
 
 
+class CommandRefused(Refused):
+    """The vehicle does not obey a command, and says so.
+
+    Attributes:
+        command: MAV_CMD.
+        code: the number in its COMMAND_ACK, to compare with `CommandResult`.
+        reason: the same in words.
+    """
+
+    def __init__(self, system: int, component: int, command: int, code: int) -> None:
+        reason = CommandResult.name_of(code)
+        message = f"command {command} was refused by {system}/{component}: {reason}"
+        super().__init__(message, system=system, component=component, code=code)
+        self.command = command
+        self.reason = reason
+
+
 class TypeMismatch(VehicleError):
     """The vehicle holds the parameter in another type than the one that was sent."""
 
@@ -170,6 +280,10 @@ class ValueNotApplied(VehicleError):
         self.actual = actual
 
 
+class VehicleArmed(VehicleError):
+    """The vehicle is armed. Nothing is set then unless told otherwise."""
+
+
 class FileTransferError(VehicleError):
     """The vehicle did not do what was asked with a file.
 
@@ -195,6 +309,20 @@ class FileTransferError(VehicleError):
         return self.code == FileErrorCode.FILE_NOT_FOUND or (
             self.code == FileErrorCode.FAIL_ERRNO and self.errno == 2
         )
+
+
+class AnotherVehicle(VehicleError):
+    """Another vehicle than the one that was meant answers under the system id.
+
+    Attributes:
+        expected, found: the two vehicles, in words: the hardware id where there is one.
+    """
+
+    def __init__(self, system: int, component: int, expected: str, found: str) -> None:
+        message = f"another vehicle answers as {system}/{component}: it is {found}, and was to be {expected}"
+        super().__init__(message, system=system, component=component)
+        self.expected = expected
+        self.found = found
 
 
 class NoReply(ParamClientError, TimeoutError):

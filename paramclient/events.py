@@ -66,6 +66,8 @@ class Found:
 class Rebooted:
     """A vehicle has started again: its clock went back, or its heartbeat says that it is booting.
 
+    For one that was told to (see `Component.reboot`), its silence may have shown it too.
+
     Attributes:
         component: which one.
     """

@@ -35,16 +35,16 @@ class Forwarder:
     Args:
         link: to the program.
         is_stream: whether the vehicle link delivers a stream.
-        to_vehicle: takes each frame of the program; None for nobody, where nothing may be sent.
 
     Attributes:
+        to_vehicle: takes each frame of the program; None for nobody, where nothing may be sent.
         lost: frames that the program had no room for.
     """
 
-    def __init__(self, link: Link, *, is_stream: bool, to_vehicle: Callable[[bytes], None] | None) -> None:
+    def __init__(self, link: Link, *, is_stream: bool) -> None:
         self.lost = 0
         self._link = link
-        self._to_vehicle = to_vehicle
+        self.to_vehicle: Callable[[bytes], None] | None = None
         self._from_vehicle = FrameCutter(stream=is_stream)
         self._from_program = FrameCutter(stream=link.is_stream)
         self._waiting: deque[bytes] = deque()
@@ -88,8 +88,8 @@ class Forwarder:
                     await self._reach()
                 for peer, data in await self._link.receive():
                     for frame in self._from_program.cut(data, peer):
-                        if self._to_vehicle is not None:
-                            self._to_vehicle(frame)
+                        if self.to_vehicle is not None:
+                            self.to_vehicle(frame)
             except LinkError as error:
                 self._is_there = False
                 self._from_program.flush()

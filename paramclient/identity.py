@@ -101,6 +101,27 @@ class Identity:
             return f"uid:{self.uid}"
         return f"system:{self.system}@{self.link}"
 
+    @property
+    def has_own_uid(self) -> bool:
+        """Whether its hardware id names it alone."""
+        return self.uid is not None and self.uid not in SHARED_UIDS
+
+    def is_same_vehicle(self, other: Identity) -> bool:
+        """Whether what was heard as `other`, under this or another system id, is this vehicle.
+
+        The hardware id decides. Where there is none, or one that many have, as far as can be told: the same
+        link, autopilot and vehicle type.
+        """
+        if self.has_own_uid:
+            return other.uid == self.uid
+        mine, others = ((each.link, each.autopilot, each.vehicle_type) for each in (self, other))
+        return mine == others and (self.uid is None or other.uid == self.uid)
+
+    def __str__(self) -> str:
+        if self.uid is not None:
+            return f"the {autopilot_name(self.autopilot)} {self.uid}"
+        return f"a vehicle of type {self.vehicle_type} with {autopilot_name(self.autopilot)}"
+
 
 def autopilot_name(number: int) -> str:
     """A MAV_AUTOPILOT in a word: px4, ardupilot, generic, …; others by their number."""

@@ -97,7 +97,7 @@ class _Import:
     def __init__(self, name: str, versions: Mapping[Address, bytes], cache: ParamCache) -> None:
         self._versions = versions
         self._at = 0.0
-        self._station = Station(link=name, is_stream=False, upkeep=Upkeep.of_listener(is_log=True))
+        self._station = Station(link=name, is_stream=False, upkeep=Upkeep.chosen(None, "auto", is_log=True))
         self._writer = _PastWriter(
             cache,
             identity_of=self._identity_of,

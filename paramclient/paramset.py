@@ -45,19 +45,24 @@ class WrittenParam:
         Raises:
             UsageError: the value does not fit the type.
         """
+        if isinstance(self.value, bytes):
+            return int.from_bytes(self.value, "little")  # all four, also of a type that has fewer
         return bits_of(self.value, number)
 
     def is_held_by(self, param: Param) -> bool:
         """Whether a vehicle's parameter has this value, compared in the type that the vehicle gives it.
 
         −0 equals 0, a NaN equals only the same NaN, and a float is rounded to float32 first. False where the
-        value does not fit that type at all.
+        value does not fit that type at all. Raw bytes equal only the same raw bytes: what they mean as a
+        number is not known.
         """
+        if isinstance(self.value, bytes) or param.is_raw:
+            return self.value == param.value
         try:
             bits = self.bits_as(param.type)
         except UsageError:
             return False
-        return isinstance(self.value, bytes) <= param.is_raw and same_bits(param.type, bits, param.bits)
+        return same_bits(param.type, bits, param.bits)
 
     def __str__(self) -> str:
         kind = ParamType.REAL32 if self.type is None else self.type

@@ -338,14 +338,21 @@ def bits_of(value: Value, number: int) -> int:
         UsageError: the value does not fit the type.
     """
     value = check_value(value)
-    if number in (ParamType.UINT64, ParamType.INT64) and isinstance(value, int):
+    if number in (ParamType.UINT64, ParamType.INT64) and not isinstance(value, bytes):
         kind = ParamType(number)
         low, high = kind.bounds
+        if isinstance(value, float):
+            if not value.is_integer():
+                raise UsageError(f"{value!r} is not a whole number, and the parameter is {kind.name}")
+            value = int(value)
         if not low <= value <= high:
             raise UsageError(f"{value} does not fit {kind.name}, which holds {low} to {high}")
         return value & 0xFFFFFFFF_FFFFFFFF
     if number == ParamType.REAL64 and not isinstance(value, bytes):
-        return int.from_bytes(struct.pack("<d", value), "little")
+        try:
+            return int.from_bytes(struct.pack("<d", value), "little")
+        except struct.error:
+            raise UsageError(f"{value} is beyond the range of REAL64") from None
     size = ParamType(number).size if 1 <= number <= ParamType.REAL64 else 4
     return int.from_bytes(encode(value, number, Encoding.BYTEWISE)[:size], "little")
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.values import Param
 from paramclient.worker import Worker
 
-__all__ = ["WriteThrough"]
+__all__ = ["WriteThrough", "chosen_cache"]
 
 FLUSH_INTERVAL: Final = 0.25
 """Seconds that changes are gathered for before they are written. A download fills several batches."""
@@ -80,6 +81,10 @@ class WriteThrough:
         finally:
             cache = self._cache if self._owned else None
             await self._worker.close(_nothing if cache is None else cache.close)
+
+    async def aside(self, work: Callable[[], Result]) -> Result:
+        """Do what blocks in the cache's thread, behind what is under way there. Cancelled, it is done."""
+        return await self._worker.run(work)
 
     def may_have(self, system: int, component: int) -> bool:
         """Whether the cache had a table for such an address when the client was opened."""
@@ -288,6 +293,23 @@ class _News:
         self.kept.machine.table.dirty = self.dirty | self.kept.machine.table.dirty
         self.kept.is_whole |= self.update.replace
         self.kept.state = None
+
+
+def chosen_cache(
+    cache: ParamCache | str | os.PathLike[str] | bool | None, *, is_log: bool
+) -> ParamCache | None:
+    """The cache that a user's choice means, see `ParamClient`.
+
+    Raises:
+        UsageError: a cache is named for a log.
+    """
+    if is_log and cache not in (None, True, False):
+        raise UsageError("what a log holds is of the past: `paramclient import` brings it into a cache")
+    if isinstance(cache, ParamCache):
+        return cache
+    if cache is False or is_log:
+        return None
+    return ParamCache(None if cache is None or cache is True else cache)
 
 
 def _firmware(identity: Identity) -> tuple[int, str]:

@@ -31,6 +31,7 @@ from paramclient.errors import CacheError
 from paramclient.identity import Identity
 from tests.caches import (
     CACHE_ALONE,
+    NOW,
     PX4,
     full_disk,
     read_only,
@@ -98,6 +99,13 @@ def sound_file() -> bytes:
             cache.save(whole_table(300, first=1))
         return path.read_bytes()
 
+
+BACK_TO_2 = """
+    DROP TABLE snapshot; DROP TABLE setback; DROP TABLE birth; DROP INDEX history_of_param;
+    ALTER TABLE component DROP COLUMN known_since;
+    PRAGMA user_version = 2;
+"""
+"""Makes of the present file what the second version would have made."""
 
 # Killed at any moment
 
@@ -415,7 +423,7 @@ def sound_with(at: int, byte: int) -> Callable[[Path], None]:
         (lambda path: other_program(path, APPLICATION_ID), "tables are not those of version 0"),
         (lambda path: other_program(path, APPLICATION_ID, 1), "tables are not those of version 1"),
         (sound_but("PRAGMA user_version = -1"), "tables are not those of version -1"),
-        (sound_but("DROP TABLE history"), "tables are not those of version 2"),
+        (sound_but("DROP TABLE history"), "tables are not those of version 3"),
         (sound_but("ALTER TABLE param RENAME COLUMN bits TO bats"), "tables are not those"),
         (sound_but("UPDATE param SET bits = 'much'"), "a cell holds 'much'"),
         (sound_but("UPDATE param SET name = CAST(x'ff' || owner AS TEXT) WHERE param_index = 9"), "UTF-8"),
@@ -451,8 +459,13 @@ def test_what_is_no_cache_is_set_aside_whole_and_a_fresh_one_begins(
 
 
 @pytest.mark.parametrize(("application_id", "version"), [(0, 0), (0x47504B47, 1)])
-def test_another_programs_database_is_left_where_it_is(path: Path, application_id: int, version: int) -> None:
+@pytest.mark.parametrize("counting", ["", "CREATE TABLE counted (a INTEGER PRIMARY KEY AUTOINCREMENT)"])
+def test_another_programs_database_is_left_where_it_is(
+    path: Path, application_id: int, version: int, counting: str
+) -> None:
     other_program(path, application_id, version)
+    with connect(path) as connection:  # SQLite counts in a table of its own, which is in our files too
+        connection.execute(counting)
     content = path.read_bytes()
     with ParamCache(path) as cache, pytest.raises(CacheError, match="another program's database"):
         cache.vehicles()
@@ -505,6 +518,7 @@ def test_an_older_file_is_brought_up_to_date(path: Path, monkeypatch: pytest.Mon
 def test_a_file_from_before_there_were_defaults_keeps_its_tables(path: Path) -> None:
     path.write_bytes(sound_file())
     with connect(path) as connection:  # as the first version made it; the checksums are the same
+        connection.executescript(BACK_TO_2)
         connection.execute("ALTER TABLE param DROP COLUMN default_bits")
         connection.execute("ALTER TABLE component DROP COLUMN file_works")
         connection.execute("PRAGMA user_version = 1")
@@ -512,6 +526,41 @@ def test_a_file_from_before_there_were_defaults_keeps_its_tables(path: Path) -> 
         assert len(values(cache)) == 300
         assert not cache.notes
         works(cache)
+
+
+def test_a_file_from_before_there_were_snapshots_has_a_past_from_its_last_write_on(path: Path) -> None:
+    """What names came when is not known of before."""
+    with ParamCache(path) as cache:
+        cache.save(whole_table(300))
+        cache.save(update(stored("PARAM_1", 5, at=NOW + 50), at=NOW + 50))
+        cache.save(update(stored("ALONE", 1), component=154))
+    with connect(path) as connection:
+        connection.executescript(BACK_TO_2)
+    with ParamCache(path) as cache:
+        cache.save(update(stored("PARAM_1", 6, at=NOW + 99), stored("NEW", 1, at=NOW + 99), at=NOW + 99))
+        state = cache.state_at(PX4.key, 1, NOW + 50)
+        assert (len(state), state["PARAM_1"].value) == (300, 5)
+        assert cache.state_at(PX4.key, 1, NOW + 99)["NEW"].value == 1
+        with pytest.raises(CacheError, match="begins at 2026-11-18T11:07:30Z; there is no snapshot"):
+            cache.state_at(PX4.key, 1, NOW + 49)
+        with pytest.raises(CacheError, match="was never complete"):
+            cache.state_at(PX4.key, 154, NOW + 99)
+        assert cache.snapshots(PX4.key) == []
+        assert not cache.notes
+        works(cache)
+
+
+def test_a_past_that_the_clock_has_mixed_up_begins_after_all_of_it(path: Path) -> None:
+    with ParamCache(path) as cache:
+        cache.save(whole_table(3))
+        cache.save(update(stored("PARAM_1", 5, at=NOW + 900), at=NOW + 900))
+        cache.save(update(at=NOW + 10))
+    with connect(path) as connection:
+        connection.executescript(BACK_TO_2)
+    with ParamCache(path) as cache:
+        with pytest.raises(CacheError, match="begins at 2026-11-18T11:21:40Z"):
+            cache.state_at(PX4.key, 1, NOW + 899)
+        assert cache.state_at(PX4.key, 1, NOW + 900)["PARAM_1"].value == 5
 
 
 def test_a_file_cut_at_any_page_is_set_aside_as_it_is(path: Path) -> None:

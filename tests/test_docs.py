@@ -16,7 +16,10 @@ import pytest
 
 import paramclient
 import paramclient.links
+import paramclient.metadata
+import paramclient.provision
 import paramclient.sim
+import paramclient.testing
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -25,6 +28,9 @@ EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 DIRECTIVE = re.compile(r"^\.\. (\w+):: ([\w.]+)(?:\(\))?$", re.MULTILINE)
+COMMANDS = ["fetch", "get", "set", "watch", "link", "ports", "show", "diff", "save", "history", "sim"]
+COMMANDS += ["apply", "verify", "restore", "import"]
+
 LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]*)?\)")
 
 
@@ -51,10 +57,11 @@ def commands() -> list[list[str]]:
     ]
 
 
-def run(*arguments: str, **environment: str) -> str:
+def run(*arguments: str, cwd: Path | None = None, **environment: str) -> str:
     """Run a Python program; what it printed. It must end well, and complain of nothing."""
     done = subprocess.run(
         [sys.executable, *arguments],
+        cwd=cwd,
         env=os.environ | {"PYTHONPATH": str(ROOT)} | environment,
         stdin=subprocess.DEVNULL,
         capture_output=True,
@@ -68,7 +75,8 @@ def run(*arguments: str, **environment: str) -> str:
 
 @pytest.mark.parametrize("program", [*programs()])
 def test_a_program_runs(program: str, tmp_path: Path) -> None:
-    run("-W", "error", "-c", program, XDG_CACHE_HOME=str(tmp_path))
+    folders = {"XDG_CACHE_HOME": str(tmp_path), "XDG_STATE_HOME": str(tmp_path)}
+    run("-W", "error", "-c", program, cwd=tmp_path, **folders)
 
 
 def test_the_first_example_runs(tmp_path: Path) -> None:
@@ -104,7 +112,10 @@ def test_every_page_is_in_the_table_of_contents() -> None:
 
 @pytest.mark.parametrize(
     "module",
-    [paramclient, paramclient.links, paramclient.sim],
+    [
+        *(paramclient, paramclient.links, paramclient.metadata, paramclient.provision),
+        *(paramclient.sim, paramclient.testing),
+    ],
     ids=lambda m: m.__name__,
 )
 def test_every_public_name_is_in_the_pages(module: ModuleType) -> None:
@@ -146,27 +157,15 @@ def help_of(*words: str) -> str:
 
 
 def subcommand(words: list[str]) -> list[str]:
-    return words[:2] if words[0] == "cache" else words[:1]
+    return words[:2] if words[0] in ("cache", "fleet", "signing") else words[:1]
 
 
 def test_every_command_is_shown_and_exists() -> None:
     used = {tuple(subcommand(words)) for words in commands()}
     cache = {("cache", verb) for verb in ("list", "history", "path", "remove")}
-    assert (
-        used
-        == {
-            ("fetch",),
-            ("get",),
-            ("set",),
-            ("watch",),
-            ("link",),
-            ("ports",),
-            ("show",),
-            ("sim",),
-            ("import",),
-        }
-        | cache
-    )
+    fleet = {("fleet", "diff")}
+    signing = {("signing", verb) for verb in ("setup", "disable")}
+    assert used == {(verb,) for verb in COMMANDS} | cache | fleet | signing
     for words in used:
         assert words[-1] in help_of(*words)
 
@@ -181,9 +180,12 @@ def test_options_in_examples_exist() -> None:
 def test_the_page_of_the_command_names_every_option() -> None:
     page = (DOCS / "command.md").read_text(encoding="utf-8")
     offered = set()
-    for command in ("fetch", "get", "set", "watch", "link", "ports", "show", "sim", "import"):
+    for command in COMMANDS:
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of(command)))
+    for verb in ("setup", "disable"):
+        offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("signing", verb)))
     for verb in ("list", "history", "path", "remove"):
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("cache", verb)))
+    offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("fleet", "diff")))
     named = set(re.findall(r"`(--[a-z][a-z-]+)", page))
     assert named - {"--help"} == offered - {"--help", "--version"}

@@ -9,9 +9,12 @@ from paramclient import errors
 from paramclient.errors import (
     CacheError,
     ClientClosed,
+    FileError,
     FileErrorCode,
     FileTransferError,
+    InvalidParameters,
     LinkError,
+    MetadataError,
     NoReply,
     PackError,
     ParamClientError,
@@ -21,6 +24,7 @@ from paramclient.errors import (
     UnknownParameter,
     UsageError,
     ValueNotApplied,
+    VehicleArmed,
     VehicleError,
 )
 
@@ -29,6 +33,8 @@ from paramclient.errors import (
     ("kind", "base"),
     [
         (UsageError, ValueError),
+        (MetadataError, UsageError),
+        (FileError, UsageError),
         (UnknownParameter, VehicleError),
         (Refused, VehicleError),
         (TypeMismatch, VehicleError),
@@ -37,6 +43,8 @@ from paramclient.errors import (
         (NoReply, TimeoutError),
         (LinkError, OSError),
         (ClientClosed, LinkError),
+        (InvalidParameters, UsageError),
+        (VehicleArmed, VehicleError),
         (PackError, ParamClientError),
         (CacheError, ParamClientError),
     ],
@@ -111,6 +119,21 @@ def test_a_file_that_is_none_says_where_that_showed() -> None:
     error = PackError("it is cut off", offset=7)
     assert str(error) == "it is cut off (byte 7)"
     assert error.offset == 7
+
+
+@pytest.mark.parametrize(
+    ("source", "line", "text"),
+    [
+        ("quad.param", 17, "quad.param:17: expected A"),
+        ("", 17, "line 17: expected A"),
+        ("quad.param", None, "quad.param: expected A"),
+        ("", None, "expected A"),
+    ],
+)
+def test_a_file_error_begins_with_its_place(source: str, line: int | None, text: str) -> None:
+    error = FileError("expected A", source=source, line=line, expected="A", more=("and more",))
+    assert str(error) == f"{text}\nand more"
+    assert (error.source, error.line, error.expected) == (source, line, "A")
 
 
 def test_a_value_that_was_not_applied_carries_both_values() -> None:

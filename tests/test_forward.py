@@ -153,14 +153,14 @@ async def test_a_program_that_reads_nothing_holds_nothing_up(monkeypatch: pytest
         assert bits((await component.fetch_all()).params) == bits(vehicle.params)
         assert (await component.set("PARAM_01", 8)).status == "accepted"
         assert anyio.current_time() - began < 3.0
-        assert client._forwarder is not None
-        assert len(client._forwarder._waiting) == 10
-        lost = client._forwarder.lost
+        assert client._beside.forwarder is not None
+        assert len(client._beside.forwarder._waiting) == 10
+        lost = client._beside.forwarder.lost
         assert lost > 10
         program.is_stuck = False
         await anyio.sleep(3.0)
-        assert not client._forwarder._waiting
-        assert client._forwarder.lost < lost + 20
+        assert not client._beside.forwarder._waiting
+        assert client._beside.forwarder.lost < lost + 20
     assert len(program.heard) >= 11
 
 

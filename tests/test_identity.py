@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from paramclient.identity import Identity, autopilot_name
+from paramclient.identity import SHARED_UIDS, Identity, autopilot_name
 from paramclient.protocol.wire import AutopilotVersion
 from tests import recordings
 
@@ -78,3 +78,21 @@ def test_a_hardware_id_names_the_vehicle_wherever_it_is_and_without_one_link_and
 )
 def test_autopilots_have_a_name(number: int, name: str) -> None:
     assert autopilot_name(number) == name
+
+
+def test_the_hardware_id_says_whether_it_is_the_same_vehicle() -> None:
+    mine = Identity(1, "udp", uid="0a", autopilot=3, vehicle_type=2)
+    assert mine.is_same_vehicle(replace(mine, system=9, link="tcp", vehicle_type=1))
+    assert not mine.is_same_vehicle(replace(mine, uid="0b"))
+    assert not mine.is_same_vehicle(replace(mine, uid=None))
+    assert mine.has_own_uid
+
+
+@pytest.mark.parametrize("uid", [None, *SHARED_UIDS])
+def test_where_it_says_nothing_the_kind_and_the_link_do(uid: str | None) -> None:
+    mine = Identity(1, "udp", uid=uid, autopilot=3, vehicle_type=2)
+    assert mine.is_same_vehicle(replace(mine, system=9))
+    for other in ({"link": "tcp"}, {"autopilot": 12}, {"vehicle_type": 1}):
+        assert not mine.is_same_vehicle(replace(mine, **other))
+    assert mine.is_same_vehicle(replace(mine, uid="0a")) is (uid is None)  # it may only now have said it
+    assert not mine.has_own_uid

@@ -147,7 +147,7 @@ async def test_what_would_have_to_be_sent_is_refused_at_once() -> None:
 
 def test_what_may_be_asked_cannot_be_said_where_nothing_is() -> None:
     for options in ({"policy": Policy.HASH_ONLY}, {"watch_interval": 5.0}):
-        with pytest.raises(UsageError, match="with listen_only, nothing is"):
+        with pytest.raises(UsageError, match="here nothing is sent"):
             listener(small_px4(), **options)
     listener(small_px4(), watch_interval=0, policy="auto")
 
@@ -256,7 +256,7 @@ def test_the_command_listens_too(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def station_that_listens() -> Station:
-    station = Station(link="test", is_stream=False, upkeep=Upkeep.of_listener(is_log=False))
+    station = Station(link="test", is_stream=False, upkeep=Upkeep.chosen(None, "auto", listen_only=True))
     say(station, wire.Heartbeat(2, wire.MAV_AUTOPILOT_GENERIC, system_status=4), 0.0)
     return station
 

@@ -8,7 +8,7 @@ import pytest
 
 from paramclient.errors import UsageError
 from paramclient.paramset import ParamSet, WrittenParam
-from paramclient.values import Param, ParamType, Value, bits_of
+from paramclient.values import Encoding, Param, ParamType, Value, bits_of, decode
 
 
 def held(value: Value, number: int, name: str = "P") -> Param:
@@ -40,6 +40,23 @@ def test_raw_bytes_are_held_by_raw_bytes_alone() -> None:
     number = Param("P", 1, ParamType.INT32, 0, 1)
     assert WrittenParam("P", b"\x01\0\0\0").is_held_by(raw)
     assert not WrittenParam("P", b"\x01\0\0\0").is_held_by(number)
+    assert not WrittenParam("P", 1).is_held_by(raw)  # nobody knows the other four bytes
+
+
+def test_a_number_that_its_type_cannot_hold_is_held_by_itself_alone() -> None:
+    """A vehicle that casts may report 300 for an INT8."""
+    odd, bits = decode(struct.pack("<f", 300), ParamType.INT8, Encoding.C_CAST)
+    param = Param("P", odd, ParamType.INT8, 0, bits)
+    assert WrittenParam.of(param).is_held_by(param)
+    assert not WrittenParam("P", bits & 0x7F).is_held_by(param)
+
+
+def test_raw_bytes_count_with_all_four_also_in_a_small_type() -> None:
+    """ArduPilot can send a float that its own integer type cannot hold."""
+    raw = struct.pack("<f", 1e20)
+    param = Param("P", raw, ParamType.INT8, 0, int.from_bytes(raw, "little"))
+    assert WrittenParam.of(param).is_held_by(param)
+    assert not WrittenParam("P", struct.pack("<f", 2e20)).is_held_by(param)
 
 
 def test_a_value_that_does_not_fit_the_type_says_so_when_its_bits_are_asked_for() -> None:

@@ -24,6 +24,7 @@ from paramclient.values import (
     ParamType,
     Trust,
     Value,
+    bits_of,
     check_name,
     check_value,
     crc32_px4,
@@ -489,6 +490,20 @@ def test_zero_of_a_real64_has_two_forms_too() -> None:
     assert same_bits(ParamType.REAL64, 0, 1 << 63)
     assert not same_bits(ParamType.REAL64, 0, 0x80000000)
     assert not same_bits(ParamType.REAL32, 0, 1 << 63)
+
+
+@pytest.mark.parametrize("number", [*ParamType])
+def test_a_number_beyond_every_type_has_no_bits(number: ParamType) -> None:
+    with pytest.raises(UsageError, match=number.name):
+        bits_of(10**400, number)
+
+
+@pytest.mark.parametrize("number", INTEGERS)
+def test_a_whole_number_written_with_a_point_has_the_bits_of_the_integer(number: ParamType) -> None:
+    assert bits_of(44.0, number) == bits_of(44, number) == 44
+    for value in (1.5, math.inf, math.nan):
+        with pytest.raises(UsageError, match="not a whole number"):
+            bits_of(value, number)
 
 
 # Text

@@ -101,6 +101,42 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
         "ALTER TABLE param ADD COLUMN default_bits INTEGER",
         "ALTER TABLE component ADD COLUMN file_works INTEGER",
     ),
+    (
+        # Which names a table has got since is not known of one that is older than this: it begins now.
+        "ALTER TABLE component ADD COLUMN known_since REAL",
+        """UPDATE component SET known_since = max(
+            updated_at,
+            ifnull((SELECT max(heard_at) FROM param WHERE owner = component.id), 0),
+            ifnull((SELECT max(at) FROM history WHERE owner = component.id), 0)
+        ) WHERE complete""",
+        """CREATE TABLE birth (
+            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
+            name TEXT NOT NULL,
+            line INTEGER NOT NULL,
+            at REAL NOT NULL,
+            PRIMARY KEY (owner, name, line)
+        ) WITHOUT ROWID""",
+        """CREATE TABLE setback (
+            id INTEGER PRIMARY KEY,
+            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
+            since REAL NOT NULL,
+            until REAL NOT NULL
+        )""",
+        "CREATE INDEX setback_of_component ON setback (owner)",
+        """CREATE TABLE snapshot (
+            id INTEGER PRIMARY KEY AUTOINCREMENT,
+            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
+            at REAL NOT NULL,
+            reason TEXT NOT NULL,
+            size INTEGER NOT NULL,
+            hash INTEGER,
+            complete INTEGER NOT NULL,
+            params BLOB NOT NULL,
+            checksum INTEGER NOT NULL
+        )""",
+        "CREATE INDEX snapshot_of_component ON snapshot (owner)",
+        "CREATE INDEX history_of_param ON history (owner, name)",
+    ),
 )
 """The statements that lead from each schema version to the next; the version is the number of steps taken."""
 
@@ -448,8 +484,11 @@ def _migrate(connection: sqlite3.Connection, steps: tuple[tuple[str, ...], ...])
 
 
 def _schema_of(connection: sqlite3.Connection) -> frozenset[tuple[str, ...]]:
-    """Every table and index with the statement that made it."""
-    rows = connection.execute("SELECT type, name, tbl_name, sql FROM sqlite_master WHERE sql IS NOT NULL")
+    """Every table and index with the statement that made it, without those that SQLite makes for itself."""
+    rows = connection.execute(
+        "SELECT type, name, tbl_name, sql FROM sqlite_master"
+        " WHERE sql IS NOT NULL AND name NOT GLOB 'sqlite_*'"
+    )
     return frozenset(rows.fetchall())
 
 

@@ -7,16 +7,17 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
+from paramclient.cache import earlier
 from paramclient.cache.records import BY_VEHICLE, CachedSummary, CachedVehicle, StoredParam, TableUpdate
 from paramclient.cache.rows import Row
 from paramclient.cache.tables import (
+    HISTORY_LINES,
     applied,
     hashed,
-    rows_of,
     save,
+    stored_rows,
     summaries,
     vehicles,
-    write_history,
     write_rows,
 )
 
@@ -25,6 +26,8 @@ __all__ = ["merge"]
 SAME_CHANGE: Final = 2.0
 """Seconds between two lines of history that tell of one change: who heard it live wrote it up to a quarter of
 a second later, or as much later as a slow disk took."""
+
+_LINE: Final = "at, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
 
 
 def merge(
@@ -86,7 +89,7 @@ class _Past:
         found = [self.overtaken.pop(name) for name in names if name in self.overtaken]
         if self.owner is None or not found:
             return
-        kept = rows_of(self.connection, self.owner)
+        kept = stored_rows(self.connection, self.owner)
         for item in found:
             name = item.param.name
             old, new = _row(item), kept.get(name)
@@ -99,14 +102,38 @@ class _Past:
         self.catch_up(list(self.overtaken))
         if not self.lines:
             return
-        columns = "at, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
-        kept = self.connection.execute(
-            f"SELECT {columns} FROM history WHERE owner = ? ORDER BY id", (self.owner,)
-        ).fetchall()
-        self.connection.execute("DELETE FROM history WHERE owner = ?", (self.owner,))
         assert self.owner is not None
-        lines = sorted([*kept, *self.lines], key=lambda line: float(line[0]))
-        write_history(self.connection, self.owner, lines)
+        connection, owner = self.connection, self.owner
+        kept = connection.execute(
+            f"SELECT id, {_LINE} FROM history WHERE owner = ? ORDER BY id", (owner,)
+        ).fetchall()
+        lines: list[tuple[int | None, tuple[Any, ...]]] = [(number, line) for number, *line in kept]
+        for new in self.lines:
+            later = (place for place, (_, line) in enumerate(lines) if line[0] > new[0])
+            lines.insert(next(later, len(lines)), (None, new))
+        [(last,)] = connection.execute("SELECT ifnull(max(id), 0) FROM history")
+        dropped, lines = lines[:-HISTORY_LINES], lines[-HISTORY_LINES:]
+        connection.execute("DELETE FROM history WHERE owner = ?", (owner,))
+        connection.executemany(
+            f"INSERT INTO history (id, owner, {_LINE}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            [(last + number, owner, *line) for number, (_, line) in enumerate(lines, start=1)],
+        )
+        self._renumber(
+            {old: last + number for number, (old, _) in enumerate(lines, start=1) if old is not None}
+        )
+        if dropped:
+            earlier.forget(connection, owner, max(line[0] for _, line in dropped))
+
+    def _renumber(self, places: Mapping[int, int]) -> None:
+        """Names that appeared did so behind a line of history, which has another number now."""
+        lines = self.connection.execute("SELECT DISTINCT line FROM birth WHERE owner = ?", (self.owner,))
+        # from the last one on: a new number is above every old one
+        for (line,) in sorted(lines.fetchall(), reverse=True):
+            behind = max((new for old, new in places.items() if old <= line), default=0)
+            self.connection.execute(
+                "UPDATE OR REPLACE birth SET line = ? WHERE owner = ? AND line = ?",
+                (behind, self.owner, line),
+            )
 
     def _save(self, update: TableUpdate, vehicle: CachedVehicle | None) -> None:
         if vehicle is not None and vehicle.last_seen > update.at:
@@ -125,7 +152,7 @@ class _Past:
     def _bring_in(self, update: TableUpdate, table: CachedSummary) -> None:
         """Bring in what an update has of values that are not kept of a later time."""
         assert self.owner is not None
-        before = rows_of(self.connection, self.owner)
+        before = stored_rows(self.connection, self.owner)
         gone_since = table.synced_at if table.complete and table.synced_at is not None else float("-inf")
         later: list[StoredParam] = []
         for item in update.params:
@@ -135,21 +162,22 @@ class _Past:
                 # its place is that of another count, perhaps
                 later.append(replace(item, param=replace(item.param, index=None)))
                 continue
-            earlier = self.overtaken.get(name)
+            before_it = self.overtaken.get(name)
             self.overtaken[name] = item
-            if row is not None and earlier is not None:
-                self.lines += self._line(earlier, item)
+            if row is not None and before_it is not None:
+                self.lines += self._line(before_it, item)
         self.catch_up(item.param.name for item in later)
-        after, changes = applied(replace(update, params=later, removed=(), replace=False), before)
+        after, changes, births = applied(replace(update, params=later, removed=(), replace=False), before)
         if after != before:
             write_rows(self.connection, self.owner, before, after)
             if hashed(before) != hashed(after):
                 self.connection.execute("UPDATE component SET hash = NULL WHERE id = ?", (self.owner,))
+        earlier.write_births(self.connection, self.owner, births)
         self.lines += changes
 
-    def _line(self, earlier: StoredParam, item: StoredParam) -> Iterator[tuple[Any, ...]]:
+    def _line(self, old_item: StoredParam, item: StoredParam) -> Iterator[tuple[Any, ...]]:
         """The line of a change between two observations, unless it is there."""
-        old, new = _row(earlier), _row(item)
+        old, new = _row(old_item), _row(item)
         if old.same_value(new):
             return
         around = self._lines(item.param.name, item.heard_at - SAME_CHANGE, item.heard_at + SAME_CHANGE)

@@ -9,6 +9,7 @@ from typing import Final
 
 from paramclient.identity import Identity, autopilot_name
 from paramclient.params import ParamMap
+from paramclient.paramset import ParamSet
 from paramclient.values import Param
 
 __all__ = [
@@ -18,6 +19,8 @@ __all__ = [
     "CachedSummary",
     "CachedVehicle",
     "HistoryEntry",
+    "Snapshot",
+    "SnapshotSummary",
     "StoredParam",
     "TableState",
     "TableUpdate",
@@ -42,7 +45,7 @@ class StoredParam:
     Attributes:
         param: the parameter; its trust is not kept. An index of None leaves a known index as it is, except
             in a whole table.
-        heard_at: when the vehicle said so.
+        heard_at: when the vehicle said so, not after the update's `at`.
         volatile: whether the vehicle leaves it out of its hash; None leaves what is known.
         by: who caused the change, should it be one: `BY_US`, `BY_VEHICLE` or `by_station(…)`.
     """
@@ -119,6 +122,47 @@ class HistoryEntry:
     old: Param
     new: Param | None
     by: str
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class SnapshotSummary:
+    """A table as it was set down at a moment, without its parameters.
+
+    Attributes:
+        id: its number in the cache, which no other snapshot ever gets.
+        key: the name under which the vehicle's tables are kept.
+        component: component id.
+        at: when, to the millisecond.
+        reason: what for, in words.
+        size: parameters in it.
+        hash: the hash under which the vehicle would have confirmed it; None where none was known.
+        complete: it has every parameter that the vehicle had.
+    """
+
+    id: int
+    key: str
+    component: int
+    at: float
+    reason: str
+    size: int
+    hash: int | None
+    complete: bool
+
+    def __repr__(self) -> str:
+        at = datetime.fromtimestamp(self.at, UTC)
+        what = f"{self.id} of {self.key}/{self.component}: {self.size} params, {at:%Y-%m-%d %H:%MZ}"
+        return f"<{type(self).__name__} {what}, {self.reason!r}>"
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Snapshot(SnapshotSummary):
+    """A table as it was set down at a moment.
+
+    Attributes:
+        params: its parameters, with type and default where they were known, and who the vehicle was then.
+    """
+
+    params: ParamSet = field(hash=False)
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,23 +4,31 @@ from __future__ import annotations
 
 import os
 import sqlite3
-from collections.abc import Mapping, Sequence
+import time
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
 import platformdirs
 
-from paramclient.cache import tables
+from paramclient.cache import earlier, fleet, tables
 from paramclient.cache.database import Database
+from paramclient.cache.fleet import FleetDiff
 from paramclient.cache.merge import merge
 from paramclient.cache.records import (
     CachedComponent,
     CachedSummary,
     CachedVehicle,
     HistoryEntry,
+    Snapshot,
+    SnapshotSummary,
     TableUpdate,
 )
+from paramclient.cache.rows import read_param
 from paramclient.errors import CacheError
+from paramclient.identity import Identity
+from paramclient.paramset import ParamSet
 
 __all__ = ["ParamCache", "default_path"]
 
@@ -158,7 +166,12 @@ class ParamCache:
         return self._database.read(work)
 
     def history(
-        self, vehicle: str, component: int | None = None, name: str | None = None, limit: int | None = None
+        self,
+        vehicle: str,
+        component: int | None = None,
+        name: str | None = None,
+        limit: int | None = None,
+        since: float | None = None,
     ) -> list[HistoryEntry]:
         """The changes of a vehicle's values, newest last. Of each table the newest `HISTORY_LINES` are kept.
 
@@ -167,6 +180,7 @@ class ParamCache:
             component: of this component only.
             name: of this parameter only.
             limit: the newest so many.
+            since: those from this time on only, in unix seconds.
 
         Raises:
             CacheError: there is no such vehicle, or more than one.
@@ -174,12 +188,173 @@ class ParamCache:
 
         return self._database.read(
             lambda connection: tables.history(
-                connection, self._choose(connection, vehicle), component, name, limit
+                connection, self._choose(connection, vehicle), component, name, limit, since
             )
         )
 
+    def snapshot(self, vehicle: str, component: int, *, reason: str, at: float | None = None) -> Snapshot:
+        """Set a table down as it is kept now, so that it can be had again however it changes.
+
+        Of each table the newest `SNAPSHOTS` are kept.
+
+        Args:
+            vehicle: its key, or the beginning of its hardware id.
+            component: component id.
+            reason: what for, in words.
+            at: unix seconds; None for now.
+
+        Raises:
+            CacheError: there is no such table, or more than one.
+        """
+
+        def work(connection: sqlite3.Connection) -> Snapshot:
+            key, owner = self._table(connection, vehicle, component)
+            [(_, state)] = tables.summaries(connection, key, component)
+            params = ParamSet.of(
+                (
+                    read_param(name, *row.value, row.param_index, row.default_bits)
+                    for name, row in tables.stored_rows(connection, owner).items()
+                ),
+                identity=state.identity,
+            )
+            return earlier.store(
+                connection, owner, params, at=moment, reason=reason, hash=state.hash, complete=state.complete
+            )
+
+        moment = time.time() if at is None else at
+        self._database.read(lambda connection: self._table(connection, vehicle, component))
+        return self._database.write(work)
+
+    def store_snapshot(
+        self,
+        vehicle: Identity | str,
+        component: int,
+        params: ParamSet,
+        *,
+        reason: str,
+        at: float | None = None,
+        hash: int | None = None,  # noqa: A002  # the word of the record
+        complete: bool = True,
+    ) -> Snapshot:
+        """Set down a table that the caller has, as what a vehicle holds at this moment.
+
+        The table that is kept does not change. Of each table the newest `SNAPSHOTS` are kept.
+
+        Args:
+            vehicle: who it is; one that the cache does not know yet is written down. Or the key of one that
+                it knows, or the beginning of its hardware id.
+            component: component id.
+            params: names, values, types and defaults are kept, comments and lines are not.
+            reason: what for, in words.
+            at: unix seconds; None for now.
+            hash: the hash under which the vehicle would confirm these parameters, where it is known.
+            complete: these are all the parameters that the vehicle has.
+
+        Raises:
+            CacheError: a key was given, and there is no such table, or more than one.
+        """
+        moment = time.time() if at is None else at
+
+        def work(connection: sqlite3.Connection) -> Snapshot:
+            if isinstance(vehicle, Identity):
+                identity, autopilot = vehicle, vehicle.autopilot if component == 1 else 0
+                owner = tables.owner_of(connection, vehicle.key, component)
+                if owner is None:
+                    owner = tables.make(
+                        connection,
+                        TableUpdate(identity=vehicle, component=component, autopilot=autopilot, at=moment),
+                    )
+            else:
+                key, owner = self._table(connection, vehicle, component)
+                [(_, state)] = tables.summaries(connection, key, component)
+                identity = state.identity
+            whole = replace(params, identity=identity)
+            return earlier.store(
+                connection, owner, whole, at=moment, reason=reason, hash=hash, complete=complete
+            )
+
+        if isinstance(vehicle, str):
+            self._database.read(lambda connection: self._table(connection, vehicle, component))
+        return self._database.write(work)
+
+    def snapshots(self, vehicle: str, component: int | None = None) -> list[SnapshotSummary]:
+        """The snapshots of a vehicle's tables, newest last.
+
+        Args:
+            vehicle: its key, or the beginning of its hardware id.
+            component: of this component only.
+
+        Raises:
+            CacheError: there is no such vehicle, or more than one.
+        """
+        return self._database.read(
+            lambda connection: earlier.snapshots(connection, self._choose(connection, vehicle), component)
+        )
+
+    def state_at(self, vehicle: str, component: int, when: float) -> ParamSet:
+        """A table as it was at a moment.
+
+        Exact where a snapshot was made then. Else it is worked backwards from the present table over the
+        lines of history, and is what was last known at that moment: a change counts from when it was heard.
+        It reaches back to the moment when the table was first complete, or to the oldest line of history
+        that was dropped (`HISTORY_LINES`) if that is later. Names heard for the first time after `when` are
+        not in it. Defaults and the firmware of the vehicle are only known of snapshots.
+
+        Args:
+            vehicle: its key, or the beginning of its hardware id.
+            component: component id.
+            when: a float is a time, in unix seconds; an int is the id of a snapshot.
+
+        Raises:
+            UsageError: a time that is not in unix seconds.
+            CacheError: there is no such table, or more than one; there is no such snapshot of it, or it is
+                damaged; history does not reach back so far (the text says how far, and which snapshots are
+                next to it), or the clock of this computer went through that moment twice.
+        """
+
+        def work(connection: sqlite3.Connection) -> ParamSet:
+            key, owner = self._table(connection, vehicle, component)
+            if isinstance(when, int):
+                return earlier.snapshot(connection, owner, when).params
+            [(_, state)] = tables.summaries(connection, key, component)
+            rows = tables.stored_rows(connection, owner)
+            return earlier.state_at(connection, owner, state.identity, rows, when)
+
+        return self._database.read(work)
+
+    def fleet_diff(self, wanted: Iterable[str] | ParamSet, *, component: int | None = None) -> FleetDiff:
+        """Compare every vehicle in some parameters: which of them differ, and since when.
+
+        It takes a fraction of a second for a thousand vehicles and hundreds of parameters.
+
+        Args:
+            wanted: the values that all should have; or names, to compare the vehicles with each other.
+                Names may be patterns of the shell: `MC_*`.
+            component: component id; None for that of `wanted`, or the autopilot's.
+
+        Raises:
+            CacheError: no vehicle has a table of the component, or none has a parameter of such a name.
+        """
+        written = wanted if isinstance(wanted, ParamSet) else None
+        names = () if written is not None else tuple(wanted)
+        number = component or (written and written.component) or 1
+
+        def work(connection: sqlite3.Connection) -> FleetDiff:
+            chosen = {name: fleet.names_like(connection, number, name) for name in names}
+            plain: dict[str, None] = dict.fromkeys(each for like in chosen.values() for each in like)
+            found = fleet.fleet_diff(connection, number, plain if written is None else written)
+            if not found.vehicles:
+                raise CacheError(f"the cache {self.path} holds no table of component {number}")
+            held = {each.name for each in found.names if each.values}
+            for name, like in chosen.items():
+                if held.isdisjoint(like):
+                    raise CacheError(f"no vehicle in the cache {self.path} has a parameter {name}")
+            return found
+
+        return self._database.read(work)
+
     def remove(self, vehicle: str, component: int | None = None) -> int:
-        """Forget a vehicle's tables and their history; give the number of tables.
+        """Forget a vehicle's tables with their history and snapshots; give the number of tables.
 
         Args:
             vehicle: its key, or the beginning of its hardware id.
@@ -190,6 +365,13 @@ class ParamCache:
         """
         key = self._database.read(lambda connection: self._choose(connection, vehicle))
         return self._database.write(lambda connection: tables.remove(connection, key, component))
+
+    def _table(self, connection: sqlite3.Connection, vehicle: str, component: int) -> tuple[str, int]:
+        """The key of the vehicle that is meant, and the id of its table."""
+        key = self._choose(connection, vehicle, component=component)
+        owner = tables.owner_of(connection, key, component)
+        assert owner is not None, "what was chosen exists for the whole transaction"
+        return key, owner
 
     def _load(self, connection: sqlite3.Connection, key: str, component: int) -> CachedComponent | None:
         def history(name: str | None, limit: int | None) -> list[HistoryEntry]:

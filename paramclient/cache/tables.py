@@ -13,6 +13,7 @@ from dataclasses import fields
 from types import MappingProxyType
 from typing import Final
 
+from paramclient.cache import earlier
 from paramclient.cache.database import Damaged
 from paramclient.cache.records import (
     BY_VEHICLE,
@@ -34,12 +35,13 @@ __all__ = [
     "component",
     "hashed",
     "history",
+    "make",
+    "owner_of",
     "remove",
-    "rows_of",
     "save",
+    "stored_rows",
     "summaries",
     "vehicles",
-    "write_history",
     "write_rows",
 ]
 
@@ -59,14 +61,18 @@ def save(connection: sqlite3.Connection, updates: Iterable[TableUpdate]) -> None
     """Write what was learnt, in the order given."""
     for update in updates:
         _forget_other_firmware(connection, update.identity)
-        owner = _owner(connection, update)
-        before = rows_of(connection, owner)
-        after, lines = applied(update, before)
+        earlier.watch_clock(connection, update.identity.key, update.component, time_cell(update.at))
+        owner = make(connection, update)
+        before = stored_rows(connection, owner)
+        after, lines, births = applied(update, before)
         if after != before:
             write_rows(connection, owner, before, after)
-        write_history(connection, owner, lines)
+        earlier.write_births(connection, owner, births)
+        _write_history(connection, owner, lines)
         if update.table is not None:
             _write_state(connection, owner, update.table)
+            if update.table.complete:
+                earlier.begin(connection, owner, update.at)
         elif hashed(before) != hashed(after):
             connection.execute("UPDATE component SET hash = NULL WHERE id = ?", (owner,))
 
@@ -120,7 +126,7 @@ def component(
 ) -> CachedComponent | None:
     """One table with its parameters, or None."""
     for owner, summary in summaries(connection, key, number):
-        rows = rows_of(connection, owner)
+        rows = stored_rows(connection, owner)
         return CachedComponent(
             **{field.name: getattr(summary, field.name) for field in fields(summary)},
             params=ParamMap(
@@ -137,34 +143,33 @@ def component(
 
 
 def history(
-    connection: sqlite3.Connection, key: str, component: int | None, name: str | None, limit: int | None
+    connection: sqlite3.Connection,
+    key: str,
+    component: int | None,
+    name: str | None,
+    limit: int | None,
+    since: float | None = None,
 ) -> list[HistoryEntry]:
     """The changes of a vehicle's values, newest last."""
     rows = connection.execute(
         "SELECT at, component, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
         " FROM history h JOIN component c ON c.id = owner"
         " WHERE vehicle = ? AND component = ifnull(?, component) AND name = ifnull(?, name)"
-        " ORDER BY h.id DESC LIMIT ?",
-        (key, component, name, -1 if limit is None else limit),
+        " AND at >= ifnull(?, at) ORDER BY h.id DESC LIMIT ?",
+        (key, component, name, since, -1 if limit is None else limit),
     ).fetchall()
     return [_entry(row) for row in reversed(rows)]
 
 
-def _forget_other_firmware(connection: sqlite3.Connection, identity: Identity) -> None:
-    """Where a vehicle has another firmware than before: drop what was true of that one only."""
-    updated = connection.execute(
-        "SELECT c.id FROM vehicle JOIN component c ON vehicle = key"
-        " WHERE key = ? AND (firmware, git_hash) != (?, ?)",
-        (identity.key, identity.firmware, identity.git_hash),
-    ).fetchall()
-    for (owner,) in updated:
-        before = rows_of(connection, owner)
-        after = {name: row._replace(default_bits=None) for name, row in before.items()}
-        write_rows(connection, owner, before, after)
-        connection.execute("UPDATE component SET file_works = NULL WHERE id = ?", (owner,))
+def owner_of(connection: sqlite3.Connection, key: str, component: int) -> int | None:
+    """The id of a table in the database, or None where there is none."""
+    found = connection.execute(
+        "SELECT id FROM component WHERE vehicle = ? AND component = ?", (key, component)
+    ).fetchone()
+    return None if found is None else int(found[0])
 
 
-def _owner(connection: sqlite3.Connection, update: TableUpdate) -> int:
+def make(connection: sqlite3.Connection, update: TableUpdate) -> int:
     """Write whose table it is; give the id of the table, which is made where there is none."""
     at = time_cell(update.at)
     key = update.identity.key
@@ -188,11 +193,41 @@ def _owner(connection: sqlite3.Connection, update: TableUpdate) -> int:
     return int(owner)
 
 
+def stored_rows(connection: sqlite3.Connection, owner: int) -> dict[str, Row]:
+    """A table's parameters by index, then name, those without an index last; `Damaged` where one changed."""
+    found = connection.execute(
+        "SELECT name, type, bits, is_raw, param_index, volatile, heard_at, default_bits"
+        " FROM param WHERE owner = ?"
+        " ORDER BY param_index IS NULL, param_index, name",
+        (owner,),
+    )
+    rows = {name: Row(*row) for name, *row in (cells(row, "siiiIifI") for row in found)}
+    [(expected,)] = connection.execute("SELECT checksum FROM component WHERE id = ?", (owner,))
+    if checksum(rows) != expected:
+        raise Damaged("a table is not what was written")
+    return rows
+
+
+def _forget_other_firmware(connection: sqlite3.Connection, identity: Identity) -> None:
+    """Where a vehicle has another firmware than before: drop what was true of that one only."""
+    updated = connection.execute(
+        "SELECT c.id FROM vehicle JOIN component c ON vehicle = key"
+        " WHERE key = ? AND (firmware, git_hash) != (?, ?)",
+        (identity.key, identity.firmware, identity.git_hash),
+    ).fetchall()
+    for (owner,) in updated:
+        before = stored_rows(connection, owner)
+        after = {name: row._replace(default_bits=None) for name, row in before.items()}
+        write_rows(connection, owner, before, after)
+        connection.execute("UPDATE component SET file_works = NULL WHERE id = ?", (owner,))
+
+
 def applied(
     update: TableUpdate, before: Mapping[str, Row]
-) -> tuple[dict[str, Row], list[tuple[object, ...]]]:
-    """The rows after an update, and the lines of history that it causes."""
+) -> tuple[dict[str, Row], list[tuple[object, ...]], list[tuple[str, float]]]:
+    """The rows after an update, the lines of history that it causes, and the new names with their times."""
     after = dict(before)
+    births: list[tuple[str, float]] = []
     heard = {item.param.name for item in update.params}
     lines: list[tuple[object, ...]] = [
         (update.at, name, BY_VEHICLE, *after.pop(name).value, None, None, None)
@@ -203,9 +238,11 @@ def applied(
         name = item.param.name
         old = after.get(name)
         new = after[name] = _merged(item, old, whole=update.replace)
-        if old and not old.same_value(new):
+        if not old:
+            births.append((name, new.heard_at))
+        elif not old.same_value(new):
             lines.append((new.heard_at, name, item.by, *old.value, *new.value))
-    return after, lines
+    return after, lines, births
 
 
 def _merged(item: StoredParam, old: Row | None, *, whole: bool) -> Row:
@@ -238,8 +275,7 @@ def write_rows(
     connection.execute("UPDATE component SET checksum = ? WHERE id = ?", (checksum(after), owner))
 
 
-def write_history(connection: sqlite3.Connection, owner: int, lines: Sequence[tuple[object, ...]]) -> None:
-    """Write lines of history: at, name, by, old value, new value; the oldest go when they are too many."""
+def _write_history(connection: sqlite3.Connection, owner: int, lines: Sequence[tuple[object, ...]]) -> None:
     if not lines:
         return
     connection.executemany(
@@ -248,11 +284,12 @@ def write_history(connection: sqlite3.Connection, owner: int, lines: Sequence[tu
         " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
         [(owner, *line) for line in lines],
     )
-    connection.execute(
-        "DELETE FROM history WHERE owner = ?1 AND id <="
-        " (SELECT id FROM history WHERE owner = ?1 ORDER BY id DESC LIMIT 1 OFFSET ?2)",
-        (owner, HISTORY_LINES),
-    )
+    for (last,) in connection.execute(
+        "SELECT id FROM history WHERE owner = ? ORDER BY id DESC LIMIT 1 OFFSET ?", (owner, HISTORY_LINES)
+    ).fetchall():
+        [(at,)] = connection.execute("SELECT max(at) FROM history WHERE owner = ? AND id <= ?", (owner, last))
+        connection.execute("DELETE FROM history WHERE owner = ? AND id <= ?", (owner, last))
+        earlier.forget(connection, owner, at)
 
 
 def _write_state(connection: sqlite3.Connection, owner: int, state: TableState) -> None:
@@ -263,21 +300,6 @@ def _write_state(connection: sqlite3.Connection, owner: int, state: TableState) 
         " WHERE id = ?",
         (state.hash, state.count, state.complete, state.volatile_known, synced, state.file_works, owner),
     )
-
-
-def rows_of(connection: sqlite3.Connection, owner: int) -> dict[str, Row]:
-    """A table's parameters by index, then name, those without an index last; `Damaged` where one changed."""
-    found = connection.execute(
-        "SELECT name, type, bits, is_raw, param_index, volatile, heard_at, default_bits"
-        " FROM param WHERE owner = ?"
-        " ORDER BY param_index IS NULL, param_index, name",
-        (owner,),
-    )
-    rows = {name: Row(*row) for name, *row in (cells(row, "siiiIifI") for row in found)}
-    [(expected,)] = connection.execute("SELECT checksum FROM component WHERE id = ?", (owner,))
-    if checksum(rows) != expected:
-        raise Damaged("a table is not what was written")
-    return rows
 
 
 def _summary(row: Sequence[object]) -> tuple[int, CachedSummary]:

@@ -14,12 +14,18 @@ from typing import Final
 import anyio
 from cyclopts import App, CycloptsError, Parameter
 
+from paramclient.cli.diff import diff
+from paramclient.cli.fleet import fleet_diff
+from paramclient.cli.history import history
 from paramclient.cli.link import link
 from paramclient.cli.logs import import_
-from paramclient.cli.offline import cache_history, cache_list, cache_path, cache_remove, show
+from paramclient.cli.offline import cache_list, cache_path, cache_remove, show
 from paramclient.cli.outcome import ExitCode, code_of
 from paramclient.cli.output import printable, report, say
 from paramclient.cli.ports import ports
+from paramclient.cli.save import save
+from paramclient.cli.setup import apply, restore, verify
+from paramclient.cli.signing import disable, setup
 from paramclient.cli.simulate import sim
 from paramclient.cli.vehicle import fetch, get, set_, watch
 from paramclient.errors import ParamClientError
@@ -41,7 +47,9 @@ def run(arguments: Sequence[str]) -> int:
             if _is_verbose(bound.arguments):
                 lines.show_steps()
             call = partial(command, *bound.args, **bound.kwargs)
-            code = anyio.run(_until_signal, call) if inspect.iscoroutinefunction(command) else call()
+            work = call if inspect.iscoroutinefunction(command) else call()
+            # a command that has asked the user something gives what is to be awaited after that
+            code = anyio.run(_until_signal, work) if callable(work) else work
         except CycloptsError as error:
             report(str(error))
             return ExitCode.USAGE
@@ -130,7 +138,7 @@ def _examples(*lines: str) -> str:
 
 _EXIT_CODES: Final = """
 
-Exit codes: 0 done; 1 refused or incomplete; 2 usage; 3 no vehicle or no answer; 4 link; 5 cache."""
+Exit codes: 0 done; 1 refused, incomplete, different; 2 usage; 3 no vehicle or no answer; 4 link; 5 cache."""
 
 _app: Final = App(
     name="paramclient",
@@ -153,6 +161,20 @@ _cache: Final = App(
     help_epilogue=_examples("cache list", "cache history 1 MC_ROLL_P", "cache path", "cache remove 1"),
 )
 
+_signing: Final = App(
+    name="signing",
+    help="Give a vehicle its key for signed messages, and take it away.",
+    help_epilogue=_examples(
+        "signing setup udpin:0.0.0.0:14550 --signing-key vehicle.key",
+        "signing disable udpin:0.0.0.0:14550 --signing-key vehicle.key",
+    ),
+)
+_fleet: Final = App(
+    name="fleet",
+    help="Compare the vehicles in the cache, with no link.",
+    help_epilogue=_examples("fleet diff BAT1_N_CELLS 'COM_ARM_*'", "fleet diff quad.params"),
+)
+
 _app.command(
     fetch,
     help_epilogue=_examples(
@@ -167,8 +189,11 @@ _app.command(
 _app.command(
     set_,
     name="set",
-    usage="Usage: paramclient set [OPTIONS] URL NAME VALUE [NAME VALUE...]",
-    help_epilogue=_examples("set udpin:0.0.0.0:14550 MC_ROLL_P 6.5 MC_PITCH_P 6.5"),
+    usage="Usage: paramclient set [OPTIONS] URL NAME VALUE|NAME=VALUE [NAME VALUE|NAME=VALUE...]",
+    help_epilogue=_examples(
+        "set udpin:0.0.0.0:14550 MC_ROLL_P 6.5 MC_PITCH_P 6.5",
+        "set udpin:0.0.0.0:14550 FLTMODE1=Loiter --metadata apm.pdef.xml",
+    ),
 )
 _app.command(
     watch,
@@ -180,8 +205,58 @@ _app.command(
 )
 _app.command(
     show,
-    usage="Usage: paramclient show [OPTIONS] [VEHICLE]",
-    help_epilogue=_examples("show", "show 1", "show 00020000 --json"),
+    usage="Usage: paramclient show [OPTIONS] [FILE|VEHICLE [NAME...]]",
+    help_epilogue=_examples("show", "show 1", "show 1 MC_ROLL_P", "show 00020000 --json", "show quad.params"),
+)
+_app.command(
+    diff,
+    usage="Usage: paramclient diff [OPTIONS] A B",
+    help_epilogue=_examples(
+        "diff before.params after.params",
+        "diff quad.param udpin:0.0.0.0:14550 --only 'MC_*'",
+        "diff 1 2 --base defaults",
+    ),
+)
+_app.command(
+    history,
+    usage="Usage: paramclient history [OPTIONS] VEHICLE [NAME]",
+    help_epilogue=_examples("history 1 MC_ROLL_P", "history 1 --since '2h ago'", "history 1 --snapshots"),
+)
+_app.command(_fleet)
+_app.command(
+    save,
+    usage="Usage: paramclient save [OPTIONS] URL|VEHICLE FILE",
+    help_epilogue=_examples(
+        "save udpin:0.0.0.0:14550 quad.yaml",
+        "save sim:ardupilot tuned.param --changed",
+        "save 1 before.params --all",
+    ),
+)
+_app.command(
+    apply,
+    usage="Usage: paramclient apply [OPTIONS] URL FILE",
+    help_epilogue=_examples(
+        "apply udpin:0.0.0.0:14550 quad.params --dry-run",
+        "apply udpin:0.0.0.0:14550 quad.params --reboot --backup before.yaml",
+        "apply udpin:0.0.0.0:14550 fleet.param --all --overlay 'own/{system}.param'",
+        "apply sim:ardupilot copter.param",
+    ),
+)
+_app.command(
+    verify,
+    usage="Usage: paramclient verify [OPTIONS] URL FILE",
+    help_epilogue=_examples(
+        "verify udpin:0.0.0.0:14550 quad.params", "verify udpin:0.0.0.0:14550 fleet.param --all --expect 5"
+    ),
+)
+_app.command(
+    restore,
+    usage="Usage: paramclient restore [OPTIONS] URL [WHEN|FILE]",
+    help_epilogue=_examples(
+        "restore udpin:0.0.0.0:14550 --dry-run",
+        "restore udpin:0.0.0.0:14550 '2h ago'",
+        "restore udpin:0.0.0.0:14550 before.yaml",
+    ),
 )
 _app.command(
     import_,
@@ -197,9 +272,16 @@ _app.command(
         "sim px4 --link udpout:127.0.0.1:14550 --loss 0.05 --seed 1", "sim ardupilot --link udpin:127.0.0.1:0"
     ),
 )
+_app.command(_signing)
+_signing.command(setup)
+_signing.command(disable)
 _cache.command(cache_list, name="list")
-_cache.command(
-    cache_history, name="history", usage="Usage: paramclient cache history [OPTIONS] VEHICLE [NAME]"
-)
+_cache.command(history, name="history", usage="Usage: paramclient cache history [OPTIONS] VEHICLE [NAME]")
 _cache.command(cache_path, name="path")
 _cache.command(cache_remove, name="remove")
+_fleet.command(
+    fleet_diff,
+    name="diff",
+    usage="Usage: paramclient fleet diff [OPTIONS] NAME...|FILE",
+    help_epilogue=_examples("fleet diff BAT1_N_CELLS 'COM_ARM_*'", "fleet diff quad.params --json"),
+)

@@ -1,20 +1,26 @@
-"""The commands that need no link: show, cache list, cache history, cache path, cache remove."""
+"""The commands that need no link: show, cache list, cache path, cache remove."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Annotated, Any, Final
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
 
-from cyclopts import Parameter
-from cyclopts.validators import Number
-
-from paramclient.cache import CachedComponent, CachedSummary, HistoryEntry, ParamCache
+from paramclient.cache import CachedComponent, CachedSummary, ParamCache
 from paramclient.cli.logs import cache_of_log
+from paramclient.cli.metadata import (
+    DESCRIBED_COLUMNS,
+    MetadataChoice,
+    described_cells,
+    described_json,
+    from_file,
+    known_of_table,
+    print_descriptions,
+)
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import (
     NO_DEFAULTS,
-    as_json,
     by_index,
     default_text,
     hash_text,
@@ -25,13 +31,15 @@ from paramclient.cli.output import (
     report,
     say,
     time_text,
-    value_json,
 )
-from paramclient.errors import CacheError
+from paramclient.cli.sources import is_file, open_file, vehicle_key
+from paramclient.cli.written import show_file
+from paramclient.errors import CacheError, UsageError
 from paramclient.identity import autopilot_name
+from paramclient.metadata import Metadata
 from paramclient.values import Param, check_name, format_value, type_name
 
-__all__ = ["cache_history", "cache_list", "cache_path", "cache_remove", "show"]
+__all__ = ["cache_list", "cache_path", "cache_remove", "show", "tables_of"]
 
 _DEFAULTS: Final = CacheOptions()
 
@@ -39,34 +47,47 @@ _DEFAULTS: Final = CacheOptions()
 def show(
     vehicle: str | None = None,
     /,
-    *,
+    *names: str,
     component: Id = None,
     changed: bool = False,
+    metadata: MetadataChoice = None,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Print what was last known of a vehicle, with no link, or what a telemetry log holds.
+    """Print what was last known of a vehicle, or what a parameter file or a log holds, with no link.
 
     With --changed, exit code 1 says that the firmware's defaults are not known.
 
     Args:
-        vehicle: Its system id, the beginning of its hardware id, or its key in the cache; or replay:FILE.
+        vehicle: A parameter file; else a vehicle's system id, the beginning of its hardware id, its key in
+            the cache, or cache: and one of these; or replay:FILE, a telemetry log.
         component: This component only.
         changed: Only what differs from the firmware's defaults.
+        names: These parameters of a vehicle only, with what is known of them.
+        metadata: A file that describes parameters. Without it, what is kept of the vehicle's firmware.
     """
+    if vehicle is not None and is_file(vehicle):
+        if names or metadata is not None:
+            raise UsageError("names and --metadata go with a vehicle in the cache, not with a parameter file")
+        return show_file(open_file(vehicle), component, changed=changed, json=options.json)
+    wanted = tuple(check_name(name) for name in dict.fromkeys(names))
+    described = from_file(metadata, offline=True)
     is_log = vehicle is not None and vehicle.lower().startswith("replay:")
     with _open(options) if not is_log or vehicle is None else cache_of_log(vehicle) as cache:
         summaries = _choose(cache, None if is_log else vehicle, component)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
         tables = [] if is_list else _load(cache, summaries)
+    views = [_View.of(table, wanted, described, cache, changed=changed) for table in tables]
+    if unknown := [name for name in wanted if not any(name in table.params for table in tables)]:
+        raise CacheError(f"not among the cached parameters: {', '.join(unknown)}")
     if options.json:
-        print_json({"components": [_table_json(table, changed=changed) for table in tables]})
+        print_json({"components": [_table_json(view) for view in views]})
     elif is_list:
         _print_summaries(summaries)
         say("paramclient show VEHICLE shows one of them: by its system id, or the beginning of its key")
     elif not summaries:
         say(f"the cache {printable(str(cache.path))} is empty")
-    for table in [] if options.json else tables:
-        _print_table(table, changed=changed)
+    for view in [] if options.json else views:
+        _print_table(view)
     if changed and tables and not any(_has_defaults(table) for table in tables):
         report(NO_DEFAULTS)
         return ExitCode.INCOMPLETE
@@ -83,33 +104,6 @@ def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
         _print_summaries(summaries)
     else:
         say(f"the cache {printable(str(cache.path))} is empty")
-    return ExitCode.DONE
-
-
-def cache_history(
-    vehicle: str,
-    name: str | None = None,
-    /,
-    *,
-    component: Id = None,
-    limit: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
-    options: CacheOptions = _DEFAULTS,
-) -> ExitCode:
-    """Print how the values of a vehicle have changed: when, from, to, and by whom. The newest comes last.
-
-    Args:
-        vehicle: Its system id, the beginning of its hardware id, or its key in the cache.
-        name: This parameter only.
-        component: This component only.
-        limit: The newest so many only.
-    """
-    with _open(options) as cache:
-        key = _key(cache, vehicle)
-        entries = cache.history(key, component, None if name is None else check_name(name), limit)
-    if options.json:
-        print_json({"history": [_entry_json(entry) for entry in entries]})
-    else:
-        print_table(["time", "component", "name", "old", "new", "by"], map(_entry_cells, entries))
     return ExitCode.DONE
 
 
@@ -133,7 +127,7 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
     """
     with _open(options) as cache:
         _choose(cache, vehicle, component)
-        key = _key(cache, vehicle)
+        key = vehicle_key(cache, vehicle)
         removed = cache.remove(key, component)
     if options.json:
         print_json({"key": key, "removed": removed})
@@ -142,24 +136,18 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
     return ExitCode.DONE
 
 
-def _open(options: CacheOptions) -> ParamCache:
-    return ParamCache(options.cache)
-
-
-def _key(cache: ParamCache, vehicle: str) -> str:
-    """The key of the vehicle that the user means.
+def tables_of(options: CacheOptions, vehicle: str, component: int | None) -> list[CachedComponent]:
+    """The cached tables of a vehicle, or that of one of its components.
 
     Raises:
-        CacheError: none fits, or more than one.
+        CacheError: there is none, more than one vehicle fits, or the cache cannot be read.
     """
-    if vehicle.isdecimal():
-        fits = [known for known in cache.vehicles() if str(known.identity.system) == vehicle]
-        if len(fits) > 1:
-            listed = "; ".join(map(str, fits))
-            raise CacheError(f"system {vehicle} fits more than one vehicle in the cache: {listed}")
-        if fits:
-            return fits[0].key
-    return cache.components(vehicle)[0].key
+    with _open(options) as cache:
+        return _load(cache, _choose(cache, vehicle, component))
+
+
+def _open(options: CacheOptions) -> ParamCache:
+    return ParamCache(options.cache)
 
 
 def _choose(cache: ParamCache, vehicle: str | None, component: int | None) -> list[CachedSummary]:
@@ -168,7 +156,7 @@ def _choose(cache: ParamCache, vehicle: str | None, component: int | None) -> li
     Raises:
         CacheError: a vehicle was named and there is none such, or more than one; or it has no such component.
     """
-    summaries = cache.components(None if vehicle is None else _key(cache, vehicle))
+    summaries = cache.components(None if vehicle is None else vehicle_key(cache, vehicle))
     chosen = [each for each in summaries if component in (None, each.component)]
     if not chosen and (summaries or vehicle is not None):
         known = ", ".join(f"{each.system}/{each.component}" for each in summaries)
@@ -185,7 +173,43 @@ def _has_defaults(table: CachedComponent) -> bool:
     return any(param.default is not None for param in table.params.values())
 
 
-def _table_json(table: CachedComponent, *, changed: bool) -> dict[str, Any]:
+@dataclass(frozen=True, slots=True)
+class _View:
+    """What is to be shown of a table.
+
+    Attributes:
+        table: the table.
+        names: the parameters that were named, or none for all.
+        metadata: what is known of them, or None.
+        changed: only what differs from the defaults.
+    """
+
+    table: CachedComponent
+    names: tuple[str, ...]
+    metadata: Metadata | None
+    changed: bool
+
+    @classmethod
+    def of(
+        cls,
+        table: CachedComponent,
+        names: tuple[str, ...],
+        metadata: Metadata | None,
+        cache: ParamCache,
+        *,
+        changed: bool,
+    ) -> _View:
+        known = known_of_table(cache.path, table) if metadata is None else metadata
+        return cls(table, tuple(name for name in names if name in table.params), known, changed)
+
+    @property
+    def params(self) -> Iterable[Param]:
+        params = self.table.params.changed() if self.changed else self.table.params
+        return [params[name] for name in self.names if name in params] if self.names else params.values()
+
+
+def _table_json(view: _View) -> dict[str, Any]:
+    table = view.table
     return {
         "system": table.system,
         "component": table.component,
@@ -193,7 +217,7 @@ def _table_json(table: CachedComponent, *, changed: bool) -> dict[str, Any]:
         "uid": table.identity.uid,
         "hash": hash_text(table.hash),
         "synced_at": _time(table.synced_at),
-        "params": as_json((table.params.changed() if changed else table.params).values()),
+        "params": described_json(view.params, view.metadata, whole=bool(view.names)),
     }
 
 
@@ -213,23 +237,6 @@ def _summary_json(summary: CachedSummary) -> dict[str, Any]:
     }
 
 
-def _entry_json(entry: HistoryEntry) -> dict[str, Any]:
-    new = entry.new
-    return {
-        "time": time_text(entry.at),
-        "component": entry.component,
-        "name": entry.name,
-        "old": value_json(entry.old.value, entry.old.type),
-        "new": None if new is None else value_json(new.value, new.type),
-        "by": entry.by,
-    }
-
-
-def _entry_cells(entry: HistoryEntry) -> tuple[object, ...]:
-    new = None if entry.new is None else _value(entry.new)
-    return time_text(entry.at), entry.component, entry.name, _value(entry.old), new, entry.by
-
-
 def _print_summaries(summaries: Sequence[CachedSummary]) -> None:
     rows = (
         (
@@ -245,19 +252,27 @@ def _print_summaries(summaries: Sequence[CachedSummary]) -> None:
     print_table(["component", "autopilot", "params", "hash", "synced", "key"], rows, right="params")
 
 
-def _print_table(table: CachedComponent, *, changed: bool) -> None:
+def _print_table(view: _View) -> None:
+    table, changed, metadata = view.table, view.changed, view.metadata
     if changed and not _has_defaults(table):
         return
-    params = by_index((table.params.changed() if changed else table.params).values())
+    params = by_index(view.params)
     rows = (
         (
             *(param.name, _value(param), *([default_text(param)] if changed else [])),
             *(type_name(param.type), param.index, time_text(table.heard_at[param.name])),
+            *(() if metadata is None else described_cells(metadata, param)),
         )
         for param in params
     )
     default = ["default"] if changed else []
-    print_table(["name", "value", *default, "type", "index", "heard"], rows, right="value default index")
+    more = [] if metadata is None else DESCRIBED_COLUMNS
+    columns = ["name", "value", *default, "type", "index", "heard", *more]
+    print_table(columns, rows, right="value default index")
+    if metadata is not None:
+        print_descriptions(view.names, metadata)
+    if view.names:
+        return
     synced = "never complete" if table.synced_at is None else f"synced {time_text(table.synced_at)}"
     crc = "" if table.hash is None else f"; hash {hash_text(table.hash)}"
     who = f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"

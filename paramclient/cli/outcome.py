@@ -6,6 +6,7 @@ from enum import IntEnum
 from typing import Final
 
 from paramclient.errors import (
+    AnotherVehicle,
     CacheError,
     FileTransferError,
     LinkError,
@@ -29,6 +30,8 @@ class ExitCode(IntEnum):
     DONE = 0
     INCOMPLETE = 1
     """The vehicle refused something, or did not give everything."""
+    DIFFERENT = 1
+    """What was compared is not the same."""
     USAGE = 2
     """Something was asked for that cannot be right."""
     NO_ANSWER = 3
@@ -61,6 +64,7 @@ _STATUSES: Final = {
     UnknownParameter: "unknown",
     TypeMismatch: "mismatch",
     ValueNotApplied: "not-applied",
+    AnotherVehicle: "another",
     NoReply: "no-reply",
     UsageError: "invalid",
     LinkError: "link",

@@ -11,6 +11,7 @@ import math
 import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final
 
@@ -21,6 +22,7 @@ if TYPE_CHECKING:
     from rich.table import Table
 
 __all__ = [
+    "Coloured",
     "NO_DEFAULTS",
     "as_json",
     "bits_text",
@@ -48,6 +50,17 @@ NO_DEFAULTS: Final = (
 )
 UNLIMITED: Final = 10_000
 """Columns of an output that is no terminal: nothing is wrapped or cut there."""
+
+
+@dataclass(frozen=True, slots=True)
+class Coloured:
+    """A cell of a table that is to stand out, in words of rich: `bold red`. It does so on terminals only."""
+
+    text: str
+    style: str
+
+    def __str__(self) -> str:
+        return self.text
 
 
 def printable(text: str) -> str:
@@ -255,7 +268,15 @@ def _table(columns: Sequence[str], rows: Iterable[Sequence[object]], right: Cont
     for column in columns:
         table.add_column(column, justify="right" if column in right else "left", overflow="fold")
     for row in rows:
-        table.add_row(*(Text("" if cell is None else printable(str(cell))) for cell in row))
+        table.add_row(
+            *(
+                Text(
+                    "" if cell is None else printable(str(cell)),
+                    style=cell.style if isinstance(cell, Coloured) else "",
+                )
+                for cell in row
+            )
+        )
     return table
 
 

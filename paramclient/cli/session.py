@@ -13,8 +13,9 @@ import anyio
 from paramclient.cli.options import LinkOptions
 from paramclient.client import ParamClient
 from paramclient.component import Component
-from paramclient.links import LinkKind, LinkSpec, create_link, parse_link
+from paramclient.links import LinkKind, parse_link
 from paramclient.protocol.result import Policy
+from paramclient.signing import Signing
 
 __all__ = ["Deadline", "Session", "connect", "listen"]
 
@@ -70,25 +71,30 @@ async def connect(
     """
     deadline = Deadline(options.timeout)
     async with ParamClient(
-        create_link(url if is_live else _at_once(url)),
+        url if is_live else _at_once(url),
         cache=options.place,
         encoding=options.encoding,
         policy=policy,
         listen_only=options.listen_only,
         forward=options.forward,
         tlog=options.tlog,
+        signing=options.signing,
     ) as client:
         patience = HEARING_PATIENCE if options.timeout is None else deadline.left()
         component = await client.component(options.system, options.component, timeout=patience)
         yield Session(client, component, deadline)
 
 
-def listen(url: str, *, listen_only: bool = False, tlog: Path | None = None) -> ParamClient:
+def listen(
+    url: str, signing: Signing | None = None, *, listen_only: bool = False, tlog: Path | None = None
+) -> ParamClient:
     """A client that counts everything it hears, and neither reads nor writes a cache."""
-    return ParamClient(url, cache=False, traffic=True, listen_only=listen_only, tlog=tlog)
+    return ParamClient(url, cache=False, traffic=True, signing=signing, listen_only=listen_only, tlog=tlog)
 
 
-def _at_once(url: str) -> str | LinkSpec:
+def _at_once(url: str) -> str:
+    """The same link; a log whose name says nothing of the speed as fast as it goes."""
+    if not url.lower().startswith(f"{LinkKind.REPLAY}:"):
+        return url
     spec = parse_link(url)
-    is_log = spec.kind is LinkKind.REPLAY and not spec.options
-    return replace(spec, options=(("speed", 0.0),)) if is_log else url
+    return spec.name if spec.options else replace(spec, options=(("speed", 0.0),)).name

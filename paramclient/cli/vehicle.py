@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import math
-import re
 import time
 from collections.abc import AsyncGenerator, Iterable, Sequence
 from contextlib import aclosing, suppress
@@ -15,6 +13,19 @@ import anyio
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from paramclient.cli.metadata import (
+    DESCRIBED_COLUMNS,
+    MetadataChoice,
+    described_cells,
+    described_json,
+    from_file,
+    known_of_session,
+    needs_reboot,
+    parse_pairs,
+    problems,
+    resolved,
+    written_json,
+)
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.outcome import ExitCode, code_of, status_of
 from paramclient.cli.output import (
@@ -38,7 +49,7 @@ from paramclient.cli.output import (
 from paramclient.cli.session import Session, connect
 from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError, ValueNotApplied
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
-from paramclient.links import LinkKind, parse_link
+from paramclient.metadata import Metadata
 from paramclient.protocol.result import FetchResult, Policy
 from paramclient.protocol.sampling import SAMPLE_SIZE, Sample
 from paramclient.protocol.table import Change
@@ -111,22 +122,37 @@ async def fetch(
     return ExitCode.DONE
 
 
-async def get(url: str, name: str, /, *names: str, options: LinkOptions = _DEFAULTS) -> int:
+async def get(
+    url: str,
+    name: str,
+    /,
+    *names: str,
+    metadata: MetadataChoice = None,
+    options: LinkOptions = _DEFAULTS,
+) -> int:
     """Ask the vehicle for single parameters.
 
     Args:
         url: The link.
         name: The parameter.
         names: More of them.
+        metadata: A file that describes parameters; or vehicle, to ask the vehicle for what it says of them.
     """
+    described = from_file(metadata)
     wanted = [check_name(each) for each in dict.fromkeys((name, *names))]
     async with connect(url, options) as session:
         params, errors = await _get_all(session, wanted)
+        if described is None:
+            described = await known_of_session(session, metadata)
     if options.json:
         texts = {each: str(error) for each, error in errors.items()}
-        print_json({"params": as_json(params), **({"errors": texts} if texts else {})})
-    elif params:
+        found = described_json(params, described, whole=True)
+        print_json({"params": found, **({"errors": texts} if texts else {})})
+    elif params and described is None:
         print_table(_COLUMNS, map(_cells, params), right="value index")
+    elif params and described is not None:
+        rows = ((*_cells(param), *described_cells(described, param)) for param in params)
+        print_table([*_COLUMNS, *DESCRIBED_COLUMNS], rows, right="value index")
     return _report_all(errors.values())
 
 
@@ -134,18 +160,31 @@ async def set_(
     url: str,
     /,
     *pairs: Annotated[str, Parameter(name="NAME VALUE", allow_leading_hyphen=True)],
+    metadata: MetadataChoice = None,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
     """Write parameters, in the order given, and prove by its value that the vehicle has taken each.
 
-    A value is a decimal number, a hexadecimal one (0x1F), nan or inf. All are tried even if one is refused.
+    A value is a decimal number, a hexadecimal one (0x1F), nan or inf. Written as NAME=VALUE it may also be
+    the name of a value, or names of bits with | between them, where the parameter is described: the vehicle
+    is asked for that, unless --metadata names a file. All are tried even if one is refused.
 
     Args:
         url: The link.
-        pairs: A parameter and its value, as often as wanted.
+        pairs: A parameter and its value, as often as wanted; NAME=VALUE is one too.
+        metadata: A file that describes parameters; or vehicle, to ask the vehicle for what it says of them.
     """
-    writes = _parse_pairs(pairs)
+    wanted = parse_pairs(pairs)
+    described = from_file(metadata)
+    if described is not None:
+        wanted = [*resolved(wanted, described)]
     async with connect(url, options) as session:
+        if described is None:
+            has_names = any(isinstance(value, str) for _, value in wanted)
+            described = await known_of_session(session, metadata, must=has_names)
+        writes = resolved(wanted, described)
+        for problem in problems(writes, described):
+            report(problem)
         began = anyio.current_time()
         outcomes = [await _write(session, name, value) for name, value in writes]
         client = session.client
@@ -155,7 +194,7 @@ async def set_(
             f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent"
         )
     if options.json:
-        print_json({"results": [outcome.as_json() for outcome in outcomes]})
+        print_json({"results": [outcome.as_json(described) for outcome in outcomes]})
     else:
         print_table(
             ["name", "requested", "actual", "status"],
@@ -163,6 +202,9 @@ async def set_(
             right="requested actual",
         )
         say(summary)
+    late = {each.name: None for each in outcomes if not each.reason and needs_reboot(each.name, described)}
+    if late:
+        say(printable(f"to count when the vehicle has started again: {', '.join(late)}"))
     for outcome in outcomes:
         if outcome.reason:
             report(f"{outcome.name}: {outcome.reason}")
@@ -186,14 +228,12 @@ async def watch(
     wanted = [check_name(each) for each in dict.fromkeys(names)]
     async with connect(url, options, policy=policy, is_live=True) as session:
         changes, events = session.component.changes(), session.client.events()
-        listens = options.listen_only or parse_link(url).kind is LinkKind.REPLAY
-        if listens:
-            pass  # nothing can be asked
-        elif wanted:
+        listens = session.client.listens_only
+        if wanted and not listens:
             _, errors = await _get_all(session, wanted)
             if errors:
                 return _report_all(errors.values())
-        else:
+        elif not listens:
             with suppress(CacheError):  # there may be nothing in it: then all that is heard is new
                 await _fetch_all(session)
         known = None if listens else set(session.component.params)
@@ -375,7 +415,7 @@ class _Written:
     reason: str = ""
     code: ExitCode = ExitCode.DONE
 
-    def as_json(self) -> dict[str, Any]:
+    def as_json(self, metadata: Metadata | None) -> dict[str, Any]:
         actual = None if self.actual is None else value_json(self.actual, self.type)
         return {
             "name": self.name,
@@ -383,6 +423,7 @@ class _Written:
             "actual": actual,
             "status": self.status,
             **({"reason": self.reason} if self.reason else {}),
+            **written_json(self.name, self.actual, metadata),
         }
 
     def cells(self) -> tuple[object, ...]:
@@ -407,37 +448,6 @@ async def _write(session: Session, name: str, value: int | float) -> _Written:
     return _Written(name, done.param.type, requested=value, actual=done.actual, status=done.status)
 
 
-def _parse_pairs(words: Sequence[str]) -> list[tuple[str, int | float]]:
-    if not words or len(words) % 2:
-        raise UsageError(f"set takes pairs of NAME and VALUE, not {len(words)} words")
-    return [
-        (check_name(name), _parse_number(name, text))
-        for name, text in zip(words[::2], words[1::2], strict=True)
-    ]
-
-
-def _parse_number(name: str, text: str) -> int | float:
-    """Read a value exactly: an integer as an int, everything else as a float.
-
-    Raises:
-        UsageError: it is no number, or one beyond a float.
-    """
-    if _INTEGER.fullmatch(text):
-        return int(text, 16 if "x" in text.lower() else 10)
-    if _REAL.fullmatch(text):
-        value = float(text)
-        if math.isinf(value) and "i" not in text.lower():
-            raise UsageError(f"{name}: {text} is beyond the range of a float")
-        return value
-    raise UsageError(f"{name}: {text!r} is no number; 12, 0x1F, -1.5, 1e-3, nan and inf are")
-
-
-_INTEGER: Final = re.compile(r"[+-]?(0[xX][0-9a-fA-F]{1,32}|[0-9]{1,40})")
-_REAL: Final = re.compile(
-    r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(inf|infinity|nan)", re.IGNORECASE
-)
-
-
 # watch
 
 
@@ -458,8 +468,7 @@ async def _print_news(
         async for each in news:
             if isinstance(each, Change):
                 if each.old is None and (known is None or each.name in known):
-                    if known is not None:
-                        known.discard(each.name)
+                    known = known and known - {each.name}
                     continue
                 if wanted and each.name not in wanted:
                     continue

@@ -14,6 +14,7 @@ from paramclient.protocol.events import ParamChanged
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.parts import Parts
 from paramclient.protocol.reads import Key, Read
+from paramclient.protocol.restart import SAVING_TIME, Restart
 from paramclient.protocol.result import FetchResult, Policy, Sampled
 from paramclient.protocol.table import Change
 from paramclient.protocol.wire import (
@@ -22,6 +23,7 @@ from paramclient.protocol.wire import (
     NO_INDEX,
     AutopilotVersion,
     CommandAck,
+    ComponentMetadata,
     FileTransfer,
     Heartbeat,
     HighLatency2,
@@ -65,6 +67,9 @@ class ComponentMachine(Parts):
         presence: whether it is there.
         sync: whether the table is still the vehicle's.
         files: its files.
+        descriptions: where it says that what it has to say of itself lies.
+        commands: what it is told to do.
+        restart: the restart that it was told to make and that is under way, or None.
         fetches: what was and is being fetched.
     """
 
@@ -93,6 +98,8 @@ class ComponentMachine(Parts):
                 self.reads.refused(message, now)
         elif isinstance(message, CommandAck):
             self.who.acknowledged(message, now)
+            self.descriptions.acknowledged(message, now)
+            self.commands.acknowledged(message, now)
         elif isinstance(message, StatusText):
             denied = _WRITE_DENIED.search(message.text)
             if denied:
@@ -102,6 +109,8 @@ class ComponentMachine(Parts):
                 self._rebooted(now)
         elif isinstance(message, FileTransfer):
             self.files.heard(message, now)
+        elif isinstance(message, ComponentMetadata):
+            self.descriptions.heard(message, now)
         elif isinstance(message, HighLatency2):
             self.who.heartbeat(message)
             self.presence.high_latency()
@@ -215,8 +224,42 @@ class ComponentMachine(Parts):
         if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
             encode(value, known.type, self.table.encoding)
         write = self.writes.set(name, value, now)
-        write.on_done.append(lambda: self.sync.write_ended(write.ended_at))
+        write.on_done.append(lambda: self._write_ended(write.ended_at))
         return write
+
+    def begin_restart(self, now: float, *, returns: bool = True) -> Restart:
+        """Tell it to start again, or join the one under way; give it back with `end_restart`.
+
+        Args:
+            now: the time.
+            returns: whether it comes back under its address, see `Restart`.
+
+        Raises:
+            NoReply: the component is lost. Nothing was sent.
+        """
+        if self.restart is None or self.restart.done:
+            self.check_present(f"the restart of {self.system}/{self.component}", now)
+            self.restart = Restart(
+                (self.system, self.component),
+                self.commands,
+                self.who,
+                self.presence,
+                self.round_trip,
+                self._saved_at,
+                self._rebooted,
+                returns=returns,
+                now=now,
+            )
+        self.restart.waiters += 1
+        return self.restart
+
+    def end_restart(self, restart: Restart, now: float) -> None:
+        """Wait for it no longer. The last one who waited ends it; whether it is obeyed is then not known."""
+        restart.waiters -= 1
+        if not restart.waiters:
+            restart.stop(now)
+            if self.restart is restart:
+                self.restart = None
 
     def begin_fetch(
         self, now: float, *, refresh: bool = False, listed: bool = False, sampled: Sampled | None = None
@@ -268,9 +311,13 @@ class ComponentMachine(Parts):
         self.reads.tick(now)
         self.writes.tick(now)
         self.files.tick(now)
+        self.commands.tick(now)
+        if self.restart is not None:
+            self.restart.tick(now)
         if self.fetch is not None:
             self.fetch.tick(now)
         self.who.tick(now)
+        self.descriptions.tick(now)
         self._follow_identity(now)
         self.sync.tick(now)
         for name in self._authors.doubted(now):
@@ -283,8 +330,11 @@ class ComponentMachine(Parts):
             self.reads.next_deadline(),
             self.writes.next_deadline(),
             self.files.next_deadline(),
+            self.commands.next_deadline(),
+            math.inf if self.restart is None else self.restart.next_deadline(),
             math.inf if self.fetch is None else self.fetch.next_deadline(),
             self.who.next_deadline(),
+            self.descriptions.next_deadline(),
             self.sync.next_deadline(),
             self.presence.lost_at(),
             self._authors.next_deadline(),
@@ -301,6 +351,8 @@ class ComponentMachine(Parts):
         self.reads.resume(now)
         self.writes.resume(now)
         self.files.resume(now)
+        self.descriptions.resume(now)
+        self.commands.resume(now)
         if self.fetch is not None:
             self.fetch.resume(now)
 
@@ -312,6 +364,10 @@ class ComponentMachine(Parts):
         if self.sync.refresh is not None:
             self.sync.refresh.fail(error, now)
         self.files.fail_all(error, now)
+        self.descriptions.fail_all(error, now)
+        if self.restart is not None:
+            self.restart.fail(error, now)
+        self.commands.fail_all(error, now)
         self.writes.fail_all(error, now)
         self.reads.fail_all(error, now)
         self.sync.stop()
@@ -323,6 +379,9 @@ class ComponentMachine(Parts):
         self.sync.forget()
         self.fetches.forget()
         self._known_as = None
+        if self.restart is not None:
+            self.restart.another(now)
+        self.commands.lose(now, ": another vehicle answers there now")
         what = f"writes to {self.system}/{self.component}: another vehicle answers there now"
         self.writes.fail_all(NoReply(what, attempts=0, waited=0.0), now)
         if self.fetch is not None:
@@ -362,6 +421,8 @@ class ComponentMachine(Parts):
         self.writes.lose(now)
         self.reads.lose(now)
         self.files.lose(now)
+        self.descriptions.lose(now)
+        self.commands.lose(now)
         self._doubt()
 
     def _was_silent(self, silence: float, now: float) -> None:
@@ -375,6 +436,8 @@ class ComponentMachine(Parts):
             self.who.doubt(now)
         elif presence.was_away(silence) and silence < math.inf:
             self.who.doubt(now)
+        if self.restart is not None:
+            self.restart.silent(silence, now)
         if presence.has_beaten:  # else nothing says when it should have been heard
             self.sync.silence(now)
 
@@ -385,6 +448,8 @@ class ComponentMachine(Parts):
         self._authors.clear()
         self.sync.check(now)
         self.who.doubt(now)
+        if self.restart is not None:
+            self.restart.rebooted(now)
         if self.fetch is not None and self.fetch.is_under_way:
             self.fetch.restart(now)
 
@@ -411,6 +476,10 @@ class ComponentMachine(Parts):
         for change in changes:
             self.sync.changed(change)
         self._report(changes)
+
+    def _write_ended(self, now: float) -> None:
+        self._saved_at = now + SAVING_TIME
+        self.sync.write_ended(now)
 
     def _resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
         self._emit(events.TableResynced(self, changed, confirmed))

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 from paramclient.identity import Identity
 from paramclient.protocol.authors import Authors
+from paramclient.protocol.commands import Commands
+from paramclient.protocol.descriptions import Descriptions
 from paramclient.protocol.events import Event
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.fetches import Fetches
@@ -15,6 +18,7 @@ from paramclient.protocol.identify import Identification
 from paramclient.protocol.presence import Presence
 from paramclient.protocol.reads import Key, Reads
 from paramclient.protocol.refresh import Refresh
+from paramclient.protocol.restart import Restart
 from paramclient.protocol.result import FetchResult, Means, Sampled
 from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
 from paramclient.protocol.table import Change, Table
@@ -88,6 +92,11 @@ class Parts(ABC):
             end_fetch=self.end_fetch,
             resynced=self._resynced,
         )
+        self.descriptions = Descriptions(
+            target, own, self.round_trip, send, is_identifying=lambda: self.who.is_asking
+        )
+        self.commands = Commands(target, own, self.round_trip, send)
+        self.restart: Restart | None = None
         self.files = FileTransfers(target, own, self.round_trip, send)
         self.fetches = Fetches(
             Means(
@@ -119,6 +128,7 @@ class Parts(ABC):
         self._is_vehicle_doubted = is_vehicle_doubted
         self._known_as: str | None = None  # the key of the identity that was reported
         self._may_write = False
+        self._saved_at = -math.inf  # when all that we have written will have been saved
         self._authors = Authors()
 
     @abstractmethod
@@ -182,6 +192,8 @@ class Parts(ABC):
     def is_waiting(self) -> bool:
         """Whether anything is awaited: an answer, a fetch, a file, or who it is."""
         is_asked = len(self.reads) > 0 or len(self.writes) > 0 or not self.files.is_idle
+        is_asked = is_asked or len(self.commands) > 0 or self.restart is not None
+        is_asked = is_asked or self.descriptions.is_asking
         return is_asked or self.fetch is not None or self.who.is_asking
 
     @property

@@ -38,6 +38,9 @@ class Presence:
     A component that never sent a heartbeat is never lost: nothing says when it should have been heard.
 
     Attributes:
+        beat_at: when a heartbeat came last; minus infinity before one did.
+        base_mode: MAV_MODE_FLAG bits of that heartbeat; None before one came, and while it is known that
+            others follow of which none is heard.
         gap: seconds of silence from which on something may have been missed.
         heard_at: when anything came from it last.
         is_lost: whether it has been silent for too long since.
@@ -45,12 +48,13 @@ class Presence:
     """
 
     __slots__ = (
-        "_beat_at",
         "_boot_beat_at",
         "_boot_ms",
         "_boot_ms_at",
         "_interval",
         "_state",
+        "base_mode",
+        "beat_at",
         "gap",
         "heard_at",
         "is_high_latency",
@@ -62,7 +66,8 @@ class Presence:
         self.is_lost = False
         self.is_high_latency = False
         self.gap = BEATS_IN_A_GAP * USUAL_INTERVAL
-        self._beat_at = -math.inf
+        self.beat_at = -math.inf
+        self.base_mode: int | None = None
         self._interval = math.inf  # the shortest time between two heartbeats: the others were lost
         self._state: int | None = None
         self._boot_beat_at = -math.inf  # the last heartbeat that said it was booting
@@ -83,7 +88,22 @@ class Presence:
     @property
     def has_beaten(self) -> bool:
         """Whether it ever sent a heartbeat."""
-        return self._beat_at > -math.inf
+        return self.beat_at > -math.inf
+
+    @property
+    def is_booting(self) -> bool:
+        """Whether its last heartbeat said so."""
+        return self._state == MAV_STATE_BOOT
+
+    @property
+    def clock_at(self) -> float:
+        """When it told the time since its start last; minus infinity before it did."""
+        return self._boot_ms_at
+
+    @property
+    def started_at(self) -> float | None:
+        """When it has started by what its clock told last, or later by what that took; None before it did."""
+        return None if self._boot_ms is None else self._boot_ms_at - self._boot_ms / 1000
 
     def heard(self, now: float) -> float:
         """Anything has come. Gives the seconds of silence before it: infinity for the first word."""
@@ -93,11 +113,12 @@ class Presence:
 
     def heartbeat(self, message: Heartbeat, now: float) -> bool:
         """Take a heartbeat; true when it shows that the component has started again."""
-        interval = now - self._beat_at
+        interval = now - self.beat_at
         if COPY <= interval < self._interval:
             self._interval = interval
             self.gap = BEATS_IN_A_GAP * max(interval, USUAL_INTERVAL)
-        self._beat_at = now
+        self.beat_at = now
+        self.base_mode = message.base_mode
         self.is_high_latency = False
         before, self._state = self._state, message.system_status
         if message.system_status != MAV_STATE_BOOT:
@@ -112,6 +133,7 @@ class Presence:
     def high_latency(self) -> None:
         """HIGH_LATENCY2 has come: what it sends from now on is one of those every few seconds."""
         self.is_high_latency = True
+        self.base_mode = None
 
     def system_time(self, message: SystemTime, now: float) -> bool:
         """Take a SYSTEM_TIME; true when it shows that the component has started again.

@@ -32,9 +32,14 @@ from paramclient.protocol.wire import (
     ParamRequestList,
     ParamSet,
     ParamValue,
+    SetupSigning,
+    Signer,
+    SigningKey,
+    Verifier,
     decode,
     decode_param_value,
     encode,
+    sign_frame,
 )
 from paramclient.values import Encoding
 
@@ -52,7 +57,7 @@ MOST_COMPONENTS: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each have. Further ones are not heard."""
 MOST_PEERS: Final = 256
 """Stream peers whose unfinished frames are kept."""
-HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345})
+HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
 """The message ids that matter here: HEARTBEAT, SYSTEM_TIME, PARAM_VALUE, PARAM_SET (of others), COMMAND_ACK,
 FILE_TRANSFER_PROTOCOL, AUTOPILOT_VERSION, HIGH_LATENCY2, STATUSTEXT, PARAM_ERROR."""
 _SETS: Final = frozenset({23})
@@ -80,6 +85,7 @@ class Station:
         listens_only: whether nothing is ever sent.
         is_log: whether the link is a log, which ends: then no time-out means anything, and nobody is lost.
         is_over: whether nothing more will come, as at the end of a log.
+        verifier: looks at signatures; None where there is no key, and they count for nothing.
     """
 
     def __init__(
@@ -115,9 +121,23 @@ class Station:
         self._outbox: list[tuple[bytes, Peer | None]] = []
         self._events: list[Event] = []
         self._sequence = 0
+        self._signer: Signer | None = None
+        self._is_watched = counts_traffic  # one look in the hot path for both
+        self.verifier: Verifier | None = None
         self._heartbeat_at = math.inf if self.listens_only else -math.inf
         self._is_paused = False
         self._turns = Turns()
+
+    def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
+        """From now on sign what is sent and take what the verifier accepts; before anything has come."""
+        self._signer = signer
+        self._is_watched = True
+        self.verifier = verifier
+        self._framer.guard = verifier.accepts
+
+    def send_setup_signing(self, system: int, component: int, key: SigningKey | None, timestamp: int) -> None:
+        """Give a vehicle its signing key, in clear, or with None take it away. Nothing answers."""
+        self._send(SetupSigning(system, component, key, timestamp), system, 2)
 
     def receive(self, data: bytes, peer: Peer, now: float) -> bool:
         """Take a datagram, or a chunk of a stream. An empty chunk says that the peer's stream has ended.
@@ -125,8 +145,8 @@ class Station:
         Gives whether there was anything of interest in it; all that is not telemetry is.
         """
         self.bytes_received += len(data)
-        if self.traffic is not None:
-            self.traffic.receive(data, peer, now)
+        if self._is_watched:
+            self._watch(data, peer, now)
         frames = self._cut_stream(data, peer) if self._is_stream else self._framer.receive(data)
         for frame in frames:
             number, system, component, _, payload, version = frame
@@ -151,6 +171,8 @@ class Station:
         """Do what is due: our heartbeat, and every component's time-outs."""
         if self._is_paused or self.is_log:
             return
+        if self._signer is not None:
+            self._signer.advance(now)
         if self._heartbeat_at <= now:
             self._heartbeat_at = now + HEARTBEAT_INTERVAL
             beat = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=MAV_STATE_ACTIVE)
@@ -251,6 +273,18 @@ class Station:
                 return machine
         return None
 
+    def find(self, system: int | None, component: int | None) -> ComponentMachine | None:
+        """The first component with this address, as far as it is given; without its id, an autopilot."""
+        if component is None:
+            for machine in self.components.values():
+                if system in (None, machine.system) and machine.who.is_autopilot:
+                    return self.autopilot_of(machine.system) or machine
+            return None
+        for address, found in self.components.items():
+            if address[1] == component and system in (None, address[0]) and found.who.has_spoken:
+                return found
+        return None
+
     def check_refresh(self, refresh: bool) -> None:
         """See whether a fetch may download what the cache has.
 
@@ -283,11 +317,19 @@ class Station:
                 return [machine.begin_fetch(now, refresh=refresh, listed=True) for machine in machines]
         return [machine.begin_fetch(now, refresh=refresh) for machine in machines]
 
+    def _watch(self, data: bytes, peer: Peer, now: float) -> None:
+        """What somebody wants done with everything that comes, before it is looked into."""
+        if self._signer is not None:
+            self._signer.advance(now)
+        if self.traffic is not None:
+            self.traffic.receive(data, peer, now)
+
     def _cut_stream(self, data: bytes, peer: Peer) -> list[Frame]:
         """The frames that a chunk of a peer's stream completes, or that its end leaves."""
         framer = self._framers.get(peer)
         if framer is None:
             framer = self._framers[peer] = Framer(HEARD)
+            framer.guard = self._framer.guard
             if len(self._framers) > MOST_PEERS:
                 self._retire(next(iter(self._framers)))
         if data:
@@ -370,6 +412,8 @@ class Station:
         data = encode(
             message, system=own_system, component=own_component, sequence=self._sequence, version=version
         )
+        if self._signer is not None:
+            data = sign_frame(data, self._signer)
         self._sequence = (self._sequence + 1) & 0xFF
         self.bytes_sent += len(data)
         self.frames_sent += 1

@@ -74,17 +74,24 @@ class Upkeep:
     is_log: bool = False
 
     @classmethod
-    def of_listener(cls, *, is_log: bool) -> Upkeep:
-        """What is done where nothing may be sent: nothing."""
-        return cls(policy=Policy.CACHE_ONLY, listens_only=True, is_log=is_log)
-
-    @classmethod
-    def chosen(cls, interval: float | None, policy: Policy | str) -> Upkeep:
+    def chosen(
+        cls,
+        interval: float | None,
+        policy: Policy | str,
+        *,
+        listen_only: bool = False,
+        is_log: bool = False,
+    ) -> Upkeep:
         """What a user's choice means; see `ParamClient`.
 
         Raises:
-            UsageError: there is no such policy, or the interval is too short.
+            UsageError: there is no such policy, the interval is too short, or either is chosen where nothing
+                may be asked.
         """
+        if listen_only or is_log:
+            if interval or policy != Policy.AUTO:
+                raise UsageError("watch_interval and policy are for clients that ask; here nothing is sent")
+            return cls(policy=Policy.CACHE_ONLY, listens_only=True, is_log=is_log)
         try:
             policy = Policy(policy)
         except ValueError:

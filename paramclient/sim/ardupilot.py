@@ -13,7 +13,7 @@ from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.protocol import wire
 from paramclient.protocol.pack import PackedParam
 from paramclient.sim.ftp import FileServer
-from paramclient.sim.table import Entry, Table, ardupilot_table, as_table, ek2_group
+from paramclient.sim.table import Entry, Table, ardupilot_table, as_table, ek2_group, with_system_id
 from paramclient.sim.vehicle import Vehicle, VehicleOptions
 from paramclient.values import Encoding, ParamType, bits_of, from_bits
 
@@ -37,15 +37,18 @@ class ArduPilotVehicle(Vehicle):
       Hidden parameters can be read and set by name.
     - MAVFTP serves `@PARAM/param.pck` and `files`: one session, 5 requests waiting, bursts paced to a third
       of the link (see `FileServer`). A param.pck that is written sets parameters, and nothing tells of it.
+    - SYSID_THISMAV takes effect with the next full second, and nothing is said of it.
+    - Told to start again it acknowledges, and goes off 0.2 s later; armed it answers FAILED.
     - Some values change by themselves and are sent unasked, index 65535.
 
     Args:
         table: its parameters (see `Table`), in the order of their indices; None for those of a real quad,
-            `ardupilot_table()`.
+            `ardupilot_table()`. SYSID_THISMAV, where it is among them, says `system`.
         system, component: its own ids, 1 to 255.
         uid2: the hardware id that it reports, up to 18 bytes; by default its own for every system.
         groups: by the name of a switch in the table, the parameters that follow it while it is not 0.
             None: with the table of the real quad, the 52 of EK2_ENABLE; with another table, none.
+        reboot_groups: names of switches whose group appears, or goes, with the next start only.
         read_only: names that cannot be set.
         live: names of parameters that change by themselves: whole numbers count seconds, others waver in
             their last bit. Names that are not in the table are passed over.
@@ -60,6 +63,8 @@ class ArduPilotVehicle(Vehicle):
         UsageError: an argument cannot be.
     """
 
+    _restart_delay = 0.2
+    _armed_result = wire.MAV_RESULT_FAILED
     _read_at: float
     _answer_at: float
 
@@ -71,6 +76,7 @@ class ArduPilotVehicle(Vehicle):
         uid2: bytes | None = None,
         table: Table | None = None,
         groups: Mapping[str, Table] | None = None,
+        reboot_groups: Iterable[str] = (),
         read_only: Iterable[str] = (),
         live: Iterable[str] = ("STAT_RUNTIME", "BARO1_GND_PRESS"),
         live_period: float = 30.0,
@@ -82,7 +88,7 @@ class ArduPilotVehicle(Vehicle):
     ) -> None:
         if groups is None:
             groups = {"EK2_ENABLE": ek2_group()} if table is None else {}
-        rows = ardupilot_table() if table is None else as_table(table)
+        rows = with_system_id(ardupilot_table() if table is None else as_table(table), _SYSTEM_ID, system)
         members = {switch: as_table(group) for switch, group in groups.items()}
         if unknown := (members.keys() | frozenset(read_only)).difference(row.name for row in rows):
             raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
@@ -96,6 +102,10 @@ class ArduPilotVehicle(Vehicle):
             self._ftp = FileServer(self._packed_params, self._apply_packed, ftp_rate)
         self._switch_of = {row.name: switch for switch, group in members.items() for row in group}
         self._switches = members.keys()
+        self._late_switches = frozenset(reboot_groups)
+        if others := self._late_switches - self._switches:
+            raise UsageError(f"no switches of groups: {', '.join(sorted(others))}")
+        self._was_on = {row.name: row.bits != 0 for row in rows if row.name in self._late_switches}
         self._read_only = frozenset(read_only)
         self._live = frozenset(live)
         self._live_period = live_period
@@ -123,10 +133,12 @@ class ArduPilotVehicle(Vehicle):
 
     def _is_listed(self, entry: Entry) -> bool:
         switch = self._switch_of.get(entry.name)
-        return switch is None or self._entry(switch).bits != 0
+        if switch is None:
+            return True
+        return self._was_on[switch] if switch in self._late_switches else self._entry(switch).bits != 0
 
     def _timers(self) -> tuple[float, ...]:
-        return self._read_at, self._answer_at, self._live_at
+        return self._read_at, self._answer_at, self._live_at, self._system_id_at
 
     def _on_list(self) -> None:
         if self._now < self._on_at + self._boot_time:
@@ -158,9 +170,7 @@ class ArduPilotVehicle(Vehicle):
             self._write(entry, _converted(value, entry.type))
 
     def _write(self, entry: Entry, bits: int) -> None:
-        entry.store(bits)
-        if entry.name in self._switches:
-            self._relist()
+        self._hold(entry, bits)
         self._answers[entry.name] = entry
         self._answer_at = min(self._answer_at, self._next(_LOOP))
 
@@ -176,9 +186,19 @@ class ArduPilotVehicle(Vehicle):
         value = from_bits(param.bits, param.type)
         if entry.name in self._read_only or isinstance(value, bytes) or not math.isfinite(value):
             return
-        entry.store(param.bits if param.type == entry.type else _converted(value, entry.type))
+        self._hold(entry, param.bits if param.type == entry.type else _converted(value, entry.type))
+
+    def _hold(self, entry: Entry, bits: int) -> None:
+        entry.store(bits)
         if entry.name in self._switches:
             self._relist()
+        if entry.name == _SYSTEM_ID:
+            self._system_id_at = self._next(1.0)
+
+    def _end_all(self) -> None:
+        super()._end_all()
+        self._was_on = {name: self._entry(name).bits != 0 for name in self._late_switches}
+        self._take_system_id(self._find(_SYSTEM_ID))
 
     def _switch_on(self, at: float) -> None:
         self._waiting: deque[tuple[wire.ParamRequestRead, wire.Frame]] = deque()
@@ -186,11 +206,15 @@ class ArduPilotVehicle(Vehicle):
         self._answers: dict[str, Entry] = {}
         self._read_at = math.inf
         self._answer_at = math.inf
+        self._system_id_at = math.inf
         self._live_at = at + self._live_period if self._live_period else math.inf
         self._list_count = 0
         super()._switch_on(at)
 
     def _work(self, now: float) -> None:
+        if self._system_id_at <= now:
+            self._system_id_at = math.inf
+            self._take_system_id(self._find(_SYSTEM_ID))
         if self._live_at <= now:
             self._live_at += self._live_period
             if self._live_at <= now:
@@ -244,6 +268,7 @@ class ArduPilotVehicle(Vehicle):
                     self._write(entry, entry.bits ^ 1)
 
 
+_SYSTEM_ID = "SYSID_THISMAV"
 _QUADROTOR = 2
 _STANDBY = 3
 _UID2 = b"3d1219c7c4c5404aa\0"

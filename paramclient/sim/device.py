@@ -22,6 +22,8 @@ class Device(ABC):
     """
 
     _ack_first = True  # whether COMMAND_ACK comes before what the command asked for
+    _restart_delay = 0.3  # seconds from accepting to start again until it is off
+    _armed_result = wire.MAV_RESULT_DENIED  # what becomes of a restart while it is armed
     _next_telemetry: float
 
     def __init__(
@@ -36,6 +38,12 @@ class Device(ABC):
         mavlink_version: int,
         stream: bool,
         high_latency: bool,
+        signing_key: wire.SigningKey | None,
+        signing_timestamp: int,
+        usb: bool,
+        armed: bool,
+        reboot_ack: bool,
+        reboot_down: float,
     ) -> None:
         for what, number in (("system", system), ("component", component)):
             if not 1 <= number <= 255:
@@ -46,21 +54,40 @@ class Device(ABC):
             raise UsageError(f"boot_time is a number of seconds from 0 up, not {boot_time}")
         if not 0.0 <= telemetry <= 10_000.0:
             raise UsageError(f"telemetry is a number of messages per second from 0 to 10000, not {telemetry}")
+        if not reboot_down >= 0.0:
+            raise UsageError(f"reboot_down is a number of seconds from 0 up, not {reboot_down}")
+        self.armed = armed
         self.system = system
         self.component = component
         self.requests: Counter[str] = Counter()
         self._high_latency = high_latency
+        self._reboot_ack = reboot_ack
+        self._reboot_down = reboot_down
         self._heartbeat = heartbeat
         self._version = version
         self._boot_time = boot_time
         self._telemetry_period = 1.0 / telemetry if telemetry else math.inf
         self._mavlink_version = mavlink_version
         self._framer = wire.Framer(wire.UNDERSTOOD, stream=stream)
+        self._usb = usb
+        self._signer: wire.Signer | None = None
+        self._verifier: wire.Verifier | None = None
         self._sequence = 0
         self._out: list[bytes] = []
         self._started = False
         self._now = -math.inf
         self._switch_on(math.inf)
+        self._take_key(signing_key, signing_timestamp)
+
+    @property
+    def signing_key(self) -> wire.SigningKey | None:
+        """The key with which it signs and checks now; None where it does not."""
+        return None if self._signer is None else self._signer.key
+
+    @property
+    def signing_report(self) -> wire.SigningReport | None:
+        """What it makes of the signatures that it gets; None where it has no key."""
+        return None if self._verifier is None else self._verifier.report()
 
     @property
     def high_latency(self) -> bool:
@@ -81,13 +108,13 @@ class Device(ABC):
         """Switch off at `now` and on again `down` seconds later, never if that is `math.inf`.
 
         All that was going on ends, and what is received while it is off is gone, as is what it had ready to
-        be fetched; the values stay. Without `now` it happens at the time that the vehicle was last given.
+        be fetched; the values stay, and those that wait for a start take effect. Without `now` it happens at
+        the time that the vehicle was last given.
         """
         if now is None:
             now = self._now
-        self._out.clear()
-        self._framer.flush()
         self._started = True
+        self._end_all()
         self._switch_on(now + down)
         self.tick(now)
 
@@ -102,9 +129,14 @@ class Device(ABC):
     def tick(self, now: float) -> None:
         """Do what has become due by `now`."""
         self._now = now
+        if self._signer is not None:
+            self._signer.advance(now)
         if not self._started:
             self._started = True
             self._switch_on(now)
+        if self._restart_at <= now:
+            self.reboot(self._restart_at, down=self._reboot_down)
+            self._now = now
         if now >= self._on_at:
             self._work(now)
 
@@ -112,7 +144,7 @@ class Device(ABC):
         """When `tick` is wanted next; None before the first call and when switched off for good."""
         if self._now < self._on_at:
             return None if self._on_at == math.inf else self._on_at
-        due = [self._next_heartbeat, *self._timers()]
+        due = [self._next_heartbeat, self._restart_at, *self._timers()]
         return min(due) if self._high_latency else min(self._next_transmission(), *due)
 
     def data_to_send(self) -> list[bytes]:
@@ -137,6 +169,17 @@ class Device(ABC):
         """When something is due that high latency leaves out."""
         return self._next_telemetry
 
+    def _end_all(self) -> None:
+        """Going off ends what was under way; see to what takes effect with the next start."""
+        self._out.clear()
+        self._framer.flush()
+
+    def _may_restart(self, mode: int) -> int:
+        """The MAV_RESULT for MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN with this as its first parameter."""
+        if self.armed:
+            return self._armed_result
+        return wire.MAV_RESULT_ACCEPTED if mode == _REBOOT else wire.MAV_RESULT_UNSUPPORTED
+
     def _skip_what_was_left_out(self) -> None:
         """What became due while high latency left it out is due from now on, once."""
         self._next_telemetry = max(self._now, self._next_telemetry)
@@ -145,8 +188,10 @@ class Device(ABC):
         """Begin anew, with nothing going on, at the time `at`; `math.inf` leaves it off."""
         self._on_at = at
         self._sequence = 0
+        self._restart_at = math.inf
         self._next_heartbeat = at
         self._next_telemetry = at + self._telemetry_period
+        self._forget_streams()
 
     def _work(self, now: float) -> None:
         """Do what is due, each thing at its own pace; of what repeats for ever, a late call skips some."""
@@ -181,13 +226,29 @@ class Device(ABC):
 
     # The rest
 
+    def _take_key(self, key: wire.SigningKey | None, timestamp: int) -> None:
+        """Sign with another key from now on, or not at all."""
+        self._signer = None if key is None else wire.Signer(key, timestamp=timestamp)
+        self._forget_streams()
+
+    def _forget_streams(self) -> None:
+        """Know nobody's timestamps, as after a start."""
+        self._verifier = None
+        if self._signer is not None:
+            policy = wire.SigningPolicy.ACCEPT_ALL if self._usb else wire.SigningPolicy.UNSIGNED_RADIOS
+            self._verifier = wire.Verifier(self._signer, policy, most_streams=_MOST_STREAMS)
+        self._framer.guard = None if self._verifier is None else self._verifier.accepts
+
     def _send_signs_of_life(self, now: float) -> None:
         beat = self._heartbeat
         if self._high_latency:
             self._send(wire.HighLatency2(beat.type, beat.autopilot))
             return
-        is_booting = now < self._on_at + self._boot_time
-        self._send(replace(beat, system_status=wire.MAV_STATE_BOOT) if is_booting else beat)
+        if now < self._on_at + self._boot_time:
+            beat = replace(beat, system_status=wire.MAV_STATE_BOOT)
+        if self.armed:
+            beat = replace(beat, base_mode=beat.base_mode | wire.MAV_MODE_FLAG_SAFETY_ARMED)
+        self._send(beat)
         self._send(wire.SystemTime(0, self._time_boot_ms(now)))
 
     def _time_boot_ms(self, now: float) -> int:
@@ -208,6 +269,8 @@ class Device(ABC):
 
     def _queue(self, frame: bytes) -> None:
         self._sequence = (self._sequence + 1) & 0xFF
+        if self._signer is not None:
+            frame = wire.sign_frame(frame, self._signer)
         if len(self._out) < OUT_LIMIT:
             self._out.append(frame)
 
@@ -222,7 +285,8 @@ class Device(ABC):
             | wire.ParamRequestList
             | wire.ParamSet
             | wire.CommandLong
-            | wire.FileTransfer,
+            | wire.FileTransfer
+            | wire.SetupSigning,
         ):
             return
         if not self._answers_system(message.target_system):
@@ -232,10 +296,16 @@ class Device(ABC):
         self.requests[_NAMES[type(message)]] += 1
         if isinstance(message, wire.CommandLong):
             self._on_command(message, frame)
+        elif isinstance(message, wire.SetupSigning):
+            if not self.armed:
+                self._take_key(message.key, message.initial_timestamp)
         else:
             self._on_request(message, frame)
 
     def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
+        if request.command == wire.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN:
+            self._on_restart_command(int(request.params[0]), sender)
+            return
         wanted = request.command == wire.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES or (
             request.command == wire.MAV_CMD_REQUEST_MESSAGE and request.params[0] == _AUTOPILOT_VERSION
         )
@@ -245,6 +315,15 @@ class Device(ABC):
         for answer in answers if self._ack_first else reversed(answers):
             self._send(answer)
 
+    def _on_restart_command(self, mode: int, sender: wire.Frame) -> None:
+        result = self._may_restart(mode)
+        is_obeyed = result == wire.MAV_RESULT_ACCEPTED and mode == _REBOOT
+        if is_obeyed:
+            self._restart_at = min(self._restart_at, self._now + self._restart_delay)
+        if self._reboot_ack or not is_obeyed:
+            command = wire.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+            self._send(wire.CommandAck(command, result, sender.system, sender.component))
+
 
 _NAMES = {
     wire.ParamRequestRead: "PARAM_REQUEST_READ",
@@ -252,8 +331,11 @@ _NAMES = {
     wire.ParamSet: "PARAM_SET",
     wire.CommandLong: "COMMAND_LONG",
     wire.FileTransfer: "FILE_TRANSFER_PROTOCOL",
+    wire.SetupSigning: "SETUP_SIGNING",
 }
+_REBOOT = 1  # of the autopilot; others shut down, or stay in the bootloader
 _AUTOPILOT_VERSION = 148
 _ATTITUDE = 30
 _LEVEL_FLIGHT = struct.pack("<6f", 0.0, 0.0, 0.5, 0.0, 0.0, 0.01)
 _HIGH_LATENCY_PAUSE = 5.0
+_MOST_STREAMS = 16  # MAVLINK_MAX_SIGNING_STREAMS of the C library, which both autopilots use

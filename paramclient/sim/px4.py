@@ -4,17 +4,23 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from typing import Unpack
+from typing import Final, Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.protocol import wire
 from paramclient.sim.ftp import FileServer
 from paramclient.sim.generic import BytewiseVehicle
-from paramclient.sim.table import Entry, SimParam, Table, as_table, px4_table
+from paramclient.sim.metadata import GENERAL_FILE, metadata_files
+from paramclient.sim.table import Entry, SimParam, Table, as_table, px4_table, with_system_id
 from paramclient.sim.vehicle import VehicleOptions
-from paramclient.values import Encoding, ParamType, px4_hash
+from paramclient.values import Encoding, ParamType, crc32_px4, px4_hash
 
 __all__ = ["PX4Vehicle"]
+
+RESET_KEEPS: Final = (
+    *("SYS_AUTOSTART", "SYS_PARAM_VER", "RC", "CAL_", "COM_FLTMODE", "LND_FLIGHT", "TC_", "COM_FLIGHT"),
+)
+"""How the names begin that SYS_AUTOCONFIG leaves alone (the start script `rcS` of PX4 1.16)."""
 
 
 class PX4Vehicle(BytewiseVehicle):
@@ -30,11 +36,18 @@ class PX4Vehicle(BytewiseVehicle):
     - A wrong type, an unknown name and an unknown index are met with silence.
     - A parameter that is not in use can be read and set by name (index 65535) and is neither in the list
       nor in the hash.
+    - With `metadata`, COMPONENT_METADATA names a general file among `files`, and that one with descriptions
+      of the parameters.
     - MAVFTP serves `files` and, if `ftp` is on as in the newest ones, `@PARAM/param.pck` (see `FileServer`).
     - It answers to its own system only, and to component 0.
+    - Told to start again it acknowledges, and goes off 0.4 s later; armed it denies that. With the start,
+      MAV_SYS_ID takes effect, and SYS_AUTOCONFIG above 0 has brought what it resets (see `RESET_KEEPS`) to
+      the values of the table, MAV_SYS_ID to 1. Values that it has not saved are not lost, as they may be with
+      a real one.
 
     Args:
         table: its parameters (see `Table`), in any order; None for those of a real quad, `px4_table()`.
+            MAV_SYS_ID, where it is among them, says `system`.
         system, component: its own ids, 1 to 255.
         uid: the hardware id that it reports; by default its own for every system.
         hash_check: whether it has `_HASH_CHECK` at all; the parameter MAV_HASH_CHK_EN at 0 also turns it off.
@@ -48,6 +61,7 @@ class PX4Vehicle(BytewiseVehicle):
             every 0.125 s.
         ftp: whether there is a param.pck, as after 1.17; otherwise it is said not to be found.
         ftp_rate: bytes per second of a burst of MAVFTP.
+        metadata: whether it describes its parameters, as those with enough memory do.
         options: those of every `Vehicle`. A list that is asked for within its `boot_time` starts then.
 
     Raises:
@@ -55,6 +69,7 @@ class PX4Vehicle(BytewiseVehicle):
     """
 
     _ack_first = False
+    _restart_delay = 0.4
     _push_at: float
     _save_at: float
 
@@ -74,9 +89,10 @@ class PX4Vehicle(BytewiseVehicle):
         period: float = 0.020,
         ftp: bool = False,
         ftp_rate: float = 48_500.0,
+        metadata: bool = False,
         **options: Unpack[VehicleOptions],
     ) -> None:
-        rows = px4_table() if table is None else as_table(table)
+        rows = with_system_id(px4_table() if table is None else as_table(table), _SYSTEM_ID, system)
         if table is None and late_use is None:
             compass = _third_compass(rows)
             late_use = {"CAL_MAG2_ID": [row.name for row in compass]}
@@ -96,6 +112,12 @@ class PX4Vehicle(BytewiseVehicle):
             numbers_sessions=True,
             burst_blocks=_BURST_BLOCKS,
         )
+        self._has_metadata = metadata
+        if metadata:
+            if options.get("mavlink_version") == 1:
+                raise UsageError("COMPONENT_METADATA does not exist in MAVLink 1")
+            self._ftp.files |= metadata_files(rows)
+        self._first_bits = {row.name: row.bits for row in rows}
         self._hash: int | None = None
         self._hash_check = hash_check
         self._autosave = autosave
@@ -150,6 +172,17 @@ class PX4Vehicle(BytewiseVehicle):
         self._hash_next = self._position is None and self.announced_hash() is not None
         self._start_list(self._now)
 
+    def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
+        general = self.files.get(GENERAL_FILE) if self._has_metadata else None
+        is_message = request.command == wire.MAV_CMD_REQUEST_MESSAGE
+        if general is None or not is_message or request.params[0] != wire.COMPONENT_METADATA_ID:
+            super()._on_command(request, sender)
+            return
+        self._send(wire.ComponentMetadata(f"mftp://{GENERAL_FILE}", crc32_px4(general)))
+        self._send(
+            wire.CommandAck(request.command, wire.MAV_RESULT_ACCEPTED, sender.system, sender.component)
+        )
+
     def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
         if request.param_index < 0 and request.param_id == wire.HASH_CHECK:
             self._send_hash()
@@ -179,6 +212,23 @@ class PX4Vehicle(BytewiseVehicle):
     def _relist(self) -> None:
         super()._relist()
         self._hash = None
+
+    def _may_restart(self, mode: int) -> int:
+        if mode == 0:
+            return wire.MAV_RESULT_ACCEPTED  # and nothing happens
+        return super()._may_restart(mode) if mode == 1 else wire.MAV_RESULT_DENIED
+
+    def _end_all(self) -> None:
+        super()._end_all()
+        autoconfig = self._find("SYS_AUTOCONFIG")
+        if autoconfig is not None and autoconfig.bits != 0:
+            for entry in self._entries:
+                if not entry.name.startswith(RESET_KEEPS):
+                    entry.store(self._first_bits[entry.name])
+            autoconfig.store(0)
+            if (system := self._find(_SYSTEM_ID)) is not None:
+                system.store(1)
+        self._take_system_id(self._find(_SYSTEM_ID))
 
     def _switch_on(self, at: float) -> None:
         self._unused = set(self._first_unused)
@@ -229,6 +279,7 @@ class PX4Vehicle(BytewiseVehicle):
             )
 
 
+_SYSTEM_ID = "MAV_SYS_ID"
 _QUADROTOR = 2
 _RELEASE = 17891392  # 1.17.0
 _MAIN = 0x01120000  # 1.18

@@ -6,7 +6,7 @@ import csv
 import math
 import struct
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cache
 from importlib import resources
 from typing import TypeAlias
@@ -24,7 +24,16 @@ from paramclient.values import (
     known_type,
 )
 
-__all__ = ["Entry", "SimParam", "Table", "ardupilot_table", "as_table", "ek2_group", "px4_table"]
+__all__ = [
+    "Entry",
+    "SimParam",
+    "Table",
+    "ardupilot_table",
+    "as_table",
+    "ek2_group",
+    "px4_table",
+    "with_system_id",
+]
 
 FLT_EPSILON = 2.0**-23
 """By how much ArduPilot lets a value differ from its default before it tells the default."""
@@ -141,6 +150,11 @@ def as_table(table: Table) -> tuple[SimParam, ...]:
     if isinstance(table, Mapping):
         return tuple(_row(name, entry) for name, entry in table.items())
     return tuple(table)
+
+
+def with_system_id(rows: Iterable[SimParam], name: str, system: int) -> tuple[SimParam, ...]:
+    """A table in which the parameter of this name says the system id."""
+    return tuple(replace(row, value=system) if row.name == name else row for row in rows)
 
 
 @cache

@@ -31,6 +31,12 @@ class VehicleOptions(TypedDict, total=False):
     list_stops: float
     repeated_names: bool
     high_latency: bool
+    signing_key: wire.SigningKey | None
+    signing_timestamp: int
+    usb: bool
+    armed: bool
+    reboot_ack: bool
+    reboot_down: float
 
 
 class Vehicle(Device):
@@ -41,6 +47,7 @@ class Vehicle(Device):
 
     Attributes:
         system, component: its own ids.
+        armed: whether its heartbeat says so; it does not start again then. Can be set in flight.
         requests: how many messages of each kind were received that were for this vehicle, by their MAVLink
             names (`requests["PARAM_REQUEST_READ"]`).
 
@@ -60,7 +67,14 @@ class Vehicle(Device):
         list_stops: how many lists that happens to; `math.inf` for all.
         repeated_names: whether a name may stand in the table more than once, as it does where names are cut
             at 16 bytes. Each has its index; by name the first is meant.
-        high_latency: see the attribute.
+        high_latency, armed: see the attributes.
+        reboot_ack: whether it acknowledges the command to start again before it does.
+        reboot_down: seconds for which it is off then.
+        signing_key: with which it signs what it sends; it takes only frames signed with it, and RADIO_STATUS.
+            None: neither, until SETUP_SIGNING brings a key. Of a sender's frames it takes those with a
+            rising timestamp, from at most 16 senders and links, until it is switched off.
+        signing_timestamp: where its timestamps begin; it has no other clock. They go on from those it hears.
+        usb: whether the link counts as safe: it takes whatever comes, as ArduPilot does over USB.
     """
 
     _ftp: FileServer | None = None
@@ -90,6 +104,12 @@ class Vehicle(Device):
         list_stops: float = 1,
         repeated_names: bool = False,
         high_latency: bool = False,
+        signing_key: wire.SigningKey | None = None,
+        signing_timestamp: int = 0,
+        usb: bool = False,
+        armed: bool = False,
+        reboot_ack: bool = True,
+        reboot_down: float = 1.0,
     ) -> None:
         rows = tuple(table)
         if not repeated_names and len({row.name for row in rows}) < len(rows):
@@ -128,6 +148,12 @@ class Vehicle(Device):
             mavlink_version=mavlink_version,
             stream=stream,
             high_latency=high_latency,
+            signing_key=signing_key,
+            signing_timestamp=signing_timestamp,
+            usb=usb,
+            armed=armed,
+            reboot_ack=reboot_ack,
+            reboot_down=reboot_down,
         )
 
     # The public face
@@ -320,6 +346,11 @@ class Vehicle(Device):
             entry = self._find(param.name)
             if entry is not None:
                 self._set_from_file(entry, param)
+
+    def _take_system_id(self, entry: Entry | None) -> None:
+        """Speak under the system id that a parameter says, if it is there and can be one."""
+        if entry is not None and isinstance(entry.value, int) and 1 <= entry.value <= 255:
+            self.system = entry.value
 
     def _start_list(self, at: float) -> None:
         """Send the list from its start, from `at` on, and not before the vehicle has booted."""

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeAlias
 
+from paramclient.protocol.wire.signing import SigningKey
+
 __all__ = [
     "AUTOPILOT_COMPONENT",
     "AUTOPILOT_VERSION_ID",
@@ -12,9 +14,11 @@ __all__ = [
     "CAPABILITY_FTP",
     "CAPABILITY_PARAM_ENCODE_BYTEWISE",
     "CAPABILITY_PARAM_ENCODE_C_CAST",
+    "COMPONENT_METADATA_ID",
     "COMP_ID_ALL",
     "CommandAck",
     "CommandLong",
+    "ComponentMetadata",
     "FileTransfer",
     "HASH_CHECK",
     "Heartbeat",
@@ -23,9 +27,13 @@ __all__ = [
     "MAV_AUTOPILOT_GENERIC",
     "MAV_AUTOPILOT_INVALID",
     "MAV_AUTOPILOT_PX4",
+    "MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN",
     "MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES",
     "MAV_CMD_REQUEST_MESSAGE",
+    "MAV_MODE_FLAG_SAFETY_ARMED",
     "MAV_RESULT_ACCEPTED",
+    "MAV_RESULT_DENIED",
+    "MAV_RESULT_FAILED",
     "MAV_RESULT_UNSUPPORTED",
     "MAV_STATE_ACTIVE",
     "MAV_STATE_BOOT",
@@ -38,6 +46,7 @@ __all__ = [
     "ParamRequestRead",
     "ParamSet",
     "ParamValue",
+    "SetupSigning",
     "StatusText",
     "SystemTime",
 ]
@@ -55,14 +64,19 @@ MAV_AUTOPILOT_GENERIC: Final = 0
 MAV_AUTOPILOT_ARDUPILOTMEGA: Final = 3
 MAV_AUTOPILOT_INVALID: Final = 8
 MAV_AUTOPILOT_PX4: Final = 12
+MAV_MODE_FLAG_SAFETY_ARMED: Final = 128
 MAV_STATE_BOOT: Final = 1
 MAV_STATE_ACTIVE: Final = 4
 PARAM_VALUE_ID: Final = 22
 AUTOPILOT_VERSION_ID: Final = 148
+COMPONENT_METADATA_ID: Final = 397
+MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: Final = 246
 MAV_CMD_REQUEST_MESSAGE: Final = 512
 MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: Final = 520
 MAV_RESULT_ACCEPTED: Final = 0
+MAV_RESULT_DENIED: Final = 2
 MAV_RESULT_UNSUPPORTED: Final = 3
+MAV_RESULT_FAILED: Final = 4
 CAPABILITY_PARAM_ENCODE_BYTEWISE: Final = 16
 CAPABILITY_FTP: Final = 32
 CAPABILITY_PARAM_ENCODE_C_CAST: Final = 131072
@@ -189,6 +203,27 @@ class HighLatency2:
     autopilot: int
 
 
+@dataclass(frozen=True, slots=True)
+class SetupSigning:
+    """SETUP_SIGNING: gives a vehicle its key, in clear; without one (zeros) it signs no more.
+
+    There is no answer to it. It exists in MAVLink 2 alone.
+    """
+
+    target_system: int
+    target_component: int
+    key: SigningKey | None
+    initial_timestamp: int
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentMetadata:
+    """COMPONENT_METADATA: where the general metadata file lies, and its CRC-32; its time is not read."""
+
+    uri: str
+    file_crc: int
+
+
 Message: TypeAlias = (
     Heartbeat
     | AutopilotVersion
@@ -203,4 +238,6 @@ Message: TypeAlias = (
     | FileTransfer
     | SystemTime
     | HighLatency2
+    | SetupSigning
+    | ComponentMetadata
 )

@@ -1,0 +1,162 @@
+"""The command fleet diff: which of the vehicles that were ever seen differ, and since when."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Final
+
+from paramclient.cache import FleetDiff, FleetVehicle, Holder, NameSpread, ParamCache
+from paramclient.cli.options import CacheOptions, Id
+from paramclient.cli.outcome import ExitCode
+from paramclient.cli.output import (
+    bits_text,
+    print_json,
+    print_table,
+    report,
+    say,
+    time_text,
+    value_json,
+)
+from paramclient.errors import UsageError
+from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.values import Param, ParamType, check_name, format_value, type_name
+
+__all__ = ["fleet_diff"]
+
+_DEFAULTS: Final = CacheOptions()
+
+
+def fleet_diff(
+    *wanted: str,
+    component: Id = None,
+    options: CacheOptions = _DEFAULTS,
+) -> ExitCode:
+    """Compare all vehicles in the cache: in some parameters with each other, or with a parameter file.
+
+    With each other, those stand out that have another value than most. Exit code 1 says that some do.
+
+    Args:
+        wanted: Names of parameters, or patterns such as 'MC_*'; or one parameter file.
+        component: This component instead of the autopilot.
+    """
+    if not wanted:
+        raise UsageError("name the parameters to compare, or a parameter file")
+    chosen = _chosen(wanted, component)
+    with ParamCache(options.cache) as cache:
+        found = cache.fleet_diff(chosen, component=component)
+    if options.json:
+        print_json(_json(found))
+    else:
+        _print(found)
+    return ExitCode.DIFFERENT if found.differs else ExitCode.DONE
+
+
+def _chosen(wanted: tuple[str, ...], component: int | None) -> ParamSet | tuple[str, ...]:
+    """What to compare: what a file wants of a component, or names."""
+    files = [word for word in wanted if "/" in word or "." in word or Path(word).is_file()]
+    if not files:
+        return tuple(map(check_name, wanted))
+    if len(wanted) > 1:
+        raise UsageError(f"{files[0]} is a file: name one file, or parameters, not both")
+
+    from paramclient.files import read_file  # only here: it takes its time
+
+    file = read_file(files[0])
+    for note in file.notes:
+        report(note)
+    return file.choose(component)
+
+
+def _print(found: FleetDiff) -> None:
+    rows = [row for each in found.names if each.differs for row in _rows(each, len(found.vehicles))]
+    if rows:
+        print_table(["name", "value", "vehicles", "since", "vehicle"], rows, right="value vehicles")
+    count = sum(each.differs for each in found.names)
+    some = f"{count} of {_number(len(found.names), 'parameter')}" if count else "no parameter"
+    say(f"{some} {'differ' if count > 1 else 'differs'} among {_number(len(found.vehicles), 'vehicle')}")
+
+
+def _rows(each: NameSpread, vehicles: int) -> Iterator[tuple[object, ...]]:
+    """A line for what should be, then one for each vehicle that stands out."""
+    name: str | None = each.name
+    agreeing = [value for value in each.values if value.agrees]
+    if each.wanted is not None:
+        count = sum(len(value.holders) for value in agreeing)
+        yield name, _written(each.wanted), f"{count} of {vehicles}", None, "wanted"
+        name = None
+    else:
+        for value in agreeing:
+            yield name, _value(value.param), f"{len(value.holders)} of {vehicles}", None, "most"
+            name = None
+    for value in each.values:
+        for number, holder in enumerate(() if value.agrees else value.holders):
+            count_text = None if number else f"{len(value.holders)} of {vehicles}"
+            yield name, _value(value.param), count_text, _since(holder), _who(holder.vehicle)
+            name = None
+    for what, holders in (("lacks it", each.lacking), ("not known", each.unknown)):
+        for number, holder in enumerate(holders):
+            count_text = None if number else f"{len(holders)} of {vehicles}"
+            yield name, what, count_text, _since(holder), _who(holder.vehicle)
+            name = None
+
+
+def _since(holder: Holder) -> str | None:
+    if holder.since is None:
+        return None
+    return f"{'' if holder.changed else 'before '}{time_text(holder.since)}"
+
+
+def _who(vehicle: FleetVehicle) -> str:
+    return f"{vehicle.system} ({vehicle.key})"
+
+
+def _written(wanted: WrittenParam) -> str:
+    return format_value(wanted.value, ParamType.REAL32 if wanted.type is None else wanted.type)
+
+
+def _value(param: Param) -> str:
+    return format_value(param.value, param.type)
+
+
+def _number(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def _json(found: FleetDiff) -> dict[str, Any]:
+    return {
+        "component": found.component,
+        "vehicles": len(found.vehicles),
+        "different": found.differs,
+        "names": [_name_json(each) for each in found.names],
+    }
+
+
+def _name_json(each: NameSpread) -> dict[str, Any]:
+    wanted = each.wanted
+    return {
+        "name": each.name,
+        "different": each.differs,
+        "wanted": None if wanted is None else value_json(wanted.value, wanted.type or ParamType.REAL32),
+        "values": [
+            {
+                "value": value_json(value.param.value, value.param.type),
+                "type": type_name(value.param.type),
+                "bits": bits_text(value.param),
+                "agrees": value.agrees,
+                "vehicles": [_holder_json(holder) for holder in value.holders],
+            }
+            for value in each.values
+        ],
+        "lacking": [_holder_json(holder) for holder in each.lacking],
+        "unknown": [_holder_json(holder) for holder in each.unknown],
+    }
+
+
+def _holder_json(holder: Holder) -> dict[str, Any]:
+    return {
+        "key": holder.vehicle.key,
+        "system": holder.vehicle.system,
+        "since": None if holder.since is None else time_text(holder.since),
+        "changed": holder.changed,
+    }

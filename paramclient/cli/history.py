@@ -1,0 +1,116 @@
+"""The command history: how the values of a vehicle have changed, and what was set down of them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from typing import Annotated, Any, Final
+
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from paramclient.cache import HistoryEntry, ParamCache, SnapshotSummary
+from paramclient.cli.options import CacheOptions, Id
+from paramclient.cli.outcome import ExitCode
+from paramclient.cli.output import hash_text, print_json, print_table, time_text, value_json
+from paramclient.cli.sources import vehicle_key
+from paramclient.cli.when import parse_time
+from paramclient.errors import UsageError
+from paramclient.values import Param, check_name, format_value
+
+__all__ = ["history"]
+
+_DEFAULTS: Final = CacheOptions()
+
+
+def history(
+    vehicle: str,
+    name: str | None = None,
+    /,
+    *,
+    component: Id = None,
+    since: str | None = None,
+    limit: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
+    snapshots: bool = False,
+    options: CacheOptions = _DEFAULTS,
+) -> ExitCode:
+    """Print how the values of a vehicle have changed: when, from, to, and by whom. The newest comes last.
+
+    With --snapshots, print what was set down of its tables instead, each with its number.
+
+    Args:
+        vehicle: Its system id, the beginning of its hardware id, or its key in the cache.
+        name: This parameter only.
+        component: This component only.
+        since: From this time on only: 2h ago, yesterday, '2026-11-20 14:00'.
+        limit: The newest so many only.
+        snapshots: The snapshots instead of the changes.
+    """
+    begin = None if since is None else parse_time(since, time.time())
+    if snapshots and name is not None:
+        raise UsageError("--snapshots lists whole tables: it takes no parameter's name")
+    if name is not None:
+        check_name(name)
+    with ParamCache(options.cache) as cache:
+        key = vehicle_key(cache, vehicle)
+        if snapshots:
+            kept = [each for each in cache.snapshots(key, component) if begin is None or each.at >= begin]
+            _print_snapshots(kept[-limit:] if limit else kept, options)
+        else:
+            _print_entries(cache.history(key, component, name, limit, begin), options)
+    return ExitCode.DONE
+
+
+def _print_entries(entries: Sequence[HistoryEntry], options: CacheOptions) -> None:
+    if options.json:
+        print_json({"history": [_entry_json(entry) for entry in entries]})
+    else:
+        print_table(["time", "component", "name", "old", "new", "by"], map(_entry_cells, entries))
+
+
+def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> None:
+    if options.json:
+        print_json({"snapshots": [_snapshot_json(each) for each in kept]})
+        return
+    rows = (
+        (each.id, time_text(each.at), each.component, each.size, hash_text(each.hash), _reason(each))
+        for each in kept
+    )
+    print_table(["id", "time", "component", "params", "hash", "reason"], rows, right="id params")
+
+
+def _entry_json(entry: HistoryEntry) -> dict[str, Any]:
+    new = entry.new
+    return {
+        "time": time_text(entry.at),
+        "component": entry.component,
+        "name": entry.name,
+        "old": value_json(entry.old.value, entry.old.type),
+        "new": None if new is None else value_json(new.value, new.type),
+        "by": entry.by,
+    }
+
+
+def _entry_cells(entry: HistoryEntry) -> tuple[object, ...]:
+    new = None if entry.new is None else _value(entry.new)
+    return time_text(entry.at), entry.component, entry.name, _value(entry.old), new, entry.by
+
+
+def _snapshot_json(each: SnapshotSummary) -> dict[str, Any]:
+    return {
+        "id": each.id,
+        "time": time_text(each.at),
+        "component": each.component,
+        "size": each.size,
+        "complete": each.complete,
+        "hash": hash_text(each.hash),
+        "reason": each.reason,
+    }
+
+
+def _reason(each: SnapshotSummary) -> str:
+    return each.reason if each.complete else f"{each.reason} (not complete)"
+
+
+def _value(param: Param) -> str:
+    return format_value(param.value, param.type)

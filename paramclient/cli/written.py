@@ -1,0 +1,167 @@
+"""How parameters without a vehicle are shown: those of a file, and whatever is compared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any, Final
+
+from paramclient.cli.outcome import ExitCode
+from paramclient.cli.output import (
+    NO_DEFAULTS,
+    print_json,
+    print_table,
+    printable,
+    report,
+    say,
+    time_text,
+    value_json,
+)
+from paramclient.compare import same_value
+from paramclient.errors import UsageError
+from paramclient.files import ParamFile
+from paramclient.files.model import address
+from paramclient.identity import autopilot_name
+from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.values import ParamType, Value, format_value, type_name
+
+__all__ = ["bits_written", "described", "origin_json", "show_file", "value_text", "written_json"]
+
+
+def show_file(file: ParamFile, component: int | None, *, changed: bool, json: bool) -> ExitCode:
+    """Print what a parameter file holds; see `paramclient show`."""
+    sets = file.sets if component is None else [file.choose(component)]
+    if changed:
+        shown = [_changed(each) for each in sets if any(param.default is not None for param in each.values())]
+    else:
+        shown = [*sets]
+    if json:
+        print_json(
+            {"file": file.source, "form": file.form, "components": [_set_json(each) for each in shown]}
+        )
+    else:
+        for each in shown:
+            _print_set(each, changed=changed)
+    if changed and not shown:
+        report(NO_DEFAULTS)
+        return ExitCode.INCOMPLETE
+    return ExitCode.DONE
+
+
+def described(params: ParamSet) -> str:
+    """A set in words: `903 parameters of 1/1 px4 from link sim:px4, 2026-11-20T18:00:00.000Z`."""
+    who = [
+        "" if params.component is None and params.system is None else f"of {address(params)}",
+        "" if params.identity is None else autopilot_name(params.identity.autopilot),
+        f"from {params.source}" if params.source else "",
+    ]
+    at = "" if params.at is None else f", {time_text(params.at)}"
+    return " ".join(filter(None, [_counted(len(params)), *who])) + at
+
+
+def origin_json(params: ParamSet) -> dict[str, Any]:
+    """Whose parameters a set has, for programs."""
+    identity = params.identity
+    return {
+        "source": params.source,
+        "system": params.system,
+        "component": params.component,
+        "autopilot": None if identity is None else autopilot_name(identity.autopilot),
+        "uid": None if identity is None else identity.uid,
+        "at": None if params.at is None else time_text(params.at),
+        "count": len(params),
+    }
+
+
+def written_json(param: WrittenParam) -> dict[str, Any]:
+    """A parameter's value for programs; its name is the key under which it stands.
+
+    Without a type, `value` is the number as it is written, and there are no `bits`.
+    """
+    return {
+        "value": _json(param.value, param),
+        "type": None if param.type is None else type_name(param.type),
+        "bits": bits_written(param),
+    }
+
+
+def value_text(param: WrittenParam) -> str:
+    """A parameter's value for people."""
+    return _text(param.value, param)
+
+
+def bits_written(param: WrittenParam) -> str | None:
+    """The value's bits as hexadecimal digits; None where no type stands beside it, or one that it exceeds."""
+    if param.type is None:
+        return None
+    try:
+        bits = (
+            int.from_bytes(param.value, "little")
+            if isinstance(param.value, bytes)
+            else param.bits_as(param.type)
+        )
+    except UsageError:
+        return None
+    is_wide = isinstance(param.type, ParamType) and param.type.size == 8
+    return f"{bits:0{16 if is_wide else 8}x}"
+
+
+_COLUMNS: Final = ("name", "value", "default", "type", "comment")
+
+
+def _print_set(params: ParamSet, *, changed: bool) -> None:
+    """A table of a set; columns that would be empty are left out."""
+    rows = [
+        (
+            param.name,
+            value_text(param),
+            None if param.default is None else _text(param.default, param),
+            None if param.type is None else type_name(param.type),
+            param.comment or None,
+        )
+        for param in params.values()
+    ]
+    kept = [
+        place
+        for place, column in enumerate(_COLUMNS)
+        if place < 2 or any(row[place] is not None for row in rows)
+    ]
+    print_table(
+        [_COLUMNS[place] for place in kept],
+        ([row[place] for place in kept] for row in rows),
+        right="value default",
+    )
+    say(printable(f"{described(params)}{', those that differ from their default' if changed else ''}"))
+
+
+def _set_json(params: ParamSet) -> dict[str, Any]:
+    return {**origin_json(params), "params": {name: _param_json(param) for name, param in params.items()}}
+
+
+def _param_json(param: WrittenParam) -> dict[str, Any]:
+    return {
+        **written_json(param),
+        **({} if param.default is None else {"default": _json(param.default, param)}),
+        **({"comment": param.comment} if param.comment else {}),
+    }
+
+
+def _changed(params: ParamSet) -> ParamSet:
+    """Those whose value differs from the firmware's default."""
+    differing = {
+        name: param
+        for name, param in params.items()
+        if param.default is not None and not same_value(param, replace(param, value=param.default))
+    }
+    return replace(params, params=differing)
+
+
+def _json(value: Value, param: WrittenParam) -> int | float | str:
+    return value_json(value, ParamType.REAL64 if param.type is None else param.type)
+
+
+def _text(value: Value, param: WrittenParam) -> str:
+    return format_value(value, ParamType.REAL32 if param.type is None else param.type)
+
+
+def _counted(number: int) -> str:
+    return f"{number} {'parameter' if number == 1 else 'parameters'}"

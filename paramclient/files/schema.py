@@ -1,0 +1,192 @@
+"""What the document of paramclient may hold, guarded field by field; only reading one loads this room."""
+
+from __future__ import annotations
+
+import re
+from datetime import datetime
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from paramclient.errors import UsageError
+from paramclient.files.text import as_type
+from paramclient.identity import Identity
+from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.values import ParamType, Value, check_name, from_bits, known_type
+
+__all__ = ["Place", "parse"]
+
+Place = tuple[str | int, ...]
+"""Where in a document something stands: keys and positions from the top."""
+
+_A_NUMBER = "expected a number (or NaN, Infinity, 0x and 8 digits for raw bytes)"
+_WORDS = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
+_raw = re.compile(r"0x([0-9a-fA-F]{8})").fullmatch
+_type_number = re.compile(r"TYPE_([0-9]{1,3})").fullmatch
+_date = re.compile(r"[0-9]{4}-[0-9]{2}-").match
+_bits = re.compile(r"[0-9a-fA-F]{8}(?:[0-9a-fA-F]{8})?").fullmatch
+
+
+def parse(content: object, source: str) -> tuple[tuple[ParamSet, ...], tuple[str, ...]]:
+    """The sets and the header of a document that was read as JSON or YAML.
+
+    Raises:
+        Wrong: it is not one.
+    """
+    try:
+        document = _Document.model_validate(content)
+    except ValidationError as error:
+        raise Wrong([(each["loc"], _told(each)) for each in error.errors(include_url=False)]) from None
+    problems: list[tuple[Place, str]] = []
+    sets = []
+    for place, each in enumerate(document.sets):
+        params = {}
+        for name, written in each.params.items():
+            where: Place = ("sets", place, "params", name)
+            try:
+                params[check_name(name)] = written.param(name)
+            except UsageError as error:
+                problems.append((where, str(error)))
+        identity = None if each.identity is None else Identity(**each.identity.model_dump())
+        at = None if each.at is None else each.at.timestamp()
+        sets.append(ParamSet(params, each.component, each.system, identity, at, source))
+    if problems:
+        raise Wrong(problems)
+    return tuple(sets), tuple(document.header)
+
+
+class Wrong(Exception):
+    """A document is not as it should be: places in it, and what is wrong there."""
+
+    def __init__(self, problems: list[tuple[Place, str]]) -> None:
+        super().__init__(problems)
+        self.problems = problems
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+
+
+_Id = Annotated[int, Field(ge=1, le=255)]
+_Count = Annotated[int, Field(ge=0)]
+
+
+class _Identity(_Model):
+    system: _Id
+    link: str = ""
+    uid: str | None = None
+    autopilot: _Count = 0
+    vehicle_type: _Count = 0
+    firmware: _Count = 0
+    git_hash: str = ""
+    board: _Count = 0
+    vendor_id: _Count = 0
+    product_id: _Count = 0
+    capabilities: _Count = 0
+
+
+def _is_scalar(content: object) -> object:
+    if isinstance(content, bool) or not isinstance(content, int | float | str):
+        raise ValueError(_A_NUMBER)
+    return content
+
+
+_Scalar = Annotated[int | float | str, BeforeValidator(_is_scalar)]
+
+
+class _Param(_Model):
+    value: _Scalar
+    type: str | None = None
+    bits: str | None = None
+    default: _Scalar | None = None
+    comment: str = ""
+
+    def param(self, name: str) -> WrittenParam:
+        """The parameter; UsageError where its fields contradict each other."""
+        kind = None if self.type is None else _kind(self.type)
+        value = _value(self.value)
+        default = None if self.default is None else _value(self.default)
+        if kind is not None:
+            value = as_type(value, kind)
+            default = None if default is None else as_type(default, kind)
+        if self.bits is not None:
+            value = _with_bits(value, kind, self.bits)
+        return WrittenParam(name, value, kind, default, self.comment)
+
+
+class _Set(_Model):
+    system: _Id | None = None
+    component: _Id | None = None
+    identity: _Identity | None = None
+    at: Annotated[datetime | None, Field(strict=False)] = None
+    source: str = ""
+    params: dict[str, _Param]
+
+    @model_validator(mode="before")
+    @classmethod
+    def _time_is_text(cls, content: Any) -> Any:
+        """A bare number could be seconds or milliseconds."""
+        at = content.get("at") if isinstance(content, dict) else None
+        if at is not None and not (isinstance(at, str) and _date(at)):
+            raise ValueError("the time `at` is written as 2026-01-31T12:00:00Z")
+        return content
+
+    @model_validator(mode="after")
+    def _time_has_zone(self) -> _Set:
+        if self.at is not None and self.at.tzinfo is None:
+            raise ValueError("the time `at` needs its zone, as in 2026-01-31T12:00:00Z")
+        return self
+
+
+class _Document(_Model):
+    paramclient: Literal[1]
+    header: list[str] = []
+    sets: list[_Set]
+
+
+def _kind(text: str) -> ParamType | int:
+    if text in ParamType.__members__:
+        return ParamType[text]
+    if match := _type_number(text):
+        number = int(match[1])
+        if number <= 255 and not isinstance(known_type(number), ParamType):
+            return number
+    raise UsageError(f"no type is called {text!r}; types are {', '.join(ParamType.__members__)}")
+
+
+def _value(written: int | float | str) -> Value:
+    if not isinstance(written, str):
+        return written
+    if written in _WORDS:
+        return _WORDS[written]
+    if match := _raw(written):
+        return int(match[1], 16).to_bytes(4, "little")
+    raise UsageError(f"{_A_NUMBER}, found {written!r}")
+
+
+def _with_bits(value: Value, kind: ParamType | int | None, text: str) -> Value:
+    """The value that the bits say, if that is the value which stands beside them."""
+    if kind is None:
+        raise UsageError("bits say nothing without a type")
+    if not _bits(text):
+        raise UsageError(f"bits are 8 or 16 hexadecimal digits, not {text!r}")
+    bits = int(text, 16)
+    size = kind.size if isinstance(kind, ParamType) and not isinstance(value, bytes) else 4
+    if bits >= 1 << 8 * size:
+        raise UsageError(f"bits {text} are more than the type has")
+    exact = from_bits(bits, kind, is_raw=isinstance(value, bytes))
+    both_nan = value != value and exact != exact
+    if exact != value and not both_nan:
+        raise UsageError(f"value {value!r} and bits {text} ({exact!r}) contradict each other; leave out one")
+    return exact
+
+
+def _told(error: Any) -> str:
+    """What pydantic found, in a sentence."""
+    if error["type"] == "extra_forbidden":
+        return "no such field is known"
+    if error["type"] == "missing":
+        return "the field is missing"
+    found = error["input"]
+    text = error["msg"].removeprefix("Value error, ").replace("Input should", "it should")
+    return text if isinstance(found, dict | list) else f"{text}, found {found!r}"

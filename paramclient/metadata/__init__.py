@@ -1,0 +1,13 @@
+"""What firmwares say of their parameters: units, ranges, names of values and bits, descriptions.
+
+Nothing depends on it. It comes from a file (`read_metadata`) or from the vehicle itself (`metadata_of`).
+"""
+
+from __future__ import annotations
+
+from paramclient.metadata.download import metadata_of
+from paramclient.metadata.info import Metadata, ParamInfo
+from paramclient.metadata.reading import read_content, read_metadata
+from paramclient.metadata.store import MetadataStore
+
+__all__ = ["Metadata", "MetadataStore", "ParamInfo", "metadata_of", "read_content", "read_metadata"]

@@ -1,0 +1,289 @@
+"""ArduPilot's descriptions: apm.pdef.xml and apm.pdef.json, which its build makes of comments in its source.
+
+Source of the forms: `Tools/autotest/param_metadata` of ArduPilot (xmlemit.py, jsonemit.py). Their texts are
+written by hand, so a range or a list that does not read as numbers is left out; of a file that has another
+structure nothing is taken.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Any, Final
+from xml.parsers import expat
+
+from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
+
+from paramclient.errors import MetadataError, UsageError
+from paramclient.metadata.info import MOST_BITS, Metadata, ParamInfo, number_of
+from paramclient.metadata.px4 import MOST_PARAMS, told, whole
+
+__all__ = ["read_json", "read_xml"]
+
+DEEPEST: Final = 16
+"""Levels of elements; the files have six."""
+
+
+def read_xml(content: bytes, *, source: str) -> Metadata:
+    """Read an apm.pdef.xml.
+
+    What a document type can declare, entities above all, is refused: the files have none.
+
+    Raises:
+        MetadataError: it is none.
+    """
+    reader = _XmlReader(source)
+    try:
+        reader.parse(content)
+    except MetadataError:
+        raise
+    except (expat.ExpatError, ValueError, LookupError) as error:
+        raise MetadataError(f"{source}: no XML: {error}", source=source) from None
+    return _gathered(reader.found, source)
+
+
+def read_json(document: object, *, source: str) -> Metadata:
+    """Take an apm.pdef.json, its JSON read.
+
+    Raises:
+        MetadataError: it is none.
+    """
+    try:
+        groups = _GROUPS.validate_python(document)
+        if groups.pop("json", None) is None:
+            raise MetadataError(f'{source}: has no "json", which marks the files of ArduPilot', source=source)
+        if sum(map(len, groups.values())) > MOST_PARAMS:
+            raise _too_many(source)
+        rows = {group: _ROWS.validate_python(described) for group, described in groups.items()}
+    except ValidationError as error:
+        raise MetadataError(f"{source}{told(error)}", source=source) from None
+    infos = (each.info(name, group) for group, described in rows.items() for name, each in described.items())
+    return _gathered(infos, source)
+
+
+@dataclass(slots=True)
+class _Row:
+    """One parameter, its fields as text."""
+
+    name: str
+    short: str = ""
+    long: str = ""
+    user: str = ""
+    fields: dict[str, str] = field(default_factory=dict)
+    values: dict[str, str] = field(default_factory=dict)
+    bits: dict[str, str] = field(default_factory=dict)
+
+    def info(self, group: str) -> ParamInfo:
+        fields = self.fields
+        low, high = _range(fields.get("Range", ""))
+        values = self.values or _items(fields.get("Values", ""))
+        bits = self.bits or _items(fields.get("Bitmask", ""))
+        return ParamInfo(
+            self.name,
+            None,
+            self.short,
+            self.long,
+            fields.get("Units", ""),
+            low,
+            high,
+            _number(fields.get("Increment", "")),
+            None,
+            None,
+            _values(values),
+            _bits(bits),
+            _is_true(fields.get("RebootRequired", "")),
+            _is_true(fields.get("ReadOnly", "")),
+            _is_true(fields.get("Volatile", "")),
+            self.user,
+            group,
+        )
+
+
+class _Described(BaseModel):
+    """A parameter in the JSON; what the build could not take apart stands there as one text."""
+
+    model_config = ConfigDict(extra="ignore")
+
+    short: str = Field("", alias="DisplayName")
+    long: str = Field("", alias="Description")
+    user: str = Field("", alias="User")
+    units: str = Field("", alias="Units")
+    range: dict[str, str] | str = Field("", alias="Range")
+    increment: str = Field("", alias="Increment")
+    values: dict[str, str] | str = Field("", alias="Values")
+    bits: dict[str, str] | str = Field("", alias="Bitmask")
+    reboot_required: str = Field("", alias="RebootRequired")
+    is_read_only: str = Field("", alias="ReadOnly")
+    is_volatile: str = Field("", alias="Volatile")
+
+    def info(self, name: str, group: str) -> ParamInfo:
+        span = self.range
+        fields = {
+            "Units": self.units,
+            "Range": span if isinstance(span, str) else f"{span.get('low', '')} {span.get('high', '')}",
+            "Increment": self.increment,
+            "Values": self.values if isinstance(self.values, str) else "",
+            "Bitmask": self.bits if isinstance(self.bits, str) else "",
+            "RebootRequired": self.reboot_required,
+            "ReadOnly": self.is_read_only,
+            "Volatile": self.is_volatile,
+        }
+        values = {} if isinstance(self.values, str) else self.values
+        bits = {} if isinstance(self.bits, str) else self.bits
+        return _Row(name.rpartition(":")[2], self.short, self.long, self.user, fields, values, bits).info(
+            group
+        )
+
+
+_GROUPS: Final = TypeAdapter(dict[str, dict[str, Any]])
+_ROWS: Final = TypeAdapter(dict[str, _Described])
+
+
+class _XmlReader:
+    """Takes the parameters out of an XML file, element by element.
+
+    Attributes:
+        found: the parameters; the group of each is the vehicle or the library that it belongs to.
+    """
+
+    def __init__(self, source: str) -> None:
+        self.found: list[ParamInfo] = []
+        self._source = source
+        self._depth = 0
+        self._group = ""
+        self._row: _Row | None = None
+        self._store: dict[str, str] | None = None  # where the text of the element goes, under this key
+        self._key = ""
+        self._text: list[str] = []
+
+    def parse(self, content: bytes) -> None:
+        """Read it all.
+
+        Raises:
+            MetadataError: it has a document type, or is no file of parameters.
+            ExpatError, ValueError, LookupError: it is no XML.
+        """
+        parser = expat.ParserCreate()
+        parser.buffer_text = True
+        parser.StartDoctypeDeclHandler = self._refuse_doctype
+        parser.StartElementHandler = self._begin
+        parser.EndElementHandler = self._end
+        parser.CharacterDataHandler = self._take
+        parser.Parse(content, True)
+
+    def _refuse_doctype(self, *_: object) -> None:
+        raise self._error("has a document type (<!DOCTYPE …>), which the files of ArduPilot have not")
+
+    def _begin(self, tag: str, attributes: dict[str, str]) -> None:
+        self._depth += 1
+        if self._depth == 1 and tag != "paramfile":
+            raise self._error(f"begins with <{tag}>, where the files of ArduPilot have <paramfile>")
+        if self._depth > DEEPEST:
+            raise self._error(f"has more than {DEEPEST} levels")
+        row = self._row
+        if tag == "parameters":
+            self._group = attributes.get("name", "")
+        elif tag == "param":
+            if row is not None:
+                raise self._error(f"has a parameter inside of {row.name}")
+            name = attributes.get("name", "").rpartition(":")[2]
+            if not name:
+                raise self._error("has a parameter without a name")
+            self._row = _Row(
+                name,
+                attributes.get("humanName", ""),
+                attributes.get("documentation", ""),
+                attributes.get("user", ""),
+            )
+        elif row is not None and tag in _KEYS:
+            self._store = {"field": row.fields, "value": row.values, "bit": row.bits}[tag]
+            self._key = attributes.get(_KEYS[tag], "")
+            self._text = []
+
+    def _take(self, text: str) -> None:
+        if self._store is not None:
+            self._text.append(text)
+
+    def _end(self, tag: str) -> None:
+        self._depth -= 1
+        if tag == "param" and self._row is not None:
+            if len(self.found) >= MOST_PARAMS:
+                raise _too_many(self._source)
+            self.found.append(self._row.info(self._group))
+            self._row = None
+        elif self._store is not None and tag in _KEYS:
+            self._store[self._key] = "".join(self._text)
+            self._store = None
+
+    def _error(self, text: str) -> MetadataError:
+        return MetadataError(f"{self._source}: {text}", source=self._source)
+
+
+_KEYS: Final = {"field": "name", "value": "code", "bit": "code"}
+_ITEM: Final = re.compile(r",(?=\s*[+-]?[0-9.]+\s*:)")  # a comma may also stand in a name
+
+
+def _gathered(found: Iterable[ParamInfo], source: str) -> Metadata:
+    """The parameters of all groups. One that two vehicles describe differently is left out."""
+    infos: dict[str, ParamInfo] = {}
+    doubtful = set()
+    for info in found:
+        before = infos.setdefault(info.name, info)
+        if replace(before, group="") != replace(info, group=""):
+            doubtful.add(info.name)
+    if not infos:
+        raise MetadataError(f"{source}: describes no parameters", source=source)
+    return Metadata.of((info for info in infos.values() if info.name not in doubtful), source=source)
+
+
+def _too_many(source: str) -> MetadataError:
+    return MetadataError(f"{source}: describes more than {MOST_PARAMS} parameters", source=source)
+
+
+def _range(text: str) -> tuple[int | float | None, int | float | None]:
+    parts = text.replace(",", " ").split()
+    low, high = (_number(part) for part in parts) if len(parts) == 2 else (None, None)
+    return (None, None) if low is None or high is None or low > high else (low, high)
+
+
+def _number(text: str) -> int | float | None:
+    """A finite number, whole ones as int; None for anything else."""
+    try:
+        number = number_of(text)
+    except UsageError:
+        return None
+    return None if number is None or not math.isfinite(number) else whole(number)
+
+
+def _items(text: str) -> dict[str, str]:
+    """`0:Disabled,1:Enabled` by the numbers; empty where any of it has another form."""
+    items = {}
+    for each in _ITEM.split(text):
+        code, colon, name = each.partition(":")
+        if not colon:
+            return {}
+        items[code] = name
+    return items
+
+
+def _values(items: Mapping[str, str]) -> Mapping[int | float, str]:
+    named = {_number(code): name.strip() for code, name in items.items()}
+    return MappingProxyType({code: name for code, name in named.items() if code is not None and name})
+
+
+def _bits(items: Mapping[str, str]) -> Mapping[int, str]:
+    named = {_number(code): name.strip() for code, name in items.items()}
+    return MappingProxyType(
+        {
+            code: name
+            for code, name in named.items()
+            if isinstance(code, int) and 0 <= code < MOST_BITS and name
+        }
+    )
+
+
+def _is_true(text: str) -> bool:
+    return text.strip().lower() == "true"

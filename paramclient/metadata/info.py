@@ -1,0 +1,304 @@
+"""What is known of a parameter beside its value: units, range, names of values and of bits, in words."""
+
+from __future__ import annotations
+
+import difflib
+import functools
+import math
+import operator
+import re
+import struct
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from types import MappingProxyType
+from typing import Final, TypeVar
+
+from paramclient.errors import UsageError
+from paramclient.values import ParamType, Value, format_value, shortest_float
+
+__all__ = ["Metadata", "ParamInfo", "number_of"]
+
+MOST_NAMED: Final = 12
+"""Names that an error lists; of more it gives the nearest, as a line with hundreds says nothing."""
+MOST_BITS: Final = 64
+"""Bits of the widest type."""
+INSTANCE: Final = "{n}"
+"""What stands for a number in the name of a group of equal parameters, and in what is said of them."""
+
+Key = TypeVar("Key", int, int | float)
+
+
+@dataclass(frozen=True, slots=True)
+class ParamInfo:
+    """One parameter as its firmware describes it. What the description leaves out is None, "" or empty.
+
+    Attributes:
+        name: param_id; in a group of equal parameters with `{n}` where each has its number.
+        type: its type, where that is said (ArduPilot does not).
+        short_description, long_description: in words for people.
+        units: such as `m/s` or `deg`.
+        minimum, maximum: the range that its developers mean it to have. Vehicles take other values as well.
+        increment: the step in which to change it.
+        decimals: how many places behind the point to show.
+        default: the firmware's own value; that of one vehicle may be another, see `Param.default`.
+        values: what single values mean.
+        bits: what the bits mean where it is a mask, by their number from 0.
+        reboot_required: whether a new value counts only when the vehicle has started again.
+        is_read_only: whether the vehicle sets it by itself.
+        is_volatile: whether the vehicle changes it by itself; PX4 leaves it out of its hash.
+        category, group: where ground stations show it.
+    """
+
+    name: str
+    type: ParamType | None = None
+    short_description: str = ""
+    long_description: str = ""
+    units: str = ""
+    minimum: int | float | None = None
+    maximum: int | float | None = None
+    increment: int | float | None = None
+    decimals: int | None = None
+    default: int | float | None = None
+    values: Mapping[int | float, str] = field(default_factory=lambda: MappingProxyType({}), hash=False)
+    bits: Mapping[int, str] = field(default_factory=lambda: MappingProxyType({}), hash=False)
+    reboot_required: bool = False
+    is_read_only: bool = False
+    is_volatile: bool = False
+    category: str = ""
+    group: str = ""
+
+    def text(self, value: Value) -> str | None:
+        """A value in words: `Loiter`, or for a mask `GPS|Baro`. None where there are none for it.
+
+        Bits without a name, or with a number for one, stand at the end as one hexadecimal number. `parse`
+        reads the text back, unless the name of a value is a number.
+        """
+        if isinstance(value, bytes) or not math.isfinite(value):
+            return None
+        number = shortest_float(value) if isinstance(value, float) else value
+        named = self.values.get(number)
+        if named is not None:
+            return named
+        if not self.bits or number != int(number):
+            return None
+        mask = self._unsigned(int(number))
+        if mask is None or mask == 0:
+            return None
+        named_bits = {bit: name for bit, name in sorted(self.bits.items()) if number_of(name) is None}
+        names = [name for bit, name in named_bits.items() if mask >> bit & 1]
+        rest = mask & ~sum(1 << bit for bit in named_bits)
+        return "|".join([*names, hex(rest)] if rest else names)
+
+    def parse(self, text: str) -> int | float:
+        """The value that a text means: a number, the name of a value, or names of bits.
+
+        A number is always itself, also where a name looks like one. Names are taken in any case. Names of
+        bits, and numbers among them, are joined with `|`, `+` or a comma.
+
+        Raises:
+            UsageError: it is none of these; the error says what could have been meant.
+        """
+        number = number_of(text)
+        if number is not None:
+            return number
+        value = self._only(self.values, text)
+        if value is None and self.bits:
+            value = self._mask(text)
+        if value is None:
+            raise UsageError(f"{self.name}: {text!r} is no number{self._meant(text)}")
+        return value
+
+    def problem(self, value: Value) -> str | None:
+        """What speaks against a value: that it is outside the range. None where nothing does.
+
+        Numbers with a fraction are compared as float32, which is what a vehicle makes of them.
+        """
+        if isinstance(value, bytes):
+            return None
+        if math.isnan(value):
+            is_bounded = self.minimum is not None or self.maximum is not None
+            return f"{self.name}: nan is in no range" if is_bounded else None
+        units = f" {self.units}" if self.units else ""
+        shown = format_value(value)
+        if self.minimum is not None and _is_below(value, self.minimum):
+            return f"{self.name}: {shown} is below the minimum of {format_value(self.minimum)}{units}"
+        if self.maximum is not None and _is_below(self.maximum, value):
+            return f"{self.name}: {shown} is above the maximum of {format_value(self.maximum)}{units}"
+        return None
+
+    def instance(self, name: str, number: str) -> ParamInfo:
+        """The description of one of a group of equal parameters."""
+        return replace(
+            self,
+            name=name,
+            short_description=self.short_description.replace(INSTANCE, number),
+            long_description=self.long_description.replace(INSTANCE, number),
+        )
+
+    def _unsigned(self, number: int) -> int | None:
+        """The bits of a number; None for a negative one whose width is not known."""
+        if number >= 0:
+            return number
+        if self.type is None or not self.type.is_integer:
+            return None
+        return number & ((1 << 8 * self.type.size) - 1)
+
+    def _mask(self, text: str) -> int | None:
+        """What the names of bits in a text make together; None where one of them is none.
+
+        Raises:
+            UsageError: it can be read in two ways.
+        """
+        bit = self._bit(text)
+        if bit is not None:
+            return self._as_typed(bit)
+        for joints in ("|", "|+,"):
+            bits = [self._bit(part) for part in re.split(f"[{joints}]", text)]
+            if None in bits:
+                continue
+            for name in self.bits.values():
+                if any(joint in name for joint in joints) and _folded(name) in _folded(text):
+                    raise UsageError(f"{self.name}: {text!r} can mean several things; give the number")
+            return self._as_typed(functools.reduce(operator.or_, (bit for bit in bits if bit is not None)))
+        return None
+
+    def _bit(self, text: str) -> int | None:
+        """One of the things that are joined to a mask."""
+        number = number_of(text)
+        if number is not None:
+            return number if isinstance(number, int) and 0 <= number < 1 << MOST_BITS else None
+        bit = self._only(self.bits, text)
+        return None if bit is None else 1 << bit
+
+    def _as_typed(self, mask: int) -> int:
+        """The number of a signed type that has these bits."""
+        if self.type is not None and self.type.is_integer:
+            low, high = self.type.bounds
+            if low < 0 and high < mask <= high - low:
+                return mask - (high - low + 1)
+        return mask
+
+    def _only(self, named: Mapping[Key, str], text: str) -> Key | None:
+        """What has this name; None for nothing.
+
+        Raises:
+            UsageError: more than one has it.
+        """
+        wanted = _folded(text)
+        found = [number for number, name in named.items() if wanted and _folded(name) == wanted]
+        if len(found) > 1:
+            listed = " and ".join(map(str, found))
+            raise UsageError(f"{self.name}: {text.strip()!r} is the name of {listed}; give the number")
+        return found[0] if found else None
+
+    def _meant(self, text: str) -> str:
+        """The rest of the sentence that says what could have been meant."""
+        if not self.bits:
+            return _choice(", nor one of its values", self.values, text)
+        parts = [part.strip() for part in re.split("[|+,]", text)]
+        if len(parts) == 1:
+            return _choice(", nor one of its bits", self.bits, text)
+        wrong = next((part for part in parts if self._bit(part) is None), text)
+        return _choice(f", nor is {wrong!r} one of its bits", self.bits, wrong)
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Metadata(Mapping[str, ParamInfo]):
+    """What a firmware says of its parameters, by their names. It does not change.
+
+    A parameter that is described as one of a group (`FOO{n}_BAR` for FOO1_BAR, FOO2_BAR, …) is found under
+    its own name; the group counts and is listed once.
+
+    Attributes:
+        params: the descriptions as they are written.
+        source: where they come from, in words for people.
+    """
+
+    params: Mapping[str, ParamInfo]
+    source: str = ""
+
+    @classmethod
+    def of(cls, infos: Iterable[ParamInfo], *, source: str = "") -> Metadata:
+        """Of these descriptions; of two with one name the last counts."""
+        return cls(MappingProxyType({info.name: info for info in infos}), source)
+
+    def __getitem__(self, name: str) -> ParamInfo:
+        found = self.params.get(name)
+        if found is not None:
+            return found
+        for digits in _DIGITS.finditer(name):
+            group = self.params.get(f"{name[: digits.start()]}{INSTANCE}{name[digits.end() :]}")
+            if group is not None:
+                return group.instance(name, digits.group())
+        raise KeyError(name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.params)
+
+    def __len__(self) -> int:
+        return len(self.params)
+
+    def __repr__(self) -> str:
+        origin = f" from {self.source}" if self.source else ""
+        return f"<Metadata of {len(self)} {'param' if len(self) == 1 else 'params'}{origin}>"
+
+
+def number_of(text: str) -> int | float | None:
+    """The number that a text is, read exactly: integers as int, everything else as float. None for none.
+
+    Hexadecimal ones begin with `0x`; `nan` and `inf` are numbers.
+
+    Raises:
+        UsageError: it is one beyond a float.
+    """
+    text = text.strip()
+    if _INTEGER.fullmatch(text):
+        return int(text, 16 if "x" in text.lower() else 10)
+    if _REAL.fullmatch(text):
+        value = float(text)
+        if math.isinf(value) and "i" not in text.lower():
+            raise UsageError(f"{text} is beyond the range of a float")
+        return value
+    return None
+
+
+_INTEGER: Final = re.compile(r"[+-]?(0[xX][0-9a-fA-F]{1,32}|[0-9]{1,40})")
+_REAL: Final = re.compile(
+    r"[+-]?([0-9]+(\.[0-9]*)?|\.[0-9]+)([eE][+-]?[0-9]+)?|[+-]?(inf|infinity|nan)", re.IGNORECASE
+)
+_DIGITS: Final = re.compile(r"[0-9]+")
+_FLOAT32: Final = struct.Struct("<f")
+
+
+def _folded(name: str) -> str:
+    """What two spellings of a name have in common."""
+    return " ".join(name.split()).casefold()
+
+
+def _choice(sentence: str, named: Mapping[Key, str], text: str) -> str:
+    """A sentence with the names that there are, or those near to a text where there are many."""
+    if not named:
+        return ", and its values have no names"
+    if len(named) <= MOST_NAMED:
+        return f"{sentence}: {', '.join(f'{name} ({number})' for number, name in named.items())}"
+    folded = {_folded(name): name for name in named.values()}
+    nearest = [folded[each] for each in difflib.get_close_matches(_folded(text), folded, n=3, cutoff=0.5)]
+    return (
+        f"{sentence}; near it: {', '.join(nearest)}"
+        if nearest
+        else f"{sentence}, of which there are {len(named)}"
+    )
+
+
+def _is_below(a: int | float, b: int | float) -> bool:
+    if isinstance(a, int) and isinstance(b, int):
+        return a < b
+    return _as_float32(a) < _as_float32(b)
+
+
+def _as_float32(number: int | float) -> float:
+    try:
+        rounded: float = _FLOAT32.unpack(_FLOAT32.pack(number))[0]
+    except OverflowError:
+        return math.inf if number > 0 else -math.inf
+    return rounded

@@ -1,0 +1,291 @@
+"""The command save: what it writes, what it refuses to write, and what it says of it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from paramclient import FileForm, ParamCache, ParamClient, ParamType, read_file
+from paramclient.cli import run, session
+from paramclient.cli.sources import names_vehicle
+from paramclient.links import SimLink
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
+
+ODD = [
+    SimParam("BIG", ParamType.INT32, 16777217),
+    SimParam("TENTH", ParamType.REAL32, 0.1),
+    SimParam("NAN", ParamType.REAL32, float("nan")),
+]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a command ended, and what it printed."""
+
+    code: int
+    out: str
+    err: str
+
+
+Command = Callable[..., Outcome]
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Command:
+    """Runs the command in this process."""
+
+    def call(*arguments: object) -> Outcome:
+        code = run([str(argument) for argument in arguments])
+        printed = capsys.readouterr()
+        return Outcome(code, printed.out, printed.err)
+
+    return call
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Callable[[Endpoint], str]:
+    """Puts a simulated vehicle behind every URL; gives a URL."""
+
+    def place(far_end: Endpoint) -> str:
+        def client(url: str, **options: Any) -> ParamClient:
+            return ParamClient(SimLink(far_end, url), **options)
+
+        monkeypatch.setattr(session, "ParamClient", client)
+        return "sim:px4"
+
+    return place
+
+
+def test_save_writes_what_the_vehicle_has(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+) -> None:
+    path = tmp_path / "quad.json"
+    saved = command("save", put(GenericVehicle(ODD)), path, "--no-cache")
+    assert (saved.code, saved.out) == (0, "")
+    assert saved.err == f"3 parameters of 1/1 written to {path} (json)\n"
+    file = read_file(path)
+    params = file.choose()
+    assert (params["BIG"].value, params["BIG"].type) == (16777217, ParamType.INT32)
+    assert params["TENTH"].bits_as(ParamType.REAL32) == 0x3DCCCCCD
+    assert params["NAN"].bits_as(ParamType.REAL32) == 0x7FC00000
+    assert (params.system, params.component) == (1, 1)
+    assert params.identity is not None
+    assert params.at is not None
+    assert json.loads(path.read_text())["sets"][0]["source"] == "link sim:px4"
+
+
+def test_save_prints_json_for_programs(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+) -> None:
+    path = tmp_path / "quad.txt"
+    saved = command("save", put(GenericVehicle(ODD)), path, "--form", "qgc", "--json", "--no-cache")
+    assert (saved.code, saved.err) == (0, "")
+    assert json.loads(saved.out) == {
+        "path": str(path),
+        "form": "qgc",
+        "components": [{"system": 1, "component": 1, "params": 3}],
+    }
+    assert read_file(path).form is FileForm.QGC
+
+
+def test_save_brings_a_cached_table_up_to_date(command: Command, tmp_path: Path) -> None:
+    """PX4 leaves volatile values out of its hash; they are read afresh and stand in the file too."""
+    cache = tmp_path / "cache.sqlite3"
+    for path in (tmp_path / "a.params", tmp_path / "b.params"):
+        assert command("save", "sim:px4", path, "--cache", cache).code == 0
+        assert len(read_file(path).choose()) == 903
+    assert (
+        read_file(tmp_path / "a.params").choose().params == read_file(tmp_path / "b.params").choose().params
+    )
+
+
+def test_save_needs_no_link_for_a_vehicle_in_the_cache(command: Command, tmp_path: Path) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    assert command("fetch", "sim:px4", "--cache", cache).code == 0
+    (vehicle,) = ParamCache(cache).vehicles()
+    uid = vehicle.identity.uid
+    assert uid is not None
+    for where in ("1", uid[:6], vehicle.key):
+        path = tmp_path / "quad.json"
+        saved = command("save", where, path, "--cache", cache)
+        assert (saved.code, saved.err) == (0, f"903 parameters of 1/1 written to {path} (json)\n")
+        params = read_file(path).choose()
+        assert params.identity == vehicle.identity
+        path.unlink()
+    # of the cached table, and not of the moment
+    (table,) = ParamCache(cache).components()
+    assert table.synced_at is not None
+    assert params.at == pytest.approx(table.synced_at, abs=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "problem"),
+    [
+        (["--no-cache"], "--no-cache, --system, --encoding and --timeout go with a link; '1' names none"),
+        (["--timeout", "3"], "go with a link"),
+        (["--system", "1"], "go with a link"),
+        (["--encoding", "bytewise"], "go with a link"),
+        (["--refresh"], "--refresh goes with a link"),
+        (["--all", "--component", "1"], "--all and --component exclude each other"),
+        (["--form", "px4-script"], "are read and not written"),
+        (["--form", "exe"], "exe"),
+    ],
+)
+def test_options_that_mean_nothing_are_refused(
+    options: list[str], problem: str, command: Command, tmp_path: Path
+) -> None:
+    saved = command("save", "1", tmp_path / "quad.param", *options)
+    assert (saved.code, saved.out) == (2, "")
+    assert problem in saved.err
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("where", "is_link"),
+    [
+        ("sim:px4", True),
+        ("udpin:0.0.0.0:14550", True),
+        ("/dev/ttyACM0,57600", True),
+        ("COM5", True),
+        ("nonsense:", True),
+        ("1", False),
+        ("0002", False),
+        ("uid:0002", False),
+        ("4954414c44494e4f/1", False),
+        ("system:1@udpin:0.0.0.0:14550", False),
+    ],
+)
+def test_a_link_and_a_vehicle_are_told_apart(where: str, is_link: bool) -> None:
+    assert names_vehicle(where) is not is_link
+
+
+def test_nobody_is_asked_where_the_file_cannot_be(command: Command, tmp_path: Path) -> None:
+    saved = command("save", "tcp:127.0.0.1:1", tmp_path / "quad.txt")
+    assert saved.code == 2
+    assert "the ending '.txt' stands for no form" in saved.err
+
+
+def test_a_vehicle_that_is_not_in_the_cache_says_so(command: Command, tmp_path: Path) -> None:
+    saved = command("save", "7", tmp_path / "quad.param", "--cache", tmp_path / "cache.sqlite3")
+    assert (saved.code, saved.out) == (5, "")
+    assert not (tmp_path / "quad.param").exists()
+
+
+def test_save_writes_what_differs_from_the_defaults(command: Command, tmp_path: Path) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    for where in ("sim:ardupilot", "1"):
+        path = tmp_path / "quad.param"
+        saved = command("save", where, path, "--changed", "--cache", cache)
+        assert (saved.code, saved.err) == (0, f"41 parameters of 1/1 written to {path} (mission-planner)\n")
+        assert read_file(path).choose()["RELAY1_FUNCTION"].value == 1
+        path.unlink()
+
+
+def test_without_defaults_nothing_is_written(command: Command, tmp_path: Path) -> None:
+    path = tmp_path / "quad.param"
+    path.write_bytes(b"OLD,1\n")
+    saved = command("save", "sim:px4", path, "--changed", "--no-cache")
+    assert (saved.code, saved.out) == (1, "")
+    assert "defaults are not known" in saved.err
+    assert f"nothing was written to {path}" in saved.err
+    assert path.read_bytes() == b"OLD,1\n"
+
+
+def test_where_nothing_differs_nothing_is_written(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+) -> None:
+    vehicle = ArduPilotVehicle(table=[SimParam("A", ParamType.INT8, 1, default=1)])
+    saved = command("save", put(vehicle), tmp_path / "quad.param", "--changed", "--no-cache")
+    assert saved.code == 1
+    assert "1/1: no parameter differs from its default" in saved.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_an_incomplete_table_is_not_written(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+) -> None:
+    """A file that lacks some parameters would look like one of a vehicle that has no more."""
+    cache, path = tmp_path / "cache.sqlite3", tmp_path / "quad.param"
+    vehicle = GenericVehicle([SimParam(f"P{at}", ParamType.INT32, at) for at in range(20)], dead=[5])
+    saved = command("save", put(vehicle), path, "--cache", cache)
+    assert (saved.code, saved.out) == (1, "")
+    assert "1/1 is incomplete: 1 of 20 parameters did not come" in saved.err
+    assert not path.exists()
+    cached = command("save", "1", path, "--cache", cache)
+    assert (cached.code, cached.out) == (1, "")
+    assert "1/1 is incomplete: 19 of 20 parameters are in the cache" in cached.err
+    assert not path.exists()
+
+
+def test_all_components_of_a_vehicle_go_into_one_file(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    url = put(Air([PX4Vehicle(table={"A": 1}), GenericVehicle({"B": 2, "C": 3}, component=100)]))
+    path = tmp_path / "quad.params"
+    saved = command("save", url, path, "--all", "--cache", cache)
+    assert (saved.code, saved.err) == (
+        0,
+        f"1 parameter of 1/1, 2 parameters of 1/100 written to {path} (qgc)\n",
+    )
+    file = read_file(path)
+    assert [(each.component, list(each)) for each in file.sets] == [(1, ["A"]), (100, ["B", "C"])]
+
+    offline = command("save", "1", tmp_path / "all.json", "--all", "--cache", cache)
+    assert offline.code == 0
+    assert [each.component for each in read_file(tmp_path / "all.json").sets] == [1, 100]
+    pilot = command("save", "1", tmp_path / "pilot.param", "--cache", cache)
+    assert (pilot.code, list(read_file(tmp_path / "pilot.param").choose())) == (0, ["A"])
+    gimbal = command("save", "1", tmp_path / "gimbal.param", "--component", 100, "--cache", cache)
+    assert (gimbal.code, list(read_file(tmp_path / "gimbal.param").choose())) == (0, ["B", "C"])
+
+    refused = command("save", "1", tmp_path / "all.param", "--all", "--cache", cache)
+    assert refused.code == 2
+    assert "the form mission-planner holds one component, and there are 1/1, 1/100" in refused.err
+    assert not (tmp_path / "all.param").exists()
+
+
+def test_without_an_autopilot_someone_has_to_be_named(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    url = put(Air([GenericVehicle({"B": 2}, component=each) for each in (100, 101)]))
+    for each in (100, 101):
+        assert command("fetch", url, "--component", each, "--cache", cache).code == 0
+    saved = command("save", "1", tmp_path / "quad.param", "--cache", cache)
+    assert saved.code == 2
+    assert "no autopilot is among 1/100, 1/101; choose with --component, or take --all" in saved.err
+
+
+def test_what_the_disk_refuses_ends_the_command(command: Command, tmp_path: Path) -> None:
+    saved = command("save", "sim:px4", tmp_path / "none" / "quad.param", "--no-cache")
+    assert (saved.code, saved.out) == (2, "")
+    assert "quad.param: cannot be written: No such file or directory" in saved.err
+
+
+def test_a_name_that_is_no_text_reaches_no_terminal(command: Command, tmp_path: Path) -> None:
+    path = tmp_path / "\x1b[31m.param"
+    saved = command("save", "sim:px4", path, "--no-cache")
+    assert saved.code == 0
+    assert "\x1b" not in saved.err
+    assert path.exists()
+
+
+def test_a_value_that_is_only_last_known_is_not_written(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+) -> None:
+    """No hash speaks for a volatile value: where the vehicle does not give it, nobody knows what it is."""
+    cache, path = tmp_path / "cache.sqlite3", tmp_path / "quad.param"
+    rows = [SimParam("A", ParamType.INT32, 1), SimParam("CAL_ACC0_XOFF", ParamType.INT32, 2, volatile=True)]
+    assert command("save", put(PX4Vehicle(table=rows)), path, "--cache", cache).code == 0
+    path.unlink()
+    silent = PX4Vehicle(table=rows, dead=["CAL_ACC0_XOFF"])
+    saved = command("save", put(silent), path, "--cache", cache)
+    assert (saved.code, saved.out) == (1, "")
+    assert "1/1 is incomplete: 1 of 2 parameters did not come" in saved.err
+    assert not path.exists()
