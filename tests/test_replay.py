@@ -472,3 +472,24 @@ def test_the_command_imports_logs(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "flight.tlog  1/1        generic         2  yes" in capsys.readouterr().out
     assert run(["show", "1", "--cache", str(cache)]) == 0
     assert run(["import"]) == 2
+
+
+def test_earlier_states_are_told_as_before_when_a_log_completes_the_history(tmp_path: Path) -> None:
+    """Lines of history get other numbers then, behind which names have appeared."""
+    cache = tmp_path / "cache"
+    later = Log(NOW + 1000.0).beat().identify().list(A=1, B=2).wait(10.0).change("A", 3)
+    later.wait(10.0).list(C=4).wait(10.0).change("B", 5).wait(1.0).beat()
+    imported(later.write(tmp_path / "later.tlog"), cache=cache)
+    moments = [NOW + 1005.0, NOW + 1015.0, NOW + 1025.0, NOW + 1035.0]
+
+    def told() -> list[dict[str, object]]:
+        with ParamCache(cache) as kept:
+            states = [kept.state_at(KEY, 1, at) for at in moments]
+        return [{name: param.value for name, param in state.items()} for state in states]
+
+    before = told()
+    assert before == [{"A": 1, "B": 2}, {"A": 3, "B": 2}, {"A": 3, "B": 2, "C": 4}, {"A": 3, "B": 5, "C": 4}]
+    earlier = whole(A=7, B=8).wait(9.0).change("A", 9).wait(1.0).beat()
+    imported(earlier.write(tmp_path / "earlier.tlog"), cache=cache)
+    assert [each[:3] for each in lines(cache)] == [("A", 7, 9), ("A", 1, 3), ("B", 2, 5)]
+    assert told() == before
