@@ -51,7 +51,9 @@ from paramclient.protocol.sampling import Sample
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
 from paramclient.protocol.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport
+from paramclient.protocol.wire import Refusal, SigningKey, SigningPolicy, SigningReport, SigningStream
 from paramclient.protocol.writes import SetResult
+from paramclient.signing import Signing, key_from_environment, read_key
 from paramclient.values import Encoding, Param, ParamType, Trust
 from paramclient.version import __version__
 
@@ -106,10 +108,16 @@ __all__ = [
     "Progress",
     "Rebooted",
     "RadioStatus",
+    "Refusal",
     "Refused",
     "Resynced",
     "Sample",
     "SetResult",
+    "Signing",
+    "SigningKey",
+    "SigningPolicy",
+    "SigningReport",
+    "SigningStream",
     "Snapshot",
     "SnapshotSummary",
     "SyncState",
@@ -122,6 +130,8 @@ __all__ = [
     "VehicleError",
     "WrittenParam",
     "__version__",
+    "key_from_environment",
+    "read_key",
     "read_file",
     "write_file",
 ]

@@ -34,6 +34,9 @@ from paramclient.protocol.station import Address, Station
 from paramclient.protocol.succession import SEARCH_PACE, Succession
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.traffic import TrafficReport
+from paramclient.protocol.wire import SigningKey, SigningReport
+from paramclient.signing import Signing
+from paramclient.timestamps import TimestampKeeper
 from paramclient.together import FetchedAll, FetchTogether
 from paramclient.values import Encoding
 from paramclient.writethrough import WriteThrough
@@ -81,6 +84,8 @@ class ParamClient:
             same.
         traffic: whether to count everything that is heard, for `traffic_report`. That takes time for each
             frame, also of those that a client otherwise steps over.
+        signing: the key with which what is sent is signed and what comes is checked, or a `Signing`, which
+            says more. None: nothing is signed, and signatures count for nothing.
 
     Attributes:
         cache: where tables are kept, or None.
@@ -102,6 +107,7 @@ class ParamClient:
         watch_interval: float | None = None,
         policy: Policy | str = Policy.AUTO,
         traffic: bool = False,
+        signing: Signing | SigningKey | None = None,
     ) -> None:
         for number in (system, component):
             if not 1 <= number <= 255:
@@ -132,6 +138,9 @@ class ParamClient:
         self._components: dict[Address, Component] = {}
         self._tasks: anyio.abc.TaskGroup | None = None
         self._carrier = Carrier(self._link, self._station, dispatch=self._dispatch, end=self._end)
+        if isinstance(signing, SigningKey):
+            signing = Signing(signing)
+        self._keeper = None if signing is None else TimestampKeeper(signing)
         self._is_entered = False
         self._opened_at = -math.inf
 
@@ -169,6 +178,8 @@ class ParamClient:
         try:
             await self._link.open()
             await self._writer.open()
+            if self._keeper is not None:
+                self._station.begin_signing(*await self._keeper.open())
         except BaseException:
             await self._release()
             raise
@@ -179,6 +190,8 @@ class ParamClient:
         tasks.start_soon(self._carrier.read, name="paramclient reader")
         tasks.start_soon(self._carrier.send, name="paramclient sender")
         tasks.start_soon(self._writer.run, name="paramclient cache writer")
+        if self._keeper is not None:
+            tasks.start_soon(self._keeper.run, name="paramclient timestamp keeper")
         return self
 
     async def __aexit__(
@@ -206,7 +219,11 @@ class ParamClient:
                 for machine in self._station.components.values():
                     await self._writer.keep_late(machine)
             finally:
-                await self._writer.close()
+                try:
+                    await self._writer.close()
+                finally:
+                    if self._keeper is not None:
+                        await self._keeper.close()
 
     def events(self) -> Events:
         """What happens to components from now on: `async for event in client.events()`.
@@ -260,7 +277,8 @@ class ParamClient:
             await found._wait_for_cache()
         if found is None:
             waited = anyio.current_time() - began
-            raise NoReply(_wanted(system, component), attempts=0, waited=waited)
+            wanted = _wanted(system, component) + self._refused_in_words()
+            raise NoReply(wanted, attempts=0, waited=waited)
         return found
 
     async def successor(
@@ -358,6 +376,13 @@ class ParamClient:
         self._check_open()
         return self._station.traffic.report(anyio.current_time())
 
+    def signing_report(self) -> SigningReport | None:
+        """How the signatures on the link stand: what came signed, what was refused and why.
+
+        None where the client has no key.
+        """
+        return None if self._station.verifier is None else self._station.verifier.report()
+
     # what has happened
 
     async def _load(self, component: Component, identity: Identity) -> None:
@@ -446,6 +471,13 @@ class ParamClient:
                 for machine in self._station.components.values()
             ):
                 await self._carrier.news.wait()
+
+    def _refused_in_words(self) -> str:
+        """Why somebody may be there and not be heard, for the end of a sentence."""
+        report = self.signing_report()
+        refused = {} if report is None else report.refused
+        reasons = ", ".join(f"{count} for: {reason}" for reason, count in refused.items())
+        return f" (frames were refused, {reasons})" if reasons else ""
 
     def _may_be_cached(self, component: Component) -> bool:
         return self._writer.may_have(component.system, component.component)

@@ -22,8 +22,9 @@ from paramclient.protocol.result import FetchResult, Progress, Sampled
 from paramclient.protocol.sampling import SAMPLE_SIZE
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
-from paramclient.protocol.wire import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, NO_INDEX, ParamValue
+from paramclient.protocol.wire import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, NO_INDEX, ParamValue, SigningKey
 from paramclient.protocol.writes import SetResult
+from paramclient.signing import timestamp_now
 from paramclient.values import Encoding, Param, check_name, check_value, decode, known_type
 
 if TYPE_CHECKING:
@@ -40,6 +41,9 @@ PROGRESS_INTERVAL = 0.1
 """Seconds between two calls of a progress callback."""
 IDENTITY_PATIENCE = 1.5
 """Seconds to wait for a component to say who it is before its cached table is done without."""
+SETUP_TRIES = 3
+SETUP_PAUSE = 0.1
+"""How often SETUP_SIGNING is sent, and the seconds after each: nothing answers it, and frames get lost."""
 TIME_IS_OVER = "The time given for the fetch was over."
 """Why a result is partial that a time limit ended."""
 
@@ -292,6 +296,35 @@ class Component:
         refresh = self._machine.refresh
         if refresh is not None:
             await self._wait(refresh, timeout, lambda: ("the values that no hash covers", 0))
+
+    async def setup_signing(self, key: SigningKey | None, *, link_is_safe: bool = False) -> None:
+        """Give a vehicle its signing key, or with None take it away, by SETUP_SIGNING.
+
+        The key goes over the link in clear, so only where nobody listens: over a USB cable, a wire. Nothing
+        answers it; whether the vehicle has obeyed shows in a session with the new key. This one goes on with
+        its own, which must be the vehicle's until then, unless that trusts the link (ArduPilot trusts USB).
+
+        Args:
+            key: its new key.
+            link_is_safe: that the user has said so.
+
+        Raises:
+            UsageError: nobody has said that the link is safe, or the component speaks MAVLink 1.
+            LinkError: the link failed, or the client was closed.
+        """
+        if not link_is_safe:
+            raise UsageError(
+                "SETUP_SIGNING carries the key in clear: only over a link on which nobody else can listen, "
+                "and with link_is_safe=True"
+            )
+        if self._machine.version == 1:
+            raise UsageError(f"{self.system}/{self.component} speaks MAVLink 1, which knows no signatures")
+        for _ in range(SETUP_TRIES):
+            self._client._check_open()
+            timestamp = 0 if key is None else timestamp_now()
+            self._client._station.send_setup_signing(self.system, self.component, key, timestamp)
+            self._client._wake()
+            await anyio.sleep(SETUP_PAUSE)
 
     async def reboot(self, *, system: int | None = None, timeout: float | None = None) -> Component:
         """Let the vehicle start again, and wait until the same one is back.

@@ -3,25 +3,20 @@
 from __future__ import annotations
 
 import logging
-import threading
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
-from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
-from queue import SimpleQueue
 from typing import Final, TypeVar
 
 import anyio
-import anyio.from_thread
-import anyio.lowlevel
 
 from paramclient.cache import CachedComponent, ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentMachine
 from paramclient.values import Param
+from paramclient.worker import Worker
 
 __all__ = ["WriteThrough"]
 
@@ -59,7 +54,7 @@ class WriteThrough:
         self._identity_of = identity_of
         self._is_doubted = is_doubted
         self._owned = owned
-        self._worker = _Worker()
+        self._worker = Worker("paramclient cache")
         self._kept: dict[ComponentMachine, _Kept] = {}
         self._has_failed = False
         self._tables: dict[tuple[int, int], bool] = {}
@@ -282,53 +277,6 @@ class _News:
         self.kept.machine.table.dirty = self.dirty | self.kept.machine.table.dirty
         self.kept.is_whole |= self.update.replace
         self.kept.state = None
-
-
-class _Worker:
-    """One thread for calls that block. They are done in order; `close` ends it.
-
-    Not a thread of anyio's pool: that would be left behind, idle, until the event loop ends.
-    """
-
-    def __init__(self) -> None:
-        self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
-        self._thread: threading.Thread | None = None
-
-    async def run(self, work: Callable[[], Result]) -> Result:
-        """Do it in the thread. Cancelled, it is done all the same."""
-        if self._thread is None:
-            self._thread = threading.Thread(target=self._main, name="paramclient cache", daemon=True)
-            self._thread.start()
-        future: Future[Result] = Future()
-        ended = anyio.Event()
-        token = anyio.lowlevel.current_token()
-
-        def call() -> None:
-            try:
-                future.set_result(work())
-            except BaseException as error:
-                future.set_exception(error)
-            with suppress(anyio.RunFinishedError):
-                anyio.from_thread.run_sync(ended.set, token=token)
-
-        self._calls.put(call)
-        await ended.wait()
-        return future.result()
-
-    async def close(self, work: Callable[[], None]) -> None:
-        """Do a last piece of work, and end the thread."""
-        if self._thread is None:
-            work()
-            return
-        try:
-            await self.run(work)
-        finally:
-            self._calls.put(None)
-        self._thread.join()  # at once: it has nothing more to do
-
-    def _main(self) -> None:
-        while (call := self._calls.get()) is not None:
-            call()
 
 
 def _firmware(identity: Identity) -> tuple[int, str]:

@@ -11,11 +11,12 @@ from unittest import mock
 
 import anyio
 
-from paramclient import Component, Param, ParamClient, ParamType, writethrough
+from paramclient import Component, Param, ParamClient, ParamType
 from paramclient.errors import LinkError
 from paramclient.links import Peer, SimLink
 from paramclient.protocol import wire
 from paramclient.sim import Endpoint, GenericVehicle, PX4Vehicle, SimParam
+from paramclient.worker import Worker
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -120,7 +121,7 @@ def swiftly(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
 
     @functools.wraps(test)
     def run(*args: P.args, **kwargs: P.kwargs) -> T:
-        in_thread = writethrough._Worker.run
+        in_thread = Worker.run
 
         async def counted(worker: Any, work: Callable[[], Any]) -> Any:
             swift_loop().threads += 1
@@ -130,7 +131,7 @@ def swiftly(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
                 swift_loop().threads -= 1
 
         with (
-            mock.patch.object(writethrough._Worker, "run", counted),
+            mock.patch.object(Worker, "run", counted),
             asyncio.Runner(loop_factory=SwiftLoop) as runner,
         ):
             return runner.run(test(*args, **kwargs))

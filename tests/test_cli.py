@@ -794,7 +794,7 @@ def test_a_link_that_fails_under_watch_is_told_once(
 
 LINK_KEYS = [
     *("link", "seconds", "bytes_received", "bytes_sent", "received_per_s", "sent_per_s"),
-    *("frames", "unknown", "damaged", "other_bytes", "components"),
+    *("frames", "unknown", "damaged", "other_bytes", "signing", "components"),
 ]
 HEARD_KEYS = [
     *("system", "component", "mavlink", "autopilot", "type", "state", "heartbeat_age_s", "age_s"),

@@ -72,7 +72,8 @@ def run(*arguments: str, cwd: Path | None = None, **environment: str) -> str:
 
 @pytest.mark.parametrize("program", [*programs()])
 def test_a_program_runs(program: str, tmp_path: Path) -> None:
-    run("-W", "error", "-c", program, cwd=tmp_path, XDG_CACHE_HOME=str(tmp_path))
+    folders = {"XDG_CACHE_HOME": str(tmp_path), "XDG_STATE_HOME": str(tmp_path)}
+    run("-W", "error", "-c", program, cwd=tmp_path, **folders)
 
 
 def test_the_first_example_runs(tmp_path: Path) -> None:
@@ -150,14 +151,15 @@ def help_of(*words: str) -> str:
 
 
 def subcommand(words: list[str]) -> list[str]:
-    return words[:2] if words[0] in ("cache", "fleet") else words[:1]
+    return words[:2] if words[0] in ("cache", "fleet", "signing") else words[:1]
 
 
 def test_every_command_is_shown_and_exists() -> None:
     used = {tuple(subcommand(words)) for words in commands()}
     cache = {("cache", verb) for verb in ("list", "history", "path", "remove")}
     fleet = {("fleet", "diff")}
-    assert used == {(verb,) for verb in COMMANDS} | cache | fleet
+    signing = {("signing", verb) for verb in ("setup", "disable")}
+    assert used == {(verb,) for verb in COMMANDS} | cache | fleet | signing
     for words in used:
         assert words[-1] in help_of(*words)
 
@@ -174,6 +176,8 @@ def test_the_page_of_the_command_names_every_option() -> None:
     offered = set()
     for command in COMMANDS:
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of(command)))
+    for verb in ("setup", "disable"):
+        offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("signing", verb)))
     for verb in ("list", "history", "path", "remove"):
         offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("cache", verb)))
     offered |= set(re.findall(r"--[a-z][a-z-]+", help_of("fleet", "diff")))

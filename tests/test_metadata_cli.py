@@ -252,6 +252,48 @@ def test_a_name_is_never_taken_from_what_was_kept_alone(command: Command, put: A
     assert not vehicle.requests["FILE_TRANSFER_PROTOCOL"]
 
 
+# diff
+
+
+def test_diff_says_what_values_mean_and_their_units(command: Command, tmp_path: Path) -> None:
+    left, right = tmp_path / "left.param", tmp_path / "right.param"
+    left.write_text("FLTMODE1,5\nTST_ALT,100\n")
+    right.write_text("FLTMODE1,6\nTST_ALT,120\n")
+    done = command("diff", left, right, "--metadata", XML)
+    assert done.code == 1
+    assert [line.split() for line in done.out.splitlines()][:3] == [
+        ["name", "left", "right", "units", "is"],
+        ["FLTMODE1", "5", "(Loiter)", "6", "(RTL)", "different"],
+        ["TST_ALT", "100", "120", "cm", "different"],
+    ]
+    params = command("diff", left, right, "--metadata", XML, "--json").json["params"]
+    assert (params["FLTMODE1"]["left"]["text"], params["FLTMODE1"]["right"]["text"]) == ("Loiter", "RTL")
+    assert params["TST_ALT"]["units"] == "cm"
+    plain = command("diff", left, right)
+    assert "Loiter" not in plain.out
+    assert "units" not in plain.out
+
+
+def test_diff_knows_what_was_kept_for_the_firmware_of_a_side(
+    command: Command, put: Any, tmp_path: Path
+) -> None:
+    cache = ("--cache", tmp_path / "cache.sqlite3")
+    assert command("get", put(quad()), "MC_ROLL_P", "--metadata", "vehicle", *cache).code == 0
+    file = tmp_path / "wanted.param"
+    file.write_text("COM_FLTMODE1,5\nMC_ROLL_P,7\n")
+    put(quad())
+    done = command("diff", "sim:px4", file, "--only", "COM_FLTMODE1", "--only", "MC_ROLL_P", *cache)
+    assert "-1 (Unassigned)" in done.out
+    assert "5 (Return)" in done.out
+    assert "1/s" in done.out
+
+
+def test_diff_takes_a_file_that_describes_parameters_and_not_a_vehicle(command: Command) -> None:
+    done = command("diff", "a.param", "b.param", "--metadata", "vehicle")
+    assert done.code == 2
+    assert "it takes a file" in done.err
+
+
 def test_where_nothing_is_kept_nothing_is_looked_for(
     command: Command, put: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

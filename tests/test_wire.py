@@ -36,6 +36,8 @@ from paramclient.protocol.wire import (
     ParamRequestRead,
     ParamSet,
     ParamValue,
+    SetupSigning,
+    SigningKey,
     StatusText,
     SystemTime,
     build_frame,
@@ -172,6 +174,11 @@ MESSAGES: list[tuple[Message, Any]] = [
     (SystemTime(2**40 + 1, 2**31 + 2), dialect.MAVLink_system_time_message(2**40 + 1, 2**31 + 2)),
     (HighLatency2(2, 12), dialect.MAVLink_high_latency2_message(0, 2, 12, *[0] * 24)),
     (
+        SetupSigning(1, 2, SigningKey(bytes(range(32))), 2**40 + 3),
+        dialect.MAVLink_setup_signing_message(1, 2, list(range(32)), 2**40 + 3),
+    ),
+    (SetupSigning(1, 2, None, 0), dialect.MAVLink_setup_signing_message(1, 2, [0] * 32, 0)),
+    (
         FileTransfer(0, 1, 2, bytes(range(1, 252))),
         dialect.MAVLink_file_transfer_protocol_message(0, 1, 2, bytes(range(1, 252))),
     ),
@@ -221,7 +228,9 @@ def test_a_mavlink_2_frame_is_pymavlinks(ours: Message, theirs: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("ours", "theirs"), [pair for pair in MESSAGES if not isinstance(pair[0], ParamError)], ids=kind_of
+    ("ours", "theirs"),
+    [pair for pair in MESSAGES if not isinstance(pair[0], ParamError | SetupSigning)],
+    ids=kind_of,
 )
 def test_a_mavlink_1_frame_is_pymavlinks_without_extension_fields(ours: Message, theirs: Any) -> None:
     number = theirs.get_msgId()

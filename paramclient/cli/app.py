@@ -23,6 +23,7 @@ from paramclient.cli.outcome import ExitCode, code_of
 from paramclient.cli.output import report
 from paramclient.cli.ports import ports
 from paramclient.cli.save import save
+from paramclient.cli.signing import disable, setup
 from paramclient.cli.simulate import sim
 from paramclient.cli.vehicle import fetch, get, set_, watch
 from paramclient.errors import ParamClientError
@@ -42,7 +43,9 @@ def run(arguments: Sequence[str]) -> int:
         try:
             command, bound, _ = _app.parse_args(arguments, exit_on_error=False, print_error=False)
             call = partial(command, *bound.args, **bound.kwargs)
-            code = anyio.run(_until_signal, call) if inspect.iscoroutinefunction(command) else call()
+            work = call if inspect.iscoroutinefunction(command) else call()
+            # a command that has asked the user something gives what is to be awaited after that
+            code = anyio.run(_until_signal, work) if callable(work) else work
         except CycloptsError as error:
             report(str(error))
             return ExitCode.USAGE
@@ -136,6 +139,14 @@ _cache: Final = App(
     help_epilogue=_examples("cache list", "cache history 1 MC_ROLL_P", "cache path", "cache remove 1"),
 )
 
+_signing: Final = App(
+    name="signing",
+    help="Give a vehicle its key for signed messages, and take it away.",
+    help_epilogue=_examples(
+        "signing setup udpin:0.0.0.0:14550 --signing-key vehicle.key",
+        "signing disable udpin:0.0.0.0:14550 --signing-key vehicle.key",
+    ),
+)
 _fleet: Final = App(
     name="fleet",
     help="Compare the vehicles in the cache, with no link.",
@@ -207,6 +218,9 @@ _app.command(
         "sim px4 --link udpout:127.0.0.1:14550 --loss 0.05 --seed 1", "sim ardupilot --link udpin:127.0.0.1:0"
     ),
 )
+_app.command(_signing)
+_signing.command(setup)
+_signing.command(disable)
 _cache.command(cache_list, name="list")
 _cache.command(history, name="history", usage="Usage: paramclient cache history [OPTIONS] VEHICLE [NAME]")
 _cache.command(cache_path, name="path")

@@ -6,6 +6,7 @@ from typing import Annotated, Any, Final
 
 from cyclopts import Parameter
 
+from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import NO_DEFAULTS, Coloured, print_json, print_table, printable, say
@@ -13,6 +14,7 @@ from paramclient.cli.sources import resolve_all
 from paramclient.cli.written import bits_written, described, origin_json, value_text, written_json
 from paramclient.compare import Comparison, Difference, Moved, Standing, compare, defaults_of
 from paramclient.errors import UsageError
+from paramclient.metadata import Metadata
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.values import type_name
 
@@ -32,6 +34,7 @@ async def diff(
     base: str | None = None,
     only: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
     everything: Annotated[bool, Parameter(name="--all")] = False,
+    metadata: MetadataChoice = None,
     options: LinkOptions = _OPTIONS,
 ) -> ExitCode:
     """Compare the parameters of two files, links or vehicles in the cache.
@@ -45,17 +48,20 @@ async def diff(
         base: A third one, or "defaults" for the firmware's, to see which of the two has moved away from it.
         only: A name or a pattern such as "MC_*"; all others are left out. It may be given again.
         everything: Print also what is the same.
+        metadata: A file that describes parameters. Without it, what is kept of the vehicles' firmware.
     """
+    chosen = from_file(metadata, offline=True)
     third_source = [] if base is None or base == DEFAULTS else [base]
     ours, theirs, *third = await resolve_all([left, right, *third_source], options)
     before = _defaults(ours, theirs) if base == DEFAULTS else next(iter(third), None)
     outcome = compare(ours, theirs, base=before, names=only or None)
+    sides = _Sides(ours, theirs, before, options, chosen)
     shown = [entry for entry in outcome.entries if everything or _is_news(entry)]
     if options.json:
-        print_json(_as_json(outcome, shown))
+        print_json(_as_json(outcome, shown, sides))
     else:
         if shown:
-            _print(outcome, shown)
+            _print(outcome, shown, sides)
         for line in _summary(outcome):
             say(printable(line))
     return ExitCode.DONE if outcome.is_same else ExitCode.DIFFERENT
@@ -72,34 +78,64 @@ def _is_news(entry: Difference) -> bool:
     return not entry.is_same or entry.types_differ or entry.moved not in (None, Moved.NEITHER)
 
 
+class _Sides:
+    """What is known of the parameters of each side: firmwares of two ages may call a value differently."""
+
+    def __init__(
+        self,
+        left: ParamSet,
+        right: ParamSet,
+        base: ParamSet | None,
+        options: LinkOptions,
+        chosen: Metadata | None,
+    ) -> None:
+        sets = [left, right] if base is None else [left, right, base]
+        found = known_of_sets(sets, options) if chosen is None else [chosen] * len(sets)
+        self.left, self.right, self.base = [*found, None][:3]
+        self.is_known = any(each is not None for each in found)
+
+    def units(self, name: str) -> str:
+        return units_of(self.left, name) or units_of(self.right, name)
+
+
 # for people
 
 
-def _print(outcome: Comparison, shown: list[Difference]) -> None:
+def _print(outcome: Comparison, shown: list[Difference], sides: _Sides) -> None:
     has_base = outcome.base is not None
-    columns = (
-        ["name", "left", "right", "base", "is", "moved"] if has_base else ["name", "left", "right", "is"]
-    )
-    rows = (_cells(entry, has_base=has_base) for entry in shown)
+    columns = [
+        *("name", "left", "right", *(["base"] if has_base else []), *(["units"] if sides.is_known else [])),
+        *("is", *(["moved"] if has_base else [])),
+    ]
+    rows = (_cells(entry, sides, has_base=has_base) for entry in shown)
     print_table(columns, rows, right="left right base")
 
 
-def _cells(entry: Difference, *, has_base: bool) -> list[object]:
+def _cells(entry: Difference, sides: _Sides, *, has_base: bool) -> list[object]:
     """A row: with a base the values that have moved stand out, else those that differ."""
-    left, right = (None if each is None else value_text(each) for each in (entry.left, entry.right))
+    left, right = _shown(entry.left, sides.left), _shown(entry.right, sides.right)
     if left == right and not entry.is_same:
         left, right = _told_apart(entry.left), _told_apart(entry.right)
     style = "bold red" if entry.moved is Moved.CONFLICT else _STYLES[entry.standing]
     together = (Moved.BOTH, Moved.CONFLICT, None)
-    base = None if entry.base is None else value_text(entry.base)
+    base = _shown(entry.base, sides.base)
     return [
         entry.name,
         None if left is None else Coloured(left, style if entry.moved in (Moved.LEFT, *together) else ""),
         None if right is None else Coloured(right, style if entry.moved in (Moved.RIGHT, *together) else ""),
         *([base] if has_base else []),
+        *([sides.units(entry.name)] if sides.is_known else []),
         Coloured(_word(entry), style),
         *([entry.moved or "unknown"] if has_base else []),
     ]
+
+
+def _shown(param: WrittenParam | None, metadata: Metadata | None) -> str | None:
+    """A value, and what it means where that is known: `5 (Loiter)`."""
+    if param is None:
+        return None
+    meaning = meaning_of(metadata, param.name, param.value)
+    return f"{value_text(param)} ({meaning})" if meaning else value_text(param)
 
 
 def _told_apart(param: WrittenParam | None) -> str | None:
@@ -156,7 +192,7 @@ _STYLES: Final = {
 # for programs
 
 
-def _as_json(outcome: Comparison, shown: list[Difference]) -> dict[str, Any]:
+def _as_json(outcome: Comparison, shown: list[Difference], sides: _Sides) -> dict[str, Any]:
     has_base = outcome.base is not None
     return {
         "same": outcome.is_same,
@@ -165,17 +201,26 @@ def _as_json(outcome: Comparison, shown: list[Difference]) -> dict[str, Any]:
         "base": None if outcome.base is None else origin_json(outcome.base),
         "counts": {standing.value: outcome.counts[standing] for standing in Standing},
         "moves": {moved.value: outcome.moves[moved] for moved in Moved} if has_base else None,
-        "params": {entry.name: _entry_json(entry) for entry in shown},
+        "params": {entry.name: _entry_json(entry, sides) for entry in shown},
     }
 
 
-def _entry_json(entry: Difference) -> dict[str, Any]:
+def _entry_json(entry: Difference, sides: _Sides) -> dict[str, Any]:
+    units = sides.units(entry.name)
     return {
         "is": entry.standing,
         "types_differ": entry.types_differ,
         "rounding": entry.is_rounding,
-        "left": None if entry.left is None else written_json(entry.left),
-        "right": None if entry.right is None else written_json(entry.right),
-        "base": None if entry.base is None else written_json(entry.base),
+        "left": _value_json(entry.left, sides.left),
+        "right": _value_json(entry.right, sides.right),
+        "base": _value_json(entry.base, sides.base),
         "moved": entry.moved,
+        **({"units": units} if units else {}),
     }
+
+
+def _value_json(param: WrittenParam | None, metadata: Metadata | None) -> dict[str, Any] | None:
+    if param is None:
+        return None
+    meaning = meaning_of(metadata, param.name, param.value)
+    return written_json(param) | ({"text": meaning} if meaning else {})

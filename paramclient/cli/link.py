@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import anyio
 
-from paramclient.cli.options import Seconds
+from paramclient.cli.options import Seconds, SigningOptions
 from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import live_view, milliseconds, print_json, print_line, print_table, rounded
 from paramclient.cli.session import Deadline, listen
@@ -19,7 +19,7 @@ from paramclient.component import Component
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.identity import autopilot_name
 from paramclient.protocol.traffic import ComponentTraffic, TrafficReport
-from paramclient.protocol.wire import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, enum_word
+from paramclient.protocol.wire import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, SigningReport, enum_word
 
 __all__ = ["link"]
 
@@ -33,10 +33,13 @@ FIRST_MEASURE: Final = 2.0
 MEASURE_INTERVAL: Final = 4.0
 """Seconds until the round trip is measured by reading a value, and between two such reads: request and answer
 together take less of the link than our heartbeats."""
+_UNSIGNED: Final = SigningOptions()
 NO_AUTOPILOT: Final = ("unknown", autopilot_name(MAV_AUTOPILOT_INVALID))
 
 
-async def link(url: str, /, *, seconds: Seconds = None, json: bool = False) -> int:
+async def link(
+    url: str, /, *, seconds: Seconds = None, json: bool = False, options: SigningOptions = _UNSIGNED
+) -> int:
     """Print who is heard on a link, how much comes, and what is lost on the way.
 
     On a terminal the table is live until Ctrl-C. Elsewhere, and with --json, it is printed once, after
@@ -49,7 +52,7 @@ async def link(url: str, /, *, seconds: Seconds = None, json: bool = False) -> i
     """
     is_live = sys.stdout.isatty() and not json
     deadline = Deadline(seconds if is_live or seconds is not None else LISTENING_TIME)
-    async with listen(url) as client:
+    async with listen(url, options.signing) as client:
         report = await _while_measuring(client, _show if is_live else _listen, deadline)
     if not report.frames:
         noise = f" (but {report.bytes_received:,} other bytes)" if report.bytes_received else ""
@@ -159,6 +162,13 @@ def _lines(client: ParamClient, report: TrafficReport) -> Iterator[str]:
         f"{report.frames:,} frames, {lost:,} lost, {report.damaged:,} with a wrong checksum, "
         f"{report.unknown:,} of unknown ids, {signed:,} signed; {report.other_bytes:,} other bytes"
     )
+    signing = client.signing_report()
+    if signing is not None:
+        unproven, refused = (
+            "".join(f", {count:,} {what}: {reason}" for reason, count in counts.items())
+            for counts, what in ((signing.unproven, "accepted"), (signing.refused, "refused"))
+        )
+        yield f"key {signing.fingerprint}: {signing.signed:,} frames proven{unproven}{refused}"
 
 
 def _pace(client: ParamClient, report: TrafficReport) -> str:
@@ -201,7 +211,22 @@ def _as_json(client: ParamClient, report: TrafficReport) -> dict[str, Any]:
         "unknown": report.unknown,
         "damaged": report.damaged,
         "other_bytes": report.other_bytes,
+        "signing": _signing_json(client.signing_report()),
         "components": [_component_json(client, each) for each in report.components],
+    }
+
+
+def _signing_json(report: SigningReport | None) -> dict[str, Any] | None:
+    if report is None:
+        return None
+    return {
+        "fingerprint": report.fingerprint,
+        "policy": report.policy,
+        "link_id": report.link_id,
+        "signed": report.signed,
+        "unsigned": report.unsigned,
+        "unproven": dict(report.unproven),
+        "refused": dict(report.refused),
     }
 
 

@@ -11,12 +11,14 @@ import anyio
 import anyio.to_thread
 from cyclopts import Parameter
 
-from paramclient.cache import CachedComponent
+from paramclient.cache import CachedComponent, ParamCache
+from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import param_json, print_line, printable, say, value_json
 from paramclient.cli.session import Session
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of, read_metadata
 from paramclient.metadata.info import number_of
+from paramclient.paramset import ParamSet
 from paramclient.values import Param, ParamType, Value, check_name, format_value
 
 __all__ = [
@@ -26,12 +28,15 @@ __all__ = [
     "described_json",
     "from_file",
     "known_of_session",
+    "known_of_sets",
     "known_of_table",
+    "meaning_of",
     "needs_reboot",
     "parse_pairs",
     "print_descriptions",
     "problems",
     "resolved",
+    "units_of",
     "written_json",
 ]
 
@@ -102,6 +107,21 @@ class _Reading:
 def known_of_table(cache: Path, table: CachedComponent) -> Metadata | None:
     """What is kept for the firmware that a cached table is of."""
     return MetadataStore.beside(cache).known(table.identity, table.component)
+
+
+def known_of_sets(sets: Sequence[ParamSet], options: LinkOptions) -> list[Metadata | None]:
+    """For each set what is kept for its vehicle's firmware; where it names none, what another one has."""
+    if options.place is False:
+        return [None] * len(sets)
+    store = MetadataStore.beside(ParamCache(options.cache).path)
+    own = [
+        None
+        if params.identity is None or params.component is None
+        else store.known(params.identity, params.component)
+        for params in sets
+    ]
+    first = next(filter(None, own), None)
+    return [first if each is None else each for each in own]
 
 
 # what is to be set
@@ -176,8 +196,19 @@ DESCRIBED_COLUMNS: Final = ("meaning", "units")
 
 def described_cells(metadata: Metadata, param: Param) -> tuple[str, str]:
     """What stands in these columns."""
-    info = info_of(metadata, param.name)
-    return ("", "") if info is None else (info.text(param.value) or "", info.units)
+    return meaning_of(metadata, param.name, param.value), units_of(metadata, param.name)
+
+
+def meaning_of(metadata: Metadata | None, name: str, value: Value) -> str:
+    """What a value means in a word, or "" where it is only a number."""
+    info = info_of(metadata, name)
+    return ("" if info is None else info.text(value)) or ""
+
+
+def units_of(metadata: Metadata | None, name: str) -> str:
+    """The units of a parameter, or "" where there are none or they are not known."""
+    info = info_of(metadata, name)
+    return "" if info is None else info.units
 
 
 def described_json(params: Iterable[Param], metadata: Metadata | None, *, whole: bool) -> dict[str, Any]:

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import getpass
 import math
+import sys
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, TypeAlias
+from typing import Annotated, ClassVar, TypeAlias
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.errors import UsageError
+from paramclient.protocol.wire import SigningKey, SigningPolicy
+from paramclient.signing import Signing, key_from_environment, read_key
 from paramclient.values import Encoding
 
-__all__ = ["CacheOptions", "Id", "LinkOptions", "Seconds"]
+__all__ = ["CacheOptions", "Id", "KeyOptions", "LinkOptions", "Seconds", "SigningOptions"]
 
 Id: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))]
 """A system or component id."""
@@ -41,8 +45,58 @@ class CacheOptions:
 
 
 @Parameter(name="*")
+@dataclass(frozen=True, kw_only=True)
+class KeyOptions:
+    """Which signing key, of commands that open a link."""
+
+    signing_key: Path | None = None
+    """A file with the key for signed messages. Without it, the one that the environment names, if any."""
+
+    signing_passphrase: bool = False
+    """Ask for the passphrase of which the key is made, instead."""
+
+    _typed: ClassVar[SigningKey | None] = None  # of the class, as the fields of one are options
+
+    def __post_init__(self) -> None:
+        if self.signing_passphrase:
+            if self.signing_key is not None:
+                raise UsageError("--signing-key and --signing-passphrase exclude each other")
+            object.__setattr__(self, "_typed", _typed_passphrase())
+
+    @property
+    def key(self) -> SigningKey | None:
+        """The key, if there is one.
+
+        Raises:
+            UsageError: it cannot be read.
+        """
+        if self._typed is not None:
+            return self._typed
+        return key_from_environment() if self.signing_key is None else read_key(self.signing_key)
+
+
+@Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
-class LinkOptions:
+class SigningOptions(KeyOptions):
+    """Of commands that sign what they send and check what comes."""
+
+    signing_policy: SigningPolicy = SigningPolicy.UNSIGNED_RADIOS
+    """What is taken of what comes, where there is a key."""
+
+    @property
+    def signing(self) -> Signing | None:
+        """As `ParamClient` takes it.
+
+        Raises:
+            UsageError: the key cannot be read.
+        """
+        key = self.key
+        return None if key is None else Signing(key, self.signing_policy)
+
+
+@Parameter(name="*")
+@dataclass(frozen=True, kw_only=True, slots=True)
+class LinkOptions(SigningOptions):
     """Of commands that speak to a vehicle."""
 
     json: bool = False
@@ -76,3 +130,19 @@ class LinkOptions:
         if self.no_cache and self.cache is not None:
             raise UsageError("--cache and --no-cache exclude each other")
         return not self.no_cache if self.cache is None else self.cache
+
+
+def _typed_passphrase() -> SigningKey:
+    """The key of a passphrase that the user types, unseen.
+
+    Not to be asked within the event loop, where Ctrl-C would not end it.
+
+    Raises:
+        UsageError: there is no terminal to ask at, or nothing was typed.
+    """
+    if not sys.stdin.isatty():
+        raise UsageError("there is no terminal to ask for the passphrase at")
+    try:
+        return SigningKey.from_passphrase(getpass.getpass("Signing passphrase: "))
+    except EOFError:
+        raise UsageError("no passphrase was given") from None

@@ -13,6 +13,7 @@ from paramclient.cli.options import LinkOptions
 from paramclient.client import ParamClient
 from paramclient.component import Component
 from paramclient.protocol.result import Policy
+from paramclient.signing import Signing
 
 __all__ = ["Deadline", "Session", "connect", "listen"]
 
@@ -63,12 +64,14 @@ async def connect(url: str, options: LinkOptions, *, policy: Policy = Policy.AUT
         LinkError: the link cannot be opened, or failed.
     """
     deadline = Deadline(options.timeout)
-    async with ParamClient(url, cache=options.place, encoding=options.encoding, policy=policy) as client:
+    async with ParamClient(
+        url, cache=options.place, encoding=options.encoding, policy=policy, signing=options.signing
+    ) as client:
         patience = HEARING_PATIENCE if options.timeout is None else deadline.left()
         component = await client.component(options.system, options.component, timeout=patience)
         yield Session(client, component, deadline)
 
 
-def listen(url: str) -> ParamClient:
+def listen(url: str, signing: Signing | None = None) -> ParamClient:
     """A client that counts everything it hears, and neither reads nor writes a cache."""
-    return ParamClient(url, cache=False, traffic=True)
+    return ParamClient(url, cache=False, traffic=True, signing=signing)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 from anyio.abc import TaskStatus
@@ -15,6 +16,7 @@ from paramclient.errors import UsageError
 from paramclient.links import Link, LinkKind, LinkSpec, create_link, parse_link, serve_endpoint
 from paramclient.links.tcp import TcpIn
 from paramclient.links.udp import UdpIn
+from paramclient.signing import read_key, timestamp_now
 
 if TYPE_CHECKING:
     from paramclient.sim import OtherStation, Vehicle
@@ -134,6 +136,8 @@ async def sim(
     system: _Id = 1,
     component: _Id = 1,
     param_error: bool = False,
+    signing_key: Path | None = None,
+    usb: bool = False,
     misfortunes: Misfortunes = _NO_MISFORTUNES,
     faults: Faults = _NO_FAULTS,
 ) -> None:
@@ -145,6 +149,8 @@ async def sim(
         system: Its system id.
         component: Its component id.
         param_error: Answer what cannot be done with PARAM_ERROR, as newer firmware does.
+        signing_key: A file with the key with which it signs, and everybody else must.
+        usb: With a key, still take what is not signed, as ArduPilot does over USB.
     """
     from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle  # only here: no other command needs them
 
@@ -154,7 +160,9 @@ async def sim(
     real = create_link(spec)
     make = PX4Vehicle if autopilot == "px4" else ArduPilotVehicle
     options = misfortunes.options
-    options.update({"param_error": param_error, "stream": real.is_stream})
+    options.update({"param_error": param_error, "stream": real.is_stream, "usb": usb})
+    if signing_key is not None:
+        options.update({"signing_key": read_key(signing_key), "signing_timestamp": timestamp_now()})
     vehicle = make(system=system, component=component, **options)
     air = Air.symmetric([vehicle], others=misfortunes.befall(vehicle), **asdict(faults))
     announcement = _Announcement(f"{autopilot} {system}/{component}", spec)

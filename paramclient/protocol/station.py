@@ -31,9 +31,14 @@ from paramclient.protocol.wire import (
     ParamRequestList,
     ParamSet,
     ParamValue,
+    SetupSigning,
+    Signer,
+    SigningKey,
+    Verifier,
     decode,
     decode_param_value,
     encode,
+    sign_frame,
 )
 from paramclient.values import Encoding
 
@@ -72,6 +77,7 @@ class Station:
         bytes_received, bytes_sent: on this link, by this station.
         traffic: the counts, or None where they are not wanted.
         policy: what may be asked to bring tables up to date.
+        verifier: looks at signatures; None where there is no key, and they count for nothing.
     """
 
     def __init__(
@@ -101,9 +107,23 @@ class Station:
         self._outbox: list[tuple[bytes, Peer | None]] = []
         self._events: list[Event] = []
         self._sequence = 0
+        self._signer: Signer | None = None
+        self._is_watched = counts_traffic  # one look in the hot path for both
+        self.verifier: Verifier | None = None
         self._heartbeat_at = -math.inf
         self._is_paused = False
         self._turns = Turns()
+
+    def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
+        """From now on sign what is sent and take what the verifier accepts; before anything has come."""
+        self._signer = signer
+        self._is_watched = True
+        self.verifier = verifier
+        self._framer.guard = verifier.accepts
+
+    def send_setup_signing(self, system: int, component: int, key: SigningKey | None, timestamp: int) -> None:
+        """Give a vehicle its signing key, in clear, or with None take it away. Nothing answers."""
+        self._send(SetupSigning(system, component, key, timestamp), system, 2)
 
     def receive(self, data: bytes, peer: Peer, now: float) -> bool:
         """Take a datagram, or a chunk of a stream. An empty chunk says that the peer's stream has ended.
@@ -111,8 +131,8 @@ class Station:
         Gives whether there was anything of interest in it; all that is not telemetry is.
         """
         self.bytes_received += len(data)
-        if self.traffic is not None:
-            self.traffic.receive(data, peer, now)
+        if self._is_watched:
+            self._watch(data, peer, now)
         frames = self._cut_stream(data, peer) if self._is_stream else self._framer.receive(data)
         for frame in frames:
             number, system, component, _, payload, version = frame
@@ -130,6 +150,8 @@ class Station:
         """Do what is due: our heartbeat, and every component's time-outs."""
         if self._is_paused:
             return
+        if self._signer is not None:
+            self._signer.advance(now)
         if self._heartbeat_at <= now:
             self._heartbeat_at = now + HEARTBEAT_INTERVAL
             beat = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=MAV_STATE_ACTIVE)
@@ -242,11 +264,19 @@ class Station:
                 return [machine.begin_fetch(now, refresh=refresh, listed=True) for machine in machines]
         return [machine.begin_fetch(now, refresh=refresh) for machine in machines]
 
+    def _watch(self, data: bytes, peer: Peer, now: float) -> None:
+        """What somebody wants done with everything that comes, before it is looked into."""
+        if self._signer is not None:
+            self._signer.advance(now)
+        if self.traffic is not None:
+            self.traffic.receive(data, peer, now)
+
     def _cut_stream(self, data: bytes, peer: Peer) -> list[Frame]:
         """The frames that a chunk of a peer's stream completes, or that its end leaves."""
         framer = self._framers.get(peer)
         if framer is None:
             framer = self._framers[peer] = Framer(HEARD)
+            framer.guard = self._framer.guard
             if len(self._framers) > MOST_PEERS:
                 del self._framers[next(iter(self._framers))]
         if data:
@@ -318,6 +348,8 @@ class Station:
         data = encode(
             message, system=own_system, component=own_component, sequence=self._sequence, version=version
         )
+        if self._signer is not None:
+            data = sign_frame(data, self._signer)
         self._sequence = (self._sequence + 1) & 0xFF
         self.bytes_sent += len(data)
         self._outbox.append((data, None if system is None else self._peers.get(system)))

@@ -38,6 +38,9 @@ class Device(ABC):
         mavlink_version: int,
         stream: bool,
         high_latency: bool,
+        signing_key: wire.SigningKey | None,
+        signing_timestamp: int,
+        usb: bool,
         armed: bool,
         reboot_ack: bool,
         reboot_down: float,
@@ -66,11 +69,25 @@ class Device(ABC):
         self._telemetry_period = 1.0 / telemetry if telemetry else math.inf
         self._mavlink_version = mavlink_version
         self._framer = wire.Framer(wire.UNDERSTOOD, stream=stream)
+        self._usb = usb
+        self._signer: wire.Signer | None = None
+        self._verifier: wire.Verifier | None = None
         self._sequence = 0
         self._out: list[bytes] = []
         self._started = False
         self._now = -math.inf
         self._switch_on(math.inf)
+        self._take_key(signing_key, signing_timestamp)
+
+    @property
+    def signing_key(self) -> wire.SigningKey | None:
+        """The key with which it signs and checks now; None where it does not."""
+        return None if self._signer is None else self._signer.key
+
+    @property
+    def signing_report(self) -> wire.SigningReport | None:
+        """What it makes of the signatures that it gets; None where it has no key."""
+        return None if self._verifier is None else self._verifier.report()
 
     @property
     def high_latency(self) -> bool:
@@ -112,6 +129,8 @@ class Device(ABC):
     def tick(self, now: float) -> None:
         """Do what has become due by `now`."""
         self._now = now
+        if self._signer is not None:
+            self._signer.advance(now)
         if not self._started:
             self._started = True
             self._switch_on(now)
@@ -172,6 +191,7 @@ class Device(ABC):
         self._restart_at = math.inf
         self._next_heartbeat = at
         self._next_telemetry = at + self._telemetry_period
+        self._forget_streams()
 
     def _work(self, now: float) -> None:
         """Do what is due, each thing at its own pace; of what repeats for ever, a late call skips some."""
@@ -206,6 +226,19 @@ class Device(ABC):
 
     # The rest
 
+    def _take_key(self, key: wire.SigningKey | None, timestamp: int) -> None:
+        """Sign with another key from now on, or not at all."""
+        self._signer = None if key is None else wire.Signer(key, timestamp=timestamp)
+        self._forget_streams()
+
+    def _forget_streams(self) -> None:
+        """Know nobody's timestamps, as after a start."""
+        self._verifier = None
+        if self._signer is not None:
+            policy = wire.SigningPolicy.ACCEPT_ALL if self._usb else wire.SigningPolicy.UNSIGNED_RADIOS
+            self._verifier = wire.Verifier(self._signer, policy, most_streams=_MOST_STREAMS)
+        self._framer.guard = None if self._verifier is None else self._verifier.accepts
+
     def _send_signs_of_life(self, now: float) -> None:
         beat = self._heartbeat
         if self._high_latency:
@@ -236,6 +269,8 @@ class Device(ABC):
 
     def _queue(self, frame: bytes) -> None:
         self._sequence = (self._sequence + 1) & 0xFF
+        if self._signer is not None:
+            frame = wire.sign_frame(frame, self._signer)
         if len(self._out) < OUT_LIMIT:
             self._out.append(frame)
 
@@ -250,7 +285,8 @@ class Device(ABC):
             | wire.ParamRequestList
             | wire.ParamSet
             | wire.CommandLong
-            | wire.FileTransfer,
+            | wire.FileTransfer
+            | wire.SetupSigning,
         ):
             return
         if not self._answers_system(message.target_system):
@@ -260,6 +296,9 @@ class Device(ABC):
         self.requests[_NAMES[type(message)]] += 1
         if isinstance(message, wire.CommandLong):
             self._on_command(message, frame)
+        elif isinstance(message, wire.SetupSigning):
+            if not self.armed:
+                self._take_key(message.key, message.initial_timestamp)
         else:
             self._on_request(message, frame)
 
@@ -292,9 +331,11 @@ _NAMES = {
     wire.ParamSet: "PARAM_SET",
     wire.CommandLong: "COMMAND_LONG",
     wire.FileTransfer: "FILE_TRANSFER_PROTOCOL",
+    wire.SetupSigning: "SETUP_SIGNING",
 }
 _REBOOT = 1  # of the autopilot; others shut down, or stay in the bootloader
 _AUTOPILOT_VERSION = 148
 _ATTITUDE = 30
 _LEVEL_FLIGHT = struct.pack("<6f", 0.0, 0.0, 0.5, 0.0, 0.0, 0.01)
 _HIGH_LATENCY_PAUSE = 5.0
+_MOST_STREAMS = 16  # MAVLINK_MAX_SIGNING_STREAMS of the C library, which both autopilots use

@@ -31,6 +31,9 @@ class VehicleOptions(TypedDict, total=False):
     list_stops: float
     repeated_names: bool
     high_latency: bool
+    signing_key: wire.SigningKey | None
+    signing_timestamp: int
+    usb: bool
     armed: bool
     reboot_ack: bool
     reboot_down: float
@@ -67,6 +70,11 @@ class Vehicle(Device):
         high_latency, armed: see the attributes.
         reboot_ack: whether it acknowledges the command to start again before it does.
         reboot_down: seconds for which it is off then.
+        signing_key: with which it signs what it sends; it takes only frames signed with it, and RADIO_STATUS.
+            None: neither, until SETUP_SIGNING brings a key. Of a sender's frames it takes those with a
+            rising timestamp, from at most 16 senders and links, until it is switched off.
+        signing_timestamp: where its timestamps begin; it has no other clock. They go on from those it hears.
+        usb: whether the link counts as safe: it takes whatever comes, as ArduPilot does over USB.
     """
 
     _ftp: FileServer | None = None
@@ -96,6 +104,9 @@ class Vehicle(Device):
         list_stops: float = 1,
         repeated_names: bool = False,
         high_latency: bool = False,
+        signing_key: wire.SigningKey | None = None,
+        signing_timestamp: int = 0,
+        usb: bool = False,
         armed: bool = False,
         reboot_ack: bool = True,
         reboot_down: float = 1.0,
@@ -137,6 +148,9 @@ class Vehicle(Device):
             mavlink_version=mavlink_version,
             stream=stream,
             high_latency=high_latency,
+            signing_key=signing_key,
+            signing_timestamp=signing_timestamp,
+            usb=usb,
             armed=armed,
             reboot_ack=reboot_ack,
             reboot_down=reboot_down,

@@ -16,6 +16,7 @@ from paramclient.protocol.wire.frames import (
     checksum,
     enum_word,
     message_name,
+    sign_frame,
 )
 from paramclient.protocol.wire.messages import (
     AUTOPILOT_COMPONENT,
@@ -56,8 +57,19 @@ from paramclient.protocol.wire.messages import (
     ParamRequestRead,
     ParamSet,
     ParamValue,
+    SetupSigning,
     StatusText,
     SystemTime,
+)
+from paramclient.protocol.wire.signing import (
+    Refusal,
+    Signer,
+    SigningKey,
+    SigningPolicy,
+    SigningReport,
+    SigningStream,
+    Verifier,
+    timestamp_of,
 )
 
 __all__ = [
@@ -101,9 +113,17 @@ __all__ = [
     "ParamRequestRead",
     "ParamSet",
     "ParamValue",
+    "Refusal",
+    "SetupSigning",
+    "Signer",
+    "SigningKey",
+    "SigningPolicy",
+    "SigningReport",
+    "SigningStream",
     "StatusText",
     "SystemTime",
     "UNDERSTOOD",
+    "Verifier",
     "build_frame",
     "checksum",
     "decode",
@@ -111,5 +131,7 @@ __all__ = [
     "encode",
     "enum_word",
     "message_name",
+    "sign_frame",
     "text_of",
+    "timestamp_of",
 ]

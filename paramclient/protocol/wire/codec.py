@@ -27,9 +27,11 @@ from paramclient.protocol.wire.messages import (
     ParamRequestRead,
     ParamSet,
     ParamValue,
+    SetupSigning,
     StatusText,
     SystemTime,
 )
+from paramclient.protocol.wire.signing import SigningKey
 
 __all__ = ["UNDERSTOOD", "decode", "decode_param_value", "encode"]
 
@@ -92,6 +94,7 @@ _PARAM_ERROR = struct.Struct("<hBB16sB")
 _FILE_TRANSFER = struct.Struct("<BBB251s")
 _SYSTEM_TIME = struct.Struct("<QI")
 _HIGH_LATENCY2 = struct.Struct("<24xBB16x")
+_SETUP_SIGNING = struct.Struct("<QBB32s")
 _COMPONENT_METADATA = struct.Struct("<4xI100s")
 _V1_LENGTHS = {77: 3, 148: 60}  # extension fields exist in MAVLink 2 only
 
@@ -160,6 +163,12 @@ def _decode_high_latency2(payload: bytes) -> HighLatency2:
     return HighLatency2(*_fields(_HIGH_LATENCY2, payload))
 
 
+def _decode_setup_signing(payload: bytes) -> SetupSigning:
+    timestamp, system, component, secret = _fields(_SETUP_SIGNING, payload)
+    key = SigningKey(secret) if any(secret) else None
+    return SetupSigning(system, component, key, timestamp)
+
+
 def _decode_component_metadata(payload: bytes) -> ComponentMetadata:
     crc, uri = _fields(_COMPONENT_METADATA, payload)
     return ComponentMetadata(text_of(uri), crc)
@@ -178,6 +187,7 @@ _DECODERS: dict[int, Callable[[bytes], Message]] = {
     148: _decode_autopilot_version,
     235: _decode_high_latency2,
     253: _decode_statustext,
+    256: _decode_setup_signing,
     345: _decode_param_error,
     COMPONENT_METADATA_ID: _decode_component_metadata,
 }
@@ -244,6 +254,12 @@ _ENCODERS: dict[type, Callable[..., tuple[int, bytes]]] = {
     ),
     SystemTime: lambda m: (2, _SYSTEM_TIME.pack(m.time_unix_usec, m.time_boot_ms)),
     HighLatency2: lambda m: (235, _HIGH_LATENCY2.pack(m.type, m.autopilot)),
+    SetupSigning: lambda m: (
+        256,
+        _SETUP_SIGNING.pack(
+            m.initial_timestamp, m.target_system, m.target_component, b"" if m.key is None else m.key.secret
+        ),
+    ),
     ComponentMetadata: lambda m: (
         COMPONENT_METADATA_ID,
         _COMPONENT_METADATA.pack(m.file_crc, m.uri.encode("latin-1")),

@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import re
 import struct
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from typing import NamedTuple
 
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as dialect
 
-__all__ = ["Frame", "Framer", "build_frame", "checksum", "enum_word", "message_name"]
+from paramclient.protocol.wire.signing import SIGNATURE_LENGTH, Signer
+
+__all__ = ["Frame", "Framer", "build_frame", "checksum", "enum_word", "message_name", "sign_frame"]
 
 _MAGIC_V1 = 0xFE
 _MAGIC_V2 = 0xFD
 _SIGNED = 0x01
-_SIGNATURE_LENGTH = 13
+_SIGNED_FLAG = bytes((_SIGNED,))
 _MAGIC = re.compile(b"[\xfd\xfe]").search
 _START = struct.Struct("<BBBxBBB3s").unpack_from  # a header of MAVLink 2; version 1 shares two bytes
 _CRC_AT = struct.Struct("<H").unpack_from
@@ -52,8 +54,8 @@ class Framer:
 
     Every frame whose message id is known is checked by its CRC; one with an unknown id cannot be checked
     and is passed over. A candidate that fails is retried from its second byte, so that no noise can hide a
-    frame that stands whole outside a longer valid one. Signatures are not verified: the 13 bytes behind the
-    checksum of a signed frame count as its signature, whatever they are.
+    frame that stands whole outside a longer valid one. The 13 bytes behind the checksum of a signed frame
+    count as its signature, whatever they are; to look at them is the guard's business.
 
     Args:
         wanted: the message ids to give out; None for every known one. Frames with other ids are still
@@ -68,11 +70,27 @@ class Framer:
 
     def __init__(self, wanted: Collection[int] | None = None, *, stream: bool = True) -> None:
         ids = _CRC_EXTRA if wanted is None else wanted
-        self._number_of = {number.to_bytes(3, "little"): number for number in ids}.get
+        self._numbers = {number.to_bytes(3, "little"): number for number in ids}
+        self._number_of = self._numbers.get
+        self._guard: Callable[[bytes], bool] | None = None
         self._stream = stream
         self._tail = b""
         self.frames = 0
         self.skipped = 0
+
+    @property
+    def guard(self) -> Callable[[bytes], bool] | None:
+        """Is asked of every frame, wanted or not, by its bytes, whether it may be taken; None: all may.
+
+        Also asked of a signed frame whose signature is cut off, which is passed over whatever the answer.
+        """
+        return self._guard
+
+    @guard.setter
+    def guard(self, guard: Callable[[bytes], bool] | None) -> None:
+        self._guard = guard
+        # a guarded frame never takes the short way, so that the guard costs nothing where there is none
+        self._number_of = self._numbers.get if guard is None else _NO_NUMBERS.get
 
     def receive(self, data: bytes, *, final: bool = False) -> list[Frame]:
         """Take bytes from the link; give the frames that are complete now, in order.
@@ -99,7 +117,7 @@ class Framer:
                 crc_at = at + 10 + size
                 end = crc_at + 2
                 if flags:
-                    end += _SIGNATURE_LENGTH
+                    end += SIGNATURE_LENGTH
                     if flags != _SIGNED:
                         key = _NO_KEY  # a format that is not defined yet
             elif magic == _MAGIC_V1:
@@ -114,6 +132,8 @@ class Framer:
                 header_is_cut = crc_at - size > length
                 if may_go_on and (header_is_cut or extra is not None):
                     break
+                if self._guard is not None and extra is not None:
+                    self._show_if_cut_off(data[at:], crc_at - at, extra)
             elif extra is not None and _CRC_AT(data, crc_at)[0] == mcrf4xx(data[at + 1 : crc_at] + extra):
                 good += 1
                 number = number_of(key)
@@ -125,6 +145,10 @@ class Framer:
                         sequence, system, component = data[at + 2 : at + 5]
                         payload = data[at + 6 : crc_at]
                         found.append(Frame(number, system, component, sequence, payload, 1))
+                elif self._guard is not None and self._guard(data[at:end]):
+                    number = self._numbers.get(key)
+                    if number is not None:
+                        found.append(_frame_of(number, data[at:crc_at]))
                 at = end
                 continue
             candidate = _MAGIC(data, at + 1)
@@ -140,6 +164,12 @@ class Framer:
     def flush(self) -> list[Frame]:
         """The stream has ended or was interrupted: give what stands behind the unfinished candidate."""
         return self.receive(b"", final=True)
+
+    def _show_if_cut_off(self, data: bytes, crc_at: int, extra: bytes) -> None:
+        """Let the guard see a frame of which a part of the signature alone is missing."""
+        is_proven = crc_at + 2 <= len(data) and _CRC_AT(data, crc_at)[0] == mcrf4xx(data[1:crc_at] + extra)
+        if self._guard is not None and is_proven:
+            self._guard(data)
 
 
 def build_frame(
@@ -159,6 +189,15 @@ def build_frame(
         magic = b"\xfd"
     crc: int = mcrf4xx(body + bytes((_CRC_EXTRA[message_id],)))
     return magic + body + crc.to_bytes(2, "little")
+
+
+def sign_frame(frame: bytes, signer: Signer) -> bytes:
+    """The same frame with a signature; one of MAVLink 1, which has no place for it, as it is."""
+    if frame[0] != _MAGIC_V2:
+        return frame
+    body = frame[1:2] + _SIGNED_FLAG + frame[3:-2]
+    crc: int = mcrf4xx(body + _EXTRA_BY_ID_BYTES[frame[7:10]])
+    return signer.sign(frame[:1] + body + crc.to_bytes(2, "little"))
 
 
 def checksum(message_id: int, body: bytes) -> int | None:
@@ -181,6 +220,14 @@ def enum_word(enum: str, number: int) -> str:
     )
 
 
+def _frame_of(number: int, data: bytes) -> Frame:
+    """The frame that stands in its bytes from the first one to the checksum."""
+    if data[0] == _MAGIC_V2:
+        return Frame(number, data[5], data[6], data[4], data[10:], 2)
+    return Frame(number, data[3], data[4], data[2], data[6:], 1)
+
+
+_NO_NUMBERS: dict[bytes, int] = {}
 # of MAVLink's common set, which pymavlink 2.4.50 has without its unfinished messages
 _MISSING_NAMES = {397: "COMPONENT_METADATA"}
 _MISSING_EXTRA = {397: 182}

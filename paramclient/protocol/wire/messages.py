@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final, NamedTuple, TypeAlias
 
+from paramclient.protocol.wire.signing import SigningKey
+
 __all__ = [
     "AUTOPILOT_COMPONENT",
     "AUTOPILOT_VERSION_ID",
@@ -44,6 +46,7 @@ __all__ = [
     "ParamRequestRead",
     "ParamSet",
     "ParamValue",
+    "SetupSigning",
     "StatusText",
     "SystemTime",
 ]
@@ -201,6 +204,19 @@ class HighLatency2:
 
 
 @dataclass(frozen=True, slots=True)
+class SetupSigning:
+    """SETUP_SIGNING: gives a vehicle its key, in clear; without one (zeros) it signs no more.
+
+    There is no answer to it. It exists in MAVLink 2 alone.
+    """
+
+    target_system: int
+    target_component: int
+    key: SigningKey | None
+    initial_timestamp: int
+
+
+@dataclass(frozen=True, slots=True)
 class ComponentMetadata:
     """COMPONENT_METADATA: where the general metadata file lies, and its CRC-32; its time is not read."""
 
@@ -222,5 +238,6 @@ Message: TypeAlias = (
     | FileTransfer
     | SystemTime
     | HighLatency2
+    | SetupSigning
     | ComponentMetadata
 )
