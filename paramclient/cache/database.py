@@ -189,11 +189,13 @@ class Database:
     Attributes:
         path: the same.
         notes: the warnings so far.
+        replacements: how often a fresh file was made, or another one than before was found in its place.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.notes: list[str] = []
+        self.replacements = 0
         self._lock = threading.Lock()
         self._closed = False
         self._connection: sqlite3.Connection | None = None
@@ -242,6 +244,7 @@ class Database:
                             return work(nothing)
                     return self._transact(work, writing=writing)
                 except _Moved:
+                    self.replacements += 1
                     self._drop()
                 except Damaged as damage:
                     self._set_aside(damage)
@@ -276,6 +279,7 @@ class Database:
         if self._connection is not None:
             if self._which() == self._file:
                 return self._connection
+            self.replacements += 1
             self._drop()
         if writing:
             self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -287,6 +291,7 @@ class Database:
                 if _size(self._companion("-wal")):
                     raise Damaged("only its write-ahead log is left")
                 os.close(os.open(self.path, os.O_CREAT | os.O_WRONLY, 0o600))
+                self.replacements += 1
                 self._file = self._which()
             if _size(self.path) == 1:  # SQLite would take it for empty and write over it
                 raise Damaged("file is not a database")
