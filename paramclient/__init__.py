@@ -26,6 +26,7 @@ from paramclient.errors import (
     FileError,
     FileErrorCode,
     FileTransferError,
+    InvalidParameters,
     LinkError,
     MetadataError,
     NoReply,
@@ -37,6 +38,7 @@ from paramclient.errors import (
     UnknownParameter,
     UsageError,
     ValueNotApplied,
+    VehicleArmed,
     VehicleError,
 )
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
@@ -88,6 +90,7 @@ __all__ = [
     "HistoryEntry",
     "Holder",
     "Identity",
+    "InvalidParameters",
     "LinkError",
     "Lost",
     "MessageTraffic",
@@ -127,6 +130,7 @@ __all__ = [
     "UnknownParameter",
     "UsageError",
     "ValueNotApplied",
+    "VehicleArmed",
     "VehicleError",
     "WrittenParam",
     "__version__",

@@ -23,6 +23,11 @@ at once costs a fifth of taking them one by one, and a change that comes meanwhi
 MOST_PER_REST: Final = 64
 """Datagrams that may come in one rest, at the rate of the last ones; on a busier link it is shorter. That is
 an eighth of what Linux' usual buffer holds (see `paramclient.links.udp`): a burst still finds room there."""
+HELD_UP: Final = 0.02
+"""Seconds by which a deadline is missed where the program did something else meanwhile, or did not run. What
+has come in that time is read before anything counts as not answered."""
+READING_TIME: Final = 0.002
+"""Seconds that the reader is given for that: it is ready to go on, so one turn of the event loop would do."""
 LINK_PATIENCE: Final = 10.0
 """Seconds that calls wait for a link to come back before they fail with its error."""
 FIRST_BACKOFF: Final = 0.25
@@ -119,6 +124,8 @@ class Carrier:
             wait = due - anyio.current_time()
             with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):
                 await self._something_to_send.wait()
+            if anyio.current_time() - due > HELD_UP:
+                await anyio.sleep(READING_TIME)
 
     def wake(self) -> None:
         """There may be something to send, or another deadline."""

@@ -151,6 +151,13 @@ class ParamClient:
         return MappingProxyType(self._components)
 
     @property
+    def autopilots(self) -> list[Component]:
+        """The autopilot of each system heard so far, by system id: vehicles, without what they carry."""
+        systems = sorted({system for system, _ in self._components})
+        found = [self._find(system, None) for system in systems]
+        return [component for component in found if component is not None]
+
+    @property
     def link(self) -> Link:
         """The link."""
         return self._link

@@ -78,6 +78,10 @@ class WriteThrough:
             cache = self._cache if self._owned else None
             await self._worker.close(_nothing if cache is None else cache.close)
 
+    async def aside(self, work: Callable[[], Result]) -> Result:
+        """Do what blocks in the cache's thread, behind what is under way there. Cancelled, it is done."""
+        return await self._worker.run(work)
+
     def may_have(self, system: int, component: int) -> bool:
         """Whether the cache had a table for such an address when the client was opened."""
         return (system, component) in self._tables

@@ -24,6 +24,7 @@ from paramclient.cli.outcome import ExitCode, code_of
 from paramclient.cli.output import report
 from paramclient.cli.ports import ports
 from paramclient.cli.save import save
+from paramclient.cli.setup import apply, restore, verify
 from paramclient.cli.signing import disable, setup
 from paramclient.cli.simulate import sim
 from paramclient.cli.vehicle import fetch, get, set_, watch
@@ -207,6 +208,32 @@ _app.command(
         "save udpin:0.0.0.0:14550 quad.yaml",
         "save sim:ardupilot tuned.param --changed",
         "save 1 before.params --all",
+    ),
+)
+_app.command(
+    apply,
+    usage="Usage: paramclient apply [OPTIONS] URL FILE",
+    help_epilogue=_examples(
+        "apply udpin:0.0.0.0:14550 quad.params --dry-run",
+        "apply udpin:0.0.0.0:14550 quad.params --reboot --backup before.yaml",
+        "apply udpin:0.0.0.0:14550 fleet.param --all --overlay 'own/{system}.param'",
+        "apply sim:ardupilot copter.param",
+    ),
+)
+_app.command(
+    verify,
+    usage="Usage: paramclient verify [OPTIONS] URL FILE",
+    help_epilogue=_examples(
+        "verify udpin:0.0.0.0:14550 quad.params", "verify udpin:0.0.0.0:14550 fleet.param --all --expect 5"
+    ),
+)
+_app.command(
+    restore,
+    usage="Usage: paramclient restore [OPTIONS] URL [WHEN|FILE]",
+    help_epilogue=_examples(
+        "restore udpin:0.0.0.0:14550 --dry-run",
+        "restore udpin:0.0.0.0:14550 '2h ago'",
+        "restore udpin:0.0.0.0:14550 before.yaml",
     ),
 )
 _app.command(_cache)
