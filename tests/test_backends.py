@@ -24,15 +24,20 @@ from paramclient import (
     Param,
     ParamCache,
     ParamClient,
+    ParamSet,
     Progress,
     Rebooted,
+    Signing,
+    SigningKey,
     Trust,
+    WrittenParam,
     carrier,
 )
 from paramclient import client as client_module
 from paramclient.errors import LinkError
 from paramclient.links import Link, create_link, serve_endpoint
 from paramclient.metadata import metadata_of
+from paramclient.provision import apply, prepare, restore, verify
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, Vehicle
 from tests.cable import PATIENCE, Cable
 from tests.shell import FlakyLink, Tap, a_client, bits, generic, residue, small_px4
@@ -144,7 +149,8 @@ async def test_a_tcp_connection_that_drops_is_opened_again(monkeypatch: pytest.M
             await everything(component, vehicle)
 
 
-async def test_a_serial_port_that_is_unplugged(tmp_path: Path) -> None:
+async def test_a_serial_port_that_is_unplugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(carrier, "FIRST_BACKOFF", 0.01)
     vehicle = generic(stream=True, **QUICK)
     with Cable(tmp_path) as cable:
         async with beside() as tasks, a_client(cable.link) as client:
@@ -239,6 +245,28 @@ async def test_many_calls_at_once() -> None:
                 calls.start_soon(get if number % 2 else set_, f"PARAM_{number:02}")
         assert {param.name for param in got} == {f"PARAM_{number:02}" for number in range(1, 24, 2)}
         assert {vehicle.params[f"PARAM_{number:02}"].value for number in range(0, 24, 2)} == {5}
+
+
+async def test_a_vehicle_is_set_up_and_put_back() -> None:
+    wanted = ParamSet({name: WrittenParam(name, 7) for name in ("PARAM_01", "PARAM_02", "PARAM_04")})
+    vehicle = generic(**QUICK)
+    before = bits(vehicle.params)
+    async with beside(), a_client(vehicle) as client:
+        component = await client.component()
+        done = await apply(component, await prepare(component, wanted))
+        assert done.complete
+        assert {vehicle.params[name].value for name in wanted} == {7}
+        assert (await verify(component, wanted)).is_met
+        assert done.before is not None
+        await restore(component, done.before)
+        assert bits(vehicle.params) == before
+
+
+async def test_a_link_whose_bytes_are_signed(tmp_path: Path) -> None:
+    signing = Signing(SigningKey.from_passphrase("a key"), state=tmp_path)
+    vehicle = small_px4(signing_key=signing.key, **QUICK)
+    async with beside(), a_client(vehicle, signing=signing) as client:
+        await everything(await client.component(), vehicle)
 
 
 # What is told

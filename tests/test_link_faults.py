@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import os
 import selectors
@@ -19,8 +20,6 @@ from paramclient.links import Link, Peer, create_link, serve_endpoint, udp
 from paramclient.protocol import wire
 from tests.cable import PATIENCE
 from tests.shell import a_client, bits, generic
-
-pytestmark = pytest.mark.asyncio
 
 HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
 GONE = [errno.ENETDOWN, errno.ENETUNREACH, errno.EADDRNOTAVAIL, errno.EINVAL]
@@ -85,6 +84,7 @@ async def failure(link: Link) -> LinkError:
 
 
 @pytest.mark.parametrize("reason", GONE)
+@pytest.mark.asyncio
 async def test_a_network_that_is_away_for_moments_costs_what_is_sent_then(
     net: Net, reason: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -104,6 +104,7 @@ async def test_a_network_that_is_away_for_moments_costs_what_is_sent_then(
 
 @pytest.mark.parametrize("name", ["udpout:127.0.0.1:14999", "udpin:127.0.0.1:0"])
 @pytest.mark.parametrize("reason", GONE)
+@pytest.mark.asyncio
 async def test_a_socket_with_no_way_out_is_made_anew_on_its_port(
     net: Net, name: str, reason: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -136,6 +137,7 @@ async def test_a_socket_with_no_way_out_is_made_anew_on_its_port(
     await link.close()
 
 
+@pytest.mark.asyncio
 async def test_a_socket_for_every_address_needs_no_other(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
     """Linux sends with the address that it has by then."""
     monkeypatch.setattr(udp, "UNREACHABLE_PATIENCE", 0.0)
@@ -153,6 +155,7 @@ async def test_a_socket_for_every_address_needs_no_other(net: Net, monkeypatch: 
     await link.close()
 
 
+@pytest.mark.asyncio
 async def test_an_address_that_goes_and_comes_back(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
     """A whole session: `udpin` on an address that this computer loses for a while."""
     monkeypatch.setattr(udp, "UNREACHABLE_PATIENCE", 0.0)
@@ -185,6 +188,7 @@ async def test_an_address_that_goes_and_comes_back(net: Net, monkeypatch: pytest
 
 
 @pytest.mark.parametrize("kind", ["udpin", "udpout"])
+@pytest.mark.asyncio
 async def test_a_socket_that_fails_is_opened_again(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Whatever the system says; and what is only the answer to an earlier datagram is passed over."""
     script: list[int] = []
@@ -218,6 +222,7 @@ async def test_a_socket_that_fails_is_opened_again(kind: str, monkeypatch: pytes
 # A name gets another address
 
 
+@pytest.mark.asyncio
 async def test_udpout_follows_a_name_while_nothing_comes(
     names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -238,6 +243,7 @@ async def test_udpout_follows_a_name_while_nothing_comes(
         await link.close()
 
 
+@pytest.mark.asyncio
 async def test_a_name_that_nobody_knows_for_a_while_changes_nothing(
     names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -267,6 +273,7 @@ async def test_a_name_that_nobody_knows_for_a_while_changes_nothing(
         await link.close()
 
 
+@pytest.mark.asyncio
 async def test_what_comes_does_not_wait_for_a_slow_resolver(
     names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -287,6 +294,7 @@ async def test_what_comes_does_not_wait_for_a_slow_resolver(
         await link.close()
 
 
+@pytest.mark.asyncio
 async def test_tcp_asks_for_a_name_at_each_opening(names: dict[str, Any]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as before:
         port = before.getsockname()[1]
@@ -309,6 +317,7 @@ async def test_tcp_asks_for_a_name_at_each_opening(names: dict[str, Any]) -> Non
 @pytest.mark.parametrize("kind", ["udpin", "tcpin", "udpout"])
 @pytest.mark.parametrize("theirs", ["127.0.0.1", "0.0.0.0"])
 @pytest.mark.parametrize("options", [[socket.SO_REUSEADDR], [socket.SO_REUSEADDR, socket.SO_REUSEPORT]])
+@pytest.mark.asyncio
 async def test_nobody_gets_a_port_that_we_have(kind: str, theirs: str, options: list[int]) -> None:
     """Two programs on one port would each get a part of what comes, or the wrong one all of it."""
     link: Any = create_link(f"{kind}:127.0.0.1:{14999 if kind == 'udpout' else 0}")
@@ -325,6 +334,7 @@ async def test_nobody_gets_a_port_that_we_have(kind: str, theirs: str, options: 
 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
 @pytest.mark.parametrize("ours", ["127.0.0.1", "0.0.0.0"])
+@pytest.mark.asyncio
 async def test_nor_do_we_get_one_that_others_would_share(kind: str, ours: str) -> None:
     transport = socket.SOCK_STREAM if kind == "tcpin" else socket.SOCK_DGRAM
     with socket.socket(socket.AF_INET, transport) as other:
@@ -347,6 +357,7 @@ def without_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("without_a_file")
+@pytest.mark.asyncio
 async def test_tcpin_hears_all_of_its_clients() -> None:
     link: Any = create_link("tcpin:127.0.0.1:0")
     await link.open()
@@ -381,6 +392,7 @@ async def test_tcpin_hears_all_of_its_clients() -> None:
 
 
 @pytest.mark.usefixtures("without_a_file")
+@pytest.mark.asyncio
 async def test_a_session_over_such_a_listener() -> None:
     vehicle = generic(stream=True, burst=50, period=0.001)
     with anyio.fail_after(PATIENCE):
@@ -391,3 +403,46 @@ async def test_a_session_over_such_a_listener() -> None:
             assert (await component.fetch_all()).complete
             assert bits(component.params) == bits(vehicle.params)
             tasks.cancel_scope.cancel()
+
+
+# An event loop that cannot wait for sockets, as that of Windows
+
+
+class BlindLoop(asyncio.SelectorEventLoop):
+    """anyio then waits for them in a thread of its own."""
+
+
+def not_there(*_: object) -> None:
+    raise NotImplementedError
+
+
+for name in ("add_reader", "add_writer", "remove_reader", "remove_writer"):
+    setattr(BlindLoop, name, not_there)
+
+
+@pytest.mark.usefixtures("without_a_file")
+@pytest.mark.parametrize(
+    ("ours", "theirs"), [("udpin", "udpout"), ("tcpin", "tcp"), ("udpout", "udpin"), ("tcp", "tcpin")]
+)
+def test_a_session_on_a_loop_that_cannot_wait_for_sockets(ours: str, theirs: str) -> None:
+    async def session() -> None:
+        vehicle = generic(stream="tcp" in ours, burst=50, period=0.001)
+        with anyio.fail_after(PATIENCE):
+            async with anyio.create_task_group() as tasks:
+                client = a_client(f"{ours}:127.0.0.1:0") if ours.endswith("in") else None
+                if client is None:
+                    far: Any = create_link(f"{theirs}:127.0.0.1:0")
+                    await tasks.start(serve_endpoint, vehicle, far)
+                    client = a_client(f"{ours}:127.0.0.1:{far.address[1]}")
+                async with client:
+                    if ours.endswith("in"):
+                        link: Any = client.link
+                        there = create_link(f"{theirs}:127.0.0.1:{link.address[1]}")
+                        tasks.start_soon(serve_endpoint, vehicle, there)
+                    component = await client.component()
+                    assert (await component.fetch_all()).complete
+                    assert bits(component.params) == bits(vehicle.params)
+                    tasks.cancel_scope.cancel()
+
+    with asyncio.Runner(loop_factory=BlindLoop) as runner:
+        runner.run(session())
