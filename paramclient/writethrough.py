@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.values import Param
 from paramclient.worker import Worker
 
-__all__ = ["WriteThrough"]
+__all__ = ["WriteThrough", "chosen_cache"]
 
 FLUSH_INTERVAL: Final = 0.25
 """Seconds that changes are gathered for before they are written. A download fills several batches."""
@@ -40,6 +41,8 @@ class WriteThrough:
         owned: whether `close` closes it.
         identity_of: says who the vehicle is that a component belongs to; None while that is open.
         is_doubted: says whether another vehicle may have taken its place by now.
+        clock: the time in unix seconds.
+        now: the time of the components.
     """
 
     def __init__(
@@ -49,16 +52,22 @@ class WriteThrough:
         owned: bool,
         identity_of: Callable[[ComponentMachine], Identity | None],
         is_doubted: Callable[[ComponentMachine], bool],
+        clock: Callable[[], float] = time.time,
+        now: Callable[[], float] = anyio.current_time,
     ) -> None:
         self._cache = cache
         self._identity_of = identity_of
         self._is_doubted = is_doubted
+        self._clock = clock
+        self._now = now
         self._owned = owned
         self._worker = Worker("paramclient cache")
         self._kept: dict[ComponentMachine, _Kept] = {}
         self._has_failed = False
         self._tables: dict[tuple[int, int], bool] = {}
         self._something_to_write = anyio.Event()
+        self._replacements = 0 if cache is None else cache.replacements
+        self._has_written = False
 
     async def open(self) -> None:
         """Find out which components the cache knows."""
@@ -71,6 +80,7 @@ class WriteThrough:
         """Write what is left, and end the thread."""
         try:
             await self.flush()
+            await self.flush()  # all of it, where the file had gone
         finally:
             cache = self._cache if self._owned else None
             await self._worker.close(_nothing if cache is None else cache.close)
@@ -107,6 +117,7 @@ class WriteThrough:
         False where it was overtaken meanwhile: by another vehicle, or by the same call for another reason.
         """
         cached = await self._load(machine, identity)
+        logger.debug("cached under %s/%s: %s", identity.key, machine.component, cached or "nothing")
         current = self._identity_of(machine)
         if current is None or current.key != identity.key or self.follow(machine, current):
             return False
@@ -129,7 +140,7 @@ class WriteThrough:
         """The table was proven to be the vehicle's just now; `is_whole` by a download of all of it."""
         kept = self._kept.get(machine)
         if kept is not None:
-            kept.synced_at = time.time()
+            kept.is_synced = True
             kept.is_whole |= is_whole
 
     @property
@@ -161,14 +172,34 @@ class WriteThrough:
             return True
         is_written = False
         try:
-            is_written = await self._run(partial(_save, cache, [new.update for new in news])) is not None
+            is_written = await self._save(cache, [new.update for new in news])
         finally:
             for new in news:
                 if not is_written and self._kept.get(new.kept.machine) is new.kept:
                     new.take_back()
         if is_written:
             self._has_failed = False
+            logger.debug("written: %s values", sum(len(new.update.params) for new in news))
+            self._begin_anew(cache.replacements)
         return is_written
+
+    def _begin_anew(self, replacements: int) -> None:
+        """Where the file is another one than before: nothing that was written earlier is in it."""
+        is_another = replacements != self._replacements and (self._has_written or bool(self._tables))
+        self._replacements = replacements
+        self._has_written = True
+        if not is_another:
+            return
+        for kept in self._kept.values():
+            table = kept.machine.table
+            kept.is_whole |= table.complete
+            kept.state = None
+            for name in table.params:
+                table.dirty.setdefault(name, "vehicle")
+        self.wake()
+
+    async def _save(self, cache: ParamCache, updates: list[TableUpdate]) -> bool:
+        return await self._run(partial(_save, cache, updates)) is not None
 
     async def _load(self, machine: ComponentMachine, identity: Identity) -> CachedComponent | None:
         if self._cache is None:
@@ -185,7 +216,7 @@ class WriteThrough:
             is_same = identity.uid is not None and _firmware(cached.identity) == _firmware(identity)
             machine.use_cached(
                 _of_firmware(cached, identity),
-                anyio.current_time(),
+                self._now(),
                 count=cached.count,
                 confirmed=cached.hash,
                 complete=cached.complete,
@@ -199,20 +230,23 @@ class WriteThrough:
             kept.synced_at = cached.synced_at
             kept.state = None if table.is_displaced else self._state(machine, kept)
         if machine.sync.synced:
-            kept.synced_at = time.time()
+            kept.is_synced = True
 
     def _news_of(self, kept: _Kept) -> list[_News]:
         """What the cache does not know of a table yet; it counts as written from now on."""
         machine, table = kept.machine, kept.machine.table
         if self._is_doubted(machine):
             return []
+        now = self._clock()
+        is_synced, kept.is_synced = kept.is_synced, False
+        if is_synced:
+            kept.synced_at = now
         state = self._state(machine, kept)
         if not (table.dirty or kept.is_whole or state != kept.state):
             return []
         dirty = table.take_dirty()
         is_whole, kept.is_whole = kept.is_whole, False
         kept.state = state
-        now = time.time()
         knows_volatile = bool(table.volatile) or table.volatile_known
         update = TableUpdate(
             identity=kept.identity,
@@ -233,7 +267,7 @@ class WriteThrough:
             removed=[name for name in dirty if name not in table.params],
             replace=is_whole,
         )
-        return [_News(kept, dirty, update)]
+        return [_News(kept, dirty, update, is_synced)]
 
     def _state(self, machine: ComponentMachine, kept: _Kept) -> TableState:
         table = machine.table
@@ -265,6 +299,7 @@ class _Kept:
     identity: Identity
     state: TableState | None = None
     synced_at: float | None = None
+    is_synced: bool = False  # since it was written last, whose time then counts: the clock may be wrong now
     is_whole: bool = False
 
 
@@ -275,12 +310,31 @@ class _News:
     kept: _Kept
     dirty: dict[str, str]
     update: TableUpdate
+    is_synced: bool
 
     def take_back(self) -> None:
         """It has not arrived: it is news again."""
+        self.kept.is_synced |= self.is_synced
         self.kept.machine.table.dirty = self.dirty | self.kept.machine.table.dirty
         self.kept.is_whole |= self.update.replace
         self.kept.state = None
+
+
+def chosen_cache(
+    cache: ParamCache | str | os.PathLike[str] | bool | None, *, is_log: bool
+) -> ParamCache | None:
+    """The cache that a user's choice means, see `ParamClient`.
+
+    Raises:
+        UsageError: a cache is named for a log.
+    """
+    if is_log and cache not in (None, True, False):
+        raise UsageError("what a log holds is of the past: `paramclient import` brings it into a cache")
+    if isinstance(cache, ParamCache):
+        return cache
+    if cache is False or is_log:
+        return None
+    return ParamCache(None if cache is None or cache is True else cache)
 
 
 def _firmware(identity: Identity) -> tuple[int, str]:
