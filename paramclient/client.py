@@ -540,12 +540,6 @@ class ParamClient:
             ):
                 await self._carrier.news.wait()
 
-    def _may_be_cached(self, component: Component) -> bool:
-        return self._writer.may_have(component.system, component.component)
-
-    def _identity_of(self, machine: ComponentMachine) -> Identity | None:
-        return self._station.identity_of(machine)
-
     def _find(self, system: int | None, component: int | None) -> Component | None:
         found = self._station.find(system, component)
         return None if found is None else self._components[found.system, found.component]

@@ -85,7 +85,7 @@ class Component:
     @property
     def identity(self) -> Identity:
         """Who the vehicle is: hardware id, firmware, capabilities, as far as known."""
-        return self._client._identity_of(self._machine) or self._machine.identity
+        return self._client._station.identity_of(self._machine) or self._machine.identity
 
     @property
     def encoding(self) -> Encoding:
@@ -396,7 +396,7 @@ class Component:
         """Whether the cached table is in `params`, or is not worth waiting for."""
         return (
             self._cache_is_read.is_set()
-            or not self._client._may_be_cached(self)
+            or not self._client._writer.may_have(self.system, self.component)
             or now >= self._heard_at + IDENTITY_PATIENCE
         )
 

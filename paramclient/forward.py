@@ -61,8 +61,8 @@ class Forwarder:
             await self._link.open()
             self._is_there = True
         except LinkError as error:
-            if not self._link.reconnects:
-                raise
+            if not (self._link.reconnects and self._link.is_stream):
+                raise  # a datagram reaches whoever comes later: there is nobody to wait for
             logger.warning("%s; trying again until somebody is there", error)
 
     async def close(self) -> None:

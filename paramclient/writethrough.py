@@ -41,7 +41,7 @@ class WriteThrough:
         owned: whether `close` closes it.
         identity_of: says who the vehicle is that a component belongs to; None while that is open.
         is_doubted: says whether another vehicle may have taken its place by now.
-        clock: the time in unix seconds.
+        clock: the time in unix seconds; None for that of this computer.
         now: the time of the components.
     """
 
@@ -52,13 +52,13 @@ class WriteThrough:
         owned: bool,
         identity_of: Callable[[ComponentMachine], Identity | None],
         is_doubted: Callable[[ComponentMachine], bool],
-        clock: Callable[[], float] = time.time,
+        clock: Callable[[], float] | None = None,
         now: Callable[[], float] = anyio.current_time,
     ) -> None:
         self._cache = cache
         self._identity_of = identity_of
         self._is_doubted = is_doubted
-        self._clock = clock
+        self._clock = _time_of_day if clock is None else clock
         self._now = now
         self._owned = owned
         self._worker = Worker("paramclient cache")
@@ -335,6 +335,10 @@ def chosen_cache(
     if cache is False or is_log:
         return None
     return ParamCache(None if cache is None or cache is True else cache)
+
+
+def _time_of_day() -> float:
+    return time.time()
 
 
 def _firmware(identity: Identity) -> tuple[int, str]:
