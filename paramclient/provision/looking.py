@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from time import time
 from typing import Final
 
 import anyio
@@ -83,7 +83,7 @@ async def look(
             component=component.component,
             system=component.system,
             identity=component.identity,
-            at=time(),
+            at=time.time(),
             source=f"vehicle {component.system}/{component.component}",
         ),
         fetched.complete and len(table) == len(listed),
