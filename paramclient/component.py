@@ -22,7 +22,14 @@ from paramclient.protocol.result import FetchResult, Progress, Sampled
 from paramclient.protocol.sampling import SAMPLE_SIZE
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
-from paramclient.protocol.wire import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, NO_INDEX, ParamValue, SigningKey
+from paramclient.protocol.wire import (
+    HASH_CHECK,
+    MAV_MODE_FLAG_SAFETY_ARMED,
+    MOST_PARAMETERS,
+    NO_INDEX,
+    ParamValue,
+    SigningKey,
+)
 from paramclient.protocol.writes import SetResult
 from paramclient.signing import timestamp_now
 from paramclient.values import Encoding, Param, check_name, check_value, decode, known_type
@@ -166,8 +173,8 @@ class Component:
         """
         if isinstance(name, str):
             check_name(name)
-        elif not 0 <= name < NO_INDEX:
-            raise UsageError(f"parameter index {name}: indices are 0 to {NO_INDEX - 1}")
+        elif not 0 <= name < MOST_PARAMETERS:
+            raise UsageError(f"parameter index {name}: indices are 0 to {MOST_PARAMETERS - 1}")
         machine = self._machine
         self._client._check_open()
         read = machine.read(name, anyio.current_time())

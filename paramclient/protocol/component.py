@@ -20,7 +20,7 @@ from paramclient.protocol.table import Change
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
-    NO_INDEX,
+    MOST_PARAMETERS,
     AutopilotVersion,
     CommandAck,
     ComponentMetadata,
@@ -131,10 +131,10 @@ class ComponentMachine(Parts):
             self.reads.heard(message, now)
             return
         if who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
-            name = name.upper()
+            name = _in_capitals(name)
             message = message._replace(param_id=name)
         table = self.table
-        if count != table.count and count != NO_INDEX:
+        if count != table.count and count <= MOST_PARAMETERS:
             self._count_moved(count, now)
         authors = self._authors
         writes = self.writes
@@ -182,6 +182,8 @@ class ComponentMachine(Parts):
         """
         if self.table.complete:
             return
+        if count is not None and count > MOST_PARAMETERS:  # what an earlier version has believed
+            count, complete, placed = None, False, False
         changes = self.table.restore(
             params,
             count=count,
@@ -282,7 +284,7 @@ class ComponentMachine(Parts):
 
     def spelling(self, name: str) -> str:
         """The name as the vehicle has it. ArduPilot answers to any case; its own names have capitals only."""
-        return name.upper() if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA else name
+        return _in_capitals(name) if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA else name
 
     def check_present(self, what: str, now: float) -> None:
         """See whether it can be asked for something; NoReply is raised where it is lost."""
@@ -476,6 +478,13 @@ class ComponentMachine(Parts):
     def _report(self, changes: list[Change]) -> None:
         for change in changes:
             self._emit(ParamChanged(self, change))
+
+
+def _in_capitals(name: str) -> str:
+    """The name with capitals for its ASCII letters. Of others, as damage may bring them, the capital may be
+    two letters or none that a message can hold.
+    """
+    return name.encode("latin-1").upper().decode("latin-1")
 
 
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time

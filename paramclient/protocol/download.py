@@ -13,7 +13,7 @@ from paramclient.protocol.stream import SHORTEST_QUIET, ListStream
 from paramclient.protocol.table import Table
 from paramclient.protocol.timing import LONGEST_SILENCE, RoundTrip
 from paramclient.protocol.turns import Seen, Turns
-from paramclient.protocol.wire import NO_INDEX, Message, ParamRequestList, ParamValue
+from paramclient.protocol.wire import MOST_PARAMETERS, NO_INDEX, Message, ParamRequestList, ParamValue
 
 __all__ = ["Download", "present_of"]
 
@@ -211,8 +211,8 @@ class Download(Operation[None]):
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
         name, _, _, count, index = message
-        if index >= count or count == NO_INDEX:
-            if index == NO_INDEX and self.count is not None and count != NO_INDEX:
+        if index >= count or count > MOST_PARAMETERS:
+            if index == NO_INDEX and self.count is not None and count <= MOST_PARAMETERS:
                 # pushed, or an answer by name: it goes by the count of now, where ArduPilot's stream does not
                 self._other_count = None if count == self.count else count
             return

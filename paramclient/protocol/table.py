@@ -6,13 +6,14 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-from paramclient.protocol.wire import NO_INDEX, ParamValue
+from paramclient.protocol.wire import MOST_PARAMETERS, NO_INDEX, ParamValue
 from paramclient.values import Encoding, Param, Trust, Value, as_sent, decode, from_bits, known_type, px4_hash
 
 __all__ = ["Change", "Table"]
 
 MOST_NAMES: Final = 65_535
-"""Names that one table may hold. No more can have an index; a component that invents further ones is ill."""
+"""Names that one table may hold: as many as can have an index, and as many again of parameters that are not
+in use and have none. A component that invents further ones is ill."""
 
 _EXACT = 1 << 24  # up to here every integer is a float32
 _LIVE = Trust.LIVE  # each look into an enumeration takes a tenth of what a value takes here
@@ -125,7 +126,7 @@ class Table:
         old = params.get(name)
         if given == NO_INDEX:
             index = None if old is None else old.index
-        elif count == NO_INDEX or given >= count:
+        elif count > MOST_PARAMETERS or given >= count:
             index = None
         if old is None:
             if len(params) >= MOST_NAMES:
@@ -173,6 +174,8 @@ class Table:
         kind = known_type(number)
         initial = None if default is None else from_bits(default, number)
         old = self.params.get(name)
+        if old is None and len(self.params) >= MOST_NAMES:
+            return None
         raw = as_sent(bits, number, self._encoding)
         if is_older and old is not None and (old.type != number or self._wire.get(name) != raw):
             self.params[name] = replace(old, index=index, default=initial)
@@ -238,7 +241,7 @@ class Table:
             if volatile_known:
                 self.rehash()  # what is in the table counts, not what stood beside it
             elif any(
-                not self.params[name].same_value(param)
+                name not in self.params or not self.params[name].same_value(param)
                 for name, param in params.items()
                 if name not in volatile
             ):
@@ -260,7 +263,7 @@ class Table:
             if old is not None:
                 if old.type == param.type and name not in self._filed:
                     changes += self._complement(old, param)
-            else:
+            elif len(self.params) < MOST_NAMES:
                 new = param.with_trust(Trust.CACHED)
                 if not placed and new.index is not None:
                     new = self._displaced(new)
