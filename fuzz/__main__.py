@@ -1,8 +1,8 @@
 """Let atheris look for inputs that break a target: `python -m fuzz component --seconds 1800`.
 
 What it finds to reach new code is kept in `fuzz/corpus/<target>`, and what breaks something in
-`fuzz/findings/<target>`. Further arguments go to libFuzzer: `-merge=1 FOLDER` adds to the corpus those inputs of
-a folder that reach what no kept one does.
+`fuzz/findings/<target>`. Further arguments go to libFuzzer: `-merge=1 FOLDER` takes over from a folder what
+reaches more than the corpus does.
 """
 
 from __future__ import annotations

@@ -12,6 +12,7 @@ from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import Final
+from unittest import mock
 
 from fuzz.draw import Draw
 from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
@@ -29,7 +30,7 @@ VEHICLE: Final = Identity(1, "fuzz", uid="a1b2c3", autopilot=12)
 OTHER: Final = Identity(2, "fuzz", uid="d4e5f6", autopilot=3)
 AT: Final = 1_700_000_000.0
 
-logging.getLogger("paramclient.cache").setLevel(logging.ERROR)  # each damaged file is worth a warning
+logger = logging.getLogger("paramclient.cache")
 
 
 def run(data: bytes) -> None:
@@ -39,7 +40,8 @@ def run(data: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cache.sqlite3"
         path.write_bytes(content)
-        with suppress(CacheError):
+        # each damaged file is worth a warning
+        with suppress(CacheError), mock.patch.object(logger, "disabled", True):
             _use(path)
         files = [
             each for each in Path(folder).iterdir() if not each.name.endswith(("-wal", "-shm", "-journal"))

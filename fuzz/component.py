@@ -37,6 +37,9 @@ BOUNDS: Final = (
     (station, "MOST_COMPONENTS", 5),
     (station, "MOST_PEERS", 3),
     (table, "MOST_NAMES", 12),
+    (table, "ENOUGH_NAMES", 6),
+    (table, "MOST_NAMES_OF_LINK", 25),
+    (authors, "MOST_CHANGES", 5),
     (traffic, "MOST_COMPONENTS", 4),
     (traffic, "MOST_PEERS", 3),
     (authors, "MOST_FOREIGN_SETS", 4),
@@ -122,11 +125,15 @@ class _Session:
             assert operation.done or isinstance(operation, Restart), f"{operation} of {machine} does not end"
         for machine, operation in self.operations:
             self.give_back(machine, operation)
+        if self.station.traffic is not None:
+            self.station.traffic.report(self.now)
 
     def settle(self) -> None:
         """Do what is due, take what is sent, and see that all is as it must be."""
         for _ in range(MOST_STEPS):
-            if self.station.next_deadline() > self.now:
+            deadline = self.station.next_deadline()
+            assert not math.isnan(deadline)
+            if deadline > self.now:
                 break
             self.station.tick(self.now)
         else:
@@ -142,7 +149,6 @@ class _Session:
         for event in self.station.events():
             assert event is not None
         assert len(self.station.components) <= 5
-        assert not math.isnan(self.station.next_deadline())
         for (system, component), machine in self.station.components.items():
             self.check(machine, system, component)
         for operation in self.begun:
@@ -152,8 +158,6 @@ class _Session:
                 assert result.received + len(result.missing) == result.count
                 assert all(0 <= index < result.count for index in result.missing)
         self.begun = [operation for operation in self.begun if not operation.done]
-        if self.station.traffic is not None and self.draw.is_over:
-            self.station.traffic.report(self.now)
 
     def check(self, machine: ComponentMachine, system: int, component: int) -> None:
         held = machine.table

@@ -22,6 +22,7 @@ from paramclient.identity import Identity
 from paramclient.links import Link, create_link
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import (
+    ComponentForgotten,
     ComponentHeard,
     ComponentIdentified,
     Event,
@@ -400,6 +401,9 @@ class ParamClient:
                 self._components[machine.system, machine.component]._publish(event.change)
                 is_to_be_written = True
                 continue
+            if isinstance(event, ComponentForgotten):
+                self._part_with(machine)
+                continue
             if isinstance(event, ComponentHeard):
                 self._meet(machine)
             elif isinstance(event, ComponentIdentified):
@@ -433,6 +437,13 @@ class ParamClient:
         self._read_cache(component)
         if self._writer.may_hit(*address):
             machine.sync.ask(now)
+
+    def _part_with(self, machine: ComponentMachine) -> None:
+        """It is lost, and not followed any more."""
+        address = (machine.system, machine.component)
+        self._writer.part_with(machine)
+        silence = anyio.current_time() - machine.presence.heard_at
+        self._components.pop(address)._end(NoReply(f"{_wanted(*address)} (lost)", attempts=0, waited=silence))
 
     def _read_cache(self, component: Component) -> None:
         """Look for its cached table, once it is known whose it is."""

@@ -38,6 +38,8 @@ from paramclient.values import Param, Trust, Value, encode
 
 __all__ = ["ComponentMachine"]
 
+MOST_DOUBTED: Final = 256
+"""Reads that may be open for a value to be asked for that changed twice: each takes its share of the link."""
 FRESH_IDENTITY: Final = 1.0
 """Seconds for which an AUTOPILOT_VERSION needs no other."""
 
@@ -57,6 +59,7 @@ class ComponentMachine(Parts):
         is_vehicle_doubted: whether it is open which vehicle its autopilot belongs to.
         another: is told that another vehicle has taken the system id; by default `become_another`.
         turns: those of the lists on the link; None for a link that it has for itself.
+        room: what the tables of the link may hold together; None likewise.
 
     Attributes:
         version: the MAVLink version that it speaks, as far as heard.
@@ -311,7 +314,7 @@ class ComponentMachine(Parts):
         self._follow_identity(now)
         self.sync.tick(now)
         for name in self._authors.doubted(now):
-            if self._policy is Policy.AUTO:
+            if self._policy is Policy.AUTO and len(self.reads) < MOST_DOUBTED:
                 self.reads.ask(name, now, urgent=False)
 
     def next_deadline(self) -> float:

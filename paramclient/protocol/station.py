@@ -10,10 +10,11 @@ from paramclient.errors import LinkError, UsageError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.download import present_of
-from paramclient.protocol.events import ComponentHeard, Event
+from paramclient.protocol.events import ComponentForgotten, ComponentHeard, Event
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.result import Policy
 from paramclient.protocol.sync import Upkeep
+from paramclient.protocol.table import Room
 from paramclient.protocol.traffic import Traffic
 from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import (
@@ -51,7 +52,8 @@ Peer: TypeAlias = Hashable
 
 HEARTBEAT_INTERVAL: Final = 1.0
 MOST_COMPONENTS: Final = 1_000
-"""Components followed on one link: more than 250 systems with a few each have. Further ones are not heard."""
+"""Components followed on one link: more than 250 systems with a few each have. Further ones are heard
+when one that is lost and has told of no parameter can be forgotten for them."""
 MOST_PEERS: Final = 256
 """Stream peers whose unfinished frames are kept."""
 HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
@@ -113,6 +115,7 @@ class Station:
         self._heartbeat_at = -math.inf
         self._is_paused = False
         self._turns = Turns()
+        self._room = Room()
 
     def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
         """From now on sign what is sent and take what the verifier accepts; before anything has come."""
@@ -300,7 +303,7 @@ class Station:
     def _meet(self, sender: Address, message: Message) -> ComponentMachine | None:
         """A component that was not heard before; only what shows that it has parameters makes it one."""
         is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue)
-        if not is_sign or len(self.components) >= MOST_COMPONENTS:
+        if not is_sign or not self._has_room():
             return None
         system, component = sender
         machine: ComponentMachine | None = None
@@ -321,10 +324,27 @@ class Station:
             is_vehicle_doubted=lambda: self._autopilot_is_doubted(system),
             another=lambda now: self._become_another(system, now),
             turns=self._turns,
+            room=self._room,
         )
         self.components[sender] = machine
         self._events.append(ComponentHeard(machine))
         return machine
+
+    def _has_room(self) -> bool:
+        """Whether one more component can be followed.
+
+        Where there are too many, the first one goes that is lost, has told of no parameter, and that nobody
+        waits for: who sends heartbeats in many names must not keep out those that come later.
+        """
+        if len(self.components) < MOST_COMPONENTS:
+            return True
+        for address, machine in self.components.items():
+            if machine.presence.is_lost and not machine.table.params and not machine.is_waiting:
+                del self.components[address]
+                machine.reads.pace.idle()
+                self._events.append(ComponentForgotten(machine))
+                return True
+        return False
 
     def _become_another(self, system: int, now: float) -> None:
         """Another vehicle has taken a system id, with all of its components."""
