@@ -28,7 +28,7 @@ from paramclient.protocol.wire import (
     SystemTime,
 )
 
-__all__ = ["LIES", "LiarVehicle"]
+__all__ = ["ESCAPE", "LIES", "LiarVehicle"]
 
 STEP: Final = 0.01
 """Seconds between two times at which it says something unasked."""

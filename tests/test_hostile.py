@@ -2,32 +2,55 @@
 
 from __future__ import annotations
 
+import importlib
+import os
+import re
+import tracemalloc
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import anyio
 import pytest
 
+from paramclient import NoReply, ParamCache, ParamClient, writethrough
 from paramclient import events as events_room
-from paramclient.errors import NoReply
+from paramclient.cli import run as run_command
+from paramclient.cli import session as session_room
 from paramclient.events import Changes
+from paramclient.links import SimLink
 from paramclient.protocol import authors as authors_room
 from paramclient.protocol import component as component_room
+from paramclient.protocol import download as download_room
 from paramclient.protocol import station as station_room
 from paramclient.protocol import table as table_room
+from paramclient.protocol import traffic as traffic_room
 from paramclient.protocol.authors import Authors
 from paramclient.protocol.events import ComponentForgotten
 from paramclient.protocol.ftp import blocks as blocks_room
 from paramclient.protocol.ftp.blocks import Blocks
+from paramclient.protocol.station import Station
+from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.table import Change, Room, Table
+from paramclient.protocol.timing import INITIAL_TIMEOUT
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MOST_PARAMETERS,
     NO_INDEX,
+    AutopilotVersion,
     Heartbeat,
     Message,
     ParamRequestRead,
     ParamValue,
     encode,
+    text_of,
 )
-from tests.liar import LiarVehicle
+from paramclient.sim import Air
+from tests.liar import ESCAPE, LIES, LiarVehicle
+from tests.shell import bits, generic, small_px4, swiftly
 from tests.simulation import PEER, Simulation, known, listing_ardupilot, param_value
+
+ROOT = Path(__file__).parent.parent
 
 
 def say(session: Simulation, message: Message, *, system: int = 1, component: int = 1) -> None:
@@ -230,3 +253,180 @@ def test_one_head_after_the_other_keeps_no_turn() -> None:
     assert session.fetch(limit=5).complete
     session.until(lambda: fetch.done, limit=60)
     assert isinstance(fetch.error, NoReply)
+
+
+# Others on the same link
+
+
+@pytest.fixture(scope="module")
+def usual() -> float:
+    """Seconds that a vehicle's list takes that is alone on its link."""
+    return Simulation(listing_ardupilot()).fetch().elapsed
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_no_lie_keeps_another_vehicle_from_being_fetched(
+    lie: str, usual: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the liar is fetched as well: its list is waited for once, and its values count for it alone."""
+    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 50)
+    honest, liar = listing_ardupilot(), LiarVehicle(lie)
+    station = Station(link="sim:test", is_stream=False, upkeep=Upkeep(30.0))
+    session = Simulation(honest, liar, station=station)
+    session.meet()
+    session.until(lambda: (66, 1) in session.station.components)
+    liars = session.station.components[66, 1]
+    fetch = liars.begin_fetch(session.now)
+    session.run(0.2)
+    result = session.fetch(limit=60)
+    assert result.elapsed < usual + 2 * INITIAL_TIMEOUT
+    assert result.complete
+    truth = {name: entry.bits for name, entry in honest.params.items()}
+    assert {name: param.bits for name, param in result.params.items()} == truth
+    assert all(len(machine.table.params) <= 4_000 for machine in session.station.components.values())
+    liars.end_fetch(fetch, session.now)
+
+
+MOST_GROWTH = 300_000
+"""Bytes by which the memory may differ between two moments of one session, without anything that stays."""
+
+
+def test_all_lies_at_once_cost_no_more_than_so_much_memory() -> None:
+    """When all that has a bound has reached it, nothing grows any more."""
+    names, components = 100, 10
+    with (
+        mock.patch.object(table_room, "MOST_NAMES", names),
+        mock.patch.object(station_room, "MOST_COMPONENTS", components),
+        mock.patch.object(authors_room, "MOST_CHANGES", 100),
+        mock.patch.object(traffic_room, "MOST_COMPONENTS", components),
+        mock.patch.object(component_room, "MOST_PARAMETERS", 1_000),
+        mock.patch.object(table_room, "MOST_PARAMETERS", 1_000),
+        mock.patch.object(download_room, "MOST_PARAMETERS", 1_000),
+    ):
+        tracemalloc.start()
+        for number in range(text_of.cache_parameters()["maxsize"] or 0):
+            text_of(b"%d" % number)  # what remembers names is full
+        liars = [LiarVehicle(*list(LIES)[start::3], system=66 + start, rate=300) for start in range(3)]
+        station = Station(link="sim:test", is_stream=False, upkeep=Upkeep(30.0), counts_traffic=True)
+        held: list[int] = []
+        for now in range(5):
+            for liar in liars:
+                liar.tick(float(now))
+                for data in liar.data_to_send():
+                    station.receive(data, PEER, float(now))
+            station.tick(float(now))
+            for data, _ in station.data_to_send():
+                for liar in liars:
+                    liar.receive(data, float(now))
+            station.events()
+            held.append(tracemalloc.get_traced_memory()[0])
+            for machine in [*station.components.values()][:3]:
+                if machine.fetch is None:
+                    machine.begin_fetch(float(now))
+        tracemalloc.stop()
+        assert len(station.components) == components
+        assert max(len(machine.table.params) for machine in station.components.values()) <= names
+    assert held[-1] - held[-2] < MOST_GROWTH, held
+
+
+# The client, the cache, the terminal
+
+
+@pytest.mark.parametrize(("lies", "kept"), [((), 3), (("restless identity",), 0)], ids=["slowly", "at once"])
+@swiftly
+async def test_one_that_is_another_vehicle_each_time_fills_no_cache(
+    lies: tuple[str, ...],
+    kept: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(writethrough, "MOST_VEHICLES", 3)
+    liar = LiarVehicle(*lies, rate=1)
+    path = tmp_path / "cache" / "parameters.sqlite3"
+    async with ParamClient(Air([liar, small_px4()]), cache=path) as client:
+        await client.component(66, 1)
+        vehicle = await client.component(1, 1)
+        assert (await vehicle.fetch_all()).complete
+        for number in range(4):
+            liar.say(AutopilotVersion(16, uid=number + 1))
+            liar.say(param_value(f"V{number}"))
+            await anyio.sleep(2 * writethrough.FLUSH_INTERVAL)
+            assert len(client._writer._bringing) <= 1
+    with ParamCache(path) as cache:
+        systems = [each.identity.system for each in cache.vehicles()]
+        assert systems.count(66) == kept
+        assert bits(cache.component(system=1).params) == bits(vehicle.params)
+    assert os.listdir(tmp_path) == ["cache"]  # noqa: PTH208 - nothing stands outside of its folder
+    assert os.listdir(path.parent) == ["parameters.sqlite3"]  # noqa: PTH208 - as above
+    assert [record.message for record in caplog.records] == [
+        "66/1: too many vehicles on this link, so it is not cached"
+    ]
+
+
+@swiftly
+async def test_so_many_tables_are_kept_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(writethrough, "MOST_TABLES", 2)
+    vehicles = [small_px4(system=system) for system in (1, 2, 3)]
+    async with ParamClient(Air(vehicles), cache=tmp_path / "cache.sqlite3") as client:
+        await client.component(3, 1)
+        assert len((await client.fetch_all()).results) == 3
+    with ParamCache(tmp_path / "cache.sqlite3") as cache:
+        assert len(cache.components()) == 2
+
+
+@swiftly
+async def test_a_component_that_is_forgotten_ends_what_listens_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 2)
+    liar = LiarVehicle("obedient")
+    async with ParamClient(Air([generic(), liar]), cache=False) as client:
+        await client.component(1, 1)
+        other = await client.component(66, 1)
+        changes = other.changes()
+        await anyio.sleep(10)
+        other._machine.presence.is_lost = True
+        liar.say(Heartbeat(2, 12), 77)
+        with pytest.raises(NoReply, match=r"66/1 \(lost\)"):
+            await anext(changes)
+        assert [*client.components] == [*client._station.components] == [(1, 1), (77, 1)]
+        with pytest.raises(NoReply):
+            await other.get("A")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("fetch",), ("watch", "--duration", "2"), ("link", "--duration", "2"), ("get",)],
+    ids=lambda each: each[0],
+)
+def test_no_escape_code_reaches_the_terminal(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def client(url: str, **options: Any) -> ParamClient:
+        return ParamClient(SimLink(LiarVehicle("escape codes"), url), **options)
+
+    monkeypatch.setattr(session_room, "ParamClient", client)
+    verb, *options = words
+    named = ["--no-cache"] if verb != "get" else [ESCAPE]
+    run_command([verb, "sim:custom", *named, *options])
+    printed = capsys.readouterr()
+    assert printed.out + printed.err
+    assert "\x1b" not in printed.out + printed.err
+    assert "\x07" not in printed.out + printed.err
+
+
+BOUND = re.compile(r"^\| [^|]+ \| ([^|]+) \| ([^|]+) \|", re.MULTILINE)
+CONSTANT = re.compile(r"`([a-z_.]+)\.([A-Z_]+)`")
+
+
+def test_the_page_of_the_bounds_says_what_they_are() -> None:
+    rows = BOUND.findall((ROOT / "docs" / "bounds.md").read_text(encoding="utf-8"))
+    named = 0
+    for most, names in rows:
+        for room, name in CONSTANT.findall(names):
+            bound = getattr(importlib.import_module(f"paramclient.{room}"), name)
+            named += 1
+            if re.fullmatch(r"[0-9,]+", most):
+                assert bound == int(most.replace(",", "")), name
+            elif most.endswith(" MiB"):
+                assert bound == int(most.removesuffix(" MiB")) << 20, name
+    assert named > 35
