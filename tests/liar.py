@@ -185,6 +185,20 @@ def _endless_file(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]
             yield FileTransfer(0, *OWN, (head + content).ljust(251, b"\0"))
 
 
+def _crumbs(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
+    """Opens every file, and gives it byte by byte."""
+    if isinstance(asked, FileTransfer):
+        opcode, sequence = asked.payload[3], int.from_bytes(asked.payload[:2], "little") + 1
+        offset = int.from_bytes(asked.payload[8:12], "little")
+        content = (1 << 20).to_bytes(4, "little") if opcode == 4 else b"\x00"
+        number = 30 if opcode == 15 else 1
+        for step in range(number):
+            head = ((sequence + step) & 0xFFFF).to_bytes(2, "little")
+            head += bytes((asked.payload[2], 128, len(content), opcode, step == number - 1, 0))
+            head += (offset + step).to_bytes(4, "little")
+            yield FileTransfer(0, *OWN, (head + content).ljust(251, b"\0"))
+
+
 def _obedient(liar: LiarVehicle, asked: Message | None) -> Iterable[Message]:
     """Accepts every command, and does none; its list ends in the middle."""
     if isinstance(asked, CommandLong):
@@ -218,6 +232,7 @@ LIES: Final[dict[str, Lie]] = {
     "endless hashes": _endless_hashes,
     "dripping list": _dripping_list,
     "endless file": _endless_file,
+    "crumbs": _crumbs,
     "obedient": _obedient,
     "other addresses": _other_addresses,
 }

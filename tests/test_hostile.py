@@ -13,7 +13,7 @@ from unittest import mock
 import anyio
 import pytest
 
-from paramclient import NoReply, ParamCache, ParamClient, writethrough
+from paramclient import FileTransferError, NoReply, ParamCache, ParamClient, writethrough
 from paramclient import events as events_room
 from paramclient.cli import run as run_command
 from paramclient.cli import session as session_room
@@ -23,12 +23,16 @@ from paramclient.protocol import authors as authors_room
 from paramclient.protocol import component as component_room
 from paramclient.protocol import download as download_room
 from paramclient.protocol import station as station_room
+from paramclient.protocol import sync as sync_room
 from paramclient.protocol import table as table_room
 from paramclient.protocol import traffic as traffic_room
 from paramclient.protocol.authors import Authors
 from paramclient.protocol.events import ComponentForgotten
 from paramclient.protocol.ftp import blocks as blocks_room
+from paramclient.protocol.ftp import reading as reading_room
+from paramclient.protocol.ftp import transfers as transfers_room
 from paramclient.protocol.ftp.blocks import Blocks
+from paramclient.protocol.ftp.packets import MOST_DATA
 from paramclient.protocol.station import Station
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.table import Change, Room, Table
@@ -185,6 +189,18 @@ def test_a_link_has_so_many_components_and_no_more(monkeypatch: pytest.MonkeyPat
     assert [(event.machine.system, event.machine.component) for event in forgotten] == [(3, 1)]
 
 
+def test_ten_thousand_components_cost_what_a_thousand_do() -> None:
+    session = Simulation()
+    beat(session)
+    tracemalloc.start()
+    for number in range(10_000):
+        beat(session, system=2 + number % 250, component=1 + number // 250)
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(session.station.components) == station_room.MOST_COMPONENTS
+    assert held < station_room.MOST_COMPONENTS * 30_000
+
+
 def test_changes_that_nobody_takes_are_so_many_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(events_room, "MOST_CHANGES", 3)
     changes = Changes()
@@ -240,6 +256,46 @@ def test_a_file_has_so_many_gaps_and_no_more(monkeypatch: pytest.MonkeyPatch) ->
     blocks.ends_at(16)
     assert blocks.is_complete
     assert blocks.content == b"cdabcdabcdcdcdcd"
+
+
+def test_a_file_comes_in_so_many_pieces_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reading_room, "SPARE_PIECES", 10)
+    session = Simulation(LiarVehicle("crumbs", system=1))
+    job = session.meet().files.read("/crumbs", session.now, limit=10 * MOST_DATA)
+    session.until(lambda: job.done)
+    assert isinstance(job.error, FileTransferError)
+    assert "too many pieces" in str(job.error)
+    assert job._blocks.pieces == reading_room.SMALLEST_SHARE * 10 + 10 + 1
+
+
+def test_a_directory_has_so_many_entries_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transfers_room, "MOST_ENTRIES", 100)
+    session = Simulation(LiarVehicle("endless file", system=1))
+    job = session.meet().files.list("/endless", session.now)
+    assert len(session.outcome(job)) == 100
+
+
+def test_what_is_remembered_of_the_reads_of_a_file_is_so_much_and_no_more() -> None:
+    session = Simulation(LiarVehicle("crumbs", system=1))
+    job = session.meet().files.read("/crumbs", session.now)
+    for number in range(2 * reading_room.LATE_KEPT):
+        job._flights[number] = reading_room._Flight(number, number, session.now, 0, False)
+        job._give_up(number)
+    for _ in range(3 * reading_room.BURSTS_KEPT):
+        job._burst(session.now)
+        job._burst_attempts = 0
+    assert len(job._late) == reading_room.LATE_KEPT
+    assert len(job._bursts) == reading_room.BURSTS_KEPT
+
+
+def test_a_resync_tells_of_so_many_names_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sync_room, "MOST_NAMES", 3)
+    session = Simulation(listing_ardupilot())
+    session.fetch()
+    say(session, param_value("ONE_MORE", 1.0, count=9))  # another count: it has fallen behind
+    for name in "ABCDE":
+        session.machine.sync.changed(Change(name, None, known(name)))
+    assert len(session.machine.sync._moved) == 3
 
 
 def test_one_head_after_the_other_keeps_no_turn() -> None:
@@ -306,10 +362,10 @@ def test_all_lies_at_once_cost_no_more_than_so_much_memory() -> None:
         tracemalloc.start()
         for number in range(text_of.cache_parameters()["maxsize"] or 0):
             text_of(b"%d" % number)  # what remembers names is full
-        liars = [LiarVehicle(*list(LIES)[start::3], system=66 + start, rate=300) for start in range(3)]
+        liars = [LiarVehicle(*list(LIES)[start::3], system=66 + start, rate=150) for start in range(3)]
         station = Station(link="sim:test", is_stream=False, upkeep=Upkeep(30.0), counts_traffic=True)
         held: list[int] = []
-        for now in range(5):
+        for now in range(4):
             for liar in liars:
                 liar.tick(float(now))
                 for data in liar.data_to_send():

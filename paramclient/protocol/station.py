@@ -54,6 +54,8 @@ HEARTBEAT_INTERVAL: Final = 1.0
 MOST_COMPONENTS: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each have. Further ones are heard
 when one that is lost and has told of no parameter can be forgotten for them."""
+SEARCH_INTERVAL: Final = 0.5
+"""Seconds between two searches for one that can be forgotten, where there was none: each looks at all."""
 MOST_PEERS: Final = 256
 """Stream peers whose unfinished frames are kept."""
 HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
@@ -116,6 +118,7 @@ class Station:
         self._is_paused = False
         self._turns = Turns()
         self._room = Room()
+        self._full_until = -math.inf
 
     def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
         """From now on sign what is sent and take what the verifier accepts; before anything has come."""
@@ -296,14 +299,14 @@ class Station:
         if isinstance(message, ParamSet):
             self._receive_foreign_set(message, sender, now)
             return
-        machine = self.components.get(sender) or self._meet(sender, message)
+        machine = self.components.get(sender) or self._meet(sender, message, now)
         if machine is not None:
             machine.receive(message, now, version=frame.version)
 
-    def _meet(self, sender: Address, message: Message) -> ComponentMachine | None:
+    def _meet(self, sender: Address, message: Message, now: float) -> ComponentMachine | None:
         """A component that was not heard before; only what shows that it has parameters makes it one."""
         is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue)
-        if not is_sign or not self._has_room():
+        if not is_sign or not self._has_room(now):
             return None
         system, component = sender
         machine: ComponentMachine | None = None
@@ -330,7 +333,7 @@ class Station:
         self._events.append(ComponentHeard(machine))
         return machine
 
-    def _has_room(self) -> bool:
+    def _has_room(self, now: float) -> bool:
         """Whether one more component can be followed.
 
         Where there are too many, the first one goes that is lost, has told of no parameter, and that nobody
@@ -338,12 +341,15 @@ class Station:
         """
         if len(self.components) < MOST_COMPONENTS:
             return True
+        if now < self._full_until:
+            return False
         for address, machine in self.components.items():
             if machine.presence.is_lost and not machine.table.params and not machine.is_waiting:
                 del self.components[address]
                 machine.reads.pace.idle()
                 self._events.append(ComponentForgotten(machine))
                 return True
+        self._full_until = now + SEARCH_INTERVAL
         return False
 
     def _become_another(self, system: int, now: float) -> None:
