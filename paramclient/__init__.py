@@ -26,6 +26,7 @@ from paramclient.errors import (
     FileError,
     FileErrorCode,
     FileTransferError,
+    InvalidParameters,
     LinkError,
     MetadataError,
     NoReply,
@@ -37,6 +38,7 @@ from paramclient.errors import (
     UnknownParameter,
     UsageError,
     ValueNotApplied,
+    VehicleArmed,
     VehicleError,
 )
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
@@ -54,6 +56,7 @@ from paramclient.protocol.traffic import ComponentTraffic, MessageTraffic, Radio
 from paramclient.protocol.wire import Refusal, SigningKey, SigningPolicy, SigningReport, SigningStream
 from paramclient.protocol.writes import SetResult
 from paramclient.signing import Signing, key_from_environment, read_key
+from paramclient.stats import ClientStats
 from paramclient.values import Encoding, Param, ParamType, Trust
 from paramclient.version import __version__
 
@@ -65,6 +68,7 @@ __all__ = [
     "Change",
     "Changes",
     "ClientClosed",
+    "ClientStats",
     "CommandRefused",
     "CommandResult",
     "Component",
@@ -88,6 +92,7 @@ __all__ = [
     "HistoryEntry",
     "Holder",
     "Identity",
+    "InvalidParameters",
     "LinkError",
     "Lost",
     "MessageTraffic",
@@ -127,6 +132,7 @@ __all__ = [
     "UnknownParameter",
     "UsageError",
     "ValueNotApplied",
+    "VehicleArmed",
     "VehicleError",
     "WrittenParam",
     "__version__",

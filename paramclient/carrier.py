@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import logging
 import math
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Final
+from typing import Final, Protocol
 
 import anyio
 
 from paramclient.errors import LinkError
-from paramclient.links import Link
+from paramclient.links import Link, Peer
 from paramclient.protocol.station import Station
 
-__all__ = ["Carrier"]
+__all__ = ["Carrier", "Tap"]
 
 REST: Final = 0.02
 """Seconds for which the reader lets telemetry pile up while nobody waits for an answer: to take 20 datagrams
@@ -22,13 +23,35 @@ at once costs a fifth of taking them one by one, and a change that comes meanwhi
 MOST_PER_REST: Final = 64
 """Datagrams that may come in one rest, at the rate of the last ones; on a busier link it is shorter. That is
 an eighth of what Linux' usual buffer holds (see `paramclient.links.udp`): a burst still finds room there."""
+HELD_UP: Final = 0.02
+"""Seconds by which a deadline is missed where the program did something else meanwhile, or did not run. What
+has come in that time is read before anything counts as not answered."""
+READING_TIME: Final = 0.002
+"""Seconds that the reader is given for that: it is ready to go on, so one turn of the event loop would do."""
 LINK_PATIENCE: Final = 10.0
 """Seconds that calls wait for a link to come back before they fail with its error."""
 FIRST_BACKOFF: Final = 0.25
 LONGEST_BACKOFF: Final = 5.0
 """Seconds between two attempts to open a link again: doubled from the first to the longest."""
+OTHERS_PER_TURN: Final = 16
+MOST_OF_OTHERS: Final = 1_000
+"""Frames of another program that are sent before our own have their turn again, and that may wait: a mission
+of a thousand items. On a slow link the rest is lost, as it would be with a link of its own."""
 
 logger = logging.getLogger(__name__)
+
+
+class Tap(Protocol):
+    """Somebody who is told of everything that goes over the link. None of the calls may block or raise."""
+
+    def received(self, data: bytes, peer: Peer) -> None:
+        """This has come; an empty chunk says that the peer's stream has ended."""
+
+    def sent(self, data: bytes) -> None:
+        """This frame was given to the link to be sent."""
+
+    def pause(self) -> None:
+        """The link is away: what was cut off by that is not continued."""
 
 
 class Carrier:
@@ -42,6 +65,8 @@ class Carrier:
         station: the core.
         dispatch: hands out what has happened, after each time that something may have.
         end: takes the error of a link that has failed for good, and calls `fail_for_good`.
+        taps: who is told of everything that goes over the link.
+        may_rest: whether telemetry may be left to the link for a while: not where somebody else waits for it.
 
     Attributes:
         is_away: whether the link is away and being opened again.
@@ -57,6 +82,8 @@ class Carrier:
         *,
         dispatch: Callable[[], None],
         end: Callable[[LinkError], None],
+        taps: Sequence[Tap] = (),
+        may_rest: bool = True,
     ) -> None:
         self.is_away = False
         self.broken: LinkError | None = None
@@ -66,6 +93,9 @@ class Carrier:
         self._station = station
         self._dispatch = dispatch
         self._end = end
+        self._taps = taps
+        self._may_rest = may_rest
+        self._of_others: deque[bytes] = deque()
         self._something_to_send = anyio.Event()
         self._sent = anyio.Event()  # set when anything is sent
 
@@ -82,14 +112,18 @@ class Carrier:
                 await self._reopen(error)
                 continue
             now = anyio.current_time()
-            is_news = False
+            is_news = not chunks
+            if not chunks:
+                self._station.over(now)
             for peer, data in chunks:
                 is_news |= self._station.receive(data, peer, now)
+                for tap in self._taps:
+                    tap.received(data, peer)
             if is_news:
                 self._dispatch()
                 self.tell()
                 self.wake()
-            elif not self._station.is_waiting:
+            elif self._may_rest and not self._station.is_waiting:
                 await self._rest(min(REST, MOST_PER_REST * (now - before) / max(1, len(chunks))))
             before = now
 
@@ -104,12 +138,24 @@ class Carrier:
             if to_send:
                 self._sent.set()
             for data, peer in to_send:
-                # a link that drops is the reader's business; what is not sent now is sent again in time
-                with suppress(LinkError):
-                    await self._link.send(data, peer)
-            wait = station.next_deadline() - anyio.current_time()
+                await self._transmit(data, peer)
+            for _ in range(min(len(self._of_others), OTHERS_PER_TURN)):
+                await self._transmit(self._of_others.popleft(), None)
+            if self._of_others:
+                continue
+            due = station.next_deadline()
+            wait = due - anyio.current_time()
             with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):
                 await self._something_to_send.wait()
+            if anyio.current_time() - due > HELD_UP:
+                await anyio.sleep(READING_TIME)
+
+    def send_for_another(self, frame: bytes) -> None:
+        """Send a frame of another program to every peer, in its turn; it is lost where too many wait."""
+        if len(self._of_others) < MOST_OF_OTHERS and not self.is_away:
+            self._of_others.append(frame)
+            self._station.overhear(frame, anyio.current_time())
+            self.wake()
 
     def wake(self) -> None:
         """There may be something to send, or another deadline."""
@@ -125,6 +171,13 @@ class Carrier:
         self.ended = error
         self._fail_calls(error)
 
+    async def _transmit(self, data: bytes, peer: Peer | None) -> None:
+        for tap in self._taps:
+            tap.sent(data)
+        # a link that drops is the reader's business; what is not sent now is sent again in time
+        with suppress(LinkError):
+            await self._link.send(data, peer)
+
     async def _rest(self, seconds: float) -> None:
         """Leave what comes to the link for a while, unless something is sent that may be answered."""
         self._sent = anyio.Event()
@@ -135,7 +188,10 @@ class Carrier:
         """Open the link again, for as long as it takes."""
         logger.warning("%s; trying to open it again", error)
         self.is_away = True
+        self._of_others.clear()
         self._station.pause()
+        for tap in self._taps:
+            tap.pause()
         patience_ends = anyio.current_time() + LINK_PATIENCE
         backoff = FIRST_BACKOFF
         while True:

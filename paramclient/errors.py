@@ -5,6 +5,7 @@ The tree says who is to blame::
     ParamClientError
     ├── UsageError(ValueError)        the caller: a name, value, link name or argument that cannot be right
     │   ├── FileError                 a parameter file that cannot be read or written
+    │   ├── InvalidParameters         values that are to be set, and cannot be right
     │   └── MetadataError             a description of parameters that is none
     ├── VehicleError                  the vehicle answered, and the answer is no
     │   ├── UnknownParameter          it has no parameter of that name or index
@@ -12,6 +13,7 @@ The tree says who is to blame::
     │   │   └── CommandRefused        the same for a command: MAV_RESULT
     │   ├── TypeMismatch              it holds the parameter in a type that the value cannot take
     │   ├── ValueNotApplied           it kept another value and gave no reason
+    │   ├── VehicleArmed              it is armed, and nothing is set then unless told otherwise
     │   ├── FileTransferError         it did not do what was asked with a file
     │   └── AnotherVehicle            it is not the one that was meant
     ├── NoReply(TimeoutError)         nobody answered in time
@@ -25,6 +27,7 @@ Each carries what is known as attributes, so that a program need not read its te
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import IntEnum
 
 __all__ = [
@@ -36,6 +39,7 @@ __all__ = [
     "FileError",
     "FileErrorCode",
     "FileTransferError",
+    "InvalidParameters",
     "LinkError",
     "MetadataError",
     "NoReply",
@@ -47,6 +51,7 @@ __all__ = [
     "UnknownParameter",
     "UsageError",
     "ValueNotApplied",
+    "VehicleArmed",
     "VehicleError",
 ]
 
@@ -127,6 +132,19 @@ class ParamClientError(Exception):
 
 class UsageError(ParamClientError, ValueError):
     """The caller asked for something that cannot be right. Nothing was sent."""
+
+
+class InvalidParameters(UsageError):
+    """Values that are to be set cannot be right.
+
+    Attributes:
+        problems: by parameter name, what is wrong with its value, as a sentence.
+    """
+
+    def __init__(self, problems: Mapping[str, str]) -> None:
+        lines = [f"{name}: {problem}" for name, problem in problems.items()]
+        super().__init__("nothing was sent, as values cannot be right:\n" + "\n".join(lines))
+        self.problems = problems
 
 
 class FileError(UsageError):
@@ -260,6 +278,10 @@ class ValueNotApplied(VehicleError):
         super().__init__(message, system=system, component=component, name=name)
         self.requested = requested
         self.actual = actual
+
+
+class VehicleArmed(VehicleError):
+    """The vehicle is armed. Nothing is set then unless told otherwise."""
 
 
 class FileTransferError(VehicleError):

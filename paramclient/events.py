@@ -117,7 +117,7 @@ class Feed(AsyncIterator[Item], Generic[Item]):
     """What has come since it was made, one item for each `await`. Cancelled, it loses nothing."""
 
     def __init__(self) -> None:
-        self._error: ParamClientError | None = None
+        self._error: ParamClientError | StopAsyncIteration | None = None
         self._arrived = anyio.Event()
 
     @abstractmethod
@@ -128,9 +128,9 @@ class Feed(AsyncIterator[Item], Generic[Item]):
     def _take(self) -> Item | None:
         """The next item, or None while there is none."""
 
-    def end(self, error: ParamClientError) -> None:
-        """What waits is still given, then the error is raised."""
-        self._error = error
+    def end(self, error: ParamClientError | None) -> None:
+        """What waits is still given, then the error is raised; with None it is over, as a log is."""
+        self._error = StopAsyncIteration() if error is None else error
         self._arrived.set()
 
     def __aiter__(self) -> Feed[Item]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.values import Param
 from paramclient.worker import Worker
 
-__all__ = ["WriteThrough"]
+__all__ = ["WriteThrough", "chosen_cache"]
 
 FLUSH_INTERVAL: Final = 0.25
 """Seconds that changes are gathered for before they are written. A download fills several batches."""
@@ -45,6 +46,8 @@ class WriteThrough:
         owned: whether `close` closes it.
         identity_of: says who the vehicle is that a component belongs to; None while that is open.
         is_doubted: says whether another vehicle may have taken its place by now.
+        clock: the time in unix seconds.
+        now: the time of the components.
     """
 
     def __init__(
@@ -54,10 +57,14 @@ class WriteThrough:
         owned: bool,
         identity_of: Callable[[ComponentMachine], Identity | None],
         is_doubted: Callable[[ComponentMachine], bool],
+        clock: Callable[[], float] = time.time,
+        now: Callable[[], float] = anyio.current_time,
     ) -> None:
         self._cache = cache
         self._identity_of = identity_of
         self._is_doubted = is_doubted
+        self._clock = clock
+        self._now = now
         self._owned = owned
         self._worker = Worker("paramclient cache")
         self._kept: dict[ComponentMachine, _Kept] = {}
@@ -82,6 +89,10 @@ class WriteThrough:
         finally:
             cache = self._cache if self._owned else None
             await self._worker.close(_nothing if cache is None else cache.close)
+
+    async def aside(self, work: Callable[[], Result]) -> Result:
+        """Do what blocks in the cache's thread, behind what is under way there. Cancelled, it is done."""
+        return await self._worker.run(work)
 
     def may_have(self, system: int, component: int) -> bool:
         """Whether the cache had a table for such an address when the client was opened."""
@@ -116,6 +127,7 @@ class WriteThrough:
         try:
             while self._has_room(machine, identity):
                 cached = await self._load(machine, identity)
+                logger.debug("cached under %s/%s: %s", identity.key, machine.component, cached or "nothing")
                 current = self._identity_of(machine)
                 if current is None or (current.key == identity.key and self.follow(machine, current)):
                     return False
@@ -143,7 +155,7 @@ class WriteThrough:
         """The table was proven to be the vehicle's just now; `is_whole` by a download of all of it."""
         kept = self._kept.get(machine)
         if kept is not None:
-            kept.synced_at = time.time()
+            kept.synced_at = self._clock()
             kept.is_whole |= is_whole
 
     def part_with(self, machine: ComponentMachine) -> None:
@@ -179,14 +191,18 @@ class WriteThrough:
             return True
         is_written = False
         try:
-            is_written = await self._run(partial(_save, cache, [new.update for new in news])) is not None
+            is_written = await self._save(cache, [new.update for new in news])
         finally:
             for new in news:
                 if not is_written and self._kept.get(new.kept.machine) is new.kept:
                     new.take_back()
         if is_written:
             self._has_failed = False
+            logger.debug("written: %s values", sum(len(new.update.params) for new in news))
         return is_written
+
+    async def _save(self, cache: ParamCache, updates: list[TableUpdate]) -> bool:
+        return await self._run(partial(_save, cache, updates)) is not None
 
     def _has_room(self, machine: ComponentMachine, identity: Identity) -> bool:
         """Whether a vehicle's table may be kept, beside those of this session that are."""
@@ -218,7 +234,7 @@ class WriteThrough:
             is_same = identity.uid is not None and _firmware(cached.identity) == _firmware(identity)
             machine.use_cached(
                 _of_firmware(cached, identity),
-                anyio.current_time(),
+                self._now(),
                 count=cached.count,
                 confirmed=cached.hash,
                 complete=cached.complete,
@@ -232,7 +248,7 @@ class WriteThrough:
             kept.synced_at = cached.synced_at
             kept.state = None if table.is_displaced else self._state(machine, kept)
         if machine.sync.synced:
-            kept.synced_at = time.time()
+            kept.synced_at = self._clock()
 
     def _news_of(self, kept: _Kept) -> list[_News]:
         """What the cache does not know of a table yet; it counts as written from now on."""
@@ -245,7 +261,7 @@ class WriteThrough:
         dirty = table.take_dirty()
         is_whole, kept.is_whole = kept.is_whole, False
         kept.state = state
-        now = time.time()
+        now = self._clock()
         knows_volatile = bool(table.volatile) or table.volatile_known
         update = TableUpdate(
             identity=kept.identity,
@@ -314,6 +330,23 @@ class _News:
         self.kept.machine.table.dirty = self.dirty | self.kept.machine.table.dirty
         self.kept.is_whole |= self.update.replace
         self.kept.state = None
+
+
+def chosen_cache(
+    cache: ParamCache | str | os.PathLike[str] | bool | None, *, is_log: bool
+) -> ParamCache | None:
+    """The cache that a user's choice means, see `ParamClient`.
+
+    Raises:
+        UsageError: a cache is named for a log.
+    """
+    if is_log and cache not in (None, True, False):
+        raise UsageError("what a log holds is of the past: `paramclient import` brings it into a cache")
+    if isinstance(cache, ParamCache):
+        return cache
+    if cache is False or is_log:
+        return None
+    return ParamCache(None if cache is None or cache is True else cache)
 
 
 def _firmware(identity: Identity) -> tuple[int, str]:

@@ -54,6 +54,7 @@ from tests.shell import (
     residue,
     settled,
     small_px4,
+    swift_loop,
     swiftly,
     tasks_beside,
     until,
@@ -1466,3 +1467,28 @@ async def test_their_looks_tell_how_they_stand() -> None:
         assert repr(component.params) == "<ParamMap 25 params>"
         assert repr(await client.component(system=2)) == "<Component 2/1 generic new 0 params>"
     assert repr(client) == "<ParamClient sim:custom closed, 2 components>"
+
+
+@swiftly
+async def test_a_program_that_is_held_up_takes_what_has_come_before_it_counts_as_lost() -> None:
+    """As by a call that blocks the event loop for half a second, in the middle of a list."""
+    loop = swift_loop()
+    px4 = PX4Vehicle()
+    async with a_client(px4) as client:
+        vehicle = await client.component()
+        loop.call_later(0.41, lambda: setattr(loop, "now", loop.now + 0.5))
+        result = await vehicle.fetch_all()
+    assert result.complete
+    assert (result.lost, result.repeated, px4.requests["PARAM_REQUEST_READ"]) == (0, 0, 0)
+
+
+@swiftly
+async def test_the_autopilots_are_the_vehicles_without_what_they_carry() -> None:
+    camera = generic(system=1, component=100)
+    vehicles = [generic(system=3), small_px4(), camera, generic(system=2, component=7)]
+    async with a_client(Air(vehicles)) as client:
+        assert client.autopilots == []
+        await client.fetch_all()
+        addresses = [(each.system, each.component) for each in client.autopilots]
+        assert addresses == [(1, 1), (2, 7), (3, 1)]
+        assert len(client.components) == 4

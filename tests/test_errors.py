@@ -12,6 +12,7 @@ from paramclient.errors import (
     FileError,
     FileErrorCode,
     FileTransferError,
+    InvalidParameters,
     LinkError,
     MetadataError,
     NoReply,
@@ -23,6 +24,7 @@ from paramclient.errors import (
     UnknownParameter,
     UsageError,
     ValueNotApplied,
+    VehicleArmed,
     VehicleError,
 )
 
@@ -41,6 +43,8 @@ from paramclient.errors import (
         (NoReply, TimeoutError),
         (LinkError, OSError),
         (ClientClosed, LinkError),
+        (InvalidParameters, UsageError),
+        (VehicleArmed, VehicleError),
         (PackError, ParamClientError),
         (CacheError, ParamClientError),
     ],

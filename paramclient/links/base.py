@@ -57,8 +57,9 @@ class Link(Protocol):
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """Wait for bytes; give what is there, in order of arrival, and from whom.
 
-        An empty bytes object says that a peer has left (streams only). LinkError: the link dropped, was
-        closed, or is not open.
+        An empty bytes object says that a peer has left (streams only), and an empty list that nothing more
+        will ever come, as at the end of a log: the next call then waits for `close`. LinkError: the link
+        dropped, was closed, or is not open.
         """
 
     async def send(self, data: bytes, peer: Peer | None) -> None:

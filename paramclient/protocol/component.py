@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Final
 
-from paramclient.errors import LinkError, NoReply
+from paramclient.errors import LinkError, NoReply, UsageError
 from paramclient.identity import autopilot_name
 from paramclient.protocol import events
 from paramclient.protocol.events import ParamChanged
@@ -60,6 +60,7 @@ class ComponentMachine(Parts):
         another: is told that another vehicle has taken the system id; by default `become_another`.
         turns: those of the lists on the link; None for a link that it has for itself.
         room: what the tables of the link may hold together; None likewise.
+        trace: is told of each step.
 
     Attributes:
         version: the MAVLink version that it speaks, as far as heard.
@@ -131,6 +132,8 @@ class ComponentMachine(Parts):
             announced = self.sync.hash_heard(message, now)
             if self.fetch is not None:
                 self.fetch.announced(announced)
+            if self.fetches.overheard is not None:
+                self.fetches.overheard.announced(announced, now)
             self.reads.heard(message, now)
             return
         if who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
@@ -155,7 +158,7 @@ class ComponentMachine(Parts):
             fetch.heard(message, now)
         if writes.queues:
             writes.heard(message, now)
-        self.reads.heard(message, now)
+        self._value_heard(message, now)
 
     def foreign_set(self, name: str, station: str, now: float) -> None:
         """Another station was heard setting a parameter of this component."""
@@ -290,7 +293,16 @@ class ComponentMachine(Parts):
         return _in_capitals(name) if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA else name
 
     def check_present(self, what: str, now: float) -> None:
-        """See whether it can be asked for something; NoReply is raised where it is lost."""
+        """See whether it can be asked for something.
+
+        Raises:
+            UsageError: nothing may be sent.
+            NoReply: it is lost.
+        """
+        if self._listens_only:
+            raise UsageError(
+                f"{what} cannot be asked for where nothing is sent; what has been heard is in `params`"
+            )
         if self.presence.is_lost:
             silence = now - self.presence.heard_at
             raise NoReply(f"{what} (lost)", attempts=0, waited=silence)
@@ -403,6 +415,8 @@ class ComponentMachine(Parts):
         """What is known may be of the past: it counts again when the vehicle has confirmed it."""
         self.table.doubt(Trust.LIVE, Trust.VERIFIED)
         self.sync.doubt()
+        if self.fetches.overheard is not None:
+            self.fetches.overheard.forget()
 
     def _lose(self, now: float) -> None:
         """It is not heard any more. A fetch goes on for a while: it may only be starting again."""

@@ -290,6 +290,8 @@ class Fetch(Operation[FetchResult]):
     def _compare(self, announcement: Announcement, now: float) -> None:
         table = self._table
         listed = table.listed()
+        known = "none" if table.hash is None else f"{table.hash:08x}"
+        self._means.trace("%s/%s: hash %08x announced, %s here", *self._target, announcement.hash, known)
         if announcement.hash != table.hash or announcement.count != len(listed):
             self._proof.before = announcement
             self._begin_download(now)
@@ -344,6 +346,8 @@ class Fetch(Operation[FetchResult]):
             self._undecided_until = self.begun_at + IDENTITY_PATIENCE
             return
         self._undecided_until = math.inf
+        what = "file" if may_use_file else "list"
+        means.trace("%s/%s: the %s is wanted, %s there", *self._target, what, len(present or ()))
         if may_use_file:
             if self._expects_hash():
                 # once, and before the file: so the answer is of the time before it

@@ -23,6 +23,7 @@ from paramclient.protocol.result import FetchResult, Means, Sampled
 from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
 from paramclient.protocol.table import Change, Room, Table
 from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.trace import Trace, silent
 from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import MAV_AUTOPILOT_PX4, Message
 from paramclient.protocol.writes import Writes
@@ -52,6 +53,7 @@ class Parts(ABC):
         another: Callable[[float], None] | None = None,
         turns: Turns | None = None,
         room: Room | None = None,
+        trace: Trace = silent,
     ) -> None:
         target = (system, component)
         upkeep = upkeep or Upkeep()
@@ -59,10 +61,12 @@ class Parts(ABC):
         self.component = component
         self.version = 1
         self.round_trip = RoundTrip()
-        self.who = Identification(target, link, self.round_trip, send, encoding)
+        self.who = Identification(
+            target, link, self.round_trip, send, encoding, may_ask=not upkeep.listens_only
+        )
         self.table = Table(self.who.encoding, room)
         self.turns = Turns() if turns is None else turns
-        self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share)
+        self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share, trace)
         self.writes = Writes(
             target,
             self.round_trip,
@@ -71,6 +75,7 @@ class Parts(ABC):
             self.table.params,
             encoding=lambda: self.table.encoding,
             is_certain=lambda: self.may_be_written,
+            trace=trace,
         )
         self.presence = Presence()
         self.sync = Sync(
@@ -106,15 +111,20 @@ class Parts(ABC):
                 expects_hash=lambda: self.sync.expects_hash,
                 changed=self._moved,
                 doubt=self._doubt_identity,
+                trace=trace,
             ),
             self.sync,
-            upkeep.policy,
+            upkeep,
             says_file=lambda: self.who.says_file,
             ended=self._fetched,
         )
+        # where nothing is asked there are no reads: what others ask for is heard in their place
+        overheard = self.fetches.overheard
+        self._value_heard = self.reads.heard if overheard is None else overheard.heard
         self._own = own
         self._emit = emit
         self._policy = upkeep.policy
+        self._listens_only = upkeep.listens_only
         self._another = another or self.become_another
         self._is_vehicle_doubted = is_vehicle_doubted
         self._known_as: str | None = None  # the key of the identity that was reported

@@ -12,6 +12,7 @@ from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.sampling import Sample
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.trace import Trace, silent
 from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import Message, ParamValue
 from paramclient.values import Param, Trust
@@ -44,6 +45,7 @@ class Means:
         expects_hash: whether it has a hash, as far as is known.
         changed: is told of changes that no PARAM_VALUE brought.
         doubt: is told that a table has turned out not to be what it was.
+        trace: is told of each step.
     """
 
     target: tuple[int, int]
@@ -56,6 +58,7 @@ class Means:
     expects_hash: Callable[[], bool]
     changed: Callable[[list[Change]], None]
     doubt: Callable[[float], None]
+    trace: Trace = silent
 
 
 @dataclass(frozen=True, slots=True)

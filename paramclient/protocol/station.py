@@ -15,6 +15,7 @@ from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.result import Policy
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.table import Room
+from paramclient.protocol.trace import Told, Trace, silent
 from paramclient.protocol.traffic import Traffic
 from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import (
@@ -51,6 +52,8 @@ Peer: TypeAlias = Hashable
 """Who sent something, as the link tells them apart."""
 
 HEARTBEAT_INTERVAL: Final = 1.0
+NOBODY: Final = (0, 0)
+"""Who we are where we only listen: then whoever has our ids is somebody else."""
 MOST_COMPONENTS: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each have. Further ones are heard
 when one that is lost and has told of no parameter can be forgotten for them."""
@@ -61,6 +64,7 @@ MOST_PEERS: Final = 256
 HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
 """The message ids that matter here: HEARTBEAT, SYSTEM_TIME, PARAM_VALUE, PARAM_SET (of others), COMMAND_ACK,
 FILE_TRANSFER_PROTOCOL, AUTOPILOT_VERSION, HIGH_LATENCY2, STATUSTEXT, PARAM_ERROR."""
+_SETS: Final = frozenset({23})
 
 
 class Station:
@@ -75,12 +79,16 @@ class Station:
         encoding: for all components, where the user knows better; None: judged by the evidence.
         upkeep: what is done for tables without being asked; by default nothing.
         counts_traffic: whether everything on the link is counted, which takes time for each frame.
+        trace: is told of each step.
 
     Attributes:
         components: every component heard, by (system, component).
-        bytes_received, bytes_sent: on this link, by this station.
+        bytes_received, bytes_sent, frames_sent: on this link, by this station.
         traffic: the counts, or None where they are not wanted.
         policy: what may be asked to bring tables up to date.
+        listens_only: whether nothing is ever sent.
+        is_log: whether the link is a log, which ends: then no time-out means anything, and nobody is lost.
+        is_over: whether nothing more will come, as at the end of a log.
         verifier: looks at signatures; None where there is no key, and they count for nothing.
     """
 
@@ -94,13 +102,19 @@ class Station:
         encoding: Encoding | None = None,
         upkeep: Upkeep | None = None,
         counts_traffic: bool = False,
+        trace: Trace = silent,
     ) -> None:
         self.traffic = Traffic(is_stream=is_stream) if counts_traffic else None
         self.link = link
-        self.own: Address = (system, component)
+        self.listens_only = upkeep is not None and upkeep.listens_only
+        self.is_log = upkeep is not None and upkeep.is_log
+        self.is_over = False
+        self.own: Address = NOBODY if self.listens_only else (system, component)
         self.components: dict[Address, ComponentMachine] = {}
         self.bytes_received = 0
-        self.bytes_sent = 0
+        self.bytes_sent = self.frames_sent = 0
+        self._trace = trace
+        self._frames = self._skipped = self._damaged = 0  # of framers that are gone
         self._is_stream = is_stream
         self._encoding = encoding
         self.policy = Policy.AUTO if upkeep is None else upkeep.policy
@@ -114,7 +128,7 @@ class Station:
         self._signer: Signer | None = None
         self._is_watched = counts_traffic  # one look in the hot path for both
         self.verifier: Verifier | None = None
-        self._heartbeat_at = -math.inf
+        self._heartbeat_at = math.inf if self.listens_only else -math.inf
         self._is_paused = False
         self._turns = Turns()
         self._room = Room()
@@ -152,9 +166,16 @@ class Station:
             self._peers = {system: each for system, each in self._peers.items() if each != peer}
         return bool(frames)
 
+    def overhear(self, data: bytes, now: float) -> None:
+        """Take note of a frame that another program sends to the vehicles over this link: who sets what."""
+        for frame in Framer(_SETS, stream=False).receive(data):
+            message = decode(frame)
+            if isinstance(message, ParamSet):
+                self._receive_foreign_set(message, (frame.system, frame.component), now)
+
     def tick(self, now: float) -> None:
         """Do what is due: our heartbeat, and every component's time-outs."""
-        if self._is_paused:
+        if self._is_paused or self.is_log:
             return
         if self._signer is not None:
             self._signer.advance(now)
@@ -170,8 +191,8 @@ class Station:
             self.traffic.sent(self.bytes_sent, now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity while the link is away."""
-        if self._is_paused:
+        """When `tick` has something to do, or infinity while the link is away, and in a log."""
+        if self._is_paused or self.is_log:
             return math.inf
         turns_at = self._turns.next_deadline()
         return min(
@@ -193,7 +214,8 @@ class Station:
         """The link is away: time stands still for whatever waits."""
         self._is_paused = True
         self._outbox.clear()
-        self._framers.clear()
+        for peer in list(self._framers):
+            self._retire(peer)
         if self.traffic is not None:
             self.traffic.pause()
         self._peers.clear()  # the link that comes back has others
@@ -201,10 +223,27 @@ class Station:
     def resume(self, now: float) -> None:
         """The link is back: our heartbeat goes out, and whatever waits is asked for again."""
         self._is_paused = False
-        self._heartbeat_at = now
+        if not self.listens_only:
+            self._heartbeat_at = now
         self._turns.resume(now)
         for machine in self.components.values():
             machine.resume(now)
+
+    def over(self, now: float) -> None:
+        """Nothing more will come: whoever waits gets what there is."""
+        self.is_over = True
+        for machine in self.components.values():
+            machine.fetches.over(now)
+
+    @property
+    def framing(self) -> tuple[int, int, int]:
+        """Frames that came, bytes that belonged to none, and frames with a wrong checksum among these."""
+        framers = [self._framer, *self._framers.values()]
+        return (
+            self._frames + sum(framer.frames for framer in framers),
+            self._skipped + sum(framer.skipped for framer in framers),
+            self._damaged + sum(framer.damaged for framer in framers),
+        )
 
     @property
     def is_waiting(self) -> bool:
@@ -240,12 +279,26 @@ class Station:
                 return machine
         return None
 
+    def find(self, system: int | None, component: int | None) -> ComponentMachine | None:
+        """The first component with this address, as far as it is given; without its id, an autopilot."""
+        if component is None:
+            for machine in self.components.values():
+                if system in (None, machine.system) and machine.who.is_autopilot:
+                    return self.autopilot_of(machine.system) or machine
+            return None
+        for address, found in self.components.items():
+            if address[1] == component and system in (None, address[0]) and found.who.has_spoken:
+                return found
+        return None
+
     def check_refresh(self, refresh: bool) -> None:
         """See whether a fetch may download what the cache has.
 
         Raises:
-            UsageError: the policy says no.
+            UsageError: the policy says no, or nothing is sent at all.
         """
+        if refresh and self.listens_only:
+            raise UsageError("nothing can be downloaded where nothing is sent, so not with refresh")
         if refresh and self.policy is not Policy.AUTO:
             raise UsageError(f"the policy is {self.policy}: nothing may be downloaded, so not with refresh")
 
@@ -284,11 +337,19 @@ class Station:
             framer = self._framers[peer] = Framer(HEARD)
             framer.guard = self._framer.guard
             if len(self._framers) > MOST_PEERS:
-                del self._framers[next(iter(self._framers))]
+                self._retire(next(iter(self._framers)))
         if data:
             return framer.receive(data)
-        self._framers.pop(peer, None)
-        return framer.flush()
+        frames = framer.flush()
+        self._retire(peer)
+        return frames
+
+    def _retire(self, peer: Peer) -> None:
+        """Part with the framer of a peer, and keep what it has counted."""
+        framer = self._framers.pop(peer)
+        self._frames += framer.frames
+        self._skipped += framer.skipped
+        self._damaged += framer.damaged
 
     def _receive_other(self, frame: Frame, peer: Peer, now: float) -> None:
         """Take a frame that is no value of a known component."""
@@ -328,6 +389,7 @@ class Station:
             another=lambda now: self._become_another(system, now),
             turns=self._turns,
             room=self._room,
+            trace=self._trace,
         )
         self.components[sender] = machine
         self._events.append(ComponentHeard(machine))
@@ -370,6 +432,8 @@ class Station:
                 machine.foreign_set(message.param_id, station, now)
 
     def _send(self, message: Message, system: int | None, version: int) -> None:
+        if self.listens_only:
+            return
         own_system, own_component = self.own
         data = encode(
             message, system=own_system, component=own_component, sequence=self._sequence, version=version
@@ -378,4 +442,7 @@ class Station:
             data = sign_frame(data, self._signer)
         self._sequence = (self._sequence + 1) & 0xFF
         self.bytes_sent += len(data)
+        self.frames_sent += 1
+        if system is not None:
+            self._trace("to system %s: %s", system, Told(message))
         self._outbox.append((data, None if system is None else self._peers.get(system)))

@@ -63,19 +63,35 @@ class Upkeep:
         without_hash: whether that goes for every vehicle without a hash too: its whole table is then fetched.
             It goes anyway for those that give it as a file in no time.
         policy: what may be asked.
+        listens_only: nothing is sent at all, for whatever reason; the policy is then "cache-only".
+        is_log: the link is a log, in which nobody can be asked and which ends.
     """
 
     interval: float = math.inf
     without_hash: bool = False
     policy: Policy = Policy.AUTO
+    listens_only: bool = False
+    is_log: bool = False
 
     @classmethod
-    def chosen(cls, interval: float | None, policy: Policy | str) -> Upkeep:
+    def chosen(
+        cls,
+        interval: float | None,
+        policy: Policy | str,
+        *,
+        listen_only: bool = False,
+        is_log: bool = False,
+    ) -> Upkeep:
         """What a user's choice means; see `ParamClient`.
 
         Raises:
-            UsageError: there is no such policy, or the interval is too short.
+            UsageError: there is no such policy, the interval is too short, or either is chosen where nothing
+                may be asked.
         """
+        if listen_only or is_log:
+            if interval or policy != Policy.AUTO:
+                raise UsageError("watch_interval and policy are for clients that ask; here nothing is sent")
+            return cls(policy=Policy.CACHE_ONLY, listens_only=True, is_log=is_log)
         try:
             policy = Policy(policy)
         except ValueError:
@@ -255,6 +271,10 @@ class Sync:
         if result.hash is not None:
             self._read_unhashed(result.hash, now)
         return True
+
+    def contradicted(self) -> None:
+        """A hash has come that is not the table's, and nothing can be done about it."""
+        self._not_confirmed()
 
     def forget(self) -> None:
         """Another vehicle has taken the address: nothing that is known is about it."""

@@ -12,11 +12,13 @@ from paramclient.protocol.wire.codec import (
 from paramclient.protocol.wire.frames import (
     Frame,
     Framer,
+    bears_key,
     build_frame,
     checksum,
     enum_word,
     message_name,
     sign_frame,
+    unsign_frame,
 )
 from paramclient.protocol.wire.messages import (
     AUTOPILOT_COMPONENT,
@@ -126,6 +128,7 @@ __all__ = [
     "SystemTime",
     "UNDERSTOOD",
     "Verifier",
+    "bears_key",
     "build_frame",
     "checksum",
     "decode",
@@ -134,6 +137,7 @@ __all__ = [
     "enum_word",
     "message_name",
     "sign_frame",
+    "unsign_frame",
     "text_of",
     "timestamp_of",
 ]

@@ -1,0 +1,170 @@
+"""See what a vehicle has of what is wanted, and what would have to be done; nothing is written."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from time import time
+from typing import Final
+
+import anyio
+
+from paramclient.component import Component
+from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
+from paramclient.paramset import ParamSet
+from paramclient.provision.planning import ParamInfo, Plan, check_component, plan
+from paramclient.values import Param, Trust
+
+__all__ = ["Seen", "identified", "look", "plan_for", "prepare", "verify"]
+
+IDENTITY_PATIENCE: Final = 10.0
+"""Seconds for a vehicle to say who it is. It is asked a few times, and mostly given up sooner."""
+LOOKING_PACE: Final = 0.05
+"""Seconds between two looks whether it has."""
+
+
+@dataclass(frozen=True, slots=True)
+class Seen:
+    """A vehicle's table, and what it has besides of what is wanted.
+
+    Attributes:
+        table: all of it, each value heard in this session or confirmed by the vehicle's hash.
+        complete: whether these are all the parameters in its list.
+        hash: the hash under which the vehicle has confirmed its list, or None.
+        absent: names that it did not know, or would not tell, when it was asked.
+    """
+
+    table: ParamSet
+    complete: bool
+    hash: int | None
+    absent: frozenset[str]
+
+
+async def look(component: Component, wanted: Iterable[str], absent: frozenset[str] = frozenset()) -> Seen:
+    """Bring the table up to date, and ask by name for what is wanted and not in it.
+
+    Vehicles have parameters that are in no list: those that PX4 does not use yet, those of a group that
+    ArduPilot hides. They can be read and set by name.
+
+    Args:
+        component: the vehicle.
+        wanted: names.
+        absent: those that the vehicle is known not to have, unless they are in the list by now.
+
+    Raises:
+        NoReply: it did not answer.
+        LinkError: the link failed, or the client was closed.
+    """
+    fetched = await component.fetch_all()
+    await component.refreshed()
+    table = {
+        name: param
+        for name, param in component.params.items()
+        if param.trust is not Trust.CACHED and param.index is not None
+    }
+    asked = [name for name in wanted if name not in table and name not in absent]
+    found, unknown = await _ask(component, asked)
+    return Seen(
+        ParamSet.of(
+            (table | found).values(),
+            component=component.component,
+            system=component.system,
+            identity=component.identity,
+            at=time(),
+            source=f"vehicle {component.system}/{component.component}",
+        ),
+        fetched.complete,
+        fetched.hash,
+        (absent | unknown).difference(table),
+    )
+
+
+async def identified(component: Component) -> None:
+    """Wait until the vehicle has said who it is, or will not: what is stored goes under its name."""
+    with anyio.move_on_after(IDENTITY_PATIENCE):
+        while component._client._identity_of(component._machine) is None:  # noqa: ASYNC110 - nobody tells
+            await anyio.sleep(LOOKING_PACE)
+
+
+async def prepare(
+    component: Component,
+    wanted: ParamSet,
+    *,
+    include: str | Iterable[str] = (),
+    info: Mapping[str, ParamInfo] | None = None,
+) -> Plan:
+    """Work out what `apply` would send to a vehicle, and in which order. Only reads.
+
+    Args:
+        component: the vehicle.
+        wanted, include, info: as in `plan`.
+
+    Raises:
+        UsageError: as from `plan`.
+        NoReply: the vehicle did not answer.
+        LinkError: the link failed, or the client was closed.
+    """
+    check_component(wanted, component.component)
+    given = (include,) if isinstance(include, str) else tuple(include)
+    plan({}, wanted, include=given)  # what cannot be right is told before the vehicle is asked
+    await identified(component)
+    seen = await look(component, wanted)
+    return plan_for(component, seen.table, wanted, given, info)
+
+
+async def verify(
+    component: Component,
+    wanted: ParamSet,
+    *,
+    include: str | Iterable[str] = (),
+    info: Mapping[str, ParamInfo] | None = None,
+) -> Plan:
+    """Compare a vehicle with what is wanted. Only reads.
+
+    What comes of it is what `prepare` gives: `is_met` is the answer, and the rows that are to be *set* are
+    those that differ.
+
+    Args and errors as in `prepare`.
+    """
+    return await prepare(component, wanted, include=include, info=info)
+
+
+def plan_for(
+    component: Component,
+    table: ParamSet,
+    wanted: ParamSet,
+    include: tuple[str, ...],
+    info: Mapping[str, ParamInfo] | None,
+) -> Plan:
+    """The plan for a vehicle that has this table."""
+    return plan(
+        table,
+        wanted,
+        include=include,
+        info=info,
+        autopilot=component.autopilot,
+        encoding=component.encoding,
+    )
+
+
+async def _ask(component: Component, names: Iterable[str]) -> tuple[dict[str, Param], frozenset[str]]:
+    """Read parameters by name: those that are there, and those that the vehicle does not have."""
+    found: dict[str, Param] = {}
+    unknown: set[str] = set()
+    failed: list[NoReply | LinkError] = []
+
+    async def ask(name: str) -> None:
+        try:
+            found[name] = await component.get(name)
+        except (VehicleError, UsageError):  # a name that cannot be is not there either
+            unknown.add(name)
+        except (NoReply, LinkError) as error:
+            failed.append(error)
+            asking.cancel_scope.cancel()
+
+    async with anyio.create_task_group() as asking:
+        for name in names:
+            asking.start_soon(ask, name)
+    if failed:
+        raise failed[0]
+    return found, frozenset(unknown)

@@ -1,0 +1,448 @@
+"""One set-up: store what the vehicle has, write what is wanted in an order that works, prove it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
+from dataclasses import replace
+from typing import Final
+
+import anyio
+
+from paramclient.component import Component
+from paramclient.errors import (
+    AnotherVehicle,
+    InvalidParameters,
+    LinkError,
+    NoReply,
+    ParamClientError,
+    UsageError,
+    VehicleArmed,
+    VehicleError,
+)
+from paramclient.identity import SHARED_UIDS, Identity
+from paramclient.paramset import ParamSet
+from paramclient.provision.cautions import cautions_for
+from paramclient.provision.looking import Seen, identified, look, plan_for
+from paramclient.provision.outcome import ApplyProgress, ApplyResult, ApplyRow, ApplyStatus
+from paramclient.provision.planning import (
+    MISSING,
+    WRONG,
+    ParamInfo,
+    Plan,
+    PlanRow,
+    PlanStatus,
+    Stage,
+    Step,
+    check_component,
+    plan,
+)
+from paramclient.values import Value
+
+__all__ = ["Run"]
+
+WRITES_AT_ONCE: Final = 10
+"""Writes that are under way side by side: what ArduPilot's queue takes of reads without dropping any."""
+MOST_WRITES: Final = 2
+"""Times that a value is written which the vehicle has taken, and does not have any more when it is looked at:
+another one that was set may have changed it."""
+MOST_SILENT: Final = 3
+"""Writes without an answer, and none with one between them, after which no further is begun."""
+RESET_SYSTEM: Final = 1
+"""The system id that a PX4 has after SYS_AUTOCONFIG: MAV_SYS_ID is not among what its start script keeps."""
+FOLLOW_PATIENCE: Final = 10.0
+"""Seconds for a vehicle to be heard under its new system id; ArduPilot sends its next heartbeat under it."""
+
+
+class Run:
+    """One `apply`.
+
+    Attributes:
+        seen: the vehicle as it was looked at last.
+        plan: what is to be done then.
+        rows: what became of those on which the last word is spoken before the proof.
+        sent: to which a PARAM_SET may have gone out.
+        written: what has taken the value, and how often.
+    """
+
+    seen: Seen
+    plan: Plan
+    _first_identity: Identity
+
+    def __init__(
+        self,
+        component: Component,
+        wanted: ParamSet | Plan,
+        *,
+        include: tuple[str, ...],
+        info: Mapping[str, ParamInfo] | None,
+        reboot: bool,
+        allow_armed: bool,
+        skip_invalid: bool,
+        backup: str | os.PathLike[str] | None,
+        progress: Callable[[ApplyProgress], None] | None,
+        reason: str,
+    ) -> None:
+        self._component = component
+        self._planned_for: Identity | None = None
+        if isinstance(wanted, Plan):
+            self._planned_for = wanted.identity
+            include = (*wanted.include, *include)
+            wanted = wanted.wanted
+        self._wanted = wanted
+        self._include = include
+        self._info = info
+        self._reboot = reboot
+        self._allow_armed = allow_armed
+        self._skip_invalid = skip_invalid
+        self._backup = backup
+        self._progress = progress
+        self._reason = reason
+        self._cautions = cautions_for("")
+        self._began = anyio.current_time()
+        self.rows: dict[str, ApplyRow] = {}
+        self.sent: set[str] = set()
+        self.written: dict[str, int] = {}
+        self._first: Seen | None = None
+        self._first_plan: Plan | None = None
+        self._is_proven = True  # nothing was written since it was looked at
+        self._reboot_for: dict[str, None] = {}
+        self._reboots = 0
+        self._new_system: int | None = None  # its id from the next start on
+        self._silent = 0
+        self._error: ParamClientError | None = None
+
+    async def prepare(self) -> None:
+        """Look at the vehicle, plan, and store what it has. Nothing is written if that fails."""
+        check_component(self._wanted, self._component.component)
+        plan({}, self._wanted, include=self._include)
+        await identified(self._component)
+        self._cautions = cautions_for(self._component.autopilot)
+        whose, own = self._planned_for, self._component.identity
+        if whose is not None and not whose.is_same_vehicle(own):
+            raise UsageError(f"the plan is one for another vehicle: {whose}; this one is {own}")
+        self._check_armed()
+        await self._look()
+        self._first, self._first_plan = self.seen, self.plan
+        self._first_identity = self._component.identity
+        invalid = {row.name: row.reason for row in self.plan.of(PlanStatus.INVALID)}
+        if invalid and not self._skip_invalid:
+            raise InvalidParameters(invalid)
+        self._check_resets()
+        await self._store()
+
+    async def work(self) -> None:
+        """Write and prove until there is nothing left to do. Failures end it; see `result`."""
+        try:
+            while True:
+                stages = self._to_do()
+                for stage in stages:
+                    self._check_armed()
+                    await self._write_stage(stage)
+                if self._has_to_start(stages):
+                    await self._restart()
+                elif not stages:
+                    return
+                await self._look()
+        except ParamClientError as error:
+            if not self.sent:
+                raise
+            self._error = error
+
+    def result(self) -> ApplyResult:
+        """What came of it."""
+        assert self._first is not None
+        assert self._first_plan is not None
+        return ApplyResult(
+            self._component.system,
+            self._component.component,
+            {name: self._row(row) for name, row in self.plan.rows.items()},
+            self._first_plan,
+            self._first.table,
+            self.plan.extra,
+            self._reboots,
+            tuple(self._reboot_for),
+            self._error,
+            anyio.current_time() - self._began,
+        )
+
+    def ended_by_time(self) -> ApplyResult:
+        """What came of it so far."""
+        waited = anyio.current_time() - self._began
+        error = NoReply(f"the set-up of {self._address}", attempts=0, waited=waited)
+        if not self.sent:
+            raise error
+        self._error = error
+        return self.result()
+
+    # What is to be done
+
+    def _to_do(self) -> list[Stage]:
+        """The stages up to and with the one after which the vehicle has to be looked at."""
+        stages = []
+        may_appear = bool(self.plan.of(PlanStatus.LATER))
+        for stage in self.plan.stages:
+            steps = tuple(step for step in stage.steps if self._is_open(step.name))
+            if steps:
+                stages.append(replace(stage, steps=steps))
+                if (stage.reveals and may_appear) or (stage.reboot_first and self._reboot):
+                    break
+        return stages
+
+    def _has_to_start(self, done: list[Stage]) -> bool:
+        """Whether the vehicle has to start again, now that these stages are done."""
+        if not self._reboot:
+            return False
+        if done:
+            return done[-1].reboot_first and bool(self._reboot_for)
+        has_not_started = bool(self.plan.unstarted) or self._system_to_come() is not None
+        return bool(self._reboot_for) or (has_not_started and not self._reboots)
+
+    def _system_to_come(self) -> int | None:
+        """The system id that the vehicle has been given, and will only have from its next start on."""
+        for name, row in self.plan.rows.items():
+            is_set = row.status is PlanStatus.UNCHANGED and self._cautions.is_system_id(name)
+            if is_set and isinstance(row.before, int) and row.before != self._component.system:
+                return row.before
+        return None
+
+    def _is_open(self, name: str) -> bool:
+        """Whether it is to be written, now that the vehicle does not have the value."""
+        if name in self.rows:
+            return False
+        most = 1 if self._is_action(name) else MOST_WRITES
+        return self.written.get(name, 0) < most
+
+    def _is_action(self, name: str) -> bool:
+        caution = self._cautions.left_out(name)
+        return caution is not None and caution.category == "action"
+
+    # What is asked of the vehicle
+
+    async def _look(self) -> None:
+        self._tell("reading")
+        absent = self.seen.absent if self._first is not None else frozenset[str]()
+        self.seen = await look(self._component, self._wanted, absent)
+        self._check_it_is_the_same()
+        self.plan = plan_for(self._component, self.seen.table, self._wanted, self._include, self._info)
+        self._is_proven = True
+
+    async def _write_stage(self, stage: Stage) -> None:
+        """Write its values, side by side but for what may end the conversation."""
+        steps = iter(stage.steps)
+        if stage.is_last:
+            await self._write_each(steps)
+        else:
+            async with anyio.create_task_group() as writing:
+                for _ in range(WRITES_AT_ONCE):
+                    writing.start_soon(self._write_each, steps)
+        if self._error is not None:
+            raise self._error
+
+    async def _write_each(self, steps: Iterator[Step]) -> None:
+        """Write what nobody else has taken, until it is the end."""
+        for step in steps:
+            if self._error is not None:
+                return
+            try:
+                if self._cautions.is_system_id(step.name):
+                    await self._write_system_id(step)
+                else:
+                    await self._write(step)
+            except (NoReply, LinkError) as error:
+                self._error = error
+
+    async def _write(self, step: Step) -> None:
+        self._is_proven = False
+        self.sent.add(step.name)
+        try:
+            done = await self._component.set(step.name, step.value)
+        except (VehicleError, UsageError) as error:
+            self._silent = 0
+            self._settle(step, ApplyStatus.REFUSED, step.before, str(error))
+            return
+        except NoReply as error:
+            self._silent += 1
+            self._settle(step, ApplyStatus.FAILED, None, str(error))
+            if self._silent >= MOST_SILENT:
+                raise
+            return
+        except LinkError as error:
+            self._settle(step, ApplyStatus.FAILED, None, str(error))
+            raise
+        self._silent = 0
+        self._note_written(step)
+        if self._is_action(step.name) and self._cautions.resets(step.name):
+            self._new_system = RESET_SYSTEM
+        if done.adjusted:
+            self._settle(step, ApplyStatus.ADJUSTED, done.actual, "the vehicle made another value of it")
+        else:
+            self._tell("writing", self._row_of(step, ApplyStatus.SET, done.actual))
+
+    async def _write_system_id(self, step: Step) -> None:
+        """Set the system id, and go on with the vehicle under its new one."""
+        system = int(step.value) if not isinstance(step.value, bytes) else 0
+        client = self._component._client
+        if any(self._is_another_with(system, known) for known in client.components.values()):
+            reason = f"another one on this link is system {system}"
+            self._settle(step, ApplyStatus.SKIPPED, step.before, reason, WRONG)
+            return
+        if step.needs_reboot:
+            await self._write(step)
+            if step.name in self.written:
+                self._new_system = system
+            return
+        self._is_proven = False
+        self.sent.add(step.name)
+        failure: ParamClientError | None = None
+        async with anyio.create_task_group() as sending:
+            sending.start_soon(self._send_and_leave, step)
+            try:
+                self._component = await client.successor(self._component, system, timeout=FOLLOW_PATIENCE)
+            except ParamClientError as error:  # raised in here, it would come out in a group
+                failure = error
+            sending.cancel_scope.cancel()
+        if failure is None:
+            self._note_written(step)
+            self._tell("writing", self._row_of(step, ApplyStatus.SET, step.value))
+            return
+        self._settle(step, ApplyStatus.FAILED, None, str(failure))
+        if isinstance(failure, LinkError):
+            raise failure
+
+    def _is_another_with(self, system: int, known: Component) -> bool:
+        """Whether another vehicle has this system id: not ours under an earlier one, nor one that is gone."""
+        uid = self._component.identity.uid
+        is_ours = uid is not None and uid not in SHARED_UIDS and known.identity.uid == uid
+        return known.system == system and known.state != "lost" and not is_ours
+
+    async def _send_and_leave(self, step: Step) -> None:
+        """Write what may not be acknowledged: whether it was taken shows where the vehicle is heard then."""
+        with suppress(ParamClientError):
+            await self._component.set(step.name, step.value)
+
+    async def _restart(self) -> None:
+        """Start the vehicle again, and go on with it; under its new system id if it has been given one."""
+        self._check_armed()
+        self._tell("rebooting")
+        system = self._system_to_come() if self._new_system is None else self._new_system
+        self._component = await self._component.reboot(system=system)
+        self._new_system = None
+        self._reboots += 1
+        self._reboot_for.clear()
+
+    def _check_it_is_the_same(self) -> None:
+        found = self._component.identity
+        if self._first is not None and not self._first_identity.is_same_vehicle(found):
+            system, component = self._component.system, self._component.component
+            raise AnotherVehicle(system, component, str(self._first_identity), str(found))
+
+    # Before anything is sent
+
+    def _check_armed(self) -> None:
+        if self._component.is_armed and not self._allow_armed:
+            component = self._component
+            raise VehicleArmed(
+                f"{self._address} is armed; nothing is set then",
+                system=component.system,
+                component=component.component,
+            )
+
+    def _check_resets(self) -> None:
+        """What takes others back at the next start may only be set where that start follows at once."""
+        for step in self.plan.steps:
+            if self._is_action(step.name) and self._cautions.resets(step.name) and not self._reboot:
+                raise UsageError(
+                    f"{step.name} gives others their defaults back at the next start of the vehicle; "
+                    "it can only be set with reboot=True"
+                )
+
+    async def _store(self) -> None:
+        """Keep what the vehicle has: in the file, and in the cache if anything is to be written."""
+        client, component, seen = self._component._client, self._component, self.seen
+        if (path := self._backup) is not None:
+            from paramclient.files import write_file
+
+            await client._writer.aside(lambda: write_file(path, seen.table))
+        cache = client.cache
+        if cache is not None and self.plan.steps:
+            await client._writer.flush()  # so that history knows what is changed from
+            await client._writer.aside(
+                lambda: cache.store_snapshot(
+                    component.identity,
+                    component.component,
+                    seen.table,
+                    reason=self._reason,
+                    hash=seen.hash,
+                    complete=seen.complete,
+                )
+            )
+
+    # What is told
+
+    @property
+    def _address(self) -> str:
+        return f"{self._component.system}/{self._component.component}"
+
+    def _note_written(self, step: Step) -> None:
+        self.written[step.name] = self.written.get(step.name, 0) + 1
+        if step.needs_reboot:
+            self._reboot_for[step.name] = None
+
+    def _settle(
+        self, step: Step, status: ApplyStatus, actual: Value | None, reason: str, category: str = ""
+    ) -> None:
+        """The last word on a parameter, but for the proof."""
+        row = self._row_of(step, status, actual, reason, category)
+        self.rows[step.name] = row
+        self._tell("writing", row)
+
+    def _row_of(
+        self, step: Step, status: ApplyStatus, actual: Value | None, reason: str = "", category: str = ""
+    ) -> ApplyRow:
+        wanted = self._wanted[step.name]
+        return ApplyRow(wanted, status, self._before(step.name), actual, step.type, category, reason)
+
+    def _before(self, name: str) -> Value | None:
+        held = None if self._first is None else self._first.table.get(name)
+        return None if held is None else held.value
+
+    def _tell(self, phase: str, row: ApplyRow | None = None) -> None:
+        if self._progress is not None:
+            done = self.rows.keys() | self.written.keys()
+            left = 0 if self._first is None else sum(step.name not in done for step in self.plan.steps)
+            self._progress(ApplyProgress(phase, len(done), len(done) + left, row))
+
+    def _row(self, planned: PlanRow) -> ApplyRow:
+        """What became of a parameter in the end."""
+        name, actual = planned.name, planned.before
+
+        def row(status: ApplyStatus, reason: str = "", category: str = "") -> ApplyRow:
+            return ApplyRow(
+                planned.wanted,
+                status,
+                self._before(name),
+                actual,
+                planned.type,
+                category,
+                reason,
+                planned.nearest,
+            )
+
+        if planned.status is PlanStatus.UNCHANGED:
+            return row(ApplyStatus.SET if name in self.sent else ApplyStatus.UNCHANGED)
+        if (settled := self.rows.get(name)) is not None:
+            return replace(settled, actual=actual) if self._is_proven else settled
+        if planned.status in (PlanStatus.SKIPPED, PlanStatus.INVALID):
+            return row(ApplyStatus.SKIPPED, planned.reason, planned.category)
+        if planned.status is PlanStatus.LATER:
+            return row(ApplyStatus.SKIPPED, "not on this vehicle", MISSING)
+        if name not in self.sent:
+            return row(ApplyStatus.FAILED, "not reached")
+        if not self._is_proven:
+            answered = "acknowledged" if name in self.written else "sent, not acknowledged"
+            return row(ApplyStatus.UNPROVEN, f"{answered}, and not read back")
+        if self._is_action(name):
+            return row(ApplyStatus.SET, "done by the vehicle")
+        return row(ApplyStatus.FAILED, "it was acknowledged, and the vehicle has another value at the end")
