@@ -54,6 +54,8 @@ lint: $(VENV)/with-test $(VENV)/with-lint
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(BIN)/mypy --platform darwin paramclient
+	$(BIN)/mypy --platform win32 paramclient
 
 docs: $(VENV)/with-docs
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --fresh-env -d docs/_build/doctrees docs docs/_build/html

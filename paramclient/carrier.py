@@ -14,6 +14,7 @@ import anyio
 from paramclient.errors import LinkError
 from paramclient.links import Link, Peer
 from paramclient.protocol.station import Station
+from paramclient.standstill import Standstill
 
 __all__ = ["Carrier", "Tap"]
 
@@ -58,7 +59,8 @@ class Carrier:
     """Carries what a link delivers to a station, and what that wants sent to the link.
 
     `read` and `send` run side by side for as long as the client is open. A link that drops and can come back
-    is opened again; meanwhile time stands still for the station.
+    is opened again; meanwhile time stands still for the station. So it does while this computer sleeps, or
+    nobody lets us work.
 
     Args:
         link: an open one.
@@ -98,6 +100,7 @@ class Carrier:
         self._of_others: deque[bytes] = deque()
         self._something_to_send = anyio.Event()
         self._sent = anyio.Event()  # set when anything is sent
+        self._standstill = Standstill()
 
     async def read(self) -> None:
         """Take what comes, until the link fails for good."""
@@ -112,6 +115,7 @@ class Carrier:
                 await self._reopen(error)
                 continue
             now = anyio.current_time()
+            self._look_at_the_clock(now)
             is_news = not chunks
             if not chunks:
                 self._station.over(now)
@@ -132,7 +136,10 @@ class Carrier:
         station = self._station
         while self.ended is None:
             self._something_to_send = anyio.Event()
-            station.tick(anyio.current_time())
+            now = anyio.current_time()
+            self._look_at_the_clock(now)
+            self._standstill.expect(math.inf)  # a slow link may hold us up
+            station.tick(now)
             self._dispatch()
             to_send = station.data_to_send()
             if to_send:
@@ -144,6 +151,7 @@ class Carrier:
             if self._of_others:
                 continue
             due = station.next_deadline()
+            self._standstill.expect(due)
             wait = due - anyio.current_time()
             with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):
                 await self._something_to_send.wait()
@@ -177,6 +185,14 @@ class Carrier:
         # a link that drops is the reader's business; what is not sent now is sent again in time
         with suppress(LinkError):
             await self._link.send(data, peer)
+
+    def _look_at_the_clock(self, now: float) -> None:
+        """Before anything is taken or sent: see whether we were away."""
+        unseen = self._standstill.unseen(now)
+        if unseen is not None:
+            logger.info("%s: time has stood still here", self._link.name)
+            self._station.stood_still(unseen, now)
+            self.wake()
 
     async def _rest(self, seconds: float) -> None:
         """Leave what comes to the link for a while, unless something is sent that may be answered."""

@@ -70,10 +70,11 @@ class ParamClient:
     ClientClosed, what is new is written, and neither task nor socket nor thread remains. What the body
     raises comes out as it is.
 
-    A TCP connection that drops, or a serial port that is unplugged, is opened again with back-off for as long
-    as the client lives. Calls that wait meanwhile go on when it is back: what had not been answered is asked
-    for again. After `LINK_PATIENCE` seconds without a link they raise LinkError, and new ones do so at once.
-    A link that cannot come back (a UDP socket that fails) ends every call with its LinkError.
+    A TCP connection that drops, a serial port that is unplugged or a UDP socket that fails is opened again
+    with back-off for as long as the client lives. Calls that wait meanwhile go on when it is back: what had
+    not been answered is asked for again. After `LINK_PATIENCE` seconds without a link they raise LinkError,
+    and new ones do so at once. A link that cannot come back (`tcpin`, when nobody can be let in) ends every
+    call with its LinkError.
 
     Args:
         link: a link's name, such as `udpin:0.0.0.0:14550` (`paramclient.links.FORMS` says which there are), a

@@ -74,6 +74,8 @@ class WriteThrough:
         self._bringing: set[ComponentMachine] = set()
         self._vehicles: dict[tuple[int, int], set[str]] = {}  # that were kept in this session
         self._has_refused = False
+        self._replacements = 0 if cache is None else cache.replacements
+        self._has_written = False
 
     async def open(self) -> None:
         """Find out which components the cache knows."""
@@ -86,6 +88,7 @@ class WriteThrough:
         """Write what is left, and end the thread."""
         try:
             await self.flush()
+            await self.flush()  # all of it, where the file had gone
         finally:
             cache = self._cache if self._owned else None
             await self._worker.close(_nothing if cache is None else cache.close)
@@ -155,7 +158,7 @@ class WriteThrough:
         """The table was proven to be the vehicle's just now; `is_whole` by a download of all of it."""
         kept = self._kept.get(machine)
         if kept is not None:
-            kept.synced_at = self._clock()
+            kept.is_synced = True
             kept.is_whole |= is_whole
 
     def part_with(self, machine: ComponentMachine) -> None:
@@ -199,7 +202,23 @@ class WriteThrough:
         if is_written:
             self._has_failed = False
             logger.debug("written: %s values", sum(len(new.update.params) for new in news))
+            self._begin_anew(cache.replacements)
         return is_written
+
+    def _begin_anew(self, replacements: int) -> None:
+        """Where the file is another one than before: nothing that was written earlier is in it."""
+        is_another = replacements != self._replacements and (self._has_written or bool(self._tables))
+        self._replacements = replacements
+        self._has_written = True
+        if not is_another:
+            return
+        for kept in self._kept.values():
+            table = kept.machine.table
+            kept.is_whole |= table.complete
+            kept.state = None
+            for name in table.params:
+                table.dirty.setdefault(name, "vehicle")
+        self.wake()
 
     async def _save(self, cache: ParamCache, updates: list[TableUpdate]) -> bool:
         return await self._run(partial(_save, cache, updates)) is not None
@@ -248,20 +267,23 @@ class WriteThrough:
             kept.synced_at = cached.synced_at
             kept.state = None if table.is_displaced else self._state(machine, kept)
         if machine.sync.synced:
-            kept.synced_at = self._clock()
+            kept.is_synced = True
 
     def _news_of(self, kept: _Kept) -> list[_News]:
         """What the cache does not know of a table yet; it counts as written from now on."""
         machine, table = kept.machine, kept.machine.table
         if self._is_doubted(machine):
             return []
+        now = self._clock()
+        is_synced, kept.is_synced = kept.is_synced, False
+        if is_synced:
+            kept.synced_at = now
         state = self._state(machine, kept)
         if not (table.dirty or kept.is_whole or state != kept.state):
             return []
         dirty = table.take_dirty()
         is_whole, kept.is_whole = kept.is_whole, False
         kept.state = state
-        now = self._clock()
         knows_volatile = bool(table.volatile) or table.volatile_known
         update = TableUpdate(
             identity=kept.identity,
@@ -282,7 +304,7 @@ class WriteThrough:
             removed=[name for name in dirty if name not in table.params],
             replace=is_whole,
         )
-        return [_News(kept, dirty, update)]
+        return [_News(kept, dirty, update, is_synced)]
 
     def _state(self, machine: ComponentMachine, kept: _Kept) -> TableState:
         table = machine.table
@@ -314,6 +336,7 @@ class _Kept:
     identity: Identity
     state: TableState | None = None
     synced_at: float | None = None
+    is_synced: bool = False  # since it was written last, whose time then counts: the clock may be wrong now
     is_whole: bool = False
 
 
@@ -324,9 +347,11 @@ class _News:
     kept: _Kept
     dirty: dict[str, str]
     update: TableUpdate
+    is_synced: bool
 
     def take_back(self) -> None:
         """It has not arrived: it is news again."""
+        self.kept.is_synced |= self.is_synced
         self.kept.machine.table.dirty = self.dirty | self.kept.machine.table.dirty
         self.kept.is_whole |= self.update.replace
         self.kept.state = None

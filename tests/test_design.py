@@ -174,6 +174,13 @@ def test_the_simulators_load_only_when_a_link_asks_for_them() -> None:
                 assert not (each.runs_at_import and room_of(target) == "sim"), f"{module}:{each.line}"
 
 
+def test_only_the_command_and_the_ports_of_windows_know_asyncio() -> None:
+    """The library runs on trio too: see `tests/test_backends.py`."""
+    loops = {"asyncio", "trio"}
+    uses = {module for module in MODULES for each in imports_of(module) if each.top in loops}
+    assert {module for module in uses if not is_command(module)} == {"paramclient.links.transport"}
+
+
 def test_only_the_wire_knows_pymavlink() -> None:
     uses = {
         (module, each.module) for module in MODULES for each in imports_of(module) if each.top == "pymavlink"

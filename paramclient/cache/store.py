@@ -82,6 +82,11 @@ class ParamCache:
         """What went wrong with the file so far and was mended: one text for each file set aside."""
         return tuple(self._database.notes)
 
+    @property
+    def replacements(self) -> int:
+        """How often a fresh file was made, or another one found in its place: what was saved is not in it."""
+        return self._database.replacements
+
     def save(self, update: TableUpdate | Sequence[TableUpdate]) -> None:
         """Write what was learnt, in one transaction: all of it is kept, or nothing.
 

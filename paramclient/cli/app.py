@@ -9,6 +9,7 @@ import signal
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from types import FrameType
 from typing import Final
 
 import anyio
@@ -78,20 +79,18 @@ async def _until_signal(work: Callable[[], Awaitable[int | None]]) -> int | None
 
     with anyio.CancelScope() as scope:
 
-        def end(number: int) -> None:
+        def end(number: int, _: FrameType | None) -> None:
             received.append(number)
-            scope.cancel()
             for each in _SIGNALS:
-                loop.remove_signal_handler(each)
                 signal.signal(each, signal.SIG_DFL)
+            loop.call_soon_threadsafe(scope.cancel)
 
         for number in _SIGNALS:
-            loop.add_signal_handler(number, end, number)
+            signal.signal(number, end)  # not by the loop, which on Windows knows no signals
         try:
             return await work()
         finally:
             for number, handler in before.items():
-                loop.remove_signal_handler(number)
                 signal.signal(number, handler)
     return 128 + received[0]
 

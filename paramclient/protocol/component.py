@@ -415,6 +415,8 @@ class ComponentMachine(Parts):
         """What is known may be of the past: it counts again when the vehicle has confirmed it."""
         self.table.doubt(Trust.LIVE, Trust.VERIFIED)
         self.sync.doubt()
+        if self.fetch is not None:
+            self.fetch.doubt()
         if self.fetches.overheard is not None:
             self.fetches.overheard.forget()
 
@@ -428,6 +430,7 @@ class ComponentMachine(Parts):
         self.files.lose(now)
         self.descriptions.lose(now)
         self.commands.lose(now)
+        self.who.lose()
         self._doubt()
 
     def _was_silent(self, silence: float, now: float) -> None:

@@ -155,6 +155,10 @@ class Fetch(Operation[FetchResult]):
         if self._undecided_until < math.inf:
             self._begin_download(now, self._present)
 
+    def doubt(self) -> None:
+        """What has come may be of the past."""
+        self._proof.doubt()
+
     def resume(self, now: float) -> None:
         """The link is back."""
         if self.download is not None:

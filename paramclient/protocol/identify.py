@@ -221,6 +221,11 @@ class Identification:
             self._attempts = 0
             self._ask(now)
 
+    def lose(self) -> None:
+        """It is not heard any more. Who has said it before is asked again when it is; others are asked on."""
+        if self.settled:
+            self._is_asking = False
+
     def acknowledged(self, message: CommandAck, now: float) -> None:
         """Take a COMMAND_ACK: a refusal of one way to ask leads to the other at once."""
         asked = (MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)

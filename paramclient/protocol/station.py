@@ -229,6 +229,22 @@ class Station:
         for machine in self.components.values():
             machine.resume(now)
 
+    def stood_still(self, unseen: float, now: float) -> None:
+        """Nobody was at work here, as when the computer slept: that others were silent means nothing.
+
+        Where it was as long as it takes to get lost, every component is looked at anew, as after an absence
+        of the link. Whatever waits is asked for again.
+
+        Args:
+            unseen: seconds of it that have passed for everyone else, but not in `now`.
+            now: the time.
+        """
+        for machine in self.components.values():
+            machine.presence.age(unseen)
+        if not self._is_paused:
+            self._outbox.clear()  # for whoever was there before
+            self.resume(now)
+
     def over(self, now: float) -> None:
         """Nothing more will come: whoever waits gets what there is."""
         self.is_over = True
