@@ -19,6 +19,7 @@ from paramclient.protocol.descriptions import DescriptionAsk
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.ftp import FileRead
 from paramclient.protocol.operation import Operation
+from paramclient.protocol.overhear import Overhearing
 from paramclient.protocol.reads import Read
 from paramclient.protocol.restart import Restart
 from paramclient.protocol.result import Policy, Sampled
@@ -44,6 +45,8 @@ BOUNDS: Final = (
     (traffic, "MOST_PEERS", 3),
     (authors, "MOST_FOREIGN_SETS", 4),
 )
+LISTENS: Final = 0xE0
+"""First bytes of an input from here on mean a station that sends nothing."""
 OWN: Final = (255, 190)
 SYSTEMS: Final = (1, 1, 1, 2, 3, 4, 255, 0)
 COMPONENTS: Final = (1, 1, 100, 190)
@@ -80,7 +83,11 @@ class _Session:
         self.draw = draw
         self.now = 1000.0
         self.is_paused = False
-        self.upkeep = Upkeep(interval, without_hash=bool(options & 2), policy=policy)
+        self.listens = options >= LISTENS
+        policy = Policy.CACHE_ONLY if self.listens else policy
+        self.upkeep = Upkeep(
+            interval, without_hash=bool(options & 2), policy=policy, listens_only=self.listens
+        )
         self.station = Station(
             link="fuzz",
             is_stream=bool(options & 1),
@@ -111,18 +118,20 @@ class _Session:
         if self.is_paused:
             self.interrupt()
             self.settle()
+        endless = (Restart, Overhearing)
         for machine, operation in self.operations:
-            if isinstance(operation, Restart):
-                machine.end_restart(operation, self.now)
+            if isinstance(operation, endless):
+                self.give_back(machine, operation)
+        self.operations = [each for each in self.operations if not isinstance(each[1], endless)]
         end = self.now + PATIENCE
         for _ in range(MOST_TICKS):
             deadline = self.station.next_deadline()
-            if deadline > end or all(op.done for _, op in self.operations if not isinstance(op, Restart)):
+            if deadline > end or all(op.done for _, op in self.operations):
                 break
             self.now = max(deadline, self.now)
             self.settle()
         for machine, operation in self.operations:
-            assert operation.done or isinstance(operation, Restart), f"{operation} of {machine} does not end"
+            assert operation.done, f"{operation} of {machine} does not end"
         for machine, operation in self.operations:
             self.give_back(machine, operation)
         if self.station.traffic is not None:
@@ -139,6 +148,7 @@ class _Session:
         else:
             raise AssertionError(f"{MOST_STEPS} ticks at one moment, and something is still due")
         sent = self.station.data_to_send()
+        assert not (sent and self.listens)
         assert len(sent) <= MOST_SENT, f"{len(sent)} frames at one moment"
         for data, _ in sent:
             (frame,) = self.framer.receive(data)
@@ -161,7 +171,7 @@ class _Session:
 
     def check(self, machine: ComponentMachine, system: int, component: int) -> None:
         held = machine.table
-        assert (system, component) != OWN
+        assert (system, component) != self.station.own
         assert system != 0
         assert len(held.params) <= 12
         prefix = _prefix(system)
@@ -359,13 +369,13 @@ class _Session:
         if machine is not None:
             sampled = Sampled(1 + how % 5, 0) if how & 16 else None
             refresh = bool(how & 32) and sampled is None and self.upkeep.policy is Policy.AUTO
-            with suppress(NoReply):
+            with suppress(NoReply, UsageError):
                 self.keep(machine, machine.begin_fetch(self.now, refresh=refresh, sampled=sampled))
 
     def fetch_several(self) -> None:
         system = self.draw.one_of(SYSTEMS)
         machines = [each for each in self.station.components.values() if each.system == system]
-        if machines and not any(each.presence.is_lost for each in machines):
+        if machines and not self.listens and not any(each.presence.is_lost for each in machines):
             fetches = self.station.begin_fetches(machines, self.now)
             for machine, fetch in zip(machines, fetches, strict=True):
                 self.keep(machine, fetch)
@@ -374,7 +384,7 @@ class _Session:
         machine, key = self.machine(), self.draw.one_of((None, None, HASH_CHECK, 0, 3, 7, 8, 32767))
         if machine is not None:
             key = self.name(machine.system) if key is None else key
-            with suppress(NoReply):
+            with suppress(NoReply, UsageError):
                 self.keep(machine, machine.read(key, self.now))
 
     def write(self) -> None:
@@ -392,17 +402,17 @@ class _Session:
     def restart(self) -> None:
         machine, returns = self.machine(), bool(self.draw.number() & 1)
         if machine is not None:
-            with suppress(NoReply):
+            with suppress(NoReply, UsageError):
                 self.keep(machine, machine.begin_restart(self.now, returns=returns))
 
     def ask_description(self) -> None:
         machine = self.machine()
-        if machine is not None:
+        if machine is not None and not self.listens:
             self.keep(machine, machine.descriptions.ask(self.now))
 
     def file(self) -> None:
         machine, what = self.machine(), self.draw.number() % 5
-        if machine is None:
+        if machine is None or self.listens:
             return
         files = machine.files
         job: Operation[Any]
