@@ -43,7 +43,8 @@ coverage: $(VENV)/with-test
 soak: $(VENV)/with-test
 	$(BIN)/python -m tests.soak --sessions $(SESSIONS)
 
-# one after the other; what reaches something new is put into fuzz/corpus, what breaks something into fuzz/findings
+# one after the other; what reaches something new is put into fuzz/corpus, what breaks something into fuzz/findings;
+# `python -m fuzz.keep TARGET` leaves of a corpus what is needed
 fuzz: $(VENV)/with-test $(VENV)/with-fuzz
 	@for target in $(TARGETS); do \
 		echo "== fuzz/$$target.py, $(SECONDS) s"; \

@@ -1,8 +1,8 @@
 """Let atheris look for inputs that break a target: `python -m fuzz component --seconds 1800`.
 
 What it finds to reach new code is kept in `fuzz/corpus/<target>`, and what breaks something in
-`fuzz/findings/<target>`. Further arguments go to libFuzzer: `-merge=1 FOLDER` takes over from a folder what
-reaches more than the corpus does.
+`fuzz/findings/<target>`. Further arguments go to libFuzzer. Before a corpus is committed, `python -m
+fuzz.keep` leaves of it what is needed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import atheris
 
 HERE: Final = Path(__file__).parent
 TARGETS: Final = sorted(
-    path.stem for path in HERE.glob("*.py") if path.stem not in ("__init__", "__main__", "draw")
+    path.stem for path in HERE.glob("*.py") if path.stem not in ("__init__", "__main__", "draw", "keep")
 )
 
 
