@@ -5,7 +5,8 @@
 #   make lint       style and types                make docs       the pages, into docs/_build/html
 #   make bench      speed of parser and start      make dist       wheel and sdist, into dist
 #   make cost       CPU and memory                 make peers      downloads beside other programs
-#   make soak       10,000 sessions at random      make clean      remove all that was made
+#   make soak       10,000 sessions at random      make fuzz       each target of fuzz/ for a while
+#   make clean      remove all that was made
 
 PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
 	"$$python" -c $(IS_NEW_ENOUGH) 2>/dev/null && echo "$$python" && break; done)
@@ -16,12 +17,14 @@ BIN = $(VENV)/bin
 PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 TESTS ?=
 SESSIONS ?= 10000
+TARGETS ?= cache component files framer metadata pack
+SECONDS ?= 1800
 
 MEASURED = 'protocol/*' 'sim/*' 'cache/*' 'files/*' values.py errors.py identity.py params.py paramset.py
 # they start programs of their own, which are not measured, are about rooms that are not, or go where others have been
 UNMEASURED = $(addprefix --ignore=tests/test_,bench.py cli.py docs.py examples.py links.py machine.py packaging.py)
 
-.PHONY: demo test coverage soak lint docs bench cost peers dist clean
+.PHONY: demo test coverage soak fuzz lint docs bench cost peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -39,6 +42,14 @@ coverage: $(VENV)/with-test
 
 soak: $(VENV)/with-test
 	$(BIN)/python -m tests.soak --sessions $(SESSIONS)
+
+# one after the other; what reaches something new is put into fuzz/corpus, what breaks something into fuzz/findings;
+# `python -m fuzz.keep TARGET` leaves of a corpus what is needed
+fuzz: $(VENV)/with-test $(VENV)/with-fuzz
+	@for target in $(TARGETS); do \
+		echo "== fuzz/$$target.py, $(SECONDS) s"; \
+		$(BIN)/python -m fuzz $$target --seconds $(SECONDS) || exit 1; \
+	done
 
 lint: $(VENV)/with-test $(VENV)/with-lint
 	$(BIN)/ruff check
@@ -83,7 +94,7 @@ $(VENV)/with-cli: pyproject.toml $(VENV)/made
 	@touch $@
 
 # dependency groups need pip 25.1, and the pip of the environment is as old as its Python
-$(VENV)/with-test $(VENV)/with-lint $(VENV)/with-docs $(VENV)/with-peers: $(VENV)/with-%: pyproject.toml $(VENV)/with-cli
+$(VENV)/with-test $(VENV)/with-lint $(VENV)/with-docs $(VENV)/with-peers $(VENV)/with-fuzz: $(VENV)/with-%: pyproject.toml $(VENV)/with-cli
 	@echo "Installing what $* needs into $(VENV)"
 	@$(PIP) 'pip>=25.1'
 	@$(PIP) --group $*

@@ -24,6 +24,7 @@ from paramclient.identity import Identity
 from paramclient.links import Link, ReplayLink, create_link
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import (
+    ComponentForgotten,
     ComponentHeard,
     ComponentIdentified,
     Event,
@@ -456,6 +457,9 @@ class ParamClient:
             if isinstance(event, Fetched):
                 self._cache_hits += event.result.source == "cache"
                 self._downloads += event.result.source != "cache" and event.result.complete
+            if isinstance(event, ComponentForgotten):
+                self._components.pop((machine.system, machine.component))._part()
+                continue
             if isinstance(event, ComponentHeard):
                 self._meet(machine)
             elif isinstance(event, ComponentIdentified):

@@ -24,7 +24,14 @@ from paramclient.protocol.sampling import SAMPLE_SIZE
 from paramclient.protocol.station import Station
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
-from paramclient.protocol.wire import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, NO_INDEX, ParamValue, SigningKey
+from paramclient.protocol.wire import (
+    HASH_CHECK,
+    MAV_MODE_FLAG_SAFETY_ARMED,
+    MOST_PARAMETERS,
+    NO_INDEX,
+    ParamValue,
+    SigningKey,
+)
 from paramclient.protocol.writes import SetResult
 from paramclient.signing import timestamp_now
 from paramclient.values import Encoding, Param, check_name, check_value, decode, known_type
@@ -168,8 +175,8 @@ class Component:
         """
         if isinstance(name, str):
             check_name(name)
-        elif not 0 <= name < NO_INDEX:
-            raise UsageError(f"parameter index {name}: indices are 0 to {NO_INDEX - 1}")
+        elif not 0 <= name < MOST_PARAMETERS:
+            raise UsageError(f"parameter index {name}: indices are 0 to {MOST_PARAMETERS - 1}")
         machine = self._machine
         self._client._check_open()
         read = machine.read(name, anyio.current_time())
@@ -412,6 +419,13 @@ class Component:
         """Hand a change to everyone who listens."""
         for changes in list(self._subscriptions):
             changes.push(change)
+
+    def _part(self) -> None:
+        """It is lost, and not followed any more."""
+        self._client._writer.part_with(self._machine)
+        silence = anyio.current_time() - self._machine.presence.heard_at
+        awaited = f"{address_in_words(self.system, self.component)} (lost)"
+        self._end(NoReply(awaited, attempts=0, waited=silence))
 
     def _end(self, error: ParamClientError | None) -> None:
         """Nothing will come any more."""

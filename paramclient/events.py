@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Changes", "Event", "Events", "Feed", "Found", "Heard", "Lost", "Rebooted", "Resynced", "told"]
 
+MOST_CHANGES: Final = 100_000
+"""Changes that wait for a slow listener, one for each name: more than a table can hold, as names may go and
+others come. Beyond that the oldest ones go."""
 MOST_EVENTS: Final = 1_000
 """Events that wait for a slow listener; beyond that the oldest ones go."""
 
@@ -159,6 +162,8 @@ class Changes(Feed[Change]):
             if old is new or (old is not None and new is not None and old.same_value(new)):
                 return
         self._waiting[item.name] = item
+        if len(self._waiting) > MOST_CHANGES:
+            del self._waiting[next(iter(self._waiting))]
         self._arrived.set()
 
     def _take(self) -> Change | None:

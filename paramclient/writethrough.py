@@ -25,6 +25,11 @@ FLUSH_INTERVAL: Final = 0.25
 """Seconds that changes are gathered for before they are written. A download fills several batches."""
 RETRY_INTERVAL: Final = 5.0
 """Seconds until a cache that could not be written is tried again."""
+MOST_VEHICLES: Final = 16
+"""Vehicles under one address whose tables are kept in one session: more than are changed in a day. One that
+says each time that it is another vehicle fills no disk."""
+MOST_TABLES: Final = 4_000
+"""Tables that are kept in one session: four for each component that can be followed."""
 
 logger = logging.getLogger(__name__)
 Result = TypeVar("Result")
@@ -66,6 +71,9 @@ class WriteThrough:
         self._has_failed = False
         self._tables: dict[tuple[int, int], bool] = {}
         self._something_to_write = anyio.Event()
+        self._bringing: set[ComponentMachine] = set()
+        self._vehicles: dict[tuple[int, int], set[str]] = {}  # that were kept in this session
+        self._has_refused = False
         self._replacements = 0 if cache is None else cache.replacements
         self._has_written = False
 
@@ -116,13 +124,23 @@ class WriteThrough:
 
         False where it was overtaken meanwhile: by another vehicle, or by the same call for another reason.
         """
-        cached = await self._load(machine, identity)
-        logger.debug("cached under %s/%s: %s", identity.key, machine.component, cached or "nothing")
-        current = self._identity_of(machine)
-        if current is None or current.key != identity.key or self.follow(machine, current):
-            return False
-        self._keep(machine, current, cached)
-        return True
+        if machine in self._bringing:
+            return False  # that sees to it
+        self._bringing.add(machine)
+        try:
+            while self._has_room(machine, identity):
+                cached = await self._load(machine, identity)
+                logger.debug("cached under %s/%s: %s", identity.key, machine.component, cached or "nothing")
+                current = self._identity_of(machine)
+                if current is None or (current.key == identity.key and self.follow(machine, current)):
+                    return False
+                if current.key == identity.key:
+                    self._keep(machine, current, cached)
+                    break
+                identity = current  # another vehicle has taken its place meanwhile
+            return True
+        finally:
+            self._bringing.discard(machine)
 
     async def keep_late(self, machine: ComponentMachine) -> None:
         """Keep a table that there was no time to bring the cached one for.
@@ -133,7 +151,7 @@ class WriteThrough:
         if not (machine.table.complete or (known is not None and machine.table.params)):
             return
         identity = known or machine.identity
-        if not self.follow(machine, identity):
+        if not self.follow(machine, identity) and self._has_room(machine, identity):
             self._keep(machine, identity, await self._load(machine, identity))
 
     def synced(self, machine: ComponentMachine, *, is_whole: bool) -> None:
@@ -142,6 +160,10 @@ class WriteThrough:
         if kept is not None:
             kept.is_synced = True
             kept.is_whole |= is_whole
+
+    def part_with(self, machine: ComponentMachine) -> None:
+        """It is not followed any more."""
+        self._kept.pop(machine, None)
 
     @property
     def is_held_back(self) -> bool:
@@ -200,6 +222,21 @@ class WriteThrough:
 
     async def _save(self, cache: ParamCache, updates: list[TableUpdate]) -> bool:
         return await self._run(partial(_save, cache, updates)) is not None
+
+    def _has_room(self, machine: ComponentMachine, identity: Identity) -> bool:
+        """Whether a vehicle's table may be kept, beside those of this session that are."""
+        address = (machine.system, machine.component)
+        vehicles = self._vehicles.get(address, set())
+        if identity.key in vehicles:
+            return True
+        is_full = sum(map(len, self._vehicles.values())) >= MOST_TABLES
+        if len(vehicles) >= MOST_VEHICLES or is_full:
+            if not self._has_refused:
+                logger.warning("%d/%d: too many vehicles on this link, so it is not cached", *address)
+            self._has_refused = True
+            return False
+        self._vehicles[address] = vehicles | {identity.key}
+        return True
 
     async def _load(self, machine: ComponentMachine, identity: Identity) -> CachedComponent | None:
         if self._cache is None:

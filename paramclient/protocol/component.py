@@ -20,7 +20,7 @@ from paramclient.protocol.table import Change
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
-    NO_INDEX,
+    MOST_PARAMETERS,
     AutopilotVersion,
     CommandAck,
     ComponentMetadata,
@@ -38,6 +38,8 @@ from paramclient.values import Param, Trust, Value, encode
 
 __all__ = ["ComponentMachine"]
 
+MOST_DOUBTED: Final = 256
+"""Reads that may be open for a value to be asked for that changed twice: each takes its share of the link."""
 FRESH_IDENTITY: Final = 1.0
 """Seconds for which an AUTOPILOT_VERSION needs no other."""
 
@@ -57,6 +59,7 @@ class ComponentMachine(Parts):
         is_vehicle_doubted: whether it is open which vehicle its autopilot belongs to.
         another: is told that another vehicle has taken the system id; by default `become_another`.
         turns: those of the lists on the link; None for a link that it has for itself.
+        room: what the tables of the link may hold together; None likewise.
         trace: is told of each step.
 
     Attributes:
@@ -134,10 +137,10 @@ class ComponentMachine(Parts):
             self.reads.heard(message, now)
             return
         if who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
-            name = name.upper()
+            name = _in_capitals(name)
             message = message._replace(param_id=name)
         table = self.table
-        if count != table.count and count != NO_INDEX:
+        if count != table.count and count <= MOST_PARAMETERS:
             self._count_moved(count, now)
         authors = self._authors
         writes = self.writes
@@ -185,6 +188,8 @@ class ComponentMachine(Parts):
         """
         if self.table.complete:
             return
+        if count is not None and count > MOST_PARAMETERS:  # what an earlier version has believed
+            count, complete, placed = None, False, False
         changes = self.table.restore(
             params,
             count=count,
@@ -285,7 +290,7 @@ class ComponentMachine(Parts):
 
     def spelling(self, name: str) -> str:
         """The name as the vehicle has it. ArduPilot answers to any case; its own names have capitals only."""
-        return name.upper() if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA else name
+        return _in_capitals(name) if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA else name
 
     def check_present(self, what: str, now: float) -> None:
         """See whether it can be asked for something.
@@ -321,7 +326,7 @@ class ComponentMachine(Parts):
         self._follow_identity(now)
         self.sync.tick(now)
         for name in self._authors.doubted(now):
-            if self._policy is Policy.AUTO:
+            if self._policy is Policy.AUTO and len(self.reads) < MOST_DOUBTED:
                 self.reads.ask(name, now, urgent=False)
 
     def next_deadline(self) -> float:
@@ -493,6 +498,13 @@ class ComponentMachine(Parts):
     def _report(self, changes: list[Change]) -> None:
         for change in changes:
             self._emit(ParamChanged(self, change))
+
+
+def _in_capitals(name: str) -> str:
+    """The name with capitals for its ASCII letters. Of others, as damage may bring them, the capital may be
+    two letters or none that a message can hold.
+    """
+    return name.encode("latin-1").upper().decode("latin-1")
 
 
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time

@@ -11,7 +11,7 @@ from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.proof import Proof
 from paramclient.protocol.result import Announcement, FetchResult, Means, Policy, Progress
 from paramclient.protocol.sync import Sync
-from paramclient.protocol.wire import NO_INDEX, ParamValue
+from paramclient.protocol.wire import MOST_PARAMETERS, ParamValue
 
 __all__ = ["OVERHEARING_PATIENCE", "Overheard", "Overhearing"]
 
@@ -60,7 +60,7 @@ class Overheard:
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here after it went into the table."""
         name, _, _, count, index = message
-        if index >= count or count == NO_INDEX:
+        if index >= count or count > MOST_PARAMETERS:
             return
         names = self.names
         if count != self.count or names.get(index, name) != name:

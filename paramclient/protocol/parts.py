@@ -21,7 +21,7 @@ from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.restart import Restart
 from paramclient.protocol.result import FetchResult, Means, Sampled
 from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
-from paramclient.protocol.table import Change, Table
+from paramclient.protocol.table import Change, Room, Table
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.trace import Trace, silent
 from paramclient.protocol.turns import Turns
@@ -52,6 +52,7 @@ class Parts(ABC):
         is_vehicle_doubted: Callable[[], bool] = lambda: False,
         another: Callable[[float], None] | None = None,
         turns: Turns | None = None,
+        room: Room | None = None,
         trace: Trace = silent,
     ) -> None:
         target = (system, component)
@@ -63,7 +64,7 @@ class Parts(ABC):
         self.who = Identification(
             target, link, self.round_trip, send, encoding, may_ask=not upkeep.listens_only
         )
-        self.table = Table(self.who.encoding)
+        self.table = Table(self.who.encoding, room)
         self.turns = Turns() if turns is None else turns
         self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share, trace)
         self.writes = Writes(

@@ -12,7 +12,7 @@ from paramclient.protocol.operation import Operation
 from paramclient.protocol.pacing import Pace, Share
 from paramclient.protocol.timing import FEWEST_TRIES, LONGEST_SILENCE, MEMORY, MOST_TRIES, RoundTrip
 from paramclient.protocol.trace import Trace, silent
-from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
+from paramclient.protocol.wire import MOST_PARAMETERS, Message, ParamError, ParamRequestRead, ParamValue
 
 __all__ = ["Key", "Read", "Reads"]
 
@@ -162,7 +162,7 @@ class Reads:
             self._drop(read)
             read.finish(message, now)
             self._send_waiting(now)
-        if index < count:
+        if index < count <= MOST_PARAMETERS:
             self.control = index  # it exists, and is answered
         if index == self._control_index and self._control_at < math.inf:
             # one that was lost may have nobody left to ask again; then this is not its answer

@@ -10,10 +10,11 @@ from paramclient.errors import LinkError, UsageError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.download import present_of
-from paramclient.protocol.events import ComponentHeard, Event
+from paramclient.protocol.events import ComponentForgotten, ComponentHeard, Event
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.result import Policy
 from paramclient.protocol.sync import Upkeep
+from paramclient.protocol.table import Room
 from paramclient.protocol.trace import Told, Trace, silent
 from paramclient.protocol.traffic import Traffic
 from paramclient.protocol.turns import Turns
@@ -54,7 +55,10 @@ HEARTBEAT_INTERVAL: Final = 1.0
 NOBODY: Final = (0, 0)
 """Who we are where we only listen: then whoever has our ids is somebody else."""
 MOST_COMPONENTS: Final = 1_000
-"""Components followed on one link: more than 250 systems with a few each have. Further ones are not heard."""
+"""Components followed on one link: more than 250 systems with a few each have. Further ones are heard
+when one that is lost and has told of no parameter can be forgotten for them."""
+SEARCH_INTERVAL: Final = 0.5
+"""Seconds between two searches for one that can be forgotten, where there was none: each looks at all."""
 MOST_PEERS: Final = 256
 """Stream peers whose unfinished frames are kept."""
 HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
@@ -127,6 +131,8 @@ class Station:
         self._heartbeat_at = math.inf if self.listens_only else -math.inf
         self._is_paused = False
         self._turns = Turns()
+        self._room = Room()
+        self._full_until = -math.inf
 
     def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
         """From now on sign what is sent and take what the verifier accepts; before anything has come."""
@@ -370,14 +376,14 @@ class Station:
         if isinstance(message, ParamSet):
             self._receive_foreign_set(message, sender, now)
             return
-        machine = self.components.get(sender) or self._meet(sender, message)
+        machine = self.components.get(sender) or self._meet(sender, message, now)
         if machine is not None:
             machine.receive(message, now, version=frame.version)
 
-    def _meet(self, sender: Address, message: Message) -> ComponentMachine | None:
+    def _meet(self, sender: Address, message: Message, now: float) -> ComponentMachine | None:
         """A component that was not heard before; only what shows that it has parameters makes it one."""
         is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue)
-        if not is_sign or len(self.components) >= MOST_COMPONENTS:
+        if not is_sign or not self._has_room(now):
             return None
         system, component = sender
         machine: ComponentMachine | None = None
@@ -398,11 +404,31 @@ class Station:
             is_vehicle_doubted=lambda: self._autopilot_is_doubted(system),
             another=lambda now: self._become_another(system, now),
             turns=self._turns,
+            room=self._room,
             trace=self._trace,
         )
         self.components[sender] = machine
         self._events.append(ComponentHeard(machine))
         return machine
+
+    def _has_room(self, now: float) -> bool:
+        """Whether one more component can be followed.
+
+        Where there are too many, the first one goes that is lost, has told of no parameter, and that nobody
+        waits for: who sends heartbeats in many names must not keep out those that come later.
+        """
+        if len(self.components) < MOST_COMPONENTS:
+            return True
+        if now < self._full_until:
+            return False
+        for address, machine in self.components.items():
+            if machine.presence.is_lost and not machine.table.params and not machine.is_waiting:
+                del self.components[address]
+                machine.reads.pace.idle()
+                self._events.append(ComponentForgotten(machine))
+                return True
+        self._full_until = now + SEARCH_INTERVAL
+        return False
 
     def _become_another(self, system: int, now: float) -> None:
         """Another vehicle has taken a system id, with all of its components."""

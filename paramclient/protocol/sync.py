@@ -14,7 +14,7 @@ from paramclient.protocol.fetch import FRESH_HASH, Fetch
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.result import Announcement, FetchResult, Policy
-from paramclient.protocol.table import Change, Table
+from paramclient.protocol.table import MOST_NAMES, Change, Table
 from paramclient.protocol.wire import HASH_CHECK, ParamValue
 from paramclient.values import Trust
 
@@ -215,7 +215,7 @@ class Sync:
             self._moved_by_us_alone &= change.by == "us"
             if self.announced is not None and self.announced.at != -math.inf:
                 self.announced = replace(self.announced, at=-math.inf)
-        if self._has_fallen or self._resync is not None:
+        if (self._has_fallen or self._resync is not None) and len(self._moved) < MOST_NAMES:
             self._moved[name] = None
 
     def count_moved(self, now: float) -> None:

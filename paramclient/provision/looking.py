@@ -95,7 +95,8 @@ async def look(
 async def identified(component: Component) -> None:
     """Wait until the vehicle has said who it is, or will not: what is stored goes under its name."""
     with anyio.move_on_after(IDENTITY_PATIENCE):
-        while component._client._station.identity_of(component._machine) is None:  # noqa: ASYNC110 - nobody tells
+        station = component._client._station
+        while station.identity_of(component._machine) is None:  # noqa: ASYNC110 - nobody tells
             await anyio.sleep(LOOKING_PACE)
 
 
