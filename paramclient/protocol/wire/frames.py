@@ -35,7 +35,8 @@ _SIGNED_FLAG = bytes((_SIGNED,))
 _MAGIC = re.compile(b"[\xfd\xfe]").search
 _START = struct.Struct("<BBBxBBB3s").unpack_from  # a header of MAVLink 2; version 1 shares two bytes
 _CRC_AT = struct.Struct("<H").unpack_from
-_PADDING = bytes(10)  # behind the data: a header can be read at its last byte
+_HEADER_LENGTH = 10  # of MAVLink 2
+_PADDING = bytes(_HEADER_LENGTH)  # behind the data: a header can be read at its last byte
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
 _SETUP_SIGNING = (256).to_bytes(3, "little")
 _NO_KEY = b""  # of no message
@@ -120,12 +121,15 @@ class Framer:
         number_of = self._number_of
         extra_of = _EXTRA_BY_ID_BYTES.get
         length = len(data)
-        padded = data + _PADDING
+        last_header_at = length - _HEADER_LENGTH
         good = 0
         skipped = 0
         at = 0
         while at < length:
-            magic, size, flags, sequence, system, component, key = _START(padded, at)
+            if at > last_header_at:
+                data += _PADDING
+                last_header_at = length
+            magic, size, flags, sequence, system, component, key = _START(data, at)
             if magic == _MAGIC_V2:
                 crc_at = at + 10 + size
                 end = crc_at + 2
@@ -136,7 +140,7 @@ class Framer:
             elif magic == _MAGIC_V1:
                 crc_at = at + 6 + size
                 end = crc_at + 2
-                key = padded[at + 5 : at + 6] + b"\0\0"
+                key = data[at + 5 : at + 6] + b"\0\0"
             else:
                 crc_at = end = at
                 key = _NO_KEY
@@ -146,7 +150,7 @@ class Framer:
                 if may_go_on and (header_is_cut or extra is not None):
                     break
                 if self._guard is not None and extra is not None:
-                    self._show_if_cut_off(data[at:], crc_at - at, extra)
+                    self._show_if_cut_off(data[at:length], crc_at - at, extra)
             elif extra is not None and _CRC_AT(data, crc_at)[0] == mcrf4xx(data[at + 1 : crc_at] + extra):
                 good += 1
                 number = number_of(key)
@@ -173,7 +177,7 @@ class Framer:
         self.frames += good
         if skipped:
             self.skipped += skipped
-        self._tail = data[at:]
+        self._tail = data[at:length]
         return found
 
     def flush(self) -> list[Frame]:
