@@ -184,7 +184,7 @@ class Station:
             beat = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=MAV_STATE_ACTIVE)
             self._send(beat, None, 2)
         for machine in list(self.components.values()):
-            if machine.next_deadline() <= now:
+            if machine.next_deadline() <= now or machine.writes.is_held:  # for another component's word
                 machine.tick(now)
         self._turns.tick(now)
         if self.traffic is not None:
