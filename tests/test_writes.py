@@ -160,6 +160,17 @@ def test_what_has_to_wait_says_so_until_it_is_begun(is_known: bool) -> None:
     assert not desk.writes.is_held
 
 
+def test_a_value_that_comes_while_nothing_may_be_sent_again_leaves_the_time_outs_as_they_are() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", 2.5)
+    desk.is_certain = False
+    desk.writes.resume(3.0)
+    desk.hear("A", 2.5, at=4.0)
+    assert write.done
+    assert desk.round_trip.smoothed is None
+
+
 def test_nothing_is_sent_before_the_encoding_is_certain() -> None:
     desk = Desk()
     desk.knows("A", 1, INT32)
