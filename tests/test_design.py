@@ -281,7 +281,16 @@ def bound_names(source: ast.Module) -> set[str]:
 
 def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
     """Start-up is part of the command's promise; mavutil, besides, changes the process that imports it."""
-    unwanted = ["rich", "cyclopts", "pydantic", "serialx", "yaml", "pymavlink.mavutil"]
+    unwanted = [
+        "rich",
+        "cyclopts",
+        "pydantic",
+        "serialx",
+        "yaml",
+        "pymavlink.mavutil",
+        "psycopg",
+        "psycopg_pool",
+    ]
     unwanted += ["paramclient.sim", "paramclient.testing", "paramclient.cli", "paramclient.provision"]
     program = f"import sys, paramclient; print([name for name in {unwanted!r} if name in sys.modules])"
     run = subprocess.run(

@@ -31,10 +31,12 @@ from paramclient.values import Value, known_type
 __all__ = [
     "CLOCK_SLACK",
     "SNAPSHOTS",
+    "read_written",
     "snapshot",
     "state_at",
     "store",
     "watch_clock",
+    "written_cells",
 ]
 
 SNAPSHOTS: Final = 50
@@ -197,23 +199,30 @@ def _checksum(described: Sequence[object], blob: bytes) -> int:
 
 def _packed(identity: Identity, params: Mapping[str, WrittenParam]) -> bytes:
     """Strict JSON, compressed: who the vehicle is, and name, type, value, default of each parameter."""
-    rows = [
-        (each.name, None if each.type is None else int(each.type), _cell(each.value), _cell(each.default))
-        for each in params.values()
-    ]
+    rows = [written_cells(each) for each in params.values()]
     text = json.dumps([identity_cells(identity), rows], separators=(",", ":"), allow_nan=False)
     return zlib.compress(text.encode("ascii"))
 
 
 def _unpacked(blob: bytes) -> tuple[Identity, dict[str, WrittenParam]]:
     identity, rows = json.loads(zlib.decompress(blob))
-    params = {}
-    for name, number, value, default in rows:
-        kind = None if number is None else known_type(number)
-        written = _written(value)
-        assert written is not None
-        params[str(name)] = WrittenParam(str(name), written, kind, _written(default))
-    return read_identity(identity), params
+    found = [read_written(each) for each in rows]
+    return read_identity(identity), {each.name: each for each in found}
+
+
+def written_cells(param: WrittenParam) -> tuple[str, int | None, int | str | None, int | str | None]:
+    """A parameter's name, type, value and default, as JSON can hold them."""
+    number = None if param.type is None else int(param.type)
+    return param.name, number, _cell(param.value), _cell(param.default)
+
+
+def read_written(cells: Sequence[Any]) -> WrittenParam:
+    """The inverse of `written_cells`."""
+    name, number, value, default = cells
+    kind = None if number is None else known_type(number)
+    written = _written(value)
+    assert written is not None
+    return WrittenParam(str(name), written, kind, _written(default))
 
 
 def _cell(value: Value | None) -> int | str | None:

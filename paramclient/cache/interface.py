@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from paramclient.cache.operations import Operation
+from paramclient.cache.records import CacheChange
 from paramclient.cache.session import Session
 
 __all__ = ["Store"]
@@ -52,6 +53,22 @@ class Store(Protocol):
         Raises:
             CacheError: it cannot be written.
             UsageError: a time that is not in unix seconds.
+        """
+        ...
+
+    @property
+    def away(self) -> str | None:
+        """Why a local copy is what is read and written at present; None while it is the cache itself."""
+        ...
+
+    def follow(self, key: str, component: int) -> None:
+        """This program has to do with a table: have it where it stays when a database is lost."""
+        ...
+
+    def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
+        """Have something called, in a thread of the store, when another station has written to a table.
+
+        Gives what ends that.
         """
         ...
 

@@ -158,7 +158,7 @@ def _standing(
 ) -> tuple[CachedVehicle | None, tuple[int, CachedSummary] | None]:
     """The vehicle and the table that are kept, as far as they are."""
     key = update.identity.key
-    vehicle = next((each for each in session.vehicles() if each.key == key), None)
+    vehicle = next(iter(session.vehicles(key)), None)
     return vehicle, next(iter(session.summaries(key, update.component)), None)
 
 

@@ -12,6 +12,7 @@ from paramclient.cache.merge import merge
 from paramclient.cache.records import Snapshot, TableUpdate
 from paramclient.cache.rows import read_param
 from paramclient.cache.session import Session
+from paramclient.cache.settle import settle
 from paramclient.errors import CacheError
 from paramclient.identity import Identity
 from paramclient.paramset import ParamSet
@@ -45,7 +46,8 @@ class Save(Operation[None]):
         return {(each.identity.key, each.component) for each in self.updates}
 
     def do(self, session: Session) -> None:
-        tables.save(session, self.updates)
+        write = settle if session.is_shared else tables.save
+        write(session, self.updates)
 
 
 @dataclass(frozen=True)
@@ -99,19 +101,29 @@ class SetDown(Operation[Snapshot]):
             owner = session.make(new)
         [(_, kept)] = session.summaries(key, self.component)
         identity = kept.identity if isinstance(self.vehicle, str) else self.vehicle
-        params, crc, complete = self.params, self.hash, self.complete
-        if params is None:
-            params, crc, complete = (_kept(session, owner), kept.hash, kept.complete)
+        shown = self.resolved(session)
+        assert shown.params is not None
         return earlier.store(
             session,
             owner,
-            replace(params, identity=identity),
+            replace(shown.params, identity=identity),
             at=self.at,
             reason=self.reason,
-            hash=crc,
-            complete=complete,
+            hash=shown.hash,
+            complete=shown.complete,
             number=self.number,
         )
+
+    def resolved(self, session: Session) -> SetDown:
+        """The same with the parameters that the table has now, where it has none of its own."""
+        if self.params is not None:
+            return self
+        [(key, _)] = self.tables
+        found = session.summaries(key, self.component)
+        if not found:
+            raise CacheError(f"the table of {key}, component {self.component}, has just been removed")
+        [(owner, kept)] = found
+        return replace(self, params=_kept(session, owner), hash=kept.hash, complete=kept.complete)
 
 
 @dataclass(frozen=True)

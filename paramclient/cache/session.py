@@ -74,15 +74,22 @@ class Session(ABC):
         key, component, since = cells(row, "siF")
         return key, component, since
 
-    def vehicles(self) -> list[CachedVehicle]:
-        """Every vehicle, the one seen last first."""
+    def vehicles(self, key: str | None = None) -> list[CachedVehicle]:
+        """Every vehicle, the one seen last first; or the one of this key."""
         components: dict[str, list[int]] = {}
-        for row in self._all("SELECT vehicle, component FROM component ORDER BY component"):
+        which = (key,)
+        for row in self._all(
+            "SELECT vehicle, component FROM component WHERE vehicle = coalesce(?, vehicle)"
+            " ORDER BY component",
+            which,
+        ):
             key, component = cells(row, "si")
             components.setdefault(key, []).append(component)
         found = []
         for row in self._all(
-            f"SELECT key, first_seen, last_seen, {_IDENTITY} FROM vehicle ORDER BY last_seen DESC, key"
+            f"SELECT key, first_seen, last_seen, {_IDENTITY} FROM vehicle WHERE key = coalesce(?, key)"
+            " ORDER BY last_seen DESC, key",
+            which,
         ):
             key, first, last = cells(row[:3], "sff")
             known = tuple(components.get(key, ()))
@@ -160,6 +167,11 @@ class Session(ABC):
         """Delete parameters."""
         self._many("DELETE FROM param WHERE owner = ? AND name = ?", [(owner, name) for name in names])
 
+    def heard_last(self, owner: int) -> float:
+        """When any value of a table was heard last; minus infinity where it has none."""
+        [(at,)] = self._all("SELECT max(heard_at) FROM param WHERE owner = ?", (owner,))
+        return float("-inf") if at is None else float(at)
+
     # history
 
     def history(
@@ -178,12 +190,14 @@ class Session(ABC):
 
     def lines(self, owner: int, after: float | None = None) -> list[NumberedLine]:
         """The lines of a table with their numbers, in order; those of a later time than `after` only."""
-        which = "" if after is None else " AND at > ?"
-        found = self._all(
-            f"SELECT id, {_LINE} FROM history WHERE owner = ?{which} ORDER BY id",
-            (owner,) if after is None else (owner, after),
-        )
-        return [(number, tuple(line)) for number, *line in (cells(row, "ifssiiiIII") for row in found)]
+        if after is None:
+            return self._lines("", (owner,))
+        return self._lines(" AND at > ?", (owner, after))
+
+    def lines_from(self, owner: int, since: float) -> list[NumberedLine]:
+        """The lines from the first one on that is of a later time than `since`, in order."""
+        where = " AND id >= (SELECT min(id) FROM history WHERE owner = ? AND at > ?)"
+        return self._lines(where, (owner, owner, since))
 
     def add_lines(self, owner: int, lines: Sequence[Line]) -> None:
         """Append lines of history, in this order."""
@@ -204,24 +218,23 @@ class Session(ABC):
         self._do("DELETE FROM history WHERE owner = ? AND id <= ?", (owner, last))
         return float(at)
 
-    def replace_lines(self, owner: int, lines: Sequence[tuple[int | None, Line]]) -> None:
-        """Put these lines into the place of all that a table has, in this order, under new numbers.
+    def replace_lines(self, owner: int, lines: Sequence[tuple[int | None, Line]], *, start: int = 0) -> None:
+        """Put these lines into the place of those that a table has, in this order, under new numbers.
 
         Args:
             lines: each with the number that it had, or None for a new one. Names that appeared behind a line
                 go with it.
+            start: the number from which on lines are replaced.
         """
-        numbers = self._numbers(len(lines))
-        self._do("DELETE FROM history WHERE owner = ?", (owner,))
-        self._many(
-            f"INSERT INTO history (id, owner, {_LINE}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            [(number, owner, *line) for number, (_, line) in zip(numbers, lines, strict=True)],
+        [(ahead,)] = self._all(
+            "SELECT coalesce(max(id), 0) FROM history WHERE owner = ? AND id < ?", (owner, start)
         )
+        numbers = self._put_lines(owner, [line for _, line in lines], start)
         places = {old: number for number, (old, _) in zip(numbers, lines, strict=True) if old is not None}
-        behind = self._all("SELECT DISTINCT line FROM birth WHERE owner = ?", (owner,))
+        behind = self._all("SELECT DISTINCT line FROM birth WHERE owner = ? AND line >= ?", (owner, start))
         # from the last one on: a new number is above every old one
         for (line,) in sorted(behind, reverse=True):
-            place = max((new for old, new in places.items() if old <= line), default=0)
+            place = max((new for old, new in places.items() if old <= line), default=ahead)
             if place == line:
                 continue
             self._do(
@@ -268,6 +281,33 @@ class Session(ABC):
             [(name, owner, at, owner) for name, at in births],
         )
 
+    def births(self, owner: int) -> list[tuple[str, int, float]]:
+        """Every name that has appeared, behind which line, and when."""
+        found = self._all("SELECT name, line, at FROM birth WHERE owner = ? ORDER BY line, name", (owner,))
+        return [(name, line, at) for name, line, at in (cells(row, "sif") for row in found)]
+
+    def setbacks(self, owner: int) -> list[tuple[float, float]]:
+        """The times, from and until, that the clock went through twice."""
+        found = self._all("SELECT since, until FROM setback WHERE owner = ? ORDER BY id", (owner,))
+        return [(since, until) for since, until in (cells(row, "ff") for row in found)]
+
+    def put_past(
+        self, owner: int, lines: Sequence[Line], setbacks: Iterable[tuple[float, float]]
+    ) -> Sequence[int]:
+        """Put another past into the place of a table's; give the numbers of the lines."""
+        for table in ("history", "birth", "setback"):
+            self._do(f"DELETE FROM {table} WHERE owner = ?", (owner,))
+        for since, until in setbacks:
+            self.add_setback(owner, since, until)
+        return self._put_lines(owner, lines)
+
+    def put_births(self, owner: int, births: Iterable[tuple[str, float, int]]) -> None:
+        """Note names that appeared: when, and behind the line of which number."""
+        self._many(
+            "INSERT INTO birth (owner, name, at, line) VALUES (?, ?, ?, ?)",
+            [(owner, *birth) for birth in births],
+        )
+
     def births_after(self, owner: int, when: float) -> list[tuple[int, str]]:
         """The names that appeared after a moment, each with the line that was the last one then."""
         found = self._all("SELECT line, name FROM birth WHERE owner = ? AND at > ?", (owner, when))
@@ -311,6 +351,14 @@ class Session(ABC):
             f"SELECT s.id FROM snapshot s WHERE owner = ? ORDER BY {self._newest_first}", (owner,)
         )
         self._many("DELETE FROM snapshot WHERE id = ?", found[keep:])
+
+    def drop_snapshots(self, numbers: Iterable[int]) -> None:
+        """Delete snapshots."""
+        self._many("DELETE FROM snapshot WHERE id = ?", [(number,) for number in numbers])
+
+    def has_snapshot(self, number: int) -> bool:
+        """Whether a snapshot of any table has this number."""
+        return bool(self._all("SELECT 1 FROM snapshot WHERE id = ?", (number,)))
 
     def snapshots(self, key: str, component: int | None) -> list[SnapshotSummary]:
         """The snapshots of a vehicle's tables, newest last."""
@@ -403,6 +451,19 @@ class Session(ABC):
     @abstractmethod
     def _insert(self, sql: str, values: Sequence[object]) -> int:
         """Insert a row into a table with an `id`; give that."""
+
+    def _put_lines(self, owner: int, lines: Sequence[Line], start: int = 0) -> Sequence[int]:
+        numbers = self._numbers(len(lines))  # above those that go: a birth behind one is told from others
+        self._do("DELETE FROM history WHERE owner = ? AND id >= ?", (owner, start))
+        self._many(
+            f"INSERT INTO history (id, owner, {_LINE}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            [(number, owner, *line) for number, line in zip(numbers, lines, strict=True)],
+        )
+        return numbers
+
+    def _lines(self, where: str, values: Sequence[object]) -> list[NumberedLine]:
+        found = self._all(f"SELECT id, {_LINE} FROM history WHERE owner = ?{where} ORDER BY id", values)
+        return [(number, tuple(line)) for number, *line in (cells(row, "ifssiiiIII") for row in found)]
 
     @abstractmethod
     def _numbers(self, count: int) -> Sequence[int]:

@@ -10,6 +10,7 @@ from typing import Any, TypeVar
 
 from paramclient.cache.database import Database
 from paramclient.cache.operations import Operation
+from paramclient.cache.records import CacheChange
 from paramclient.cache.rows import Row, cells
 from paramclient.cache.session import Session
 
@@ -43,6 +44,18 @@ class SqliteStore:
     def replacements(self) -> int:
         """How often a fresh file was made, or another one found in its place."""
         return self._database.replacements
+
+    @property
+    def away(self) -> None:
+        """None: the file is the cache."""
+        return
+
+    def follow(self, key: str, component: int) -> None:
+        """Nothing: the file has every table."""
+
+    def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
+        """Nothing: a file tells nobody."""
+        return _nothing
 
     def read(self, work: Callable[[Session], T]) -> T:
         """Do work that only reads, in one transaction."""
@@ -127,3 +140,7 @@ class SqliteSession(Session):
     def _numbers(self, count: int) -> Sequence[int]:
         [(last,)] = self.connection.execute("SELECT ifnull(max(id), 0) FROM history")
         return range(last + 1, last + 1 + count)
+
+
+def _nothing() -> None:
+    return

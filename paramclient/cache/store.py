@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 
 import platformdirs
 
 from paramclient.cache import earlier, fleet, tables
+from paramclient.cache.address import Address, is_address
 from paramclient.cache.fleet import FleetDiff
 from paramclient.cache.interface import Store
 from paramclient.cache.operations import Merge, Remove, Save, SetDown
 from paramclient.cache.records import (
+    CacheChange,
     CachedComponent,
     CachedSummary,
     CachedVehicle,
@@ -25,6 +27,7 @@ from paramclient.cache.records import (
 )
 from paramclient.cache.session import Session
 from paramclient.cache.sqlite import SqliteStore
+from paramclient.cache.transfer import CopyResult, copy_store
 from paramclient.errors import CacheError
 from paramclient.identity import Identity
 from paramclient.paramset import ParamSet
@@ -38,28 +41,48 @@ def default_path() -> Path:
 
 
 class ParamCache:
-    """Tables, identities and history on disk. Usable with no link, by several threads and processes at once.
+    """Tables, identities and history. Usable with no link, by several threads and processes at once.
 
-    The file is opened by the first call that needs it. Reading creates nothing. Every call blocks, as a rule
+    They are in a file, or in a PostgreSQL that many stations share. The file is opened by the first call that
+    needs it. Reading creates nothing. Every call blocks, as a rule
     for milliseconds, and for a few seconds at most where another process holds the file. What a call has
     written survives the death of the process at any moment; a power cut may take the last calls, never the
     file. A file that is damaged, or newer than this version, is set aside with a warning in the log, and a
     fresh one begins.
 
+    Of a database (`postgresql://USER@HOST/NAME`), the tables that this program has to do with are also in a
+    local copy. While the database cannot be reached, that is what is read and written, `away` says why, and a
+    warning goes to the log. What was written goes to the database once it is back, in order and each change
+    once. Several stations that hear one vehicle write to one table: of each value the later observation
+    counts, and both are in the history. The clocks of the stations have to agree.
+
     Args:
-        path: the file; None for `default_path()`.
+        path: the file; None for `default_path()`; or the URL of a database.
+        local: where the local copy of a database is kept; None for a file in the user's cache folder.
 
     Attributes:
-        path: the file, absolute.
+        path: the file, absolute; of a database, the local copy.
 
     Raises:
+        UsageError: the URL cannot be read, or psycopg is missing.
         CacheError: from every method that reads or writes: the file cannot be used (read-only, disk full,
-            held for too long by another process), or the cache is closed. Nothing was written then.
+            held for too long by another process), the database was never reached from here or refuses, or
+            the cache is closed. Nothing was written then.
     """
 
-    def __init__(self, path: str | os.PathLike[str] | None = None) -> None:
-        self.path = Path(default_path() if path is None else path).resolve()
-        self._store: Store = SqliteStore(self.path)
+    def __init__(
+        self, path: str | os.PathLike[str] | None = None, *, local: str | os.PathLike[str] | None = None
+    ) -> None:
+        self._store: Store
+        if isinstance(path, str) and is_address(path):
+            from paramclient.cache.shared import SharedStore  # loaded only where there is a database
+
+            address = Address.parse(path)
+            self.path = Path(default_path().with_name(address.name) if local is None else local).resolve()
+            self._store = SharedStore(address, self.path)
+        else:
+            self.path = Path(default_path() if path is None else path).resolve()
+            self._store = SqliteStore(self.path)
 
     def __enter__(self) -> ParamCache:
         return self
@@ -73,13 +96,18 @@ class ParamCache:
         return f"<ParamCache {self.place}>"
 
     def close(self) -> None:
-        """Close the file; later calls raise CacheError. A cache that is thrown away closes by itself."""
+        """Close the cache; later calls raise CacheError. One that is thrown away closes by itself."""
         self._store.close()
 
     @property
     def place(self) -> str:
-        """Where the cache is, for people: the file."""
+        """Where the cache is, for people: the file, or the URL of the database without a password."""
         return self._store.place
+
+    @property
+    def away(self) -> str | None:
+        """Why a database is not used at present, but its local copy; None while it is, and for a file."""
+        return self._store.away
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -130,7 +158,10 @@ class ParamCache:
             key: `Identity.key`.
             component: component id.
         """
-        return self._store.read(lambda session: self._load(session, key, component))
+        found = self._store.read(lambda session: self._load(session, key, component))
+        if found is not None:
+            self._store.follow(key, component)
+        return found
 
     def vehicles(self) -> list[CachedVehicle]:
         """Every vehicle, the one seen last first."""
@@ -325,6 +356,42 @@ class ParamCache:
             return found
 
         return self._store.read(work)
+
+    def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
+        """Have something called when another station has written to a table of the database.
+
+        That is within a second. What was written while the database could not be reached is told when it is
+        back. Of a file nothing is told.
+
+        Args:
+            told: is called in a thread of the cache. It should be done soon, and may use the cache.
+
+        Returns:
+            What ends it.
+        """
+        return self._store.subscribe(told)
+
+    def copy_to(
+        self, target: ParamCache, *, progress: Callable[[str, int, int], None] | None = None
+    ) -> CopyResult:
+        """Bring every table into another cache, with history and snapshots, and see that it is there.
+
+        Each table is one transaction, and one of which everything is there already is left alone: ended at
+        any moment, it is begun again in the same way. What the other cache has of a table stays: of each
+        value the later observation counts, and no line of history is there twice.
+
+        Args:
+            progress: is told of each table: whose it is, its number, and how many there are.
+
+        Raises:
+            UsageError: both are the same.
+            CacheError: one of them cannot be used, its database is away, or something did not arrive.
+        """
+        result = copy_store(self._store, target._store, progress)
+        for each in (self, target):
+            if each.away is not None:
+                raise CacheError(f"{each.away}; copy again once it is back")
+        return result
 
     def remove(self, vehicle: str, component: int | None = None) -> int:
         """Forget a vehicle's tables with their history and snapshots; give the number of tables.
