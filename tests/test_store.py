@@ -36,6 +36,7 @@ from paramclient.cache.transfer import take_whole
 from paramclient.errors import CacheError, UsageError
 from tests import test_cache, test_fleet, test_snapshots
 from tests.caches import NOW, PX4, stored, update, values, whole_table
+from tests.commands import in_process
 from tests.postgres import GIVEN, PROGRAMS, WHY_NONE, Server, database_on, server
 from tests.shell import small_px4, swiftly
 
@@ -590,6 +591,24 @@ def fill(cache: ParamCache) -> None:
     cache.save(update(stored("PARAM_0", 9, at=NOW + 5), component=2, at=NOW + 5))
     cache.snapshot(PX4.key, 2, reason="second", at=NOW + 5)
     cache.save(a_value(6, "NEW"))
+
+
+def test_the_command_copies_and_reads_it(
+    path: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with ParamCache(tmp_path / "old") as old:
+        fill(old)
+    ran = in_process(capsys)("cache", "copy", tmp_path / "old", path, "--json")
+    assert (ran.code, ran.json["tables"], ran.json["lines"]) == (0, 3, 4)
+    assert "host=" in ran.json["path"]
+    ran = in_process(capsys)("cache", "copy", tmp_path / "old", path)
+    assert "copied 0 tables to postgresql://" in ran.out
+    assert "3 were there already" in ran.out
+    listed = in_process(capsys, "--cache", path)("cache", "list", "--json")
+    assert [each["size"] for each in listed.json["components"]] == [4, 2, 1]
+    ran = in_process(capsys)("cache", "copy", tmp_path / "none", path)
+    assert ran.code == 5
+    assert "there is no cache" in ran.err
 
 
 # What a client makes of it

@@ -286,12 +286,15 @@ class PostgresSession(Session):
         return [name for row in found for name in cells(row, "s")]
 
     def holders(self, owners: Sequence[int], names: Sequence[str]) -> Mapping[tuple[Any, ...], list[int]]:
+        # by names alone, so that it is the index by names that is read
         found = self._all(
-            "SELECT name, type, bits, is_raw, array_agg(owner) FROM param"
-            " WHERE owner = ANY (?) AND name = ANY (?) GROUP BY name, type, bits, is_raw",
-            (list(owners), list(names)),
+            "SELECT name, type, bits, is_raw, array_agg(owner) FROM param WHERE name = ANY (?)"
+            " GROUP BY name, type, bits, is_raw",
+            (list(names),),
         )
-        return {tuple(value): having for *value, having in found}
+        meant = frozenset(owners)
+        holders = {tuple(value): [each for each in having if each in meant] for *value, having in found}
+        return {value: some for value, some in holders.items() if some}
 
     def since(self, named: Mapping[int, Sequence[str]]) -> list[tuple[int, str, str, int, float]]:
         owners = list(named)
