@@ -1,16 +1,13 @@
-"""The service over HTTP, in this process: what it tells of vehicles, what it does when asked, how it fails."""
+"""The service over HTTP, in this process: what it tells of vehicles, what it does, how it fails."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import re
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
 from paramclient import ParamCache, UsageError
@@ -22,40 +19,8 @@ from paramclient.service import Hub, create_app, following
 from paramclient.sim import Air, ArduPilotVehicle, SimParam
 from paramclient.values import ParamType
 from tests.asgi import a_browser
+from tests.served import C, met, problem, service
 from tests.shell import VALUES, FlakyLink, Tap, generic, settled, small_px4, swiftly
-
-C = "/api/v1/components/1/1"
-
-
-@asynccontextmanager
-async def service(*links: Any, **options: Any) -> AsyncIterator[tuple[Hub, httpx.AsyncClient]]:
-    """An open hub and a client of it; without a cache, and without fetches that nobody asked for."""
-    async with (
-        Hub(links, **{"cache": False, "fetches": False} | options) as hub,
-        a_browser(create_app(hub)) as browser,
-    ):
-        yield hub, browser
-
-
-async def met(browser: httpx.AsyncClient, **sought: Any) -> dict[str, Any]:
-    """The component that is heard first."""
-    answer = await browser.post("/api/v1/find", json=sought)
-    assert answer.status_code == 200, answer.text
-    found: dict[str, Any] = answer.json()
-    return found
-
-
-def problem(answer: httpx.Response, status: int, kind: str) -> dict[str, Any]:
-    """What an answer says that is a problem of this kind."""
-    assert answer.status_code == status, answer.text
-    assert answer.headers["content-type"] == "application/problem+json"
-    told: dict[str, Any] = answer.json()
-    assert told["type"] == f"urn:paramclient:{kind}"
-    assert told["status"] == status
-    assert told["title"]
-    assert told["detail"]
-    return told
-
 
 # links and components
 
@@ -128,7 +93,9 @@ async def test_ids_that_two_links_carry_need_the_link_beside_them() -> None:
 @swiftly
 async def test_who_is_not_heard_in_time_is_a_problem_that_says_so() -> None:
     async with service(SimLink(generic())) as (_, browser):
-        told = problem(await browser.post("/api/v1/find", json={"system": 7, "timeout_s": 2}), 504, "no-reply")
+        told = problem(
+            await browser.post("/api/v1/find", json={"system": 7, "timeout_s": 2}), 504, "no-reply"
+        )
         assert told["error"] == "NoReply"
         assert told["waited"] == pytest.approx(2, abs=0.01)
         assert "system id 7" in told["detail"]
@@ -372,7 +339,10 @@ async def test_a_fetch_is_a_job_that_can_be_looked_at_and_cancelled() -> None:
         assert (await browser.delete(another)).status_code == 204
         await asyncio.sleep(0.1)
         cancelled = (await browser.get(another)).json()
-        assert (cancelled["state"], cancelled["problem"]["type"]) == ("cancelled", "urn:paramclient:cancelled")
+        assert (cancelled["state"], cancelled["problem"]["type"]) == (
+            "cancelled",
+            "urn:paramclient:cancelled",
+        )
         await asyncio.sleep(5)
         done = (await browser.get(place)).json()
         assert done["state"] == "done"
@@ -470,7 +440,7 @@ async def test_what_fails_inside_tells_nothing_of_the_inside(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with service() as (hub, browser):
-        monkeypatch.setattr(type(hub), "followed", property(lambda _: {}["the secret"]))
+        monkeypatch.setattr(type(hub), "followed", property(lambda _: dict[str, str]()["the secret"]))
         told = problem(await browser.get("/api/v1/components"), 500, "internal")
         assert "secret" not in json.dumps(told)
         assert "the secret" in caplog.text
@@ -506,7 +476,7 @@ async def test_its_numbers_are_in_the_format_of_prometheus() -> None:
                 numbers[line.rpartition(" ")[0]] = float(line.rpartition(" ")[2])
         link = r'{link="sim:\"odd\\one\""}'
         assert numbers[f"paramclient_link_downloads_total{link}"] == 1
-        assert numbers[f"paramclient_component_parameters{link[:-1]},system=\"1\",component=\"1\"}}"] == 25
+        assert numbers[f'paramclient_component_parameters{link[:-1]},system="1",component="1"}}'] == 25
 
 
 @swiftly
@@ -560,5 +530,3 @@ async def test_every_answer_forbids_a_browser_to_make_a_program_of_it() -> None:
             assert headers["x-content-type-options"] == "nosniff"
             assert headers["content-security-policy"].startswith("default-src 'none'")
             assert headers["x-seq"] == str(hub.feed.place)
-
-
