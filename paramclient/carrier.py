@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Final
 
 import anyio
+import anyio.lowlevel
 
 from paramclient.errors import LinkError
 from paramclient.links import Link
+from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.station import Station
 
 __all__ = ["Carrier"]
@@ -27,6 +30,13 @@ HELD_UP: Final = 0.02
 has come in that time is read before anything counts as not answered."""
 READING_TIME: Final = 0.002
 """Seconds that the reader is given for that: it is ready to go on, so one turn of the event loop would do."""
+LONGEST_TURN: Final = 0.005
+"""Seconds of what came at once after which other tasks get their turn: with the last value of a list its hash
+is proven, which takes 2 ms, and many lists may end at once."""
+MANY: Final = 128
+"""Datagrams read at once that show that there are more: a link gives up to 256."""
+MOST_BEHIND: Final = 3.0
+"""Seconds for which time-outs wait for what has come to be read, on a link that brings more and more."""
 LINK_PATIENCE: Final = 10.0
 """Seconds that calls wait for a link to come back before they fail with its error."""
 FIRST_BACKOFF: Final = 0.25
@@ -73,6 +83,9 @@ class Carrier:
         self._end = end
         self._something_to_send = anyio.Event()
         self._sent = anyio.Event()  # set when anything is sent
+        self._behind_since = math.inf  # since when more comes than is read at once
+        self._read_at = -math.inf
+        self._asked = True  # whether anything may have been asked of anybody
 
     async def read(self) -> None:
         """Take what comes, until the link fails for good."""
@@ -88,22 +101,36 @@ class Carrier:
                 continue
             now = anyio.current_time()
             is_news = False
+            if len(chunks) < MANY:
+                self._behind_since = math.inf
+            else:
+                self._behind_since = min(self._behind_since, now)
+            give_way_at = time.perf_counter() + LONGEST_TURN
             for peer, data in chunks:
                 is_news |= self._station.receive(data, peer, now)
+                if time.perf_counter() >= give_way_at:
+                    self._dispatch()
+                    await anyio.lowlevel.checkpoint()
+                    now = self._read_at = anyio.current_time()
+                    give_way_at = time.perf_counter() + LONGEST_TURN
             if is_news:
                 self._dispatch()
                 self.tell()
-                self.wake()
+                self._something_to_send.set()
             elif not self._station.is_waiting:
                 await self._rest(min(REST, MOST_PER_REST * (now - before) / max(1, len(chunks))))
             before = now
+            self._read_at = anyio.current_time()
 
     async def send(self) -> None:
         """Send what is to be sent, and do what is due, until the calls have failed for good."""
         station = self._station
         while self.ended is None:
             self._something_to_send = anyio.Event()
-            station.tick(anyio.current_time())
+            everyone = self._asked
+            if not self._is_behind():
+                self._asked = False
+                station.tick(anyio.current_time(), everyone=everyone)
             self._dispatch()
             to_send = station.data_to_send()
             if to_send:
@@ -112,15 +139,21 @@ class Carrier:
                 # a link that drops is the reader's business; what is not sent now is sent again in time
                 with suppress(LinkError):
                     await self._link.send(data, peer)
-            due = station.next_deadline()
+            due = station.next_deadline(everyone=everyone)
+            if self._is_behind():
+                due = anyio.current_time() + LONGEST_TURN
             wait = due - anyio.current_time()
             with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):
                 await self._something_to_send.wait()
             if anyio.current_time() - due > HELD_UP:
                 await anyio.sleep(READING_TIME)
 
-    def wake(self) -> None:
-        """There may be something to send, or another deadline."""
+    def wake(self, machine: ComponentMachine | None = None) -> None:
+        """There may be something to send, or another deadline: of this component, or of any."""
+        if machine is None:
+            self._asked = True
+        else:
+            self._station.touch(machine)
         self._something_to_send.set()
 
     def tell(self) -> None:
@@ -132,6 +165,11 @@ class Carrier:
         """No call can be answered any more."""
         self.ended = error
         self._fail_calls(error)
+
+    def _is_behind(self) -> bool:
+        """Whether more has come than was read, so that nothing can be said not to have been answered."""
+        now = anyio.current_time()
+        return self._behind_since <= now < self._behind_since + MOST_BEHIND and now - self._read_at < HELD_UP
 
     async def _rest(self, seconds: float) -> None:
         """Leave what comes to the link for a while, unless something is sent that may be answered."""

@@ -280,7 +280,7 @@ class Component:
             result = await self._wait_for_fetch(fetch, None if timeout is None else began + timeout, progress)
         finally:
             machine.end_fetch(fetch, anyio.current_time())
-            self._client._wake()  # it may have been in the way of others
+            self._client._wake(machine)  # it may have been in the way of others
         return replace(result, elapsed=anyio.current_time() - began)
 
     async def refreshed(self, *, timeout: float | None = None) -> None:
@@ -402,8 +402,9 @@ class Component:
 
     def _publish(self, change: Change) -> None:
         """Hand a change to everyone who listens."""
-        for changes in list(self._subscriptions):
-            changes.push(change)
+        if self._subscriptions:  # to go through the set takes a while, also when there is nobody in it
+            for changes in list(self._subscriptions):
+                changes.push(change)
 
     def _end(self, error: ParamClientError) -> None:
         """Nothing will come any more."""
@@ -425,7 +426,7 @@ class Component:
         began = anyio.current_time()
         ended = anyio.Event()
         operation.on_done.append(ended.set)
-        self._client._wake()
+        self._client._wake(self._machine)
         try:
             with anyio.move_on_after(patience):
                 while not operation.done:
@@ -446,7 +447,7 @@ class Component:
     ) -> FetchResult:
         ended = anyio.Event()
         fetch.on_done.append(ended.set)
-        self._client._wake()
+        self._client._wake(self._machine)
         try:
             while not fetch.done:
                 now = anyio.current_time()

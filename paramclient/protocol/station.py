@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
+from heapq import heappop, heappush
 from typing import Final, TypeAlias
 
 from paramclient.errors import LinkError, UsageError
@@ -52,6 +53,8 @@ Peer: TypeAlias = Hashable
 HEARTBEAT_INTERVAL: Final = 1.0
 MOST_COMPONENTS: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each have. Further ones are not heard."""
+MOST_PAST: Final = 8
+"""Deadlines of the past that are kept for each component before they are sorted out."""
 MOST_PEERS: Final = 256
 """Stream peers whose unfinished frames are kept."""
 HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
@@ -63,6 +66,8 @@ class Station:
     """Turns what a link delivers into tables and answers, and what is wanted into bytes to send.
 
     Feed it with `receive`, call `tick` at `next_deadline`, send what `data_to_send` gives, look at `events`.
+    Both look at every component, as anything may have been asked of any. Where there are many that takes
+    longer than all the rest; whoever calls `touch` for what was asked may have the others left out.
 
     Args:
         link: the link's canonical name.
@@ -113,6 +118,11 @@ class Station:
         self._heartbeat_at = -math.inf
         self._is_paused = False
         self._turns = Turns()
+        self._of_system: dict[int, list[ComponentMachine]] = {}
+        self._last_waiting: ComponentMachine | None = None
+        self._touched: dict[ComponentMachine, None] = {}  # whose deadline may be another than was noted
+        self._deadlines: dict[ComponentMachine, float] = {}  # as noted
+        self._order: list[tuple[float, int, int]] = []  # a heap of these, with some that are of the past
 
     def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
         """From now on sign what is sent and take what the verifier accepts; before anything has come."""
@@ -139,6 +149,7 @@ class Station:
             machine = self.components.get((system, component))
             if number == PARAM_VALUE_ID and machine is not None:  # the short way for what comes in thousands
                 self._peers[system] = peer
+                self._touched[machine] = None
                 machine.receive_value(decode_param_value(payload), now, version)
             else:
                 self._receive_other(frame, peer, now)
@@ -146,8 +157,16 @@ class Station:
             self._peers = {system: each for system, each in self._peers.items() if each != peer}
         return bool(frames)
 
-    def tick(self, now: float) -> None:
-        """Do what is due: our heartbeat, and every component's time-outs."""
+    def touch(self, machine: ComponentMachine) -> None:
+        """Something was asked of a component, or is no longer."""
+        self._touched[machine] = None
+
+    def tick(self, now: float, *, everyone: bool = True) -> None:
+        """Do what is due: our heartbeat, and every component's time-outs.
+
+        Without `everyone`, only components that were heard or touched, or whose deadline has come, are
+        looked at: a share of the link that has become larger meanwhile is then used a little later.
+        """
         if self._is_paused:
             return
         if self._signer is not None:
@@ -156,21 +175,38 @@ class Station:
             self._heartbeat_at = now + HEARTBEAT_INTERVAL
             beat = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=MAV_STATE_ACTIVE)
             self._send(beat, None, 2)
-        for machine in list(self.components.values()):
+        if not everyone:
+            while self._order and self._order[0][0] <= now:
+                _, system, component = heappop(self._order)
+                self._touched[self.components[system, component]] = None
+        for machine in list(self.components.values() if everyone else self._touched):
             if machine.next_deadline() <= now:
                 machine.tick(now)
-        self._turns.tick(now)
+                self._touched[machine] = None
+        if self._turns.tick(now):
+            self._touch_all(self.components.values())
         if self.traffic is not None:
             self.traffic.sent(self.bytes_sent, now)
 
-    def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity while the link is away."""
+    def next_deadline(self, *, everyone: bool = True) -> float:
+        """When `tick` has something to do, or infinity while the link is away. `everyone` is as there."""
         if self._is_paused:
             return math.inf
-        turns_at = self._turns.next_deadline()
-        return min(
-            [self._heartbeat_at, turns_at, *(machine.next_deadline() for machine in self.components.values())]
-        )
+        if everyone:
+            self._touch_all(self.components.values())
+        deadlines, order = self._deadlines, self._order
+        for machine in self._touched:
+            deadline = machine.next_deadline()
+            if deadline != deadlines.get(machine):
+                deadlines[machine] = deadline
+                heappush(order, (deadline, machine.system, machine.component))
+        self._touched.clear()
+        if len(order) > MOST_PAST * (len(deadlines) + 1):
+            self._order = order = sorted((at, each.system, each.component) for each, at in deadlines.items())
+        while order and deadlines[self.components[order[0][1:]]] != order[0][0]:
+            heappop(order)
+        first = order[0][0] if order else math.inf
+        return min(self._heartbeat_at, self._turns.next_deadline(), first)
 
     def data_to_send(self) -> list[tuple[bytes, Peer | None]]:
         """Frames to send, in order, each with the peer it is for; None is for all."""
@@ -197,13 +233,17 @@ class Station:
         self._is_paused = False
         self._heartbeat_at = now
         self._turns.resume(now)
+        self._touch_all(self.components.values())
         for machine in self.components.values():
             machine.resume(now)
 
     @property
     def is_waiting(self) -> bool:
         """Whether anything is awaited of any component."""
-        return any(machine.is_waiting for machine in self.components.values())
+        last = self._last_waiting
+        if last is None or not last.is_waiting:  # one is asked after the other: mostly it still is the same
+            self._last_waiting = next((each for each in self.components.values() if each.is_waiting), None)
+        return self._last_waiting is not None
 
     def fail_all(self, error: LinkError, now: float) -> None:
         """The link is gone for good: everyone who waits gets its error."""
@@ -229,8 +269,8 @@ class Station:
         first = self.components.get((system, AUTOPILOT_COMPONENT))
         if first is not None and first.who.is_autopilot:
             return first
-        for machine in self.components.values():
-            if machine.system == system and machine.who.is_autopilot:
+        for machine in self._of_system.get(system, ()):
+            if machine.who.is_autopilot:
                 return machine
         return None
 
@@ -264,6 +304,9 @@ class Station:
                 return [machine.begin_fetch(now, refresh=refresh, listed=True) for machine in machines]
         return [machine.begin_fetch(now, refresh=refresh) for machine in machines]
 
+    def _touch_all(self, machines: Iterable[ComponentMachine]) -> None:
+        self._touched.update(dict.fromkeys(machines))
+
     def _watch(self, data: bytes, peer: Peer, now: float) -> None:
         """What somebody wants done with everything that comes, before it is looked into."""
         if self._signer is not None:
@@ -295,6 +338,7 @@ class Station:
             return
         machine = self.components.get(sender) or self._meet(sender, message)
         if machine is not None:
+            self._touch_all(self._of_system[machine.system])  # what one says of the vehicle counts for all
             machine.receive(message, now, version=frame.version)
 
     def _meet(self, sender: Address, message: Message) -> ComponentMachine | None:
@@ -306,6 +350,8 @@ class Station:
         machine: ComponentMachine | None = None
 
         def send(message: Message) -> None:
+            if machine is not None:
+                self._touched[machine] = None
             self._send(message, system, 2 if machine is None else machine.version)
 
         machine = ComponentMachine(
@@ -323,14 +369,14 @@ class Station:
             turns=self._turns,
         )
         self.components[sender] = machine
+        self._of_system.setdefault(system, []).append(machine)
         self._events.append(ComponentHeard(machine))
         return machine
 
     def _become_another(self, system: int, now: float) -> None:
         """Another vehicle has taken a system id, with all of its components."""
-        for machine in self.components.values():
-            if machine.system == system:
-                machine.become_another(now)
+        for machine in self._of_system[system]:
+            machine.become_another(now)
 
     def _autopilot_is_doubted(self, system: int) -> bool:
         autopilot = self.autopilot_of(system)
@@ -341,6 +387,7 @@ class Station:
         for machine in self.components.values():
             is_target = message.target_component in (machine.component, COMP_ID_ALL)
             if is_target and message.target_system in (machine.system, 0):
+                self._touched[machine] = None
                 machine.foreign_set(message.param_id, station, now)
 
     def _send(self, message: Message, system: int | None, version: int) -> None:
