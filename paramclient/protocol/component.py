@@ -64,6 +64,7 @@ class ComponentMachine(Parts):
         table: its parameters.
         round_trip: what its answers tell of the link.
         presence: whether it is there.
+        overheard: the list that another station has asked for, while none of ours comes.
         sync: whether the table is still the vehicle's.
         files: its files.
         descriptions: where it says that what it has to say of itself lies.
@@ -150,6 +151,8 @@ class ComponentMachine(Parts):
         fetch = self.fetches.current
         if fetch is not None:
             fetch.heard(message, now)
+        else:
+            self.overheard.heard(message, now)
         if writes.queues:
             writes.heard(message, now)
         self.reads.heard(message, now)
@@ -366,6 +369,7 @@ class ComponentMachine(Parts):
         self._report(self.table.forget())
         self.sync.forget()
         self.fetches.forget()
+        self.overheard.forget()
         self._known_as = None
         if self.restart is not None:
             self.restart.another(now)
@@ -431,6 +435,7 @@ class ComponentMachine(Parts):
         """The vehicle has started again: what it had not saved is gone, and its list begins anew."""
         self._emit(events.ComponentRebooted(self))
         self._doubt()
+        self.overheard.forget()
         self._authors.clear()
         self.sync.check(now)
         self.who.doubt(now)

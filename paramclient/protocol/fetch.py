@@ -128,7 +128,9 @@ class Fetch(Operation[FetchResult]):
         if self.file is not None:
             self.file.heard(message)
         download = self.download
-        if download is not None and not download.done:
+        if download is None:
+            self._means.overheard.heard(message, now)
+        elif not download.done:
             if self._first_value_at > now:
                 self._first_value_at = now
             download.heard(message, now)
@@ -351,6 +353,10 @@ class Fetch(Operation[FetchResult]):
             file = self.file = PackFetch(means.files, means.turns, means.table, means.changed, now)
             file.on_done.append(partial(self._file_ended, file))
             return
+        count, overheard = self._table.count, means.overheard
+        if not (present or self._listed) and overheard.is_running(now):
+            # another station has asked for it: to ask again would begin it anew for both
+            present, count = overheard.hand_over(means.reads)
         download = self.download = Download(
             means.target,
             means.round_trip,
@@ -359,7 +365,7 @@ class Fetch(Operation[FetchResult]):
             means.turns,
             now,
             listed=self._listed,
-            count=self._table.count,
+            count=count,
             present=present,
         )
         if download.done:

@@ -15,6 +15,7 @@ from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.fetches import Fetches
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.identify import Identification
+from paramclient.protocol.overheard import Overheard
 from paramclient.protocol.presence import Presence
 from paramclient.protocol.reads import Key, Reads
 from paramclient.protocol.refresh import Refresh
@@ -93,6 +94,7 @@ class Parts(ABC):
         self.commands = Commands(target, own, self.round_trip, send)
         self.restart: Restart | None = None
         self.files = FileTransfers(target, own, self.round_trip, send)
+        self.overheard = Overheard()
         self.fetches = Fetches(
             Means(
                 target,
@@ -105,6 +107,7 @@ class Parts(ABC):
                 expects_hash=lambda: self.sync.expects_hash,
                 changed=self._moved,
                 doubt=self._doubt_identity,
+                overheard=self.overheard,
             ),
             self.sync,
             upkeep.policy,

@@ -8,6 +8,7 @@ from enum import StrEnum
 
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.notes import MOVED
+from paramclient.protocol.overheard import Overheard
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.sampling import Sample
 from paramclient.protocol.table import Change, Table
@@ -44,6 +45,7 @@ class Means:
         expects_hash: whether it has a hash, as far as is known.
         changed: is told of changes that no PARAM_VALUE brought.
         doubt: is told that a table has turned out not to be what it was.
+        overheard: the list that another station may be having sent.
     """
 
     target: tuple[int, int]
@@ -56,6 +58,7 @@ class Means:
     expects_hash: Callable[[], bool]
     changed: Callable[[list[Change]], None]
     doubt: Callable[[float], None]
+    overheard: Overheard
 
 
 @dataclass(frozen=True, slots=True)

@@ -291,7 +291,9 @@ class Station:
         When they are all that is known of it, none of them has a table worth going on with, none is being
         fetched, none may give it as a file, and no other list runs, the list is asked for once, of all.
         """
-        is_new = self._turns.is_free and all(machine.fetch is None for machine in machines)
+        is_new = self._turns.is_free and not any(
+            machine.fetch is not None or machine.overheard.is_running(now) for machine in machines
+        )
         may_list = self.policy is Policy.AUTO
         is_fresh = refresh or not any(m.can_hit or present_of(m.table, m.reads) for m in machines)
         has_file = any(machine.fetches.may_use_file() is not False for machine in machines)

@@ -91,7 +91,7 @@ class Turns:
 
     def __init__(self) -> None:
         self.share = Share()
-        self._are_bursty = False  # whether the lists that were looked at last come in bursts
+        self._are_bursty = False  # whether the lists that were looked at last come in bursts: on a fast link
         self._now = -math.inf
         self._limit = 1
         self._shown = 0  # how many have run beside each other and had room
@@ -128,7 +128,8 @@ class Turns:
     def has_begun(self, stream: Stream) -> None:
         """A list runs that was asked for without a turn."""
         self._running[stream] = _NOTHING
-        if len(self._running) > self._shown:  # else it has taken the place of one that is over
+        is_one_more = len(self._running) > self._shown  # else it has taken the place of one that is over
+        if is_one_more or not self._are_bursty:
             self._newest.add(stream)
             self._marked_at = None
 
@@ -170,7 +171,7 @@ class Turns:
                 self._lone = coming[0]
             self._lone_at = now
         if self._waiting and not self._newest and self._again_at <= now:
-            self._newest.update(coming)
+            self._newest.update(coming if self._are_bursty else self._running)
         if self._newest:
             self._look(now)
         room = self._limit - self._active() if self._waiting else 0
@@ -208,7 +209,8 @@ class Turns:
     def _look(self, now: float) -> None:
         """Judge by what has come whether the newest lists had room."""
         active = [stream for stream in self._running if stream.silent_at > now]
-        if any(stream.is_awaited and stream.silent_at > now for stream in self._newest):
+        judged = self._newest.intersection(active) if self._are_bursty else active
+        if any(stream.is_awaited for stream in judged):
             return
         if not active:  # all keep silent, so nothing is known of the link, and nobody is in the way
             self._limit *= GROWTH
@@ -244,7 +246,7 @@ class Turns:
         self._are_bursty = is_bursty
         is_slower = expected >= FEWEST_EXPECTED and not is_bursty and earlier < SLOWER * expected
         if is_slower or self._is_lossier(came, passed):
-            self._fail(len(active) - len(self._newest) or len(active) // 2)
+            self._fail(len(active) - len(self._newest) or len(active) // 2 * self._are_bursty)
         else:
             self._shown = max(self._shown, len(active))
             self._came += came
@@ -261,9 +263,9 @@ class Turns:
         self._marked_at = None
 
     def _fail(self, limit: int) -> None:
-        """There was no room: no more than so many for a while. What follows soon is the same want of it."""
-        if self._now < self._again_at:
-            return
+        """There was no room: no more than so many for a while."""
+        if self._are_bursty and self._now < self._again_at:
+            return  # of as many lists as run there, others are cut for the same want of room
         self._limit = self._shown = max(min(limit, self._limit), 1)
         retry = FAST_RETRY if self._are_bursty else RETRY
         self._again_at = self._now + min(retry * 2**self._failures, LONGEST_RETRY)
