@@ -386,7 +386,12 @@ class ParamClient:
     # what has happened
 
     async def _load(self, component: Component, identity: Identity) -> None:
-        if await self._writer.bring(component._machine, identity):
+        component._cache_reads += 1
+        try:
+            is_brought = await self._writer.bring(component._machine, identity)
+        finally:
+            component._cache_reads -= 1
+        if is_brought:
             component._cache_is_read.set()
             self._writer.wake()
             self._dispatch()

@@ -41,6 +41,8 @@ PROGRESS_INTERVAL = 0.1
 """Seconds between two calls of a progress callback."""
 IDENTITY_PATIENCE = 1.5
 """Seconds to wait for a component to say who it is before its cached table is done without."""
+CACHE_PATIENCE = 5.0
+"""The same while its cached table is being read: for milliseconds, but hundreds may be wanted at once."""
 SETUP_TRIES = 3
 SETUP_PAUSE = 0.1
 """How often SETUP_SIGNING is sent, and the seconds after each: nothing answers it, and frames get lost."""
@@ -73,6 +75,7 @@ class Component:
         self.component = machine.component
         self.params = ParamMap(machine.table.params)
         self._cache_is_read = anyio.Event()
+        self._cache_reads = 0  # under way
 
     @property
     def autopilot(self) -> str:
@@ -389,16 +392,17 @@ class Component:
         return (
             self._cache_is_read.is_set()
             or not self._client._may_be_cached(self)
-            or now >= self._heard_at + IDENTITY_PATIENCE
+            or now >= self._heard_at + (CACHE_PATIENCE if self._cache_reads else IDENTITY_PATIENCE)
         )
 
     async def _wait_for_cache(self) -> None:
         """Wait until the cached table, if the cache may have one, is in `params`; but not for long."""
-        now = anyio.current_time()
-        if not self._cache_is_due(now):
-            with anyio.move_on_after(self._heard_at + IDENTITY_PATIENCE - now):
-                await self._cache_is_read.wait()
-            self._client._check_open()
+        for patience in (IDENTITY_PATIENCE, CACHE_PATIENCE):
+            now = anyio.current_time()
+            if not self._cache_is_due(now):
+                with anyio.move_on_after(self._heard_at + patience - now):
+                    await self._cache_is_read.wait()
+                self._client._check_open()
 
     def _publish(self, change: Change) -> None:
         """Hand a change to everyone who listens."""

@@ -4,10 +4,14 @@ from __future__ import annotations
 
 import inspect
 import math
+import time
 from collections import Counter
+from pathlib import Path
 
 import pytest
 
+from paramclient import ParamCache, ParamClient
+from paramclient.cache import CachedComponent
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.fetch import Fetch
@@ -152,3 +156,24 @@ def test_whether_anything_is_awaited_is_asked_of_one(monkeypatch: pytest.MonkeyP
     asked.clear()
     assert station.is_waiting
     assert asked == [MANY]
+
+
+class SlowCache(ParamCache):
+    """One that has hundreds of others to read first."""
+
+    def load(self, key: str, component: int) -> CachedComponent | None:
+        time.sleep(0.3)
+        return super().load(key, component)
+
+
+@pytest.mark.asyncio
+async def test_a_cached_table_that_is_being_read_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "cache.sqlite3"
+    async with ParamClient(small(1), cache=path) as client:
+        await (await client.component()).fetch_all()
+    monkeypatch.setattr("paramclient.component.IDENTITY_PATIENCE", 0.05)
+    with SlowCache(path) as cache:
+        async with ParamClient(small(1), cache=cache) as client:
+            assert (await client.fetch_all()).results[1, 1].source == "cache"
