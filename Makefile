@@ -5,7 +5,7 @@
 #   make lint       style and types                make docs       the pages, into docs/_build/html
 #   make bench      speed of parser and start      make dist       wheel and sdist, into dist
 #   make cost       CPU and memory                 make peers      downloads beside other programs
-#   make scale      250 systems on one link
+#   make scale      250 systems on one link        make fuzz       each target of fuzz/ for a while
 #   make soak       10,000 sessions at random      make clean      remove all that was made
 
 PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
@@ -17,12 +17,14 @@ BIN = $(VENV)/bin
 PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 TESTS ?=
 SESSIONS ?= 10000
+TARGETS ?= cache component files framer metadata pack
+SECONDS ?= 1800
 
 MEASURED = 'protocol/*' 'sim/*' 'cache/*' 'files/*' values.py errors.py identity.py params.py paramset.py
 # they start programs of their own, which are not measured, are about rooms that are not, or go where others have been
 UNMEASURED = $(addprefix --ignore=tests/test_,bench.py cli.py docs.py examples.py links.py machine.py packaging.py)
 
-.PHONY: demo test coverage soak lint docs bench cost scale peers dist clean
+.PHONY: demo test coverage soak fuzz lint docs bench cost scale peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -41,10 +43,20 @@ coverage: $(VENV)/with-test
 soak: $(VENV)/with-test
 	$(BIN)/python -m tests.soak --sessions $(SESSIONS)
 
+# one after the other; what reaches something new is put into fuzz/corpus, what breaks something into fuzz/findings;
+# `python -m fuzz.keep TARGET` leaves of a corpus what is needed
+fuzz: $(VENV)/with-test $(VENV)/with-fuzz
+	@for target in $(TARGETS); do \
+		echo "== fuzz/$$target.py, $(SECONDS) s"; \
+		$(BIN)/python -m fuzz $$target --seconds $(SECONDS) || exit 1; \
+	done
+
 lint: $(VENV)/with-test $(VENV)/with-lint
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(BIN)/mypy --platform darwin paramclient
+	$(BIN)/mypy --platform win32 paramclient
 
 docs: $(VENV)/with-docs
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --fresh-env -d docs/_build/doctrees docs docs/_build/html
@@ -85,7 +97,7 @@ $(VENV)/with-cli: pyproject.toml $(VENV)/made
 	@touch $@
 
 # dependency groups need pip 25.1, and the pip of the environment is as old as its Python
-$(VENV)/with-test $(VENV)/with-lint $(VENV)/with-docs $(VENV)/with-peers: $(VENV)/with-%: pyproject.toml $(VENV)/with-cli
+$(VENV)/with-test $(VENV)/with-lint $(VENV)/with-docs $(VENV)/with-peers $(VENV)/with-fuzz: $(VENV)/with-%: pyproject.toml $(VENV)/with-cli
 	@echo "Installing what $* needs into $(VENV)"
 	@$(PIP) 'pip>=25.1'
 	@$(PIP) --group $*

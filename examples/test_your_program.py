@@ -1,18 +1,20 @@
-"""A small program for vehicles, and its tests against simulated ones.
+"""A small program for vehicles, and its tests against simulated ones, by the fixtures of the pytest plugin.
 
-python examples/test_your_program.py           run the tests; pytest finds them as well
-python examples/test_your_program.py LINK      run the program
+pytest examples/test_your_program.py           run the tests
+python examples/test_your_program.py [LINK]    run the program
 """
 
 from __future__ import annotations
 
 import asyncio
 import sys
-from contextlib import suppress
+
+import pytest
 
 from paramclient import ParamClient
 from paramclient.links import Link
-from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle
+from paramclient.sim import Endpoint
+from paramclient.testing import MakeArduPilot, MakePX4
 
 INDOOR = {"MPC_XY_VEL_MAX": 2.0, "MPC_Z_VEL_MAX_UP": 1.0, "COM_RC_IN_MODE": 1}
 
@@ -22,7 +24,7 @@ INDOOR = {"MPC_XY_VEL_MAX": 2.0, "MPC_Z_VEL_MAX_UP": 1.0, "COM_RC_IN_MODE": 1}
 
 async def prepare_for_indoors(link: str | Link | Endpoint) -> list[str]:
     """Limit a PX4 vehicle's speed; give the names of the parameters that had to be changed."""
-    async with ParamClient(link, cache=False) as client:
+    async with ParamClient(link) as client:
         vehicle = await client.component()
         if vehicle.autopilot != "px4":
             raise ValueError(f"this is for px4, and the vehicle is {vehicle.autopilot}")
@@ -34,42 +36,34 @@ async def prepare_for_indoors(link: str | Link | Endpoint) -> list[str]:
         return changed
 
 
-# its tests: a vehicle is an ordinary object, and what is on board can be looked at
+# its tests: sim_px4 and sim_ardupilot make vehicles, and what is on board can be looked at
 
 
-def test_sets_the_limits() -> None:
-    px4 = PX4Vehicle()
+def test_sets_the_limits(sim_px4: MakePX4) -> None:
+    px4 = sim_px4()
     asyncio.run(prepare_for_indoors(px4))
-    assert {name: px4.param(name).value for name in INDOOR} == INDOOR
+    assert {name: px4.vehicle.values[name] for name in INDOOR} == INDOOR
 
 
-def test_leaves_alone_what_is_right() -> None:
-    px4 = PX4Vehicle()
-    for name, value in INDOOR.items():
-        px4.set_param(name, value)
+def test_leaves_alone_what_is_right(sim_px4: MakePX4) -> None:
+    px4 = sim_px4(table=INDOOR)
     assert asyncio.run(prepare_for_indoors(px4)) == []
-    assert px4.requests["PARAM_SET"] == 0
+    assert px4.vehicle.requests["PARAM_SET"] == 0
 
 
-def test_works_on_a_bad_radio() -> None:
-    px4 = PX4Vehicle()
-    asyncio.run(prepare_for_indoors(Air.symmetric([px4], loss=0.2, delay=0.02, jitter=0.02, seed=7)))
-    assert {name: px4.param(name).value for name in INDOOR} == INDOOR
+def test_works_on_a_bad_radio(sim_px4: MakePX4) -> None:
+    px4 = sim_px4(loss=0.2, delay=0.02, jitter=0.02, seed=7)
+    asyncio.run(prepare_for_indoors(px4))
+    assert {name: px4.vehicle.values[name] for name in INDOOR} == INDOOR
 
 
-def test_refuses_other_autopilots() -> None:
-    ardupilot = ArduPilotVehicle()
-    with suppress(ValueError):
+def test_refuses_other_autopilots(sim_ardupilot: MakeArduPilot) -> None:
+    ardupilot = sim_ardupilot()
+    with pytest.raises(ValueError, match="the vehicle is ardupilot"):
         asyncio.run(prepare_for_indoors(ardupilot))
-        raise AssertionError("it took an ArduPilot for a PX4")
-    assert ardupilot.requests["PARAM_SET"] == 0
+    assert ardupilot.vehicle.requests["PARAM_SET"] == 0
 
 
 if __name__ == "__main__":
-    if len(sys.argv) > 1:
-        print("changed:", asyncio.run(prepare_for_indoors(sys.argv[1])) or "nothing")
-    else:
-        for name, test in list(globals().items()):
-            if name.startswith("test_"):
-                test()
-                print("passed:", name)
+    link = sys.argv[1] if len(sys.argv) > 1 else "sim:px4"
+    print("changed:", asyncio.run(prepare_for_indoors(link)) or "nothing")

@@ -56,6 +56,7 @@ from paramclient.protocol.traffic import ComponentTraffic, MessageTraffic, Radio
 from paramclient.protocol.wire import Refusal, SigningKey, SigningPolicy, SigningReport, SigningStream
 from paramclient.protocol.writes import SetResult
 from paramclient.signing import Signing, key_from_environment, read_key
+from paramclient.stats import ClientStats
 from paramclient.values import Encoding, Param, ParamType, Trust
 from paramclient.version import __version__
 
@@ -67,6 +68,7 @@ __all__ = [
     "Change",
     "Changes",
     "ClientClosed",
+    "ClientStats",
     "CommandRefused",
     "CommandResult",
     "Component",

@@ -12,6 +12,8 @@ __all__ = ["main"]
 
 LIBRARIES: Final = ("cyclopts", "rich")
 """What the extra `cli` installs."""
+SIGPIPE: Final = 13
+"""Windows has no such signal, and the exit code is the same there."""
 
 
 def main() -> NoReturn:
@@ -37,7 +39,7 @@ def main() -> NoReturn:
         nowhere = os.open(os.devnull, os.O_WRONLY)
         for stream in (sys.stdout, sys.stderr):
             os.dup2(nowhere, stream.fileno())
-        code = 128 + signal.SIGPIPE
+        code = 128 + SIGPIPE
     sys.exit(code)
 
 

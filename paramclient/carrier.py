@@ -5,19 +5,21 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable
+from collections import deque
+from collections.abc import Callable, Sequence
 from contextlib import suppress
-from typing import Final
+from typing import Final, Protocol
 
 import anyio
 import anyio.lowlevel
 
 from paramclient.errors import LinkError
-from paramclient.links import Link
+from paramclient.links import Link, Peer
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.station import Station
+from paramclient.standstill import Standstill
 
-__all__ = ["Carrier"]
+__all__ = ["Carrier", "Tap"]
 
 REST: Final = 0.02
 """Seconds for which the reader lets telemetry pile up while nobody waits for an answer: to take 20 datagrams
@@ -42,21 +44,41 @@ LINK_PATIENCE: Final = 10.0
 FIRST_BACKOFF: Final = 0.25
 LONGEST_BACKOFF: Final = 5.0
 """Seconds between two attempts to open a link again: doubled from the first to the longest."""
+OTHERS_PER_TURN: Final = 16
+MOST_OF_OTHERS: Final = 1_000
+"""Frames of another program that are sent before our own have their turn again, and that may wait: a mission
+of a thousand items. On a slow link the rest is lost, as it would be with a link of its own."""
 
 logger = logging.getLogger(__name__)
+
+
+class Tap(Protocol):
+    """Somebody who is told of everything that goes over the link. None of the calls may block or raise."""
+
+    def received(self, data: bytes, peer: Peer) -> None:
+        """This has come; an empty chunk says that the peer's stream has ended."""
+
+    def sent(self, data: bytes) -> None:
+        """This frame was given to the link to be sent."""
+
+    def pause(self) -> None:
+        """The link is away: what was cut off by that is not continued."""
 
 
 class Carrier:
     """Carries what a link delivers to a station, and what that wants sent to the link.
 
     `read` and `send` run side by side for as long as the client is open. A link that drops and can come back
-    is opened again; meanwhile time stands still for the station.
+    is opened again; meanwhile time stands still for the station. So it does while this computer sleeps, or
+    nobody lets us work.
 
     Args:
         link: an open one.
         station: the core.
         dispatch: hands out what has happened, after each time that something may have.
         end: takes the error of a link that has failed for good, and calls `fail_for_good`.
+        taps: who is told of everything that goes over the link.
+        may_rest: whether telemetry may be left to the link for a while: not where somebody else waits for it.
 
     Attributes:
         is_away: whether the link is away and being opened again.
@@ -72,6 +94,8 @@ class Carrier:
         *,
         dispatch: Callable[[], None],
         end: Callable[[LinkError], None],
+        taps: Sequence[Tap] = (),
+        may_rest: bool = True,
     ) -> None:
         self.is_away = False
         self.broken: LinkError | None = None
@@ -81,11 +105,15 @@ class Carrier:
         self._station = station
         self._dispatch = dispatch
         self._end = end
+        self._taps = taps
+        self._may_rest = may_rest
+        self._of_others: deque[bytes] = deque()
         self._something_to_send = anyio.Event()
         self._sent = anyio.Event()  # set when anything is sent
         self._behind_since = math.inf  # since when more comes than is read at once
         self._read_at = -math.inf
         self._asked = True  # whether anything may have been asked of anybody
+        self._standstill = Standstill()
 
     async def read(self) -> None:
         """Take what comes, until the link fails for good."""
@@ -100,7 +128,11 @@ class Carrier:
                 await self._reopen(error)
                 continue
             now = anyio.current_time()
-            is_news = False
+            self._look_at_the_clock(now)
+            is_news = not chunks
+            if not chunks:
+                self._station.over(now)
+                self._asked = True
             if len(chunks) < MANY:
                 self._behind_since = math.inf
             else:
@@ -108,6 +140,8 @@ class Carrier:
             give_way_at = time.perf_counter() + LONGEST_TURN
             for peer, data in chunks:
                 is_news |= self._station.receive(data, peer, now)
+                for tap in self._taps:
+                    tap.received(data, peer)
                 if time.perf_counter() >= give_way_at:
                     self._dispatch()
                     await anyio.lowlevel.checkpoint()
@@ -117,7 +151,7 @@ class Carrier:
                 self._dispatch()
                 self.tell()
                 self._something_to_send.set()
-            elif not self._station.is_waiting:
+            elif self._may_rest and not self._station.is_waiting:
                 await self._rest(min(REST, MOST_PER_REST * (now - before) / max(1, len(chunks))))
             before = now
             self._read_at = anyio.current_time()
@@ -127,26 +161,40 @@ class Carrier:
         station = self._station
         while self.ended is None:
             self._something_to_send = anyio.Event()
+            now = anyio.current_time()
+            self._look_at_the_clock(now)
+            self._standstill.expect(math.inf)  # a slow link may hold us up
             everyone = self._asked
             if not self._is_behind():
                 self._asked = False
-                station.tick(anyio.current_time(), everyone=everyone)
+                station.tick(now, everyone=everyone)
             self._dispatch()
             to_send = station.data_to_send()
             if to_send:
                 self._sent.set()
             for data, peer in to_send:
-                # a link that drops is the reader's business; what is not sent now is sent again in time
-                with suppress(LinkError):
-                    await self._link.send(data, peer)
+                await self._transmit(data, peer)
+            for _ in range(min(len(self._of_others), OTHERS_PER_TURN)):
+                await self._transmit(self._of_others.popleft(), None)
+            if self._of_others:
+                self._asked |= everyone  # whose deadlines have not been noted
+                continue
             due = station.next_deadline(everyone=everyone)
             if self._is_behind():
                 due = anyio.current_time() + LONGEST_TURN
+            self._standstill.expect(due)
             wait = due - anyio.current_time()
             with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):
                 await self._something_to_send.wait()
             if anyio.current_time() - due > HELD_UP:
                 await anyio.sleep(READING_TIME)
+
+    def send_for_another(self, frame: bytes) -> None:
+        """Send a frame of another program to every peer, in its turn; it is lost where too many wait."""
+        if len(self._of_others) < MOST_OF_OTHERS and not self.is_away:
+            self._of_others.append(frame)
+            self._station.overhear(frame, anyio.current_time())
+            self._something_to_send.set()
 
     def wake(self, machine: ComponentMachine | None = None) -> None:
         """There may be something to send, or another deadline: of this component, or of any."""
@@ -171,6 +219,21 @@ class Carrier:
         now = anyio.current_time()
         return self._behind_since <= now < self._behind_since + MOST_BEHIND and now - self._read_at < HELD_UP
 
+    async def _transmit(self, data: bytes, peer: Peer | None) -> None:
+        for tap in self._taps:
+            tap.sent(data)
+        # a link that drops is the reader's business; what is not sent now is sent again in time
+        with suppress(LinkError):
+            await self._link.send(data, peer)
+
+    def _look_at_the_clock(self, now: float) -> None:
+        """Before anything is taken or sent: see whether we were away."""
+        unseen = self._standstill.unseen(now)
+        if unseen is not None:
+            logger.info("%s: time has stood still here", self._link.name)
+            self._station.stood_still(unseen, now)
+            self.wake()
+
     async def _rest(self, seconds: float) -> None:
         """Leave what comes to the link for a while, unless something is sent that may be answered."""
         self._sent = anyio.Event()
@@ -181,7 +244,10 @@ class Carrier:
         """Open the link again, for as long as it takes."""
         logger.warning("%s; trying to open it again", error)
         self.is_away = True
+        self._of_others.clear()
         self._station.pause()
+        for tap in self._taps:
+            tap.pause()
         patience_ends = anyio.current_time() + LINK_PATIENCE
         backoff = FIRST_BACKOFF
         while True:

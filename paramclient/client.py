@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import weakref
@@ -12,16 +13,18 @@ from typing import TYPE_CHECKING, Final
 import anyio
 import anyio.abc
 
+from paramclient.beside import Beside
 from paramclient.cache import ParamCache
 from paramclient.carrier import Carrier
-from paramclient.component import PROGRESS_INTERVAL, Component
+from paramclient.component import PROGRESS_INTERVAL, Component, address_in_words, patience_of
 from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
 from paramclient.events import Events, told
 from paramclient.ftp import Ftp
 from paramclient.identity import Identity
-from paramclient.links import Link, create_link
+from paramclient.links import Link, ReplayLink, create_link
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import (
+    ComponentForgotten,
     ComponentHeard,
     ComponentIdentified,
     Event,
@@ -35,11 +38,12 @@ from paramclient.protocol.succession import SEARCH_PACE, Succession
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.traffic import TrafficReport
 from paramclient.protocol.wire import SigningKey, SigningReport
-from paramclient.signing import Signing
+from paramclient.signing import Signing, refused_in_words
+from paramclient.stats import ClientStats
 from paramclient.timestamps import TimestampKeeper
 from paramclient.together import FetchedAll, FetchTogether
 from paramclient.values import Encoding
-from paramclient.writethrough import WriteThrough
+from paramclient.writethrough import WriteThrough, chosen_cache
 
 if TYPE_CHECKING:
     from paramclient.sim import Endpoint
@@ -54,6 +58,10 @@ CLOSING_PATIENCE: Final = 0.5
 """Seconds that closing waits for the hash after a write, where the next session could not do without it."""
 
 
+logger = logging.getLogger(__name__)
+protocol_logger = logging.getLogger("paramclient.protocol")
+
+
 class ParamClient:
     """The ground station's side of the parameter protocol on one link, as an async context manager.
 
@@ -62,16 +70,17 @@ class ParamClient:
     ClientClosed, what is new is written, and neither task nor socket nor thread remains. What the body
     raises comes out as it is.
 
-    A TCP connection that drops, or a serial port that is unplugged, is opened again with back-off for as long
-    as the client lives. Calls that wait meanwhile go on when it is back: what had not been answered is asked
-    for again. After `LINK_PATIENCE` seconds without a link they raise LinkError, and new ones do so at once.
-    A link that cannot come back (a UDP socket that fails) ends every call with its LinkError.
+    A TCP connection that drops, a serial port that is unplugged or a UDP socket that fails is opened again
+    with back-off for as long as the client lives. Calls that wait meanwhile go on when it is back: what had
+    not been answered is asked for again. After `LINK_PATIENCE` seconds without a link they raise LinkError,
+    and new ones do so at once. A link that cannot come back (`tcpin`, when nobody can be let in) ends every
+    call with its LinkError.
 
     Args:
         link: a link's name, such as `udpin:0.0.0.0:14550` (`paramclient.links.FORMS` says which there are), a
             link object, or a simulated vehicle.
         cache: where tables are kept: None for the user's cache, a path, a `ParamCache` (which stays open), or
-            False for none.
+            False for none. A log that is replayed neither reads nor writes one.
         system, component: who we are on the link.
         encoding: how all components lay out values, for those who know better than the evidence.
         watch_interval: seconds after which it is looked again whether a table that was fetched still is the
@@ -84,6 +93,13 @@ class ParamClient:
             same.
         traffic: whether to count everything that is heard, for `traffic_report`. That takes time for each
             frame, also of those that a client otherwise steps over.
+        listen_only: never send a byte, not even a heartbeat. Tables fill by what others on the link ask for;
+            `fetch_all` waits for their list, and `get`, `set` and the like raise UsageError.
+        forward: the link to one other program, by its name or as an object, such as
+            `udpout:127.0.0.1:14551`: it gets every frame that comes, and what it sends goes to the vehicles;
+            with `listen_only` it is not. A program that is slow or absent holds nothing up.
+        tlog: a telemetry log to be made, of every frame on the link, both ways. One that exists is not
+            written over; a full disk ends it with a warning, and nothing else.
         signing: the key with which what is sent is signed and what comes is checked, or a `Signing`, which
             says more. None: nothing is signed, and signatures count for nothing.
 
@@ -92,8 +108,8 @@ class ParamClient:
 
     Raises:
         UsageError: no such link, ids outside 1 to 255, or an interval or policy that cannot be; on entering:
-            for the second time.
-        LinkError: on entering: the link cannot be opened.
+            for the second time, or the telemetry log exists or cannot be made.
+        LinkError: on entering: the link, or the one to the other program, cannot be opened.
     """
 
     def __init__(
@@ -107,26 +123,26 @@ class ParamClient:
         watch_interval: float | None = None,
         policy: Policy | str = Policy.AUTO,
         traffic: bool = False,
+        listen_only: bool = False,
+        forward: str | Link | None = None,
+        tlog: str | os.PathLike[str] | None = None,
         signing: Signing | SigningKey | None = None,
     ) -> None:
         for number in (system, component):
             if not 1 <= number <= 255:
                 raise UsageError(f"our own system and component ids are 1 to 255, not {number}")
         self._link = create_link(link)
-        if isinstance(cache, ParamCache):
-            self.cache: ParamCache | None = cache
-        elif cache is False:
-            self.cache = None
-        else:
-            self.cache = ParamCache(None if cache is None or cache is True else cache)
+        is_log = isinstance(self._link, ReplayLink)
+        self.cache = chosen_cache(cache, is_log=is_log)
         self._station = Station(
             link=self._link.name,
             is_stream=self._link.is_stream,
             system=system,
             component=component,
             encoding=encoding,
-            upkeep=Upkeep.chosen(watch_interval, policy),
+            upkeep=Upkeep.chosen(watch_interval, policy, listen_only=listen_only, is_log=is_log),
             counts_traffic=traffic,
+            trace=protocol_logger.debug,
         )
         self._writer = WriteThrough(
             self.cache,
@@ -137,7 +153,18 @@ class ParamClient:
         self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self._components: dict[Address, Component] = {}
         self._tasks: anyio.abc.TaskGroup | None = None
-        self._carrier = Carrier(self._link, self._station, dispatch=self._dispatch, end=self._end)
+        self._beside = Beside(tlog, forward, is_stream=self._link.is_stream)
+        self._carrier = Carrier(
+            self._link,
+            self._station,
+            dispatch=self._dispatch,
+            end=self._end,
+            taps=self._beside.taps,
+            may_rest=self._beside.forwarder is None,
+        )
+        if not self.listens_only:
+            self._beside.share(self._carrier.send_for_another)
+        self._downloads = self._cache_hits = 0
         if isinstance(signing, SigningKey):
             signing = Signing(signing)
         self._keeper = None if signing is None else TimestampKeeper(signing)
@@ -150,9 +177,21 @@ class ParamClient:
         return MappingProxyType(self._components)
 
     @property
+    def autopilots(self) -> list[Component]:
+        """The autopilot of each system heard so far, by system id: vehicles, without what they carry."""
+        systems = sorted({system for system, _ in self._components})
+        found = [self._find(system, None) for system in systems]
+        return [component for component in found if component is not None]
+
+    @property
     def link(self) -> Link:
         """The link."""
         return self._link
+
+    @property
+    def listens_only(self) -> bool:
+        """Whether nothing is ever sent: by choice, or as the link is a log."""
+        return self._station.listens_only
 
     @property
     def bytes_received(self) -> int:
@@ -163,6 +202,11 @@ class ParamClient:
     def bytes_sent(self) -> int:
         """Bytes of the frames that were sent, our heartbeats among them."""
         return self._station.bytes_sent
+
+    @property
+    def stats(self) -> ClientStats:
+        """What it has done so far, in numbers; also when it is closed."""
+        return ClientStats.of(self._station, downloads=self._downloads, cache_hits=self._cache_hits)
 
     def __repr__(self) -> str:
         state = "closed" if self._tasks is None or self._carrier.ended is not None else "open"
@@ -178,11 +222,13 @@ class ParamClient:
         try:
             await self._link.open()
             await self._writer.open()
+            await self._beside.open()
             if self._keeper is not None:
                 self._station.begin_signing(*await self._keeper.open())
         except BaseException:
             await self._release()
             raise
+        logger.debug("%s: open", self._link.name)
         tasks = anyio.create_task_group()
         await tasks.__aenter__()
         self._tasks = tasks
@@ -190,6 +236,7 @@ class ParamClient:
         tasks.start_soon(self._carrier.read, name="paramclient reader")
         tasks.start_soon(self._carrier.send, name="paramclient sender")
         tasks.start_soon(self._writer.run, name="paramclient cache writer")
+        self._beside.start(tasks)
         if self._keeper is not None:
             tasks.start_soon(self._keeper.run, name="paramclient timestamp keeper")
         return self
@@ -213,6 +260,7 @@ class ParamClient:
 
     async def _release(self) -> None:
         """Give back the link and the cache, also when cancelled."""
+        logger.debug("%s: closing", self._link.name)
         with anyio.CancelScope(shield=True):
             try:
                 await self._link.close()
@@ -222,15 +270,18 @@ class ParamClient:
                 try:
                     await self._writer.close()
                 finally:
-                    if self._keeper is not None:
-                        await self._keeper.close()
+                    try:
+                        if self._keeper is not None:
+                            await self._keeper.close()
+                    finally:
+                        await self._beside.close()
 
     def events(self) -> Events:
         """What happens to components from now on: `async for event in client.events()`.
 
         The events are those of `paramclient.events`: Heard, Lost, Found, Rebooted, Resynced. An absence of
         the link does not end it; it ends when nobody holds it any more. Whoever is very slow to ask misses
-        the oldest ones.
+        the oldest ones. In a log it ends with that.
 
         Raises:
             LinkError: while waiting, when the link failed for good or the client was closed. What had come
@@ -238,7 +289,7 @@ class ParamClient:
         """
         events = Events()
         self._subscriptions.add(events)
-        if self._carrier.ended is not None:
+        if self._is_over:
             events.end(self._carrier.ended)
         return events
 
@@ -271,13 +322,14 @@ class ParamClient:
         self._check_open()
         began = anyio.current_time()
         with anyio.move_on_after(timeout):
-            while (found := self._find(system, component)) is None:
+            while (found := self._find(system, component)) is None and not self._station.is_over:
                 await self._carrier.news.wait()
                 self._check_open()
-            await found._wait_for_cache()
+            if found is not None:
+                await found._wait_for_cache()
         if found is None:
             waited = anyio.current_time() - began
-            wanted = _wanted(system, component) + self._refused_in_words()
+            wanted = address_in_words(system, component) + refused_in_words(self.signing_report())
             raise NoReply(wanted, attempts=0, waited=waited)
         return found
 
@@ -341,6 +393,7 @@ class ParamClient:
             LinkError: the link failed, or the client was closed.
         """
         self._station.check_refresh(refresh)
+        timeout = patience_of(self._station, timeout)
         began = anyio.current_time()
         deadline = math.inf if timeout is None else began + timeout
         hear_until = began + HEARING_PATIENCE if timeout is None else deadline
@@ -386,12 +439,7 @@ class ParamClient:
     # what has happened
 
     async def _load(self, component: Component, identity: Identity) -> None:
-        component._cache_reads += 1
-        try:
-            is_brought = await self._writer.bring(component._machine, identity)
-        finally:
-            component._cache_reads -= 1
-        if is_brought:
+        if await self._writer.bring(component._machine, identity):
             component._cache_is_read.set()
             self._writer.wake()
             self._dispatch()
@@ -404,6 +452,13 @@ class ParamClient:
             if isinstance(event, ParamChanged):
                 self._components[machine.system, machine.component]._publish(event.change)
                 is_to_be_written = True
+                continue
+            logger.debug("%s", event)
+            if isinstance(event, Fetched):
+                self._cache_hits += event.result.source == "cache"
+                self._downloads += event.result.source != "cache" and event.result.complete
+            if isinstance(event, ComponentForgotten):
+                self._components.pop((machine.system, machine.component))._part()
                 continue
             if isinstance(event, ComponentHeard):
                 self._meet(machine)
@@ -423,6 +478,8 @@ class ParamClient:
                 self._announce(event)
         if is_to_be_written:
             self._writer.wake()
+        if self._station.is_over:
+            self._end_feeds(None)
 
     def _announce(self, event: Event) -> None:
         """Tell those who listen, if it is for them."""
@@ -458,9 +515,19 @@ class ParamClient:
         self._dispatch()
         self._carrier.fail_for_good(error)
         for component in self._components.values():
+            component._cache_is_read.set()
+        self._end_feeds(error)
+
+    def _end_feeds(self, error: LinkError | None) -> None:
+        for component in self._components.values():
             component._end(error)
         for events in list(self._subscriptions):
             events.end(error)
+
+    @property
+    def _is_over(self) -> bool:
+        """Whether nothing more will happen."""
+        return self._station.is_over or self._carrier.ended is not None
 
     def _check_open(self) -> None:
         if self._carrier.broken is not None:
@@ -477,34 +544,6 @@ class ParamClient:
             ):
                 await self._carrier.news.wait()
 
-    def _refused_in_words(self) -> str:
-        """Why somebody may be there and not be heard, for the end of a sentence."""
-        report = self.signing_report()
-        refused = {} if report is None else report.refused
-        reasons = ", ".join(f"{count} for: {reason}" for reason, count in refused.items())
-        return f" (frames were refused, {reasons})" if reasons else ""
-
-    def _may_be_cached(self, component: Component) -> bool:
-        return self._writer.may_have(component.system, component.component)
-
-    def _identity_of(self, machine: ComponentMachine) -> Identity | None:
-        return self._station.identity_of(machine)
-
     def _find(self, system: int | None, component: int | None) -> Component | None:
-        if component is None:
-            for machine in self._station.components.values():
-                if system in (None, machine.system) and machine.who.is_autopilot:
-                    autopilot = self._station.autopilot_of(machine.system) or machine
-                    return self._components[autopilot.system, autopilot.component]
-            return None
-        for address, found in self._components.items():
-            if address[1] == component and system in (None, address[0]) and found._machine.who.has_spoken:
-                return found
-        return None
-
-
-def _wanted(system: int | None, component: int | None) -> str:
-    """What was looked for, in words."""
-    if component is None:
-        return "an autopilot" if system is None else f"an autopilot with system id {system}"
-    return f"component {'*' if system is None else system}/{component}"
+        found = self._station.find(system, component)
+        return None if found is None else self._components[found.system, found.component]

@@ -18,11 +18,20 @@ from paramclient.params import ParamMap
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.operation import Operation
+from paramclient.protocol.overhear import OVERHEARING_PATIENCE
 from paramclient.protocol.result import FetchResult, Progress, Sampled
 from paramclient.protocol.sampling import SAMPLE_SIZE
+from paramclient.protocol.station import Station
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
-from paramclient.protocol.wire import HASH_CHECK, MAV_MODE_FLAG_SAFETY_ARMED, NO_INDEX, ParamValue, SigningKey
+from paramclient.protocol.wire import (
+    HASH_CHECK,
+    MAV_MODE_FLAG_SAFETY_ARMED,
+    MOST_PARAMETERS,
+    NO_INDEX,
+    ParamValue,
+    SigningKey,
+)
 from paramclient.protocol.writes import SetResult
 from paramclient.signing import timestamp_now
 from paramclient.values import Encoding, Param, check_name, check_value, decode, known_type
@@ -30,7 +39,7 @@ from paramclient.values import Encoding, Param, check_name, check_value, decode,
 if TYPE_CHECKING:
     from paramclient.client import ParamClient
 
-__all__ = ["Component"]
+__all__ = ["Component", "address_in_words", "patience_of"]
 
 Result = TypeVar("Result")
 
@@ -75,7 +84,6 @@ class Component:
         self.component = machine.component
         self.params = ParamMap(machine.table.params)
         self._cache_is_read = anyio.Event()
-        self._cache_reads = 0  # under way
 
     @property
     def autopilot(self) -> str:
@@ -86,7 +94,7 @@ class Component:
     @property
     def identity(self) -> Identity:
         """Who the vehicle is: hardware id, firmware, capabilities, as far as known."""
-        return self._client._identity_of(self._machine) or self._machine.identity
+        return self._client._station.identity_of(self._machine) or self._machine.identity
 
     @property
     def encoding(self) -> Encoding:
@@ -161,7 +169,7 @@ class Component:
                 measured round trip and loss.
 
         Raises:
-            UsageError: no such name or index can exist.
+            UsageError: no such name or index can exist, or the client only listens.
             UnknownParameter: the vehicle does not have it.
             Refused: it gave a reason not to tell.
             NoReply: it did not answer.
@@ -169,8 +177,8 @@ class Component:
         """
         if isinstance(name, str):
             check_name(name)
-        elif not 0 <= name < NO_INDEX:
-            raise UsageError(f"parameter index {name}: indices are 0 to {NO_INDEX - 1}")
+        elif not 0 <= name < MOST_PARAMETERS:
+            raise UsageError(f"parameter index {name}: indices are 0 to {MOST_PARAMETERS - 1}")
         machine = self._machine
         self._client._check_open()
         read = machine.read(name, anyio.current_time())
@@ -204,7 +212,8 @@ class Component:
             Accepted, or adjusted: the vehicle made another value of it.
 
         Raises:
-            UsageError: the name or the value cannot be right. Nothing was written.
+            UsageError: the name or the value cannot be right, or the client only listens. Nothing was
+                written.
             UnknownParameter: the vehicle does not have it.
             Refused: it gave a reason.
             TypeMismatch: it holds the parameter in another type.
@@ -243,6 +252,9 @@ class Component:
         the list, exact, and with the firmware's defaults. Else it comes by list. `source` and `notes` of the
         result say what was done, and why.
 
+        Where the client only listens, nothing is asked for: it waits for a list that others ask for, and then
+        ends when the table is whole, or 5 seconds after the last new value.
+
         It ends by itself in every case: indices that never answer are given up and named in `missing`.
         Calls at the same time share one fetch. Cancelling it leaves what has come in the table.
 
@@ -254,12 +266,13 @@ class Component:
                 as verified. Else "verified".
             sample: how many parameters are read for that.
             seed: of their draw; None for another one each time.
-            timeout: seconds, after which what has come is given with `missing`.
+            timeout: seconds, after which what has come is given with `missing`; None is 20 where the client
+                only listens.
             progress: called about ten times a second, from this task.
 
         Raises:
             UsageError: there is no such `accept`, the sample is empty, or `refresh` is given where the policy
-                of the client allows no download.
+                of the client allows no download, or it only listens.
             CacheError: nothing is cached, and the policy allows no download.
             NoReply: nothing came at all, or it is lost.
             LinkError: the link failed, or the client was closed.
@@ -273,6 +286,7 @@ class Component:
         sampled = None
         if accept == "sampled" and not refresh:
             sampled = Sampled(sample, random.getrandbits(32) if seed is None else seed)
+        timeout = patience_of(self._client._station, timeout)
         began = anyio.current_time()
         if not refresh:
             with anyio.move_on_after(timeout):
@@ -375,7 +389,7 @@ class Component:
         Each change names the parameter, what was known before and what is known now. A value that is heard
         for the first time is one too. Whoever is slow to ask gets several changes of one parameter as one,
         so what waits is never more than one change for each parameter. An absence of the link does not end
-        it; it ends when nobody holds it any more.
+        it; it ends when nobody holds it any more. In a log it ends with that.
 
         Raises:
             LinkError: while waiting, when the link failed for good or the client was closed. What had come
@@ -383,16 +397,18 @@ class Component:
         """
         changes = Changes()
         self._subscriptions.add(changes)
-        if self._client._carrier.ended is not None:
+        if self._client._is_over:
             changes.end(self._client._carrier.ended)
         return changes
 
     def _cache_is_due(self, now: float) -> bool:
         """Whether the cached table is in `params`, or is not worth waiting for."""
+        writer = self._client._writer
+        patience = CACHE_PATIENCE if writer.is_bringing(self._machine) else IDENTITY_PATIENCE
         return (
             self._cache_is_read.is_set()
-            or not self._client._may_be_cached(self)
-            or now >= self._heard_at + (CACHE_PATIENCE if self._cache_reads else IDENTITY_PATIENCE)
+            or not writer.may_have(self.system, self.component)
+            or now >= self._heard_at + patience
         )
 
     async def _wait_for_cache(self) -> None:
@@ -410,9 +426,15 @@ class Component:
             for changes in list(self._subscriptions):
                 changes.push(change)
 
-    def _end(self, error: ParamClientError) -> None:
+    def _part(self) -> None:
+        """It is lost, and not followed any more."""
+        self._client._writer.part_with(self._machine)
+        silence = anyio.current_time() - self._machine.presence.heard_at
+        awaited = f"{address_in_words(self.system, self.component)} (lost)"
+        self._end(NoReply(awaited, attempts=0, waited=silence))
+
+    def _end(self, error: ParamClientError | None) -> None:
         """Nothing will come any more."""
-        self._cache_is_read.set()
         for changes in list(self._subscriptions):
             changes.end(error)
 
@@ -470,6 +492,12 @@ class Component:
         return _outcome(fetch)
 
 
+def patience_of(station: Station, timeout: float | None) -> float | None:
+    """For how long a fetch waits: nothing tells whether others will ever ask, unless there is an end."""
+    is_open = timeout is None and station.listens_only and not station.is_log
+    return OVERHEARING_PATIENCE if is_open else timeout
+
+
 def _outcome(operation: Operation[Result]) -> Result:
     if operation.error is not None:
         raise operation.error
@@ -487,3 +515,10 @@ def _param_of(message: ParamValue, encoding: Encoding) -> Param:
 def _read_of(machine: ComponentMachine, name: str | int) -> str:
     what = name if isinstance(name, str) else f"parameter {name}"
     return f"{what} of {machine.system}/{machine.component}"
+
+
+def address_in_words(system: int | None, component: int | None) -> str:
+    """What is looked for on a link, in words."""
+    if component is None:
+        return "an autopilot" if system is None else f"an autopilot with system id {system}"
+    return f"component {'*' if system is None else system}/{component}"

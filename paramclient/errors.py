@@ -281,7 +281,7 @@ class ValueNotApplied(VehicleError):
 
 
 class VehicleArmed(VehicleError):
-    """The vehicle is armed. Nothing is set then unless told otherwise."""
+    """The vehicle is armed, or does not say that it is not. Nothing is set then unless told otherwise."""
 
 
 class FileTransferError(VehicleError):

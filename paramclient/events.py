@@ -19,6 +19,9 @@ if TYPE_CHECKING:
 
 __all__ = ["Changes", "Event", "Events", "Feed", "Found", "Heard", "Lost", "Rebooted", "Resynced", "told"]
 
+MOST_CHANGES: Final = 100_000
+"""Changes that wait for a slow listener, one for each name: more than a table can hold, as names may go and
+others come. Beyond that the oldest ones go."""
 MOST_EVENTS: Final = 1_000
 """Events that wait for a slow listener; beyond that the oldest ones go."""
 
@@ -114,7 +117,7 @@ class Feed(AsyncIterator[Item], Generic[Item]):
     """What has come since it was made, one item for each `await`. Cancelled, it loses nothing."""
 
     def __init__(self) -> None:
-        self._error: ParamClientError | None = None
+        self._error: ParamClientError | StopAsyncIteration | None = None
         self._arrived = anyio.Event()
 
     @abstractmethod
@@ -125,9 +128,9 @@ class Feed(AsyncIterator[Item], Generic[Item]):
     def _take(self) -> Item | None:
         """The next item, or None while there is none."""
 
-    def end(self, error: ParamClientError) -> None:
-        """What waits is still given, then the error is raised."""
-        self._error = error
+    def end(self, error: ParamClientError | None) -> None:
+        """What waits is still given, then the error is raised; with None it is over, as a log is."""
+        self._error = StopAsyncIteration() if error is None else error
         self._arrived.set()
 
     def __aiter__(self) -> Feed[Item]:
@@ -159,6 +162,8 @@ class Changes(Feed[Change]):
             if old is new or (old is not None and new is not None and old.same_value(new)):
                 return
         self._waiting[item.name] = item
+        if len(self._waiting) > MOST_CHANGES:
+            del self._waiting[next(iter(self._waiting))]
         self._arrived.set()
 
     def _take(self) -> Change | None:

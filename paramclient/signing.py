@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Final
 
 from paramclient.errors import UsageError
-from paramclient.protocol.wire import SigningKey, SigningPolicy, timestamp_of
+from paramclient.protocol.wire import SigningKey, SigningPolicy, SigningReport, timestamp_of
 
-__all__ = ["Signing", "key_from_environment", "read_key", "timestamp_now"]
+__all__ = ["Signing", "key_from_environment", "read_key", "refused_in_words", "timestamp_now"]
 
 KEY_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY"
 FILE_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY_FILE"
@@ -108,3 +108,10 @@ def key_from_environment(environment: Mapping[str, str] = os.environ) -> Signing
 def timestamp_now() -> int:
     """The timestamp of this moment, by the system's clock."""
     return timestamp_of(time.time())
+
+
+def refused_in_words(report: SigningReport | None) -> str:
+    """Why somebody may be there and not be heard, for the end of a sentence."""
+    refused = {} if report is None else report.refused
+    reasons = ", ".join(f"{count} for: {reason}" for reason, count in refused.items())
+    return f" (frames were refused, {reasons})" if reasons else ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -18,7 +19,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.values import Param
 from paramclient.worker import Worker
 
-__all__ = ["WriteThrough"]
+__all__ = ["WriteThrough", "chosen_cache"]
 
 FLUSH_INTERVAL: Final = 0.25
 """Seconds that changes are gathered for before they are written. A download fills several batches."""
@@ -32,6 +33,11 @@ PORTION: Final = 2_000
 few milliseconds, in which nothing else is done."""
 RETRY_INTERVAL: Final = 5.0
 """Seconds until a cache that could not be written is tried again."""
+MOST_VEHICLES: Final = 16
+"""Vehicles under one address whose tables are kept in one session: more than are changed in a day. One that
+says each time that it is another vehicle fills no disk."""
+MOST_TABLES: Final = 4_000
+"""Tables that are kept in one session: four for each component that can be followed."""
 
 logger = logging.getLogger(__name__)
 Result = TypeVar("Result")
@@ -48,6 +54,8 @@ class WriteThrough:
         owned: whether `close` closes it.
         identity_of: says who the vehicle is that a component belongs to; None while that is open.
         is_doubted: says whether another vehicle may have taken its place by now.
+        clock: the time in unix seconds; None for that of this computer.
+        now: the time of the components.
     """
 
     def __init__(
@@ -57,16 +65,25 @@ class WriteThrough:
         owned: bool,
         identity_of: Callable[[ComponentMachine], Identity | None],
         is_doubted: Callable[[ComponentMachine], bool],
+        clock: Callable[[], float] | None = None,
+        now: Callable[[], float] = anyio.current_time,
     ) -> None:
         self._cache = cache
         self._identity_of = identity_of
         self._is_doubted = is_doubted
+        self._clock = _time_of_day if clock is None else clock
+        self._now = now
         self._owned = owned
         self._worker = Worker("paramclient cache")
         self._kept: dict[ComponentMachine, _Kept] = {}
         self._has_failed = False
         self._tables: dict[tuple[int, int], bool] = {}
         self._something_to_write = anyio.Event()
+        self._bringing: set[ComponentMachine] = set()
+        self._vehicles: dict[tuple[int, int], set[str]] = {}  # that were kept in this session
+        self._has_refused = False
+        self._replacements = 0 if cache is None else cache.replacements
+        self._has_written = False
 
     async def open(self) -> None:
         """Find out which components the cache knows."""
@@ -79,6 +96,7 @@ class WriteThrough:
         """Write what is left, and end the thread."""
         try:
             await self.flush()
+            await self.flush()  # all of it, where the file had gone
         finally:
             cache = self._cache if self._owned else None
             await self._worker.close(_nothing if cache is None else cache.close)
@@ -114,12 +132,27 @@ class WriteThrough:
 
         False where it was overtaken meanwhile: by another vehicle, or by the same call for another reason.
         """
-        cached = await self._load(machine, identity)
-        current = self._identity_of(machine)
-        if current is None or current.key != identity.key or self.follow(machine, current):
-            return False
-        self._keep(machine, current, cached)
-        return True
+        if machine in self._bringing:
+            return False  # that sees to it
+        self._bringing.add(machine)
+        try:
+            while self._has_room(machine, identity):
+                cached = await self._load(machine, identity)
+                logger.debug("cached under %s/%s: %s", identity.key, machine.component, cached or "nothing")
+                current = self._identity_of(machine)
+                if current is None or (current.key == identity.key and self.follow(machine, current)):
+                    return False
+                if current.key == identity.key:
+                    self._keep(machine, current, cached)
+                    break
+                identity = current  # another vehicle has taken its place meanwhile
+            return True
+        finally:
+            self._bringing.discard(machine)
+
+    def is_bringing(self, machine: ComponentMachine) -> bool:
+        """Whether `bring` is under way for it."""
+        return machine in self._bringing
 
     async def keep_late(self, machine: ComponentMachine) -> None:
         """Keep a table that there was no time to bring the cached one for.
@@ -130,15 +163,19 @@ class WriteThrough:
         if not (machine.table.complete or (known is not None and machine.table.params)):
             return
         identity = known or machine.identity
-        if not self.follow(machine, identity):
+        if not self.follow(machine, identity) and self._has_room(machine, identity):
             self._keep(machine, identity, await self._load(machine, identity))
 
     def synced(self, machine: ComponentMachine, *, is_whole: bool) -> None:
         """The table was proven to be the vehicle's just now; `is_whole` by a download of all of it."""
         kept = self._kept.get(machine)
         if kept is not None:
-            kept.synced_at = time.time()
+            kept.is_synced = True
             kept.is_whole |= is_whole
+
+    def part_with(self, machine: ComponentMachine) -> None:
+        """It is not followed any more."""
+        self._kept.pop(machine, None)
 
     @property
     def is_held_back(self) -> bool:
@@ -194,14 +231,49 @@ class WriteThrough:
             return True
         is_written = False
         try:
-            is_written = await self._run(partial(_save, cache, [new.update for new in news])) is not None
+            is_written = await self._save(cache, [new.update for new in news])
         finally:
             for new in news:
                 if not is_written and self._kept.get(new.kept.machine) is new.kept:
                     new.take_back()
         if is_written:
             self._has_failed = False
+            logger.debug("written: %s values", sum(len(new.update.params) for new in news))
+            self._begin_anew(cache.replacements)
         return is_written
+
+    def _begin_anew(self, replacements: int) -> None:
+        """Where the file is another one than before: nothing that was written earlier is in it."""
+        is_another = replacements != self._replacements and (self._has_written or bool(self._tables))
+        self._replacements = replacements
+        self._has_written = True
+        if not is_another:
+            return
+        for kept in self._kept.values():
+            table = kept.machine.table
+            kept.is_whole |= table.complete
+            kept.state = None
+            for name in table.params:
+                table.dirty.setdefault(name, "vehicle")
+        self.wake()
+
+    async def _save(self, cache: ParamCache, updates: list[TableUpdate]) -> bool:
+        return await self._run(partial(_save, cache, updates)) is not None
+
+    def _has_room(self, machine: ComponentMachine, identity: Identity) -> bool:
+        """Whether a vehicle's table may be kept, beside those of this session that are."""
+        address = (machine.system, machine.component)
+        vehicles = self._vehicles.get(address, set())
+        if identity.key in vehicles:
+            return True
+        is_full = sum(map(len, self._vehicles.values())) >= MOST_TABLES
+        if len(vehicles) >= MOST_VEHICLES or is_full:
+            if not self._has_refused:
+                logger.warning("%d/%d: too many vehicles on this link, so it is not cached", *address)
+            self._has_refused = True
+            return False
+        self._vehicles[address] = vehicles | {identity.key}
+        return True
 
     async def _load(self, machine: ComponentMachine, identity: Identity) -> CachedComponent | None:
         if self._cache is None:
@@ -219,7 +291,7 @@ class WriteThrough:
             is_same = identity.uid is not None and _firmware(cached.identity) == _firmware(identity)
             machine.use_cached(
                 _of_firmware(cached, identity),
-                anyio.current_time(),
+                self._now(),
                 count=cached.count,
                 confirmed=cached.hash,
                 complete=cached.complete,
@@ -233,13 +305,17 @@ class WriteThrough:
             kept.synced_at = cached.synced_at
             kept.state = None if table.is_displaced else self._state(machine, kept)
         if machine.sync.synced:
-            kept.synced_at = time.time()
+            kept.is_synced = True
 
     def _news_of(self, kept: _Kept) -> list[_News]:
         """What the cache does not know of a table yet; it counts as written from now on."""
         machine, table = kept.machine, kept.machine.table
         if self._is_doubted(machine):
             return []
+        now = self._clock()
+        is_synced, kept.is_synced = kept.is_synced, False
+        if is_synced:
+            kept.synced_at = now
         state = self._state(machine, kept)
         if not (table.dirty or kept.is_whole or state != kept.state):
             return []
@@ -247,7 +323,6 @@ class WriteThrough:
         is_whole, kept.is_whole = kept.is_whole, False
         kept.state = state
         kept.written_at = anyio.current_time()
-        now = time.time()
         knows_volatile = bool(table.volatile) or table.volatile_known
         update = TableUpdate(
             identity=kept.identity,
@@ -268,7 +343,7 @@ class WriteThrough:
             removed=[name for name in dirty if name not in table.params],
             replace=is_whole,
         )
-        return [_News(kept, dirty, update)]
+        return [_News(kept, dirty, update, is_synced)]
 
     def _state(self, machine: ComponentMachine, kept: _Kept) -> TableState:
         table = machine.table
@@ -300,6 +375,7 @@ class _Kept:
     identity: Identity
     state: TableState | None = None
     synced_at: float | None = None
+    is_synced: bool = False  # since it was written last, whose time then counts: the clock may be wrong now
     is_whole: bool = False
     written_at: float = 0.0  # by the event loop's clock
 
@@ -311,12 +387,35 @@ class _News:
     kept: _Kept
     dirty: dict[str, str]
     update: TableUpdate
+    is_synced: bool
 
     def take_back(self) -> None:
         """It has not arrived: it is news again."""
+        self.kept.is_synced |= self.is_synced
         self.kept.machine.table.dirty = self.dirty | self.kept.machine.table.dirty
         self.kept.is_whole |= self.update.replace
         self.kept.state = None
+
+
+def chosen_cache(
+    cache: ParamCache | str | os.PathLike[str] | bool | None, *, is_log: bool
+) -> ParamCache | None:
+    """The cache that a user's choice means, see `ParamClient`.
+
+    Raises:
+        UsageError: a cache is named for a log.
+    """
+    if is_log and cache not in (None, True, False):
+        raise UsageError("what a log holds is of the past: `paramclient import` brings it into a cache")
+    if isinstance(cache, ParamCache):
+        return cache
+    if cache is False or is_log:
+        return None
+    return ParamCache(None if cache is None or cache is True else cache)
+
+
+def _time_of_day() -> float:
+    return time.time()
 
 
 def _firmware(identity: Identity) -> tuple[int, str]:

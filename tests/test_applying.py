@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from paramclient import ParamCache, ParamClient, read_file
+from paramclient import Component, ParamCache, ParamClient, read_file
 from paramclient.errors import (
     AnotherVehicle,
     CacheError,
@@ -43,7 +43,7 @@ from paramclient.provision import (
     verify_all,
 )
 from paramclient.provision.run import Run
-from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, SimParam
+from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, PX4Vehicle, SimParam
 from paramclient.sim.table import Entry
 from paramclient.values import ParamType, Value, bits_of, from_bits
 from tests.shell import FlakyLink, Tap, a_client, residue, swiftly
@@ -211,6 +211,63 @@ async def test_the_proof_is_asked_for_after_the_last_write(make: Callable[[], An
     else:
         hashes = [message for message in asked if isinstance(message, wire.ParamRequestRead)]
         assert {message.param_id for message in hashes} == {wire.HASH_CHECK}
+
+
+@swiftly
+async def test_a_value_that_the_last_list_leaves_out_is_not_proven() -> None:
+    vehicle = ardupilot(ftp=False)
+
+    def lose(progress: ApplyProgress) -> None:
+        if progress.row is not None and progress.row.name == "TUNE_02":
+            vehicle.when_listed(1, lambda: vehicle._entry("TUNE_01").store(0))
+            vehicle.when_listed(1, lambda: vehicle._dead.add("TUNE_01"))
+
+    async with a_client(vehicle) as client:
+        result = await apply(await client.component(), written(another("TUNE_01", "TUNE_02")), progress=lose)
+    assert statuses(result) == {"TUNE_01": "unproven", "TUNE_02": "set"}
+    assert "does not tell" in str(result.rows["TUNE_01"])
+    assert not result.complete
+
+
+@swiftly
+async def test_what_no_hash_covers_is_read_again_for_the_proof() -> None:
+    vehicle = px4()
+
+    def learn(progress: ApplyProgress) -> None:
+        if progress.phase == "reading":  # in flight, without a word
+            vehicle._entry("CAL_ACC0_XOFF").store(bits_of(0.75, ParamType.REAL32))
+
+    wanted = written({"TUNE_01": 9.5, "CAL_ACC0_XOFF": 0.5})
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        await component.fetch_all()
+        result = await apply(component, wanted, include="calibration", progress=learn)
+    assert result.before["CAL_ACC0_XOFF"].value == 0.75
+    assert statuses(result) == {"TUNE_01": "set", "CAL_ACC0_XOFF": "failed"}
+    assert result.rows["CAL_ACC0_XOFF"].actual == 0.75
+
+
+@EVERY_KIND
+@pytest.mark.parametrize("policy", ["hash-only", "cache-only"])
+@swiftly
+async def test_a_policy_that_allows_no_download_does_not_spare_the_proof(
+    make: Callable[[], Any], policy: str, tmp_path: Path
+) -> None:
+    vehicle = make()
+    with ParamCache(tmp_path / "cache.sqlite3") as cache:
+        async with ParamClient(vehicle, cache=cache) as client:
+            await (await client.component()).fetch_all()
+        tap = Tap(vehicle)
+        async with ParamClient(tap, cache=cache, policy=policy) as client:
+            result = await apply(await client.component(), written(another("TUNE_01", "TUNE_04")))
+        assert result.complete
+        (kept,) = cache.snapshots(cache.vehicles()[0].key)
+    messages = [message for _, _, message in tap.heard]
+    last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSet))
+    asked = {each.param_id for each in messages[last + 1 :] if isinstance(each, wire.ParamRequestRead)}
+    by_hash = make is px4 and policy == "hash-only"
+    assert asked == ({wire.HASH_CHECK} if by_hash else {"TUNE_01", "TUNE_04"})
+    assert not kept.complete  # what was only believed is not in it
 
 
 @EVERY_KIND
@@ -593,6 +650,33 @@ async def test_an_armed_vehicle_is_left_alone_unless_told_otherwise(make: Callab
 
 
 @swiftly
+async def test_so_is_another_part_of_an_armed_vehicle() -> None:
+    for system in (1, 2):
+        camera = GenericVehicle({"TUNE_01": 0.25}, system=1, component=100)
+        air = Air.symmetric([camera, ardupilot(armed=True, system=system)])
+        async with a_client(air) as client:
+            await client.component(system=system, component=1)
+            component = await client.component(system=1, component=100)
+            if system == 1:
+                with pytest.raises(VehicleArmed, match="1/100 is armed"):
+                    await apply(component, written({"TUNE_01": 1.5}))
+            assert (await apply(component, written({"TUNE_01": 1.5}), allow_armed=system == 1)).complete
+
+
+@swiftly
+async def test_who_does_not_say_whether_it_is_armed_may_be() -> None:
+    vehicle = ardupilot()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        with (
+            mock.patch.object(Component, "is_armed", None),
+            pytest.raises(VehicleArmed, match="1/1 does not say whether it is armed"),
+        ):
+            await apply(component, written(another()))
+        assert vehicle.requests["PARAM_SET"] == 0
+
+
+@swiftly
 async def test_a_vehicle_that_is_armed_meanwhile_ends_it() -> None:
     vehicle = ardupilot()
 
@@ -965,3 +1049,20 @@ def test_wherever_it_ends_the_next_one_brings_exactly_what_is_wanted(
                 assert all(old != new for old, new in steps)
 
     told()
+
+
+@EVERY_KIND
+@swiftly
+async def test_a_file_of_another_autopilot_is_refused_before_the_vehicle_is_asked(
+    make: Callable[[], Any],
+) -> None:
+    tap = Tap(make())
+    other = written(another(), identity=Identity(1, "sim:", autopilot=12 if make is ardupilot else 3))
+    async with a_client(tap) as client:
+        component = await client.component()
+        for call in (prepare, verify, apply):
+            with pytest.raises(UsageError, match="are those of a vehicle with"):
+                await call(component, other)
+    assert not {wire.ParamSet, wire.ParamRequestRead, wire.ParamRequestList} & {
+        type(message) for _, _, message in tap.heard
+    }

@@ -25,7 +25,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from paramclient.cache import HISTORY_LINES, ParamCache, database
+from paramclient.cache import HISTORY_LINES, ParamCache, database, lock
 from paramclient.cache.database import APPLICATION_ID, MIGRATIONS, Damaged, Database
 from paramclient.errors import CacheError
 from paramclient.identity import Identity
@@ -276,7 +276,7 @@ def test_a_program_that_holds_the_file_for_too_long_is_an_error_and_no_hindrance
 def test_a_folder_that_another_program_holds_is_waited_for_but_not_for_ever(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(database, "BUSY_TIMEOUT", 0.05)
+    monkeypatch.setattr(lock, "BUSY_TIMEOUT", 0.05)
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         fcntl.flock(folder, fcntl.LOCK_EX)
@@ -345,13 +345,13 @@ def test_a_file_that_vanishes_while_it_is_opened_is_no_file(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path.write_bytes(sound_file())
-    locked = database._locked
+    locked = lock.locked
 
     def late(folder: Path) -> Any:
         path.unlink(missing_ok=True)
         return locked(folder)
 
-    monkeypatch.setattr(database, "_locked", late)
+    monkeypatch.setattr("paramclient.cache.database.locked", late)
     with ParamCache(path) as cache:
         assert cache.vehicles() == []
 
@@ -690,7 +690,7 @@ def test_what_another_program_has_just_set_aside_is_not_set_aside_again(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path.write_bytes(sound_file())
-    locked = database._locked
+    locked = lock.locked
 
     def late(folder: Path) -> Any:
         if cache.notes == () and path.with_name("other").exists():
@@ -703,7 +703,7 @@ def test_what_another_program_has_just_set_aside_is_not_set_aside_again(
         with connect(path) as other:
             other.execute("UPDATE param SET bits = 'much'")
         path.with_name("other").write_bytes(sound_file())
-        monkeypatch.setattr(database, "_locked", late)
+        monkeypatch.setattr("paramclient.cache.database.locked", late)
         assert len(values(cache)) == 300
         works(cache)
     assert not cache.notes
@@ -745,6 +745,29 @@ def test_a_disk_that_is_full_from_the_beginning_holds_nothing_up(path: Path) -> 
             assert cache.vehicles() == []
         works(cache)
         assert not cache.notes
+
+
+def test_where_no_open_file_can_be_renamed_it_is_closed_before(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As on Windows."""
+    monkeypatch.setattr(database, "_CLOSES_TO_RENAME", True)
+    rename = Path.rename
+
+    def only_when_closed(self: Path, to: str | Path) -> Path:
+        held = {os.path.realpath(each) for each in Path("/proc/self/fd").iterdir()}
+        if str(self) in held:
+            raise PermissionError(13, "it is open")
+        return rename(self, to)
+
+    monkeypatch.setattr(Path, "rename", only_when_closed)
+    with ParamCache(path) as cache:
+        cache.save(whole_table(3))
+        with connect(path) as other:
+            other.execute("UPDATE component SET checksum = checksum + 1")
+        assert not values(cache)
+        assert len(set_aside(path)) == 1
+        works(cache)
 
 
 def test_damage_found_on_a_full_disk_is_set_aside_later(path: Path) -> None:

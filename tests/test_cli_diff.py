@@ -241,6 +241,25 @@ def test_programs_get_exact_values(command: Command, cache: Path) -> None:
 
 
 @pytest.mark.usefixtures("two")
+def test_what_only_the_other_has_may_be_left_out_and_what_only_this_one_has_may_not(command: Command) -> None:
+    names = set(command("diff", 1, 2, "--partial", "--json").json["params"])
+    assert names == set(command("diff", 1, 2, "--json").json["params"]) - {"D_RIGHT"}
+    assert "C_LEFT" in names
+
+
+def test_a_file_of_a_few_values_may_be_the_same_as_a_whole_vehicle(
+    command: Command, cache: Path, tmp_path: Path
+) -> None:
+    keep(cache, BEFORE)
+    file = tmp_path / "few.param"
+    file.write_text("B_FLOAT,0.1\nC_LEFT,5\n")
+    assert command("diff", file, 1).code == 1
+    assert command("diff", file, 1, "--partial").code == 0
+    file.write_text("B_FLAOT,0.1\n")
+    assert command("diff", file, 1, "--partial").code == 1
+
+
+@pytest.mark.usefixtures("two")
 def test_only_what_is_asked_for_counts(command: Command) -> None:
     assert command("diff", 1, 2, "--only", "A_*", "--only", "E_BOTH").code == 0
     narrowed = command("diff", 1, 2, "--only", "?_FLOAT", "--json")

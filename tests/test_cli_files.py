@@ -12,7 +12,7 @@ import pytest
 
 from paramclient import FileForm, ParamCache, ParamClient, ParamType, read_file
 from paramclient.cli import run, session
-from paramclient.cli.save import names_link
+from paramclient.cli.sources import names_vehicle
 from paramclient.links import SimLink
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
 
@@ -56,7 +56,7 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Callable[[Endpoint], str]:
             return ParamClient(SimLink(far_end, url), **options)
 
         monkeypatch.setattr(session, "ParamClient", client)
-        return "sim:custom"
+        return "sim:px4"
 
     return place
 
@@ -76,7 +76,7 @@ def test_save_writes_what_the_vehicle_has(
     assert (params.system, params.component) == (1, 1)
     assert params.identity is not None
     assert params.at is not None
-    assert json.loads(path.read_text())["sets"][0]["source"] == "link sim:custom"
+    assert json.loads(path.read_text())["sets"][0]["source"] == "link sim:px4"
 
 
 def test_save_prints_json_for_programs(
@@ -161,7 +161,7 @@ def test_options_that_mean_nothing_are_refused(
     ],
 )
 def test_a_link_and_a_vehicle_are_told_apart(where: str, is_link: bool) -> None:
-    assert names_link(where) is is_link
+    assert names_vehicle(where) is not is_link
 
 
 def test_nobody_is_asked_where_the_file_cannot_be(command: Command, tmp_path: Path) -> None:

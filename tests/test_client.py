@@ -1480,3 +1480,15 @@ async def test_a_program_that_is_held_up_takes_what_has_come_before_it_counts_as
         result = await vehicle.fetch_all()
     assert result.complete
     assert (result.lost, result.repeated, px4.requests["PARAM_REQUEST_READ"]) == (0, 0, 0)
+
+
+@swiftly
+async def test_the_autopilots_are_the_vehicles_without_what_they_carry() -> None:
+    camera = generic(system=1, component=100)
+    vehicles = [generic(system=3), small_px4(), camera, generic(system=2, component=7)]
+    async with a_client(Air(vehicles)) as client:
+        assert client.autopilots == []
+        await client.fetch_all()
+        addresses = [(each.system, each.component) for each in client.autopilots]
+        assert addresses == [(1, 1), (2, 7), (3, 1)]
+        assert len(client.components) == 4

@@ -169,9 +169,16 @@ def test_no_module_imports_itself_through_others() -> None:
 
 def test_the_simulators_load_only_when_a_link_asks_for_them() -> None:
     for module in MODULES:
-        if not is_pure(module) and not is_command(module):
+        if not is_pure(module) and not is_command(module) and module != "paramclient.testing":
             for target, each in own_imports_of(module):
                 assert not (each.runs_at_import and room_of(target) == "sim"), f"{module}:{each.line}"
+
+
+def test_only_the_command_and_the_ports_of_windows_know_asyncio() -> None:
+    """The library runs on trio too: see `tests/test_backends.py`."""
+    loops = {"asyncio", "trio"}
+    uses = {module for module in MODULES for each in imports_of(module) if each.top in loops}
+    assert {module for module in uses if not is_command(module)} == {"paramclient.links.transport"}
 
 
 def test_only_the_wire_knows_pymavlink() -> None:
@@ -275,7 +282,7 @@ def bound_names(source: ast.Module) -> set[str]:
 def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
     """Start-up is part of the command's promise; mavutil, besides, changes the process that imports it."""
     unwanted = ["rich", "cyclopts", "pydantic", "serialx", "yaml", "pymavlink.mavutil"]
-    unwanted += ["paramclient.sim", "paramclient.cli", "paramclient.provision"]
+    unwanted += ["paramclient.sim", "paramclient.testing", "paramclient.cli", "paramclient.provision"]
     program = f"import sys, paramclient; print([name for name in {unwanted!r} if name in sys.modules])"
     run = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60

@@ -19,6 +19,7 @@ import paramclient.links
 import paramclient.metadata
 import paramclient.provision
 import paramclient.sim
+import paramclient.testing
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -28,6 +29,7 @@ EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 DIRECTIVE = re.compile(r"^\.\. (\w+):: ([\w.]+)(?:\(\))?$", re.MULTILINE)
 COMMANDS = ["fetch", "get", "set", "watch", "link", "ports", "show", "diff", "save", "history", "sim"]
+COMMANDS += ["apply", "verify", "restore", "import"]
 
 LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]*)?\)")
 
@@ -110,7 +112,10 @@ def test_every_page_is_in_the_table_of_contents() -> None:
 
 @pytest.mark.parametrize(
     "module",
-    [paramclient, paramclient.links, paramclient.metadata, paramclient.provision, paramclient.sim],
+    [
+        *(paramclient, paramclient.links, paramclient.metadata, paramclient.provision),
+        *(paramclient.sim, paramclient.testing),
+    ],
     ids=lambda m: m.__name__,
 )
 def test_every_public_name_is_in_the_pages(module: ModuleType) -> None:

@@ -9,6 +9,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import yaml
+
+from paramclient import read_file
 
 ROOT = Path(__file__).parent.parent
 EXAMPLES = ROOT / "examples"
@@ -36,10 +39,20 @@ PRINTED = {
         r"wrong: +1\.5 is not a whole number",
         r"refused: .*NO_SUCH",
     ],
-    "test_your_program": [
-        r"passed: test_works_on_a_bad_radio",
-        r"passed: test_refuses_other_autopilots",
+    "setup_ardupilot": [
+        r"1: <ApplyResult 1/1 8 set, 1 skipped in ",
+        r"1: COMPASS_OFS_X = 5\.0, skipped: left out: ",
+        r"1: as it shall be",
     ],
+    "setup_px4": [
+        r"  SYS_AUTOSTART 10040 -> 4001 \(from the next start on\)",
+        r"CAL_ACC0_XOFF 0\.0 -> 0\.0125, skipped: left out: ",
+        r"the vehicle starts again",
+        r"7/7 ",
+        r"<ApplyResult 1/1 7 set, 1 skipped in .*; what was before is in before-.*\.yaml",
+        r"as the file says",
+    ],
+    "test_your_program": [r"changed: \['MPC_XY_VEL_MAX', 'MPC_Z_VEL_MAX_UP'\]"],
     "two_vehicles": [
         r"<FetchResult 1/1 903 params from stream in ",
         r"<FetchResult 2/1 903 params from stream in ",
@@ -57,7 +70,9 @@ def run(*command: str | Path, cache: Path) -> str:
     """Run a Python program with a cache of its own; what it printed. A warning would be an error."""
     done = subprocess.run(
         [sys.executable, "-W", "error", *command],
-        env=os.environ | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(cache), "COLUMNS": "80"},
+        env=os.environ
+        | {"PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(cache), "TMPDIR": str(cache)}
+        | {"COLUMNS": "80"},
         stdin=subprocess.DEVNULL,
         capture_output=True,
         encoding="utf-8",
@@ -99,4 +114,41 @@ def test_takes_a_link(name: str, arguments: list[str], line: str, tmp_path: Path
 
 def test_pytest_finds_the_tests_of_your_program(tmp_path: Path) -> None:
     example = EXAMPLES / "test_your_program.py"
-    assert "4 passed" in run("-m", "pytest", "-p", "no:cacheprovider", example, cache=tmp_path)
+    plugins = ["-p", "no:cacheprovider", "-p", "pytest_paramclient"]
+    assert "4 passed" in run("-m", "pytest", *plugins, example, cache=tmp_path)
+    assert not (tmp_path / "paramclient").exists(), "the tests used the user's cache"
+
+
+def test_the_check_of_parameter_files_finds_what_does_not_fit(tmp_path: Path) -> None:
+    """The commands of the workflow, as GitHub would run them, on files of which one has a mistyped name."""
+    text = (EXAMPLES / "check-parameters.yml").read_text(encoding="utf-8")
+    [script] = [step["run"] for step in yaml.safe_load(text)["jobs"]["check"]["steps"] if "name" in step]
+    command = tmp_path / "bin/paramclient"
+    command.parent.mkdir()
+    command.write_text(f'#!/bin/sh\nexec {sys.executable} -m paramclient "$@"\n')
+    command.chmod(0o755)
+    for path, line in {"px4/a.param": "MC_ROLL_P,6.5", "ardupilot/b.param": "RTL_ALTT,2500"}.items():
+        (tmp_path / "parameters" / path).parent.mkdir(parents=True)
+        (tmp_path / "parameters" / path).write_text(f"{line}\n")
+    done = subprocess.run(
+        ["bash", "-e", "-c", script],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "PATH": f"{command.parent}:{os.environ['PATH']}"},
+        stdin=subprocess.DEVNULL,
+        capture_output=True,
+        encoding="utf-8",
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 1
+    first, second = done.stdout.split("== parameters/ardupilot/b.param\n")
+    assert re.search(r"^MC_ROLL_P .* set$", first, re.MULTILINE)
+    assert "not on this vehicle (did you mean RTL_ALT" in second
+
+
+def test_the_parameter_files_are_what_the_check_looks_at() -> None:
+    """Laid out as the workflow expects them, and each is read."""
+    files = [path for path in (EXAMPLES / "parameters").rglob("*") if path.is_file()]
+    assert {path.parent.name for path in files} == {"px4", "ardupilot"}
+    for path in files:
+        assert not read_file(path).notes

@@ -487,6 +487,9 @@ def test_what_only_ardupilot_reads_of_a_line_is_kept_as_a_comment() -> None:
         ("A " + "9" * 5000, "with a number"),
         ("A -nan", "with a number"),
         ("A -0x10", "with a number"),
+        ("A 1.#INF", "with a number"),
+        ("A,-1.#IND", "with a number"),
+        ("A 1.#QNAN00 # said a printf", "with a number"),
         ("A None", "with a number"),
         ("1 2", "with a parameter's name"),
         ("Ä 2", "with a parameter's name"),
@@ -814,3 +817,10 @@ def test_yaml_without_its_library_says_what_to_install(monkeypatch: pytest.Monke
 def test_a_file_shows_what_it_holds() -> None:
     file = loads(b"A 1", source="x.parm")
     assert repr(file) == "<ParamFile x.parm parm ?/?: 1>"
+
+
+def test_a_letter_of_a_higher_plane_in_a_header_can_be_read_again() -> None:
+    """YAML knows no surrogates, which JSON writes such letters with."""
+    file = loads("# for the \N{HELICOPTER} of Jo \U0004f78d\n\nRC1_MIN,1100\n".encode())
+    for form in (FileForm.YAML, FileForm.JSON):
+        assert loads(dumps(file, form=form)).header == file.header

@@ -379,8 +379,8 @@ def test_what_is_a_link_already_is_taken_as_it_is() -> None:
 @pytest.mark.parametrize(
     ("name", "is_stream", "reconnects"),
     [
-        ("udpin:127.0.0.1:0", False, False),
-        ("udpout:127.0.0.1:14550", False, False),
+        ("udpin:127.0.0.1:0", False, True),
+        ("udpout:127.0.0.1:14550", False, True),
         ("tcp:127.0.0.1:5760", True, True),
         ("tcpin:127.0.0.1:0", True, False),
         ("serial:/dev/ttyACM0:57600", True, True),

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import re
+import subprocess
+import sys
 import tarfile
 import tomllib
 import zipfile
@@ -18,6 +21,7 @@ import paramclient
 
 ROOT = Path(__file__).parent.parent
 SOURCES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient").rglob("*.py")}
+PLUGIN = "pytest_paramclient.py"
 TABLES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/sim/tables").glob("*.csv")}
 
 
@@ -46,7 +50,8 @@ def metadata(wheel: dict[str, bytes]) -> Message:
 
 def test_the_wheel_has_the_package_and_nothing_else(wheel: dict[str, bytes]) -> None:
     shipped = {name for name in wheel if ".dist-info/" not in name}
-    assert shipped == SOURCES | TABLES | {"paramclient/py.typed", "paramclient/provision/cautions.toml"}
+    data = {"paramclient/py.typed", "paramclient/provision/cautions.toml"}
+    assert shipped == SOURCES | TABLES | data | {PLUGIN}
     assert len(TABLES) >= 3
 
 
@@ -61,8 +66,36 @@ def test_the_command_is_an_entry_point(wheel: dict[str, bytes]) -> None:
     assert "paramclient = paramclient.__main__:main" in wheel[name].decode()
 
 
+def test_pytest_finds_the_plugin(wheel: dict[str, bytes], tmp_path: Path) -> None:
+    """Installed, and not asked for: the files of the wheel, where Python looks for libraries."""
+    for name, content in wheel.items():
+        (tmp_path / "site" / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / "site" / name).write_bytes(content)
+    (tmp_path / "test_it.py").write_text("def test_it(sim_px4):\n    assert sim_px4(table={}).air\n")
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "pytest",
+            "-p",
+            "no:cacheprovider",
+            "-p",
+            "no:asyncio",
+            "-W",
+            "error::pytest.PytestWarning",
+        ],
+        cwd=tmp_path,
+        env=os.environ | {"PYTHONPATH": str(tmp_path / "site")},
+        capture_output=True,
+        encoding="utf-8",
+        timeout=60,
+        check=False,
+    )
+    assert "1 passed" in done.stdout, done.stdout + done.stderr
+
+
 def test_the_sdist_can_be_built_and_tested(sdist: set[str]) -> None:
-    assert sdist >= SOURCES | TABLES
+    assert sdist >= SOURCES | TABLES | {PLUGIN}
     assert sdist >= {
         "pyproject.toml",
         "README.md",

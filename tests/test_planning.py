@@ -118,14 +118,29 @@ def test_the_file_of_another_vehicle_is_not_taken_for_mistyped() -> None:
         ("ardupilot", "INS_ACC2OFFS_Y", "calibration"),
         ("ardupilot", "INS_GYROFFS_Z", "calibration"),
         ("ardupilot", "AHRS_TRIM_X", "calibration"),
+        (
+            "ardupilot",
+            "COMPASS_MOTCT",
+            "calibration",
+        ),  # says by what the vehicle's COMPASS_MOT_? are multiplied
+        ("ardupilot", "INS4_ACCOFFS_X", "calibration"),
+        ("ardupilot", "INS_TCAL1_TMAX", "calibration"),
+        ("ardupilot", "INS5_GYR_ID", "hardware"),
+        ("ardupilot", "ADSB_ICAO_ID", "identity"),
+        ("ardupilot", "NET_MACADDR0", "identity"),
         ("ardupilot", "STAT_RESET", "counter"),
         ("ardupilot", "MIS_TOTAL", "counter"),
-        ("ardupilot", "FORMAT_VERSION", "action"),
+        ("ardupilot", "ESC_CALIBRATION", "action"),
+        ("px4", "UXRCE_DDS_KEY", "identity"),
+        ("px4", "ASPD_SCALE_1", "calibration"),
+        ("px4", "SYS_BL_UPDATE", "action"),
+        ("px4", "SYS_CAL_GYRO", "action"),
         ("px4", "MAV_SYS_ID", "identity"),
         ("px4", "CAL_MAG0_ID", "hardware"),
         ("px4", "CAL_MAG0_XOFF", "calibration"),
         ("px4", "SENS_BOARD_X_OFF", "calibration"),
         ("px4", "LND_FLIGHT_T_LO", "counter"),
+        ("px4", "_HASH_CHECK", "counter"),
         ("px4", "SYS_AUTOCONFIG", "action"),
     ],
 )
@@ -145,10 +160,30 @@ def test_what_is_not_a_setting_is_left_out_and_can_be_included(
 
 @pytest.mark.parametrize(
     "name",
-    ["COMPASS_USE", "COMPASS_ORIENT", "COMPASS_MOTCT", "INS_GYRO_FILTER", "INS_POS1_X", "INS_HNTCH_ENABLE"],
+    [
+        "COMPASS_USE",
+        "COMPASS_ORIENT",
+        "INS_GYRO_FILTER",
+        "INS_POS1_X",
+        "INS_HNTCH_ENABLE",
+        "INS_TCAL1_ENABLE",
+    ],
 )
 def test_settings_of_a_sensor_are_no_calibration(name: str) -> None:
     assert only_row(plan(held(**{name: 1}), written(**{name: 2}), autopilot="ardupilot"))[0] is PlanStatus.SET
+
+
+@pytest.mark.parametrize("name", ["ASPD_SCALE_APPLY", "ASPD_SCALE_NSD", "SYS_CAL_TMAX"])
+def test_how_px4_calibrates_is_a_setting(name: str) -> None:
+    assert only_row(plan(held(**{name: 1}), written(**{name: 2}), autopilot="px4"))[0] is PlanStatus.SET
+
+
+def test_what_erases_all_others_comes_first_and_before_a_start() -> None:
+    table, wanted = held(RTL_ALT=1500, FORMAT_VERSION=120), written(RTL_ALT=2000, FORMAT_VERSION=0)
+    assert order(plan(table, wanted, autopilot="ardupilot")) == [["RTL_ALT"]]
+    made = plan(table, wanted, autopilot="ardupilot", include="action")
+    assert order(made) == [["FORMAT_VERSION"], ["RTL_ALT"]]
+    assert made.stages[0].reboot_first
 
 
 def test_of_an_unknown_autopilot_both_lists_count() -> None:
@@ -270,6 +305,12 @@ def test_raw_bytes_are_compared_with_raw_bytes() -> None:
     assert plan(table, written(ODD=b"\x01\x02\x03\x04")).is_met
     assert plan(table, written(ODD=b"\x01\x02\x03\x05")).steps[0].value == b"\x01\x02\x03\x05"
     assert plan(table, written(ODD=5)).rows["ODD"].status is PlanStatus.INVALID
+    made = plan(held(NUMBER=1), written(NUMBER=b"\x01\x02\x03\x04"))
+    assert only_row(made) == (
+        PlanStatus.INVALID,
+        WRONG,
+        "0x04030201 are raw bytes, and the vehicle gives a number",
+    )
 
 
 def test_the_order_is_one_that_works_on_ardupilot() -> None:
@@ -355,6 +396,18 @@ def test_a_file_of_another_component_is_none_of_this_one() -> None:
         plan(autopilot, camera)
     with pytest.raises(UsageError, match="component 100"):
         overlay(camera, autopilot)
+
+
+def test_a_file_of_another_autopilot_is_none_of_this_one() -> None:
+    for own, other, number in (("px4", "ardupilot", 3), ("ardupilot", "px4", 12)):
+        wanted = ParamSet(
+            {"A": WrittenParam("A", 2)}, identity=Identity(1, "sim:", autopilot=number), source="f"
+        )
+        with pytest.raises(UsageError, match=f"of f are those of a vehicle with {other}, not with {own}"):
+            plan(held(A=1), wanted, autopilot=own)
+        assert plan(held(A=1), wanted, autopilot=other).steps
+        assert plan(held(A=1), wanted, autopilot="generic").steps
+        assert plan(held(A=1), wanted).steps
 
 
 def test_one_set_lies_over_another() -> None:

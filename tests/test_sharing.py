@@ -17,7 +17,7 @@ import pytest
 from paramclient import ParamCache
 from paramclient.protocol import wire
 from paramclient.protocol.fetch import Fetch
-from paramclient.protocol.overheard import ENOUGH_OVERHEARD, Overheard
+from paramclient.protocol.following import ENOUGH_TO_FOLLOW, Following
 from paramclient.protocol.reads import Reads
 from paramclient.protocol.station import Station
 from paramclient.protocol.timing import RoundTrip
@@ -137,32 +137,32 @@ def test_where_theirs_stops_in_the_middle_we_ask_for_the_rest() -> None:
 
 @pytest.mark.parametrize("ahead", [1, 2])
 def test_single_answers_to_others_are_no_list(ahead: int) -> None:
-    overheard = Overheard()
-    for index in range(0, ahead * (ENOUGH_OVERHEARD - 1), ahead):
-        overheard.heard(param_value(f"P{index}", index=index, count=500), index * 0.01)
-        assert not overheard.is_running(index * 0.01)
+    following = Following()
+    for index in range(0, ahead * (ENOUGH_TO_FOLLOW - 1), ahead):
+        following.heard(param_value(f"P{index}", index=index, count=500), index * 0.01)
+        assert not following.is_running(index * 0.01)
 
 
 def test_a_list_is_over_at_its_end_and_when_it_falls_quiet() -> None:
-    overheard = Overheard()
+    following = Following()
     for index in range(20):
-        overheard.heard(param_value(f"P{index}", index=index, count=21), index * 0.01)
-    assert overheard.is_running(0.2)
-    assert not overheard.is_running(0.5)
+        following.heard(param_value(f"P{index}", index=index, count=21), index * 0.01)
+    assert following.is_running(0.2)
+    assert not following.is_running(0.5)
     reads = Reads((1, 1), RoundTrip(), lambda message: None, lambda key: True)
-    names, count = overheard.hand_over(reads)
+    names, count = following.hand_over(reads)
     assert (len(names), count) == (20, 21)
     assert reads.pace.gap == pytest.approx(0.01)
-    overheard.heard(param_value("P20", index=20, count=21), 0.2)
-    assert not overheard.is_running(0.2)
+    following.heard(param_value("P20", index=20, count=21), 0.2)
+    assert not following.is_running(0.2)
 
 
 def test_a_list_of_another_count_begins_anew() -> None:
-    overheard = Overheard()
+    following = Following()
     for index in range(15):
-        overheard.heard(param_value(f"P{index}", index=index, count=100), index * 0.01)
-    overheard.heard(param_value("P15", index=15, count=101), 0.15)
-    assert not overheard.is_running(0.15)
+        following.heard(param_value(f"P{index}", index=index, count=100), index * 0.01)
+    following.heard(param_value("P15", index=15, count=101), 0.15)
+    assert not following.is_running(0.15)
 
 
 PROGRAM = """

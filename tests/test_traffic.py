@@ -74,8 +74,9 @@ def sniffed(data: Iterable[bytes], *, stream: bool = True) -> tuple[list[Seen], 
 
 
 def test_a_frame_is_seen_with_all_that_counts() -> None:
-    [seen], _ = sniffed([frame(30, 7, system=3, component=4)])
-    assert seen == Seen(30, 3, 4, 7, bytes(range(1, 29)), 2, 40, False, True)
+    data = frame(30, 7, system=3, component=4)
+    [seen], _ = sniffed([data])
+    assert seen == Seen(30, 3, 4, 7, bytes(range(1, 29)), 2, 40, False, True, data)
     [seen], _ = sniffed([frame(30, 7, version=1)])
     assert (seen.version, seen.size, seen.is_signed) == (1, 36, False)
     [seen], _ = sniffed([signed()])

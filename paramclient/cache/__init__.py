@@ -1,6 +1,7 @@
 """Tables, identities and history on disk: what a vehicle's parameters were when it was last heard.
 
 `records` says what goes in and comes out. The other rooms stand on one another: `store` is what is called,
+`merge` brings in what is of the past,
 `tables` keeps tables and their history, `earlier` tells what they were before,
 `fleet` puts those of many vehicles beside each other, `rows` lays them into cells, `database` looks after
 the file.

@@ -13,11 +13,11 @@ SQLite alone: to close another descriptor of it would drop SQLite's locks.
 
 from __future__ import annotations
 
-import fcntl
 import logging
 import os
 import sqlite3
 import stat
+import sys
 import threading
 import time
 import weakref
@@ -28,16 +28,13 @@ from itertools import count
 from pathlib import Path
 from typing import Final, TypeAlias, TypeVar
 
+from paramclient.cache.lock import BUSY_TIMEOUT, locked
 from paramclient.errors import CacheError
 
 __all__ = ["APPLICATION_ID", "Damaged", "Database", "MIGRATIONS"]
 
 APPLICATION_ID: Final = 0x5041524D
 """Stands in the file's header and says whose database it is: `PARM`."""
-
-BUSY_TIMEOUT: Final = 5.0
-"""Seconds to wait for another process. Its transactions take milliseconds; who holds the file for longer is
-stuck, and the cache is not worth the wait."""
 
 MIGRATIONS: tuple[tuple[str, ...], ...] = (
     (
@@ -142,7 +139,6 @@ MIGRATIONS: tuple[tuple[str, ...], ...] = (
 
 _TRIES: Final = 3
 """Rounds of one operation: the file may be renamed under it by another process, and be damaged, once each."""
-_LOCK_POLL: Final = 0.01
 
 # So a place shows itself where no -wal or -shm can be made: a folder is read-only, a disk is full.
 _UNWRITABLE: Final = frozenset(
@@ -152,6 +148,10 @@ _UNWRITABLE: Final = frozenset(
         sqlite3.SQLITE_READONLY_DIRECTORY,
     }
 )
+
+_CLOSES_TO_RENAME: Final = sys.platform == "win32"
+"""Whether no open file can be renamed. What stands in its -wal then goes into the file on closing."""
+_VFS_WITHOUT_LOCKS: Final = "win32-none" if sys.platform == "win32" else "unix-none"
 
 _DAMAGE: Final = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
 
@@ -189,11 +189,13 @@ class Database:
     Attributes:
         path: the same.
         notes: the warnings so far.
+        replacements: how often a fresh file was made, or another one than before was found in its place.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.notes: list[str] = []
+        self.replacements = 0
         self._lock = threading.Lock()
         self._closed = False
         self._connection: sqlite3.Connection | None = None
@@ -242,6 +244,7 @@ class Database:
                             return work(nothing)
                     return self._transact(work, writing=writing)
                 except _Moved:
+                    self.replacements += 1
                     self._drop()
                 except Damaged as damage:
                     self._set_aside(damage)
@@ -276,10 +279,11 @@ class Database:
         if self._connection is not None:
             if self._which() == self._file:
                 return self._connection
+            self.replacements += 1
             self._drop()
         if writing:
             self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        with _locked(self.path.parent):
+        with locked(self.path.parent):
             self._file = self._which()
             if self._is_absent():
                 if not writing:
@@ -287,6 +291,7 @@ class Database:
                 if _size(self._companion("-wal")):
                     raise Damaged("only its write-ahead log is left")
                 os.close(os.open(self.path, os.O_CREAT | os.O_WRONLY, 0o600))
+                self.replacements += 1
                 self._file = self._which()
             if _size(self.path) == 1:  # SQLite would take it for empty and write over it
                 raise Damaged("file is not a database")
@@ -327,7 +332,7 @@ class Database:
         """
         if _size(self._companion("-wal")):
             # A killed process left transactions in it. Without locks, SQLite reads it with no -shm.
-            connection = self._connect("mode=ro&vfs=unix-none")
+            connection = self._connect(f"mode=ro&vfs={_VFS_WITHOUT_LOCKS}")
             connection.execute("PRAGMA locking_mode = EXCLUSIVE")
         else:
             connection = self._connect("mode=ro&immutable=1")
@@ -390,10 +395,12 @@ class Database:
     def _set_aside(self, damage: Damaged) -> None:
         what = f"the cache {self.path} is {damage.kind} ({' '.join(str(damage).split()):.200})"
         # The file is renamed before it is closed: SQLite then leaves its -wal as it is.
+        if _CLOSES_TO_RENAME:
+            self._close_connection()
         try:
             if self._without_locks:
                 raise PermissionError("nothing can be written there")
-            with _locked(self.path.parent):
+            with locked(self.path.parent):
                 if self._which() == self._file:
                     kept = self._free_path(damage.kind)
                     for suffix in ("-journal", "-wal", "-shm", ""):
@@ -424,7 +431,9 @@ class Database:
 
     def _may_write(self) -> bool:
         files = filter(Path.exists, map(self._companion, ("", "-wal", "-shm")))
-        return all(os.access(file, os.W_OK, effective_ids=True) for file in files)
+        return all(
+            os.access(file, os.W_OK, effective_ids=os.access in os.supports_effective_ids) for file in files
+        )
 
     def _drop(self) -> None:
         self._close_connection()
@@ -450,25 +459,6 @@ def _status(path: Path) -> os.stat_result | None:
 def _size(path: Path) -> int:
     status = _status(path)
     return status.st_size if status else 0
-
-
-@contextmanager
-def _locked(folder: Path) -> Iterator[None]:
-    """Hold the folder against every other process and thread that would open, create or rename a cache."""
-    descriptor = os.open(folder, os.O_RDONLY)
-    try:
-        deadline = time.monotonic() + BUSY_TIMEOUT
-        while True:
-            try:
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                break
-            except BlockingIOError:
-                if time.monotonic() > deadline:
-                    raise CacheError(f"another process holds the folder {folder}") from None
-            time.sleep(_LOCK_POLL)
-        yield
-    finally:
-        os.close(descriptor)
 
 
 def _code(error: sqlite3.Error) -> int | None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sqlite3
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -15,6 +15,7 @@ import platformdirs
 from paramclient.cache import earlier, fleet, tables
 from paramclient.cache.database import Database
 from paramclient.cache.fleet import FleetDiff
+from paramclient.cache.merge import merge
 from paramclient.cache.records import (
     CachedComponent,
     CachedSummary,
@@ -81,6 +82,11 @@ class ParamCache:
         """What went wrong with the file so far and was mended: one text for each file set aside."""
         return tuple(self._database.notes)
 
+    @property
+    def replacements(self) -> int:
+        """How often a fresh file was made, or another one found in its place: what was saved is not in it."""
+        return self._database.replacements
+
     def save(self, update: TableUpdate | Sequence[TableUpdate]) -> None:
         """Write what was learnt, in one transaction: all of it is kept, or nothing.
 
@@ -93,6 +99,25 @@ class ParamCache:
         updates = (update,) if isinstance(update, TableUpdate) else tuple(update)
         if updates:
             self._database.write(lambda connection: tables.save(connection, updates))
+
+    def merge(
+        self, updates: Sequence[TableUpdate], *, based_on: Mapping[tuple[str, int], float] | None = None
+    ) -> None:
+        """Write what was observed in the past, in one transaction: all of it is kept, or nothing.
+
+        What is kept of a later time than an observation stays as it is; the history is completed with what
+        changed before that. To merge the same again changes nothing.
+
+        Args:
+            updates: as for `save`, in the order of their times.
+            based_on: by key and component, `updated_at` of the kept tables that the updates go on from; the
+                others know nothing of what was kept.
+
+        Raises:
+            UsageError: a time that is not in unix seconds.
+        """
+        if updates:
+            self._database.write(lambda connection: merge(connection, updates, based_on or {}))
 
     def load(self, key: str, component: int) -> CachedComponent | None:
         """The table of a vehicle's component, or None.

@@ -31,7 +31,9 @@ from paramclient.params import ParamMap
 
 __all__ = [
     "HISTORY_LINES",
+    "applied",
     "component",
+    "hashed",
     "history",
     "make",
     "owner_of",
@@ -40,6 +42,7 @@ __all__ = [
     "stored_rows",
     "summaries",
     "vehicles",
+    "write_rows",
 ]
 
 HISTORY_LINES: Final = 10_000
@@ -61,16 +64,16 @@ def save(connection: sqlite3.Connection, updates: Iterable[TableUpdate]) -> None
         earlier.watch_clock(connection, update.identity.key, update.component, time_cell(update.at))
         owner = make(connection, update)
         before = stored_rows(connection, owner)
-        after, lines, births = _applied(update, before)
+        after, lines, births = applied(update, before)
         if after != before:
-            _write_rows(connection, owner, before, after)
+            write_rows(connection, owner, before, after)
         earlier.write_births(connection, owner, births)
         _write_history(connection, owner, lines)
         if update.table is not None:
             _write_state(connection, owner, update.table)
             if update.table.complete:
                 earlier.begin(connection, owner, update.at)
-        elif _hashed(before) != _hashed(after):
+        elif hashed(before) != hashed(after):
             connection.execute("UPDATE component SET hash = NULL WHERE id = ?", (owner,))
 
 
@@ -215,11 +218,11 @@ def _forget_other_firmware(connection: sqlite3.Connection, identity: Identity) -
     for (owner,) in updated:
         before = stored_rows(connection, owner)
         after = {name: row._replace(default_bits=None) for name, row in before.items()}
-        _write_rows(connection, owner, before, after)
+        write_rows(connection, owner, before, after)
         connection.execute("UPDATE component SET file_works = NULL WHERE id = ?", (owner,))
 
 
-def _applied(
+def applied(
     update: TableUpdate, before: Mapping[str, Row]
 ) -> tuple[dict[str, Row], list[tuple[object, ...]], list[tuple[str, float]]]:
     """The rows after an update, the lines of history that it causes, and the new names with their times."""
@@ -251,14 +254,15 @@ def _merged(item: StoredParam, old: Row | None, *, whole: bool) -> Row:
     return Row.of(item.param, index, volatile, item.heard_at)
 
 
-def _hashed(rows: Mapping[str, Row]) -> dict[str, tuple[int, int, int]]:
+def hashed(rows: Mapping[str, Row]) -> dict[str, tuple[int, int, int]]:
     """What the vehicle's hash covers of a table."""
     return {name: row.hashed for name, row in rows.items() if row.hashed is not None}
 
 
-def _write_rows(
+def write_rows(
     connection: sqlite3.Connection, owner: int, before: Mapping[str, Row], after: Mapping[str, Row]
 ) -> None:
+    """Make the stored rows of a table the ones after an update."""
     connection.executemany(
         "DELETE FROM param WHERE owner = ? AND name = ?",
         [(owner, name) for name in before.keys() - after.keys()],

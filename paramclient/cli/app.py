@@ -6,9 +6,10 @@ import asyncio
 import inspect
 import logging
 import signal
-from collections.abc import Awaitable, Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
+from types import FrameType
 from typing import Final
 
 import anyio
@@ -18,11 +19,13 @@ from paramclient.cli.diff import diff
 from paramclient.cli.fleet import fleet_diff
 from paramclient.cli.history import history
 from paramclient.cli.link import link
+from paramclient.cli.logs import import_
 from paramclient.cli.offline import cache_list, cache_path, cache_remove, show
 from paramclient.cli.outcome import ExitCode, code_of
-from paramclient.cli.output import report
+from paramclient.cli.output import printable, report, say
 from paramclient.cli.ports import ports
 from paramclient.cli.save import save
+from paramclient.cli.setup import apply, restore, verify
 from paramclient.cli.signing import disable, setup
 from paramclient.cli.simulate import sim
 from paramclient.cli.vehicle import fetch, get, set_, watch
@@ -39,9 +42,11 @@ def run(arguments: Sequence[str]) -> int:
         KeyboardInterrupt: Ctrl-C outside of an awaiting command, or a second time inside of one.
         BrokenPipeError: nobody reads what is printed.
     """
-    with _warnings_shown():
+    with _warnings_shown() as lines:
         try:
             command, bound, _ = _app.parse_args(arguments, exit_on_error=False, print_error=False)
+            if _is_verbose(bound.arguments):
+                lines.show_steps()
             call = partial(command, *bound.args, **bound.kwargs)
             work = call if inspect.iscoroutinefunction(command) else call()
             # a command that has asked the user something gives what is to be awaited after that
@@ -74,40 +79,56 @@ async def _until_signal(work: Callable[[], Awaitable[int | None]]) -> int | None
 
     with anyio.CancelScope() as scope:
 
-        def end(number: int) -> None:
+        def end(number: int, _: FrameType | None) -> None:
             received.append(number)
-            scope.cancel()
             for each in _SIGNALS:
-                loop.remove_signal_handler(each)
                 signal.signal(each, signal.SIG_DFL)
+            loop.call_soon_threadsafe(scope.cancel)
 
         for number in _SIGNALS:
-            loop.add_signal_handler(number, end, number)
+            signal.signal(number, end)  # not by the loop, which on Windows knows no signals
         try:
             return await work()
         finally:
             for number, handler in before.items():
-                loop.remove_signal_handler(number)
                 signal.signal(number, handler)
     return 128 + received[0]
 
 
 class _Lines(logging.Handler):
-    """Shows what the library warns of."""
+    """Shows what the library warns of, and what it does, where that is wanted."""
+
+    def show_steps(self) -> None:
+        """From now on show what is done too."""
+        self.setLevel(logging.DEBUG)
+        _logger.setLevel(logging.DEBUG)
 
     def emit(self, record: logging.LogRecord) -> None:
-        report(f"{record.levelname.lower()}: {record.getMessage()}")
+        if record.levelno >= logging.WARNING:
+            report(f"{record.levelname.lower()}: {record.getMessage()}")
+        else:
+            room = record.name.removeprefix("paramclient.")
+            say(printable(f"{record.relativeCreated / 1000:8.3f} {room}: {record.getMessage()}"))
+
+
+_logger: Final = logging.getLogger("paramclient")
 
 
 @contextmanager
-def _warnings_shown() -> Iterator[None]:
-    logger = logging.getLogger("paramclient")
+def _warnings_shown() -> Iterator[_Lines]:
     handler = _Lines(logging.WARNING)
-    logger.addHandler(handler)
+    level = _logger.level
+    _logger.addHandler(handler)
     try:
-        yield
+        yield handler
     finally:
-        logger.removeHandler(handler)
+        _logger.removeHandler(handler)
+        _logger.setLevel(level)
+
+
+def _is_verbose(arguments: Mapping[str, object]) -> bool:
+    options = arguments.get("options")
+    return bool(arguments.get("verbose", getattr(options, "verbose", False)))
 
 
 def _examples(*lines: str) -> str:
@@ -209,6 +230,38 @@ _app.command(
         "save sim:ardupilot tuned.param --changed",
         "save 1 before.params --all",
     ),
+)
+_app.command(
+    apply,
+    usage="Usage: paramclient apply [OPTIONS] URL FILE",
+    help_epilogue=_examples(
+        "apply udpin:0.0.0.0:14550 quad.params --dry-run",
+        "apply udpin:0.0.0.0:14550 quad.params --reboot --backup before.yaml",
+        "apply udpin:0.0.0.0:14550 fleet.param --all --overlay 'own/{system}.param'",
+        "apply sim:ardupilot copter.param",
+    ),
+)
+_app.command(
+    verify,
+    usage="Usage: paramclient verify [OPTIONS] URL FILE",
+    help_epilogue=_examples(
+        "verify udpin:0.0.0.0:14550 quad.params", "verify udpin:0.0.0.0:14550 fleet.param --all --expect 5"
+    ),
+)
+_app.command(
+    restore,
+    usage="Usage: paramclient restore [OPTIONS] URL [WHEN|FILE]",
+    help_epilogue=_examples(
+        "restore udpin:0.0.0.0:14550 --dry-run",
+        "restore udpin:0.0.0.0:14550 '2h ago'",
+        "restore udpin:0.0.0.0:14550 before.yaml",
+    ),
+)
+_app.command(
+    import_,
+    name="import",
+    usage="Usage: paramclient import [OPTIONS] FILE [FILE...]",
+    help_epilogue=_examples("import flight.tlog", "import logs/*.tlog --json"),
 )
 _app.command(_cache)
 _app.command(ports, help_epilogue=_examples("ports", "ports --json"))

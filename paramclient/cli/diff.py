@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Any, Final
 
 from cyclopts import Parameter
@@ -33,6 +34,7 @@ async def diff(
     *,
     base: str | None = None,
     only: Annotated[tuple[str, ...], Parameter(show_default=False)] = (),
+    partial: bool = False,
     everything: Annotated[bool, Parameter(name="--all")] = False,
     metadata: MetadataChoice = None,
     options: LinkOptions = _OPTIONS,
@@ -47,6 +49,7 @@ async def diff(
         right: The same.
         base: A third one, or "defaults" for the firmware's, to see which of the two has moved away from it.
         only: A name or a pattern such as "MC_*"; all others are left out. It may be given again.
+        partial: A holds only some of the parameters: leave out what only B has.
         everything: Print also what is the same.
         metadata: A file that describes parameters. Without it, what is kept of the vehicles' firmware.
     """
@@ -54,6 +57,8 @@ async def diff(
     third_source = [] if base is None or base == DEFAULTS else [base]
     ours, theirs, *third = await resolve_all([left, right, *third_source], options)
     before = _defaults(ours, theirs) if base == DEFAULTS else next(iter(third), None)
+    if partial:
+        theirs = replace(theirs, params={name: theirs[name] for name in theirs if name in ours})
     outcome = compare(ours, theirs, base=before, names=only or None)
     sides = _Sides(ours, theirs, before, options, chosen)
     shown = [entry for entry in outcome.entries if everything or _is_news(entry)]

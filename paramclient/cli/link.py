@@ -6,9 +6,11 @@ import sys
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import suppress
 from dataclasses import asdict
-from typing import Any, Final
+from pathlib import Path
+from typing import Annotated, Any, Final
 
 import anyio
+from cyclopts import Parameter
 
 from paramclient.cli.options import Seconds, SigningOptions
 from paramclient.cli.outcome import ExitCode
@@ -38,7 +40,15 @@ NO_AUTOPILOT: Final = ("unknown", autopilot_name(MAV_AUTOPILOT_INVALID))
 
 
 async def link(
-    url: str, /, *, seconds: Seconds = None, json: bool = False, options: SigningOptions = _UNSIGNED
+    url: str,
+    /,
+    *,
+    seconds: Seconds = None,
+    json: bool = False,
+    listen_only: bool = False,
+    tlog: Path | None = None,
+    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False,
+    options: SigningOptions = _UNSIGNED,
 ) -> int:
     """Print who is heard on a link, how much comes, and what is lost on the way.
 
@@ -49,10 +59,13 @@ async def link(
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
         seconds: How long to listen.
         json: Print JSON, for programs.
+        listen_only: Send nothing, so that no round trip is measured.
+        tlog: Write everything on the link, both ways, to this telemetry log, which must not exist yet.
+        verbose: Tell on stderr what is done, step by step.
     """
     is_live = sys.stdout.isatty() and not json
     deadline = Deadline(seconds if is_live or seconds is not None else LISTENING_TIME)
-    async with listen(url, options.signing) as client:
+    async with listen(url, options.signing, listen_only=listen_only, tlog=tlog) as client:
         report = await _while_measuring(client, _show if is_live else _listen, deadline)
     if not report.frames:
         noise = f" (but {report.bytes_received:,} other bytes)" if report.bytes_received else ""

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any, Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
+from paramclient.cli.logs import cache_of_log
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
     MetadataChoice,
@@ -52,13 +53,13 @@ def show(
     metadata: MetadataChoice = None,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Print what was last known of a vehicle, or what a parameter file holds, with no link.
+    """Print what was last known of a vehicle, or what a parameter file or a log holds, with no link.
 
     With --changed, exit code 1 says that the firmware's defaults are not known.
 
     Args:
         vehicle: A parameter file; else a vehicle's system id, the beginning of its hardware id, its key in
-            the cache, or cache: and one of these.
+            the cache, or cache: and one of these; or replay:FILE, a telemetry log.
         component: This component only.
         changed: Only what differs from the firmware's defaults.
         names: These parameters of a vehicle only, with what is known of them.
@@ -70,8 +71,9 @@ def show(
         return show_file(open_file(vehicle), component, changed=changed, json=options.json)
     wanted = tuple(check_name(name) for name in dict.fromkeys(names))
     described = from_file(metadata, offline=True)
-    with _open(options) as cache:
-        summaries = _choose(cache, vehicle, component)
+    is_log = vehicle is not None and vehicle.lower().startswith("replay:")
+    with _open(options) if not is_log or vehicle is None else cache_of_log(vehicle) as cache:
+        summaries = _choose(cache, None if is_log else vehicle, component)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
         tables = [] if is_list else _load(cache, summaries)
     views = [_View.of(table, wanted, described, cache, changed=changed) for table in tables]

@@ -120,6 +120,18 @@ class LinkOptions(SigningOptions):
     no_cache: bool = False
     """Neither read nor write a cache."""
 
+    listen_only: bool = False
+    """Send nothing, and take what others on the link ask for."""
+
+    forward: str | None = None
+    """The link to one other program, such as udpout:127.0.0.1:14551, that is to share the vehicle's."""
+
+    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False
+    """Tell on stderr what is done, step by step."""
+
+    tlog: Path | None = None
+    """Write everything on the link, both ways, to this telemetry log, which must not exist yet."""
+
     @property
     def place(self) -> Path | bool:
         """Where tables are kept, as `ParamClient` takes it.

@@ -18,6 +18,7 @@ from paramclient.errors import (
     UnknownParameter,
     UsageError,
     ValueNotApplied,
+    VehicleArmed,
     VehicleError,
 )
 
@@ -65,6 +66,7 @@ _STATUSES: Final = {
     TypeMismatch: "mismatch",
     ValueNotApplied: "not-applied",
     AnotherVehicle: "another",
+    VehicleArmed: "armed",
     NoReply: "no-reply",
     UsageError: "invalid",
     LinkError: "link",

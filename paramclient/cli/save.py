@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import re
-import time
 from collections.abc import Iterable, Sequence
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final
@@ -19,34 +16,18 @@ from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import NO_DEFAULTS, print_json, printable, progress_bar, report, say
 from paramclient.cli.session import Session, connect
+from paramclient.cli.sources import check_link, confirmed, names_vehicle, set_of
 from paramclient.component import Component
-from paramclient.errors import NoReply, UsageError
+from paramclient.errors import UsageError
 from paramclient.files import FileForm, write_file
 from paramclient.files.model import AUTOPILOT, address, form_of_name
-from paramclient.links import parse_link
 from paramclient.paramset import ParamSet
 from paramclient.protocol.result import FetchResult
-from paramclient.values import Param, Trust
+from paramclient.values import Param
 
-__all__ = ["names_link", "save"]
-
-REFRESH_PATIENCE: Final = 10.0
-"""Seconds for the values that no hash covers, where the user sets no limit."""
+__all__ = ["save"]
 
 _DEFAULTS: Final = LinkOptions()
-_KEYS: Final = ("uid:", "system:")
-_hardware_id: Final = re.compile(r"[0-9A-Za-z]+(?:/[0-9]*)?").fullmatch
-
-
-def names_link(where: str) -> bool:
-    """Whether this names a link. Else it names a vehicle in the cache: by system id, hardware id or key."""
-    if where.startswith(_KEYS):
-        return False  # uid:00020000 could be a host and its port
-    try:
-        parse_link(where)
-    except UsageError:
-        return _hardware_id(where) is None  # then the error of the link says what is wrong
-    return True
 
 
 async def save(
@@ -79,12 +60,13 @@ async def save(
         raise UsageError("start scripts of PX4 are read and not written; choose another form")
     if all_ and options.component is not None:
         raise UsageError("--all and --component exclude each other")
-    if names_link(where):
-        sets, faults = await _from_link(where, options, all_=all_, refresh=refresh, changed=changed)
-    else:
+    if names_vehicle(where):
         if refresh:
             raise UsageError("--refresh goes with a link")
         sets, faults = _from_cache(where, options, all_=all_, changed=changed)
+    else:
+        check_link(where)
+        sets, faults = await _from_link(where, options, all_=all_, refresh=refresh, changed=changed)
     for fault in faults:
         report(fault)
     if sets:
@@ -105,31 +87,16 @@ async def _from_link(
         fetched, silent = await _fetch(session, all_=all_, refresh=refresh)
         faults += silent
         for component, result in fetched:
-            with suppress(NoReply):  # what was not read afresh is missing below
-                await component.refreshed(timeout=session.deadline.left(REFRESH_PATIENCE))
-            who = f"{component.system}/{component.component}"
-            for note in result.notes:
-                report(f"{who}: {note}")
-            params = list(component.params.values())
-            stale = [each for each in params if each.trust is Trust.CACHED and each.index is not None]
-            lacking = max(len(result.missing), len(stale))
-            if lacking:
-                faults.append(f"{who} is incomplete: {lacking} of {result.count} parameters did not come")
-                continue
-            known = [each for each in params if each.trust is not Trust.CACHED]
-            faults += _add(
-                sets,
-                ParamSet.of(
-                    known,
-                    component=component.component,
-                    system=component.system,
-                    identity=component.identity,
-                    at=time.time(),
-                    source=f"link {url}",
-                ),
-                known,
-                changed=changed,
+            whole, known, missing = await confirmed(
+                component, result, session.client.link.name, session.deadline
             )
+            if missing:
+                who = f"{component.system}/{component.component}"
+                faults.append(
+                    f"{who} is incomplete: {len(missing)} of {result.count} parameters did not come"
+                )
+            else:
+                faults += _add(sets, whole, known, changed=changed)
     return sets, faults
 
 
@@ -176,16 +143,7 @@ def _from_cache(
                 f"{table.size}{of} parameters are in the cache"
             )
             continue
-        known_params = list(table.params.values())
-        whole = ParamSet.of(
-            known_params,
-            component=table.component,
-            system=table.system,
-            identity=table.identity,
-            at=table.updated_at if table.synced_at is None else table.synced_at,
-            source=f"cache {table.key}",
-        )
-        faults += _add(sets, whole, known_params, changed=changed)
+        faults += _add(sets, set_of(table), table.params.values(), changed=changed)
     return sets, faults
 
 

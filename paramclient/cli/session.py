@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final
 
 import anyio
@@ -12,6 +13,7 @@ import anyio
 from paramclient.cli.options import LinkOptions
 from paramclient.client import ParamClient
 from paramclient.component import Component
+from paramclient.links import LinkKind, parse_link
 from paramclient.protocol.result import Policy
 from paramclient.signing import Signing
 
@@ -55,8 +57,12 @@ class Session:
 
 
 @asynccontextmanager
-async def connect(url: str, options: LinkOptions, *, policy: Policy = Policy.AUTO) -> AsyncIterator[Session]:
+async def connect(
+    url: str, options: LinkOptions, *, policy: Policy = Policy.AUTO, is_live: bool = False
+) -> AsyncIterator[Session]:
     """Open a link and wait for the component that the options name.
+
+    A log is read as fast as it goes, unless its name says otherwise or somebody looks on live.
 
     Raises:
         UsageError: no such link, or options that exclude each other.
@@ -65,13 +71,30 @@ async def connect(url: str, options: LinkOptions, *, policy: Policy = Policy.AUT
     """
     deadline = Deadline(options.timeout)
     async with ParamClient(
-        url, cache=options.place, encoding=options.encoding, policy=policy, signing=options.signing
+        url if is_live else _at_once(url),
+        cache=options.place,
+        encoding=options.encoding,
+        policy=policy,
+        listen_only=options.listen_only,
+        forward=options.forward,
+        tlog=options.tlog,
+        signing=options.signing,
     ) as client:
         patience = HEARING_PATIENCE if options.timeout is None else deadline.left()
         component = await client.component(options.system, options.component, timeout=patience)
         yield Session(client, component, deadline)
 
 
-def listen(url: str, signing: Signing | None = None) -> ParamClient:
+def listen(
+    url: str, signing: Signing | None = None, *, listen_only: bool = False, tlog: Path | None = None
+) -> ParamClient:
     """A client that counts everything it hears, and neither reads nor writes a cache."""
-    return ParamClient(url, cache=False, traffic=True, signing=signing)
+    return ParamClient(url, cache=False, traffic=True, signing=signing, listen_only=listen_only, tlog=tlog)
+
+
+def _at_once(url: str) -> str:
+    """The same link; a log whose name says nothing of the speed as fast as it goes."""
+    if not url.lower().startswith(f"{LinkKind.REPLAY}:"):
+        return url
+    spec = parse_link(url)
+    return spec.name if spec.options else replace(spec, options=(("speed", 0.0),)).name

@@ -4,7 +4,7 @@ The form of a text alone says which of them it is, and whether there is a file o
 
 1. a file that exists, whatever its name looks like;
 2. `cache:VEHICLE`, a key of the cache (`uid:…`, `system:…`), a system id (`1`), or hexadecimal digits (the
-   beginning of a hardware id): a vehicle in the cache;
+   beginning of a hardware id, or one with a system id behind it): a vehicle in the cache;
 3. anything else: a link.
 
 So `./1` is the file and `cache:1` the vehicle, if ever there are both.
@@ -22,18 +22,30 @@ from typing import Final
 
 import anyio
 
-from paramclient.cache import CachedSummary, ParamCache
+from paramclient.cache import CachedComponent, CachedSummary, ParamCache
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import progress_bar, report
-from paramclient.cli.session import connect
+from paramclient.cli.session import Deadline, connect
+from paramclient.component import Component
 from paramclient.errors import CacheError, NoReply, UsageError, VehicleError
 from paramclient.files import ParamFile, read_file
 from paramclient.files.model import AUTOPILOT
 from paramclient.links import FORMS, parse_link
 from paramclient.paramset import ParamSet
-from paramclient.values import Trust
+from paramclient.protocol.result import FetchResult
+from paramclient.values import Param, Trust
 
-__all__ = ["is_file", "open_file", "resolve", "resolve_all", "vehicle_key"]
+__all__ = [
+    "check_link",
+    "confirmed",
+    "is_file",
+    "names_vehicle",
+    "open_file",
+    "resolve",
+    "resolve_all",
+    "set_of",
+    "vehicle_key",
+]
 
 REFRESH_PATIENCE: Final = 10.0
 """Seconds for the values that no hash covers, where the user sets no limit."""
@@ -46,7 +58,7 @@ SOURCES: Final = f"""\
 {FORMS}"""
 
 _CACHED: Final = "cache:"
-_VEHICLE: Final = re.compile(rf"{_CACHED}.*|uid:.*|system:.*|[0-9]+|[0-9a-fA-F]{{4,}}")
+_VEHICLE: Final = re.compile(rf"{_CACHED}.*|uid:.*|system:.*|[0-9]+|[0-9a-fA-F]{{4,}}(/[0-9]*)?")
 
 
 async def resolve(text: str, options: LinkOptions) -> ParamSet:
@@ -81,10 +93,10 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions) -> list[ParamS
     for text in dict.fromkeys(texts):
         if is_file(text):
             found[text] = _from_file(text, options)
-        elif _VEHICLE.fullmatch(text):
+        elif names_vehicle(text):
             found[text] = _from_cache(text, options)
         else:
-            _check_link(text)
+            check_link(text)
             links.append(text)
     errors: list[Exception] = []
 
@@ -109,6 +121,75 @@ def is_file(text: str) -> bool:
         path = Path(text)
         return path.is_file() or path.is_fifo()
     return False
+
+
+def names_vehicle(text: str) -> bool:
+    """Whether a word of the user names a vehicle in the cache. It need not be there."""
+    return _VEHICLE.fullmatch(text) is not None
+
+
+def check_link(text: str) -> None:
+    """See that a word that is neither a file nor a cached vehicle names a link.
+
+    Raises:
+        UsageError: it does not; the text says what there is.
+    """
+    try:
+        parse_link(text)
+    except UsageError as error:
+        problem = str(error).splitlines()[0]
+        raise UsageError(
+            f"no such file, and no cached vehicle; {problem}\naccepted forms:\n{SOURCES}"
+        ) from None
+
+
+async def confirmed(
+    component: Component, result: FetchResult, link: str, deadline: Deadline
+) -> tuple[ParamSet, list[Param], list[str]]:
+    """What of a fetched table was given or confirmed in this session.
+
+    The values that no hash covers are waited for. Parameters that the vehicle does not list, and that are
+    only last known, cannot be confirmed, and are left out.
+
+    Returns:
+        the set, the same parameters as the table has them, and the names (or `index 12`) of those that did
+        not come.
+
+    Raises:
+        LinkError: the link failed.
+    """
+    with suppress(NoReply):  # what was not read afresh is missing below
+        await component.refreshed(timeout=deadline.left(REFRESH_PATIENCE))
+    for note in result.notes:
+        report(f"{component.system}/{component.component} {component.autopilot} on {link}: {note}")
+    known = [param for param in component.params.values() if param.trust is not Trust.CACHED]
+    stale = {
+        param.index: param.name
+        for param in component.params.values()
+        if param.trust is Trust.CACHED and param.index is not None
+    }
+    missing = [stale.get(index, f"index {index}") for index in sorted({*result.missing, *stale})]
+    taken = ParamSet.of(
+        known,
+        component=component.component,
+        system=component.system,
+        identity=component.identity,
+        at=time.time(),
+        source=f"link {link}",
+    )
+    return taken, known, missing
+
+
+def set_of(table: CachedComponent) -> ParamSet:
+    """What the cache has of a component."""
+    return ParamSet.of(
+        table.params.values(),
+        component=table.component,
+        system=table.system,
+        identity=table.identity,
+        at=table.updated_at if table.synced_at is None else table.synced_at,
+        source=f"cache {table.key}",
+    )
 
 
 def open_file(path: str) -> ParamFile:
@@ -145,16 +226,6 @@ def vehicle_key(cache: ParamCache, vehicle: str) -> str:
     return cache.components(vehicle)[0].key
 
 
-def _check_link(text: str) -> None:
-    try:
-        parse_link(text)
-    except UsageError as error:
-        problem = str(error).splitlines()[0]
-        raise UsageError(
-            f"no such file, and no cached vehicle; {problem}\naccepted forms:\n{SOURCES}"
-        ) from None
-
-
 def _from_file(path: str, options: LinkOptions) -> ParamSet:
     file = open_file(path)
     is_of_several = len({each.system for each in file.sets}) > 1
@@ -176,14 +247,7 @@ def _from_cache(vehicle: str, options: LinkOptions) -> ParamSet:
         table = cache.load(key, summary.component)
     if table is None:
         raise CacheError(f"{who} has just been removed from the cache by another process")
-    return ParamSet.of(
-        table.params.values(),
-        component=table.component,
-        system=table.system,
-        identity=table.identity,
-        at=table.synced_at,
-        source=f"cache {key}",
-    )
+    return set_of(table)
 
 
 def _component(summaries: Sequence[CachedSummary], component: int | None) -> CachedSummary:
@@ -203,34 +267,17 @@ async def _from_link(url: str, options: LinkOptions, *, is_alone: bool) -> Param
     """The whole table of a component; progress is drawn for a link that is alone, as two would mingle."""
     async with connect(url, options) as session:
         component, deadline = session.component, session.deadline
-        who = f"{session.who} on {session.client.link.name}"
+        link = session.client.link.name
         with progress_bar(f"fetching {session.who}") if is_alone else nullcontext() as progress:
             result = await component.fetch_all(timeout=deadline.left(), progress=progress)
-        with suppress(NoReply):
-            await component.refreshed(timeout=deadline.left(REFRESH_PATIENCE))
-        for note in result.notes:
-            report(f"{who}: {note}")
-        heard = [param for param in component.params.values() if param.trust is not Trust.CACHED]
-        stale = {
-            param.index: param.name
-            for param in component.params.values()
-            if param.trust is Trust.CACHED and param.index is not None  # those not listed cannot be confirmed
-        }
-        if missing := sorted({*result.missing, *stale}):
-            named = [stale.get(index, f"index {index}") for index in missing]
+        params, _, missing = await confirmed(component, result, link, deadline)
+        if missing:
             raise VehicleError(
-                f"{who} is incomplete: {_listed(named)} did not come",
+                f"{session.who} on {link} is incomplete: {_listed(missing)} did not come",
                 system=component.system,
                 component=component.component,
             )
-        return ParamSet.of(
-            heard,
-            component=component.component,
-            system=component.system,
-            identity=component.identity,
-            at=time.time(),
-            source=f"link {session.client.link.name}",
-        )
+        return params
 
 
 def _listed(names: Sequence[str]) -> str:

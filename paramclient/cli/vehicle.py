@@ -226,17 +226,18 @@ async def watch(
         policy: What the vehicle may be asked beside NAMES: whatever is needed, only for its hash, or nothing.
     """
     wanted = [check_name(each) for each in dict.fromkeys(names)]
-    async with connect(url, options, policy=policy) as session:
+    async with connect(url, options, policy=policy, is_live=True) as session:
         changes, events = session.component.changes(), session.client.events()
-        if wanted:
+        listens = session.client.listens_only
+        if wanted and not listens:
             _, errors = await _get_all(session, wanted)
             if errors:
                 return _report_all(errors.values())
-        else:
+        elif not listens:
             with suppress(CacheError):  # there may be nothing in it: then all that is heard is new
                 await _fetch_all(session)
-        known = set(session.component.params)
-        what = ", ".join(wanted) if wanted else f"{len(known)} parameters"
+        known = None if listens else set(session.component.params)
+        what = ", ".join(wanted) if wanted else f"{len(session.component.params)} parameters"
         say(printable(f"watching {what} of {session.who}"))
         with anyio.move_on_after(session.deadline.left()):
             await _print_news(
@@ -454,20 +455,20 @@ async def _print_news(
     session: Session,
     changes: Changes,
     events: Events,
-    known: set[str],
+    known: set[str] | None,
     wanted: frozenset[str],
     *,
     as_lines_of_json: bool,
 ) -> None:
     """Print changes, and what becomes of the component, until cancelled.
 
-    A parameter that has just been heard for the first time is no change.
+    A parameter that has just been heard for the first time is no change; None: whichever it is.
     """
     async with aclosing(_merged(changes, events)) as news:
         async for each in news:
             if isinstance(each, Change):
-                if each.old is None and each.name in known:
-                    known.discard(each.name)
+                if each.old is None and (known is None or each.name in known):
+                    known = known and known - {each.name}
                     continue
                 if wanted and each.name not in wanted:
                     continue
@@ -493,11 +494,13 @@ async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | E
     try:
         wait(changes)
         wait(events)
-        while True:
+        while waiting:
             done, _ = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
             for each in [each for each in waiting if each in done]:
-                wait(waiting.pop(each))
-                yield each.result()
+                feed = waiting.pop(each)
+                if not isinstance(each.exception(), StopAsyncIteration):  # else a log is over
+                    wait(feed)
+                    yield each.result()
     finally:
         for each in waiting:
             if not each.cancel():

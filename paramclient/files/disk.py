@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import secrets
 import stat
+import sys
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -14,6 +15,11 @@ from paramclient.files.forms import LARGEST_FILE, Content, dumps, loads
 from paramclient.files.model import FileForm, ParamFile, as_form, form_of_name
 
 __all__ = ["read_file", "write_file"]
+
+if sys.platform == "win32":
+    _HOW: Final = os.O_BINARY | os.O_NOINHERIT  # else its runtime would change the ends of lines
+else:
+    _HOW: Final = os.O_NONBLOCK | os.O_CLOEXEC
 
 _NEW_MODE: Final = 0o666
 """Of a file that was not there, less what the user's umask takes away."""
@@ -76,7 +82,7 @@ def write_file(
 
 def _read(source: str) -> bytes:
     # a pipe that nobody writes to must not hold anyone up
-    descriptor = os.open(source, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    descriptor = os.open(source, os.O_RDONLY | _HOW)
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
             raise FileError("cannot be read: it is no regular file", source=source)
@@ -95,11 +101,11 @@ def _replace(target: Path, data: bytes, source: str) -> None:
     if mode is not None and not stat.S_ISREG(mode):
         raise FileError("cannot be written: it is no regular file", source=source)
     beside = target.with_name(f".{target.name[:200]}.{secrets.token_hex(8)}.tmp")
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _HOW
     descriptor = os.open(beside, flags, _NEW_MODE)
     try:
         with os.fdopen(descriptor, "wb") as file:
-            if mode is not None:
+            if mode is not None and sys.platform != "win32":
                 os.fchmod(descriptor, stat.S_IMODE(mode))
             file.write(data)
             file.flush()
@@ -114,9 +120,10 @@ def _replace(target: Path, data: bytes, source: str) -> None:
 
 def _sync_folder(folder: Path) -> None:
     """Have the new name on the disk too. The file is in its place by then, so a failure is not told."""
-    with suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+    if sys.platform != "win32":  # where a folder cannot be opened
+        with suppress(OSError):
+            descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+            try:
+                os.fsync(descriptor)
+            finally:
+                os.close(descriptor)

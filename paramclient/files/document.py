@@ -127,7 +127,7 @@ def write_yaml(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
     yield f"paramclient: {VERSION}"
     if header:
         yield "header:"
-        yield from (f"  - {_json(line)}" for line in header)
+        yield from (f"  - {_flow(line)}" for line in header)
     yield "sets:"
     for each in sets:
         mark = "-"

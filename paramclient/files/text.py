@@ -48,8 +48,9 @@ _whole: Final = re.compile(r"[+-]?[0-9]+").fullmatch
 _hexadecimal: Final = re.compile(r"0[xX][0-9a-fA-F]+").fullmatch
 _fraction: Final = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
 _word: Final = re.compile(r"([+-]?)(?:(nan)|inf(?:inity)?)", re.IGNORECASE).fullmatch
-ANY_MARK: Final = re.compile(r"#|(?:(?<=[ \t])|^)(?://|;)")
-"""What begins a comment in a list of parameters: nothing in these can begin with `//` or `;`."""
+ANY_MARK: Final = re.compile(r"(?<![0-9]\.)#|#(?!INF|IND|[QS]?NAN)|(?:(?<=[ \t])|^)(?://|;)")
+"""What begins a comment in a list of parameters: nothing in these can begin with `//` or `;`. The `#` of
+`1.#INF` and `-1.#IND`, which older C libraries of Windows print for what is no number, begins none."""
 _control: Final = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
 _PLAIN_NAN: Final = struct.pack("<d", math.nan)
 

@@ -1,4 +1,4 @@
-"""Bytes in and out: UDP, TCP, serial ports, and simulated vehicles in this process.
+"""Bytes in and out: UDP, TCP, serial ports, simulated vehicles in this process, and telemetry logs.
 
 A link is named as in pymavlink, MAVProxy and MAVSDK; `parse_link` reads the name, `create_link` makes the
 link. Every kind offers the same five things, see `Link`; a program can bring one of its own.
@@ -13,6 +13,7 @@ from paramclient.errors import UsageError
 from paramclient.links.base import Link, Peer
 from paramclient.links.names import FORMS, LinkKind, LinkSpec, parse_link
 from paramclient.links.ports import SerialPort, list_ports
+from paramclient.links.replay import ReplayLink
 from paramclient.links.serial import SerialLink
 from paramclient.links.sim import SimLink, serve_endpoint, simulated
 from paramclient.links.tcp import TcpIn, TcpOut
@@ -27,6 +28,7 @@ __all__ = [
     "LinkKind",
     "LinkSpec",
     "Peer",
+    "ReplayLink",
     "SerialPort",
     "SimLink",
     "create_link",
@@ -64,4 +66,5 @@ _MAKERS: dict[LinkKind, Callable[[LinkSpec], Link]] = {
     LinkKind.TCPIN: TcpIn,
     LinkKind.SERIAL: SerialLink,
     LinkKind.SIM: simulated,
+    LinkKind.REPLAY: ReplayLink,
 }

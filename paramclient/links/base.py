@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import errno
 import socket
+import sys
 from abc import ABC, abstractmethod
 from collections.abc import Hashable
 from contextlib import suppress
@@ -19,7 +20,7 @@ import anyio
 from paramclient.errors import LinkError
 from paramclient.links.names import LinkSpec
 
-__all__ = ["Address", "Link", "Peer", "SocketLink", "close_socket", "reason"]
+__all__ = ["Address", "Link", "Peer", "SocketLink", "claim", "close_socket", "reason"]
 
 Peer: TypeAlias = Hashable
 """Who sent something: an address on UDP, a connection on TCP, a constant on links with one far end."""
@@ -57,8 +58,9 @@ class Link(Protocol):
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """Wait for bytes; give what is there, in order of arrival, and from whom.
 
-        An empty bytes object says that a peer has left (streams only). LinkError: the link dropped, was
-        closed, or is not open.
+        An empty bytes object says that a peer has left (streams only), and an empty list that nothing more
+        will ever come, as at the end of a log: the next call then waits for `close`. LinkError: the link
+        dropped, was closed, or is not open.
         """
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
@@ -174,7 +176,7 @@ class SocketLink(ABC):
             return f"no answer from {self._target}"
         if isinstance(error, ConnectionRefusedError):
             return f"connection refused by {self._target}"
-        if error.errno == errno.EADDRINUSE:
+        if error.errno == errno.EADDRINUSE or (sys.platform == "win32" and error.errno == errno.EACCES):
             return f"port {self._port} is in use by another program"
         if error.errno == errno.EADDRNOTAVAIL:
             return f"{self._host} is no address of this computer"
@@ -190,6 +192,15 @@ class SocketLink(ABC):
             return _addresses(await anyio.getaddrinfo(self._host, self._port, type=kind))
         except socket.gaierror as error:
             raise self._error(f"host {self._host} not found: {reason(error)}") from error
+
+
+def claim(sock: socket.socket) -> None:
+    """Before it is bound: let nobody else have its port, whatever he asks for.
+
+    Elsewhere than on Windows two sockets share a port only where both have asked for that.
+    """
+    if sys.platform == "win32":
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
 
 
 def close_socket(sock: socket.socket) -> None:

@@ -26,6 +26,7 @@ FORMS: Final = """\
   tcpin:HOST:PORT     let vehicles connect; also tcpin:PORT
   serial:DEVICE:BAUD  a serial port; also /dev/ttyACM0,57600 and COM5:115200
   sim:px4             a simulated vehicle in this process; also sim:ardupilot, sim:px4?loss=0.05&seed=1
+  replay:FILE         a telemetry log (.tlog); also replay:FILE?speed=10, and speed=0 for as fast as it goes
   udpin://HOST:PORT   // may follow the first colon of each; an IPv6 address stands in brackets"""
 """The accepted forms, for people."""
 
@@ -48,6 +49,7 @@ class LinkKind(StrEnum):
     TCPIN = "tcpin"
     SERIAL = "serial"
     SIM = "sim"
+    REPLAY = "replay"
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,9 +59,9 @@ class LinkSpec:
     Attributes:
         kind: how bytes travel.
         host: a host name or an address without brackets; the device of a serial link; the autopilot of a
-            simulated one.
+            simulated one; the file of a log.
         port: 1 to 65535; 0 where a listening link lets the system choose; the baud rate of a serial link.
-        options: of a simulated link, sorted by name.
+        options: of a simulated link or a log, sorted by name.
     """
 
     kind: LinkKind
@@ -70,9 +72,9 @@ class LinkSpec:
     @property
     def name(self) -> str:
         """The canonical spelling; `parse_link` reads it back to an equal object."""
-        if self.kind is LinkKind.SIM:
+        if self.kind in (LinkKind.SIM, LinkKind.REPLAY):
             query = "&".join(f"{key}={value}" for key, value in self.options)
-            return f"sim:{self.host}?{query}" if query else f"sim:{self.host}"
+            return f"{self.kind}:{self.host}?{query}" if query else f"{self.kind}:{self.host}"
         host = f"[{self.host}]" if ":" in self.host and self.kind is not LinkKind.SERIAL else self.host
         return f"{self.kind}:{host}:{self.port}"
 
@@ -128,6 +130,8 @@ def _parse(name: str) -> LinkSpec:
         return _serial(rest)
     if kind is LinkKind.SIM:
         return _sim(rest)
+    if kind is LinkKind.REPLAY:
+        return _replay(rest)
     if kind in _LISTENING and rest.isdecimal():
         rest = f":{rest}"
     return _network(kind, rest)
@@ -203,6 +207,19 @@ def _sim(rest: str) -> LinkSpec:
     if "queue" in options and "rate" not in options:
         _fail("option queue needs a rate")
     return LinkSpec(LinkKind.SIM, autopilot.lower(), options=tuple(sorted(options.items())))
+
+
+def _replay(rest: str) -> LinkSpec:
+    path, mark, query = rest.rpartition("?")
+    if not mark or not query.startswith("speed="):
+        path, query = rest, ""
+    if not path:
+        _fail("the file is missing")
+    options: tuple[tuple[str, int | float], ...] = ()
+    if query:
+        text = query.removeprefix("speed=")
+        options = (("speed", 0.0 if text == "inf" else _real(0, 1e6)("speed", text)),)
+    return LinkSpec(LinkKind.REPLAY, path, options=options)
 
 
 def _fail(problem: str) -> NoReturn:

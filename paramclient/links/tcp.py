@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import anyio
 import anyio.lowlevel
 
-from paramclient.links.base import OPEN_TIMEOUT, Address, Peer, SocketLink, close_socket, reason
+from paramclient.links.base import OPEN_TIMEOUT, Address, Peer, SocketLink, claim, close_socket, reason
 from paramclient.links.names import LinkSpec
 
 __all__ = ["Connection", "TcpIn", "TcpOut"]
@@ -117,8 +117,10 @@ class TcpIn(SocketLink):
         assert selector is not None
         batch: list[tuple[Peer, bytes]] = []
         while not batch:
-            # The selector is itself a file that becomes readable: one wait for all connections.
-            await self._readable(selector.fileno())
+            if (file := _file_of(selector)) is not None:
+                await self._readable(file)
+            else:
+                await self._any_readable([listener, *self._clients.values()])
             for key, _ in selector.select(0):
                 if key.data is None:
                     self._accept(listener, selector)
@@ -147,8 +149,10 @@ class TcpIn(SocketLink):
         listener = socket.socket(family, socket.SOCK_STREAM)
         self._adopt(listener, opening)
         listener.setblocking(False)
-        # Not for a second listener, but to bind again while old connections linger in TIME_WAIT.
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        claim(listener)
+        if sys.platform != "win32":  # where it would let others have the port as well, and is not needed
+            # Not for a second listener, but to bind again while old connections linger in TIME_WAIT.
+            listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(address)
         listener.listen()
         self._selector = selectors.DefaultSelector()
@@ -157,12 +161,27 @@ class TcpIn(SocketLink):
     def _discard(self) -> None:
         super()._discard()
         if self._selector is not None:
-            anyio.notify_closing(self._selector.fileno())
+            if (file := _file_of(self._selector)) is not None:
+                anyio.notify_closing(file)
             self._selector.close()
             self._selector = None
         while self._clients:
             _, client = self._clients.popitem()
             close_socket(client)
+
+    async def _any_readable(self, sockets: list[socket.socket]) -> None:
+        """Wait for all of them; LinkError when the link is closed meanwhile."""
+        opening = self._openings
+        async with anyio.create_task_group() as tasks:
+
+            async def wait(sock: socket.socket) -> None:
+                with suppress(anyio.ClosedResourceError):
+                    await anyio.wait_readable(sock)
+                tasks.cancel_scope.cancel()
+
+            for sock in sockets:
+                tasks.start_soon(wait, sock)
+        self._check(opening)
 
     def _destinations(self, peer: Peer | None) -> list[socket.socket]:
         if peer is None:
@@ -200,6 +219,12 @@ class TcpIn(SocketLink):
         return [(peer, data)]
 
 
+def _file_of(selector: selectors.DefaultSelector) -> int | None:
+    """The file that stands for all that is watched and becomes readable with any of it; None on Windows."""
+    number = getattr(selector, "fileno", None)
+    return None if number is None else int(number())
+
+
 def _set_up(sock: socket.socket) -> None:
     sock.setblocking(False)
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -209,11 +234,22 @@ def _set_up(sock: socket.socket) -> None:
 
 async def _connect(sock: socket.socket, address: Address) -> None:
     status = sock.connect_ex(address)
-    if status == errno.EINPROGRESS:
+    if status in _UNDER_WAY:
         await _writable(sock)
         status = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
     if status:
-        raise OSError(status, os.strerror(status))
+        raise OSError(status, _words(status))
+
+
+if sys.platform == "win32":
+    _UNDER_WAY = (errno.WSAEWOULDBLOCK, errno.WSAEINPROGRESS)
+
+    def _words(status: int) -> str:
+        return socket.errorTab.get(status, os.strerror(status))
+
+else:
+    _UNDER_WAY = (errno.EINPROGRESS,)
+    _words = os.strerror
 
 
 async def _send_all(sock: socket.socket, data: bytes) -> None:

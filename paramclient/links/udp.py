@@ -27,9 +27,11 @@ import sys
 from contextlib import suppress
 from typing import Final
 
+import anyio
 import anyio.lowlevel
 
-from paramclient.links.base import Address, Peer, SocketLink, reason
+from paramclient.errors import LinkError
+from paramclient.links.base import OPEN_TIMEOUT, Address, Peer, SocketLink, claim, reason
 from paramclient.links.names import LinkSpec
 
 __all__ = ["UdpIn", "UdpOut"]
@@ -43,9 +45,19 @@ DATAGRAMS_PER_READ: Final = 256
 PEERS: Final = 256
 """Addresses that a listening link remembers: one for each system id. Strangers cannot make it grow."""
 
+UNREACHABLE_PATIENCE: Final = 3.0
+"""Seconds in which nothing found a way out, after which the socket is made anew: three heartbeats. It has its
+own address from when it was opened, and this computer may have got another one since."""
+
+LOOK_AGAIN: Final = 10.0
+"""Seconds of silence after which it is looked whether a name has another address by now."""
+
 
 class UdpLink(SocketLink):
     """What both kinds share: one UDP socket, and the peers on it.
+
+    While the network is away, what is sent is lost, and counted. A socket that has its own address from when
+    it was opened, and finds no way out with it for `UNREACHABLE_PATIENCE`, counts as dropped.
 
     Attributes:
         receive_buffer: bytes that the kernel granted for unread datagrams, its own book-keeping included.
@@ -54,12 +66,14 @@ class UdpLink(SocketLink):
     """
 
     is_stream = False
-    reconnects = False
+    reconnects = True
 
     def __init__(self, spec: LinkSpec) -> None:
         super().__init__(spec)
         self.receive_buffer = 0
         self.lost_sends = 0
+        self._local_port = 0  # of the opening before
+        self._stuck_since: float | None = None
         self._peers: dict[Peer, Address] = {}
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
@@ -93,6 +107,31 @@ class UdpLink(SocketLink):
                 if error.errno not in _PASSING:
                     raise self._error(f"cannot send: {reason(error)}") from error
                 self.lost_sends += 1
+                if error.errno in _NO_WAY_OUT and self._has_own_address:
+                    self._be_stuck(error)
+            else:
+                self._stuck_since = None
+
+    async def close(self) -> None:
+        """See `Link.close`."""
+        await super().close()
+        self._local_port = 0
+
+    @property
+    def _has_own_address(self) -> bool:
+        """Whether the socket sends from one address, which this computer may lose."""
+        return True
+
+    def _be_stuck(self, error: OSError) -> None:
+        now = anyio.current_time()
+        if self._stuck_since is None:
+            self._stuck_since = now
+        elif now - self._stuck_since >= UNREACHABLE_PATIENCE:
+            self._fail(f"no way out from {self._own_host} any more: {reason(error)}", error)
+
+    @property
+    def _own_host(self) -> str:
+        return self.address[0] if self.address else self._host
 
     def _learn(self, batch: list[tuple[Address, bytes]]) -> None:
         """Remember who spoke MAVLink, the latest last; forget who has been silent for longest."""
@@ -115,11 +154,13 @@ class UdpLink(SocketLink):
         sock = socket.socket(family, socket.SOCK_DGRAM)
         self._adopt(sock, opening)
         sock.setblocking(False)
+        claim(sock)
         for option in (socket.SO_RCVBUF, _SO_RCVBUFFORCE) if sys.platform == "linux" else (socket.SO_RCVBUF,):
             with suppress(OSError):  # beyond the limit, or not privileged
                 sock.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER)
         self.receive_buffer = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         self._peers = {}
+        self._stuck_since = None
         return sock
 
 
@@ -131,8 +172,14 @@ class UdpIn(UdpLink):
     """
 
     async def _open(self, opening: int) -> None:
-        family, address = (await self._resolve(socket.SOCK_DGRAM))[0]
-        self._new_socket(family, opening).bind(address)
+        family, (host, port, *more) = (await self._resolve(socket.SOCK_DGRAM))[0]
+        sock = self._new_socket(family, opening)
+        sock.bind((host, port or self._local_port, *more))
+        self._local_port = sock.getsockname()[1]
+
+    @property
+    def _has_own_address(self) -> bool:
+        return self._host not in _EVERY_ADDRESS
 
 
 class UdpOut(UdpLink):
@@ -143,16 +190,25 @@ class UdpOut(UdpLink):
 
     From a broadcast address nobody answers. There everyone who speaks to the local port is heard and is a
     peer; what is for all peers still goes to the broadcast address.
+
+    A name is looked up on opening, and again every `LOOK_AGAIN` seconds for as long as nothing comes: where
+    it has another address by then, the link counts as dropped.
     """
 
     def __init__(self, spec: LinkSpec) -> None:
         super().__init__(spec)
         self._group: Address | None = None
+        self._far: Address | None = None
 
     async def _open(self, opening: int) -> None:
         family, address = (await self._resolve(socket.SOCK_DGRAM))[0]
         sock = self._new_socket(family, opening)
-        sock.bind(("", 0))
+        try:
+            sock.bind(("", self._local_port))
+        except OSError:  # somebody else has taken it meanwhile
+            sock.bind(("", 0))
+        self._local_port = sock.getsockname()[1]
+        self._far = address
         self._group = None
         try:
             sock.connect(address)
@@ -162,6 +218,33 @@ class UdpOut(UdpLink):
         else:
             far = sock.getpeername()
             self._peers = {far: far}
+
+    async def _readable(self, waitable: socket.socket | int) -> None:
+        while True:
+            with anyio.move_on_after(LOOK_AGAIN):
+                await super()._readable(waitable)
+                return
+            failures: list[LinkError] = []
+            async with anyio.create_task_group() as tasks:  # a slow resolver must not keep what comes waiting
+                tasks.start_soon(self._look_again)
+                try:
+                    await super()._readable(waitable)
+                except LinkError as error:
+                    failures.append(error)
+                tasks.cancel_scope.cancel()
+            if failures:
+                raise failures[0]
+            return
+
+    async def _look_again(self) -> None:
+        """While nothing comes: fail when the name has another address than the one that is spoken to."""
+        opening = self._openings
+        while True:
+            with suppress(LinkError, TimeoutError), anyio.fail_after(OPEN_TIMEOUT):
+                found = [address for _, address in await self._resolve(socket.SOCK_DGRAM)]
+                if opening == self._openings and self._far not in found:
+                    self._fail(f"{self._host} is at {found[0][0]} now")
+            await anyio.sleep(LOOK_AGAIN)
 
     def _destinations(self, peer: Peer | None) -> list[Address]:
         return [self._group] if peer is None and self._group is not None else super()._destinations(peer)
@@ -176,20 +259,26 @@ class UdpOut(UdpLink):
             sock.send(data)  # that was the answer to an earlier datagram; this one had not been sent
 
 
-_PASSING = frozenset(
+_NO_WAY_OUT = frozenset({errno.EADDRNOTAVAIL, errno.EINVAL, errno.ENETDOWN, errno.ENETUNREACH})
+"""What is said of a socket whose own address has gone; the second by Linux before 5.3."""
+
+_PASSING = _NO_WAY_OUT | frozenset(
     {
         errno.EAGAIN,
         errno.ECONNREFUSED,
+        errno.ECONNRESET,
         errno.EHOSTDOWN,
         errno.EHOSTUNREACH,
-        errno.ENETDOWN,
-        errno.ENETUNREACH,
+        errno.ENETRESET,
         errno.ENOBUFS,
         errno.ENOMEM,
         errno.EPERM,
     }
 )
-"""What may be gone at the next datagram: no route, no listener, no room, a firewall's refusal."""
+"""What may be gone at the next datagram: no route, no listener (in two words of Windows, too), no room, a
+firewall's refusal."""
+
+_EVERY_ADDRESS = ("0.0.0.0", "::")
 
 _MAGICS = (b"\xfd", b"\xfe")
 _LARGEST_DATAGRAM = 65535

@@ -299,6 +299,6 @@ def _is_below(a: int | float, b: int | float) -> bool:
 def _as_float32(number: int | float) -> float:
     try:
         rounded: float = _FLOAT32.unpack(_FLOAT32.pack(number))[0]
-    except OverflowError:
+    except (OverflowError, struct.error):  # the latter for integers that no float can hold
         return math.inf if number > 0 else -math.inf
     return rounded

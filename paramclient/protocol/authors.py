@@ -11,6 +11,8 @@ FOREIGN_SET_MEMORY: Final = 2.0
 """Seconds for which a PARAM_SET of another station explains a change."""
 MOST_FOREIGN_SETS: Final = 256
 """Names remembered for that; the oldest goes first."""
+MOST_CHANGES: Final = 4_096
+"""Changes remembered for what follows: more names than an autopilot has. The oldest goes first."""
 DOUBT: Final = 2.0
 """Seconds within which a second change of one value may be an old answer that came late: ArduPilot takes the
 values for a batch of answers up to 100 ms before it sends them, and what was set meanwhile overtakes them."""
@@ -45,9 +47,11 @@ class Authors:
     def changed(self, name: str, now: float, is_written: bool) -> None:
         """A value changed: the second time in a short while, the one that came last may be the older one."""
         before = self._changed_at.pop(name, -math.inf)
-        if now - before <= DOUBT and not is_written:
+        if now - before <= DOUBT and not is_written and len(self._doubts) < MOST_CHANGES:
             self._doubts.setdefault(name, now + DOUBT / 2)
         self._changed_at[name] = now
+        if len(self._changed_at) > MOST_CHANGES:
+            del self._changed_at[next(iter(self._changed_at))]
 
     def forget(self, now: float) -> None:
         """Let go of what is too old to matter; once a second will do."""

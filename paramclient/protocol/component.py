@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping
 from typing import Final
 
-from paramclient.errors import LinkError, NoReply
+from paramclient.errors import LinkError, NoReply, UsageError
 from paramclient.identity import autopilot_name
 from paramclient.protocol import events
 from paramclient.protocol.events import ParamChanged
@@ -20,7 +20,7 @@ from paramclient.protocol.table import Change
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
-    NO_INDEX,
+    MOST_PARAMETERS,
     AutopilotVersion,
     CommandAck,
     ComponentMetadata,
@@ -38,6 +38,8 @@ from paramclient.values import Param, Trust, Value, encode
 
 __all__ = ["ComponentMachine"]
 
+MOST_DOUBTED: Final = 256
+"""Reads that may be open for a value to be asked for that changed twice: each takes its share of the link."""
 FRESH_IDENTITY: Final = 1.0
 """Seconds for which an AUTOPILOT_VERSION needs no other."""
 
@@ -57,6 +59,8 @@ class ComponentMachine(Parts):
         is_vehicle_doubted: whether it is open which vehicle its autopilot belongs to.
         another: is told that another vehicle has taken the system id; by default `become_another`.
         turns: those of the lists on the link; None for a link that it has for itself.
+        room: what the tables of the link may hold together; None likewise.
+        trace: is told of each step.
 
     Attributes:
         version: the MAVLink version that it speaks, as far as heard.
@@ -64,7 +68,7 @@ class ComponentMachine(Parts):
         table: its parameters.
         round_trip: what its answers tell of the link.
         presence: whether it is there.
-        overheard: the list that another station has asked for, while none of ours comes.
+        following: the list that another station has asked for, while none of ours comes.
         sync: whether the table is still the vehicle's.
         files: its files.
         descriptions: where it says that what it has to say of itself lies.
@@ -129,13 +133,15 @@ class ComponentMachine(Parts):
             announced = self.sync.hash_heard(message, now)
             if self.fetch is not None:
                 self.fetch.announced(announced)
+            if self.fetches.overheard is not None:
+                self.fetches.overheard.announced(announced, now)
             self.reads.heard(message, now)
             return
         if who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
-            name = name.upper()
+            name = _in_capitals(name)
             message = message._replace(param_id=name)
         table = self.table
-        if count != table.count and count != NO_INDEX:
+        if count != table.count and count <= MOST_PARAMETERS:
             self._count_moved(count, now)
         authors = self._authors
         writes = self.writes
@@ -152,10 +158,10 @@ class ComponentMachine(Parts):
         if fetch is not None:
             fetch.heard(message, now)
         else:
-            self.overheard.heard(message, now)
+            self.following.heard(message, now)
         if writes.queues:
             writes.heard(message, now)
-        self.reads.heard(message, now)
+        self._value_heard(message, now)
 
     def foreign_set(self, name: str, station: str, now: float) -> None:
         """Another station was heard setting a parameter of this component."""
@@ -185,6 +191,8 @@ class ComponentMachine(Parts):
         """
         if self.table.complete:
             return
+        if count is not None and count > MOST_PARAMETERS:  # what an earlier version has believed
+            count, complete, placed = None, False, False
         changes = self.table.restore(
             params,
             count=count,
@@ -285,10 +293,19 @@ class ComponentMachine(Parts):
 
     def spelling(self, name: str) -> str:
         """The name as the vehicle has it. ArduPilot answers to any case; its own names have capitals only."""
-        return name.upper() if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA else name
+        return _in_capitals(name) if self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA else name
 
     def check_present(self, what: str, now: float) -> None:
-        """See whether it can be asked for something; NoReply is raised where it is lost."""
+        """See whether it can be asked for something.
+
+        Raises:
+            UsageError: nothing may be sent.
+            NoReply: it is lost.
+        """
+        if self._listens_only:
+            raise UsageError(
+                f"{what} cannot be asked for where nothing is sent; what has been heard is in `params`"
+            )
         if self.presence.is_lost:
             silence = now - self.presence.heard_at
             raise NoReply(f"{what} (lost)", attempts=0, waited=silence)
@@ -312,7 +329,7 @@ class ComponentMachine(Parts):
         self._follow_identity(now)
         self.sync.tick(now)
         for name in self._authors.doubted(now):
-            if self._policy is Policy.AUTO:
+            if self._policy is Policy.AUTO and len(self.reads) < MOST_DOUBTED:
                 self.reads.ask(name, now, urgent=False)
 
     def next_deadline(self) -> float:
@@ -369,7 +386,7 @@ class ComponentMachine(Parts):
         self._report(self.table.forget())
         self.sync.forget()
         self.fetches.forget()
-        self.overheard.forget()
+        self.following.forget()
         self._known_as = None
         if self.restart is not None:
             self.restart.another(now)
@@ -402,6 +419,10 @@ class ComponentMachine(Parts):
         """What is known may be of the past: it counts again when the vehicle has confirmed it."""
         self.table.doubt(Trust.LIVE, Trust.VERIFIED)
         self.sync.doubt()
+        if self.fetch is not None:
+            self.fetch.doubt()
+        if self.fetches.overheard is not None:
+            self.fetches.overheard.forget()
 
     def _lose(self, now: float) -> None:
         """It is not heard any more. A fetch goes on for a while: it may only be starting again."""
@@ -413,6 +434,7 @@ class ComponentMachine(Parts):
         self.files.lose(now)
         self.descriptions.lose(now)
         self.commands.lose(now)
+        self.who.lose()
         self._doubt()
 
     def _was_silent(self, silence: float, now: float) -> None:
@@ -435,7 +457,7 @@ class ComponentMachine(Parts):
         """The vehicle has started again: what it had not saved is gone, and its list begins anew."""
         self._emit(events.ComponentRebooted(self))
         self._doubt()
-        self.overheard.forget()
+        self.following.forget()
         self._authors.clear()
         self.sync.check(now)
         self.who.doubt(now)
@@ -481,6 +503,13 @@ class ComponentMachine(Parts):
     def _report(self, changes: list[Change]) -> None:
         for change in changes:
             self._emit(ParamChanged(self, change))
+
+
+def _in_capitals(name: str) -> str:
+    """The name with capitals for its ASCII letters. Of others, as damage may bring them, the capital may be
+    two letters or none that a message can hold.
+    """
+    return name.encode("latin-1").upper().decode("latin-1")
 
 
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time

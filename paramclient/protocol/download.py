@@ -13,7 +13,7 @@ from paramclient.protocol.stream import SHORTEST_QUIET, ListStream
 from paramclient.protocol.table import Table
 from paramclient.protocol.timing import LONGEST_SILENCE, RoundTrip
 from paramclient.protocol.turns import Seen, Turns
-from paramclient.protocol.wire import NO_INDEX, Message, ParamRequestList, ParamValue
+from paramclient.protocol.wire import MOST_PARAMETERS, NO_INDEX, Message, ParamRequestList, ParamValue
 
 __all__ = ["Download", "present_of"]
 
@@ -133,6 +133,7 @@ class Download(Operation[None]):
         self._is_answered = False  # the first answer to it tells the round trip
         self._list_wait = 0.0
         self._list_asked = 0  # times since the turn began
+        self._is_heeded = False  # its head has come since
         self._list_at = now
         self._patient_since = now
         if listed:
@@ -211,8 +212,8 @@ class Download(Operation[None]):
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
         name, _, _, count, index = message
-        if index >= count or count == NO_INDEX:
-            if index == NO_INDEX and self.count is not None and count != NO_INDEX:
+        if index >= count or count > MOST_PARAMETERS:
+            if index == NO_INDEX and self.count is not None and count <= MOST_PARAMETERS:
                 # pushed, or an answer by name: it goes by the count of now, where ArduPilot's stream does not
                 self._other_count = None if count == self.count else count
             return
@@ -248,8 +249,12 @@ class Download(Operation[None]):
             self._finish_if_complete(now)
 
     def heed(self, now: float) -> None:
-        """The head of the list has come: it was heard, and is not asked for again yet."""
-        if self.count is None:
+        """The head of the list has come: it was heard, and is not asked for again yet.
+
+        Once for each time that it was asked for: one head after the other, and no list, must not keep a turn.
+        """
+        if self.count is None and not self._is_heeded:
+            self._is_heeded = True
             self._note_answer(now)
             self._list_at = now
             self._list_wait = max(self._list_wait, SHORTEST_QUIET)
@@ -344,6 +349,7 @@ class Download(Operation[None]):
     def _ask_for_list(self, now: float) -> None:
         self.lists += 1
         self._list_at = now
+        self._is_heeded = False
         timeout = self._round_trip.prompt_timeout
         self._list_asked += 1
         growth = 2 if self._list_asked > EVEN_LISTS else 1

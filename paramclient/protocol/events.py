@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from paramclient.protocol.result import FetchResult
 
 __all__ = [
+    "ComponentForgotten",
     "ComponentFound",
     "ComponentHeard",
     "ComponentIdentified",
@@ -61,6 +62,13 @@ class ComponentRebooted:
     machine: ComponentMachine
 
 
+@dataclass(frozen=True, slots=True)
+class ComponentForgotten:
+    """It is not followed any more, as it was lost and others want to be heard. Should it speak, it is new."""
+
+    machine: ComponentMachine
+
+
 class ParamChanged(NamedTuple):
     """A parameter appeared, changed or went away. A named tuple: each first value makes one."""
 
@@ -97,6 +105,7 @@ Event: TypeAlias = (
     | ComponentLost
     | ComponentFound
     | ComponentRebooted
+    | ComponentForgotten
     | ParamChanged
     | Fetched
     | TableResynced

@@ -34,9 +34,6 @@ from paramclient.values import Trust
 
 __all__ = ["Fetch"]
 
-FRESH_HASH: Final = 1.0
-"""Seconds for which an announced hash answers the question what the hash is. It is asked for when a component
-is found, so that a fetch right after that need not wait for another round trip."""
 IDENTITY_PATIENCE: Final = 1.0
 """Seconds for which a component may say whether it serves the file before its list is asked for."""
 MOST_RESTARTS: Final = 8
@@ -109,7 +106,7 @@ class Fetch(Operation[FetchResult]):
             self._sample(sampled, table.count, now)
         elif table.hash is None or not table.complete:
             self._begin_or_resume(announced, now)
-        elif announced is not None and now - announced.at <= FRESH_HASH:
+        elif announced is not None and announced.is_fresh(now):
             self._compare(announced, now)
         else:
             self._ask_hash(self._hash_came_first, now)
@@ -129,7 +126,7 @@ class Fetch(Operation[FetchResult]):
             self.file.heard(message)
         download = self.download
         if download is None:
-            self._means.overheard.heard(message, now)
+            self._means.following.heard(message, now)
         elif not download.done:
             if self._first_value_at > now:
                 self._first_value_at = now
@@ -156,6 +153,10 @@ class Fetch(Operation[FetchResult]):
         """It may be known by now whether the component serves the file."""
         if self._undecided_until < math.inf:
             self._begin_download(now, self._present)
+
+    def doubt(self) -> None:
+        """What has come may be of the past."""
+        self._proof.doubt()
 
     def resume(self, now: float) -> None:
         """The link is back."""
@@ -241,11 +242,8 @@ class Fetch(Operation[FetchResult]):
         if self.file is not None:
             return self.file.progress(now)
         received, total = (0, self._table.count) if self.download is None else self.download.progress
-        running = now - self._first_value_at
         came = received - (0 if self.download is None else self.download.resumed)
-        rate = came / running if came > 0 and running > 0 else 0.0
-        left = (total - received) / rate if rate and total is not None else None
-        return Progress(received, total, rate, left)
+        return Progress.after(received, total, came, now - self._first_value_at)
 
     def _sample(self, sampled: Sampled, count: int, now: float) -> None:
         """Judge the cached table by some of its parameters."""
@@ -292,6 +290,8 @@ class Fetch(Operation[FetchResult]):
     def _compare(self, announcement: Announcement, now: float) -> None:
         table = self._table
         listed = table.listed()
+        known = "none" if table.hash is None else f"{table.hash:08x}"
+        self._means.trace("%s/%s: hash %08x announced, %s here", *self._target, announcement.hash, known)
         if announcement.hash != table.hash or announcement.count != len(listed):
             self._proof.before = announcement
             self._begin_download(now)
@@ -309,7 +309,7 @@ class Fetch(Operation[FetchResult]):
             self._begin_download(now)
         elif not self._expects_hash():
             self._resume(now)
-        elif announced is not None and now - announced.at <= FRESH_HASH:
+        elif announced is not None and announced.is_fresh(now):
             self._resume_under(announced, now)
         else:
             self._ask_hash(self._hash_came_to_resume, now)
@@ -346,6 +346,8 @@ class Fetch(Operation[FetchResult]):
             self._undecided_until = self.begun_at + IDENTITY_PATIENCE
             return
         self._undecided_until = math.inf
+        what = "file" if may_use_file else "list"
+        means.trace("%s/%s: the %s is wanted, %s there", *self._target, what, len(present or ()))
         if may_use_file:
             if self._expects_hash():
                 # once, and before the file: so the answer is of the time before it
@@ -353,10 +355,10 @@ class Fetch(Operation[FetchResult]):
             file = self.file = PackFetch(means.files, means.turns, means.table, means.changed, now)
             file.on_done.append(partial(self._file_ended, file))
             return
-        count, overheard = self._table.count, means.overheard
-        if not (present or self._listed) and overheard.is_running(now):
+        count, following = self._table.count, means.following
+        if not (present or self._listed) and following.is_running(now):
             # another station has asked for it: to ask again would begin it anew for both
-            present, count = overheard.hand_over(means.reads)
+            present, count = following.hand_over(means.reads)
         download = self.download = Download(
             means.target,
             means.round_trip,

@@ -7,8 +7,9 @@ from functools import partial
 from typing import Final
 
 from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.overhear import Overheard, Overhearing
 from paramclient.protocol.result import FetchResult, Means, Policy, Sampled
-from paramclient.protocol.sync import Sync
+from paramclient.protocol.sync import Sync, Upkeep
 
 __all__ = ["Fetches"]
 
@@ -23,7 +24,7 @@ class Fetches:
     Args:
         means: what each of them works with.
         sync: the component's.
-        policy: what may be asked.
+        upkeep: what may be asked.
         says_file: whether the component says that it serves files; None while that is worth waiting for.
         ended: is told of each result in which the vehicle has said something of its table.
 
@@ -32,13 +33,14 @@ class Fetches:
         last: the result of the last one that ended, or None.
         file_works: whether this vehicle, with this firmware, gives its table as a file: None while unknown.
         is_same_firmware: whether what the cache knows is of this very vehicle with this very firmware.
+        overheard: what comes because others ask for it, where nothing may be asked here; else None.
     """
 
     def __init__(
         self,
         means: Means,
         sync: Sync,
-        policy: Policy,
+        upkeep: Upkeep,
         *,
         says_file: Callable[[], bool | None],
         ended: Callable[[FetchResult], None],
@@ -49,7 +51,10 @@ class Fetches:
         self.is_same_firmware = False
         self._means = means
         self._sync = sync
-        self._policy = policy
+        self._policy = upkeep.policy
+        self.overheard: Overheard | None = None
+        if upkeep.listens_only:
+            self.overheard = Overheard(means, sync, whole=self._overheard_whole, is_log=upkeep.is_log)
         self._says_file = says_file
         self._ended = ended
         self._file_took: float | None = None
@@ -79,7 +84,13 @@ class Fetches:
         ):
             fetch.restart(now)
         may_sample = self.is_same_firmware and self._policy is Policy.AUTO and not self._sync.is_doubted
-        if fetch is None:
+        if fetch is None and self.overheard is not None:
+            fetch = self.current = Overhearing(self._means, self.overheard, now)
+            if fetch.done:
+                self._overhearing_ended(fetch)
+            else:
+                fetch.on_done.append(partial(self._overhearing_ended, fetch))
+        elif fetch is None:
             fetch = self.current = Fetch(
                 self._means,
                 now,
@@ -107,6 +118,8 @@ class Fetches:
 
     def forget(self) -> None:
         """Another vehicle has taken the address."""
+        if self.overheard is not None:
+            self.overheard.forget()
         self.file_works = self._file_took = None
         self.is_same_firmware = False
 
@@ -117,8 +130,28 @@ class Fetches:
         if self.current is not None and self.current.is_sampling:
             self.current.restart(now)
 
+    def over(self, now: float) -> None:
+        """Nothing more will come."""
+        if self.overheard is not None:
+            self.overheard.is_over = True
+        if isinstance(self.current, Overhearing):
+            self.current.over(now)
+
+    def _overheard_whole(self, result: FetchResult, now: float) -> None:
+        """What others have asked for has made the table whole, or confirmed it."""
+        self.last = result
+        if self._sync.fetched(result, now):
+            self._ended(result)
+        if isinstance(self.current, Overhearing):
+            self.current.came(result, now)
+
+    def _overhearing_ended(self, fetch: Fetch) -> None:
+        self.current = None
+        self.last = fetch.result or self.last
+
     def _fetch_ended(self, fetch: Fetch) -> None:
         self.current = None
+        self._means.trace("%s/%s: %r", *self._means.target, fetch.result or fetch.error)
         if fetch.file_failed is not None:
             self.file_works = not fetch.file_failed
         result = fetch.result

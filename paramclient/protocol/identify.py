@@ -90,11 +90,14 @@ class Identification:
         round_trip: RoundTrip,
         send: Callable[[Message], None],
         chosen: Encoding | None,
+        *,
+        may_ask: bool = True,
     ) -> None:
         self._target = target
         self._round_trip = round_trip
         self._send = send
         self._chosen = chosen
+        self._may_ask = may_ask
         self.identity = Identity(target[0], link)
         self.settled = False
         self.was_away = False
@@ -218,6 +221,11 @@ class Identification:
             self._attempts = 0
             self._ask(now)
 
+    def lose(self) -> None:
+        """It is not heard any more. Who has said it before is asked again when it is; others are asked on."""
+        if self.settled:
+            self._is_asking = False
+
     def acknowledged(self, message: CommandAck, now: float) -> None:
         """Take a COMMAND_ACK: a refusal of one way to ask leads to the other at once."""
         asked = (MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
@@ -244,6 +252,8 @@ class Identification:
         return TRIES if is_blind else self._round_trip.tries
 
     def _ask(self, now: float) -> None:
+        if not self._may_ask:
+            return
         if self._attempts >= self._tries and now >= self._asks_until:
             self._is_asking = False
             self.settled = True

@@ -15,7 +15,7 @@ from paramclient.protocol.pack import LARGEST_FILE, Pack, decode, total_of
 from paramclient.protocol.result import Progress
 from paramclient.protocol.table import Change, Table
 from paramclient.protocol.turns import Seen, Turns
-from paramclient.protocol.wire import NO_INDEX, ParamValue
+from paramclient.protocol.wire import MOST_PARAMETERS, ParamValue
 
 __all__ = ["PARAMETER_FILE", "PackFetch"]
 
@@ -125,7 +125,7 @@ class PackFetch(Operation[None]):
     def heard(self, message: ParamValue) -> None:
         """Every PARAM_VALUE of the component passes here, after it went into the table."""
         self._heard.add(message.param_id)
-        if message.param_count != NO_INDEX:
+        if message.param_count <= MOST_PARAMETERS:
             self._heard_count = message.param_count
 
     def cancel(self, now: float) -> None:
@@ -174,6 +174,8 @@ class PackFetch(Operation[None]):
             pack = decode(job.result)
             if len(pack.entries) < pack.total:
                 raise PackError(f"it has {len(pack.entries)} of {pack.total} parameters", offset=2)
+            if pack.total > MOST_PARAMETERS:
+                raise PackError(f"no component has {pack.total} parameters", offset=4)
         except PackError as error:
             self._is_none(error, now, is_useless=True)
             return

@@ -13,17 +13,18 @@ from paramclient.protocol.descriptions import Descriptions
 from paramclient.protocol.events import Event
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.fetches import Fetches
+from paramclient.protocol.following import Following
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.identify import Identification
-from paramclient.protocol.overheard import Overheard
 from paramclient.protocol.presence import Presence
 from paramclient.protocol.reads import Key, Reads
 from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.restart import Restart
 from paramclient.protocol.result import FetchResult, Means, Sampled
 from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
-from paramclient.protocol.table import Change, Table
+from paramclient.protocol.table import Change, Room, Table
 from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.trace import Trace, silent
 from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import MAV_AUTOPILOT_PX4, Message
 from paramclient.protocol.writes import Writes
@@ -52,6 +53,8 @@ class Parts(ABC):
         is_vehicle_doubted: Callable[[], bool] = lambda: False,
         another: Callable[[float], None] | None = None,
         turns: Turns | None = None,
+        room: Room | None = None,
+        trace: Trace = silent,
     ) -> None:
         target = (system, component)
         upkeep = upkeep or Upkeep()
@@ -59,10 +62,12 @@ class Parts(ABC):
         self.component = component
         self.version = 1
         self.round_trip = RoundTrip()
-        self.who = Identification(target, link, self.round_trip, send, encoding)
-        self.table = Table(self.who.encoding)
+        self.who = Identification(
+            target, link, self.round_trip, send, encoding, may_ask=not upkeep.listens_only
+        )
+        self.table = Table(self.who.encoding, room)
         self.turns = Turns() if turns is None else turns
-        self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share)
+        self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share, trace)
         self.writes = Writes(
             target,
             self.round_trip,
@@ -71,6 +76,7 @@ class Parts(ABC):
             self.table.params,
             encoding=lambda: self.table.encoding,
             is_certain=lambda: self.may_be_written,
+            trace=trace,
         )
         self.presence = Presence()
         self.sync = Sync(
@@ -94,7 +100,7 @@ class Parts(ABC):
         self.commands = Commands(target, own, self.round_trip, send)
         self.restart: Restart | None = None
         self.files = FileTransfers(target, own, self.round_trip, send)
-        self.overheard = Overheard()
+        self.following = Following()
         self.fetches = Fetches(
             Means(
                 target,
@@ -107,16 +113,21 @@ class Parts(ABC):
                 expects_hash=lambda: self.sync.expects_hash,
                 changed=self._moved,
                 doubt=self._doubt_identity,
-                overheard=self.overheard,
+                following=self.following,
+                trace=trace,
             ),
             self.sync,
-            upkeep.policy,
+            upkeep,
             says_file=lambda: self.who.says_file,
             ended=self._fetched,
         )
+        # where nothing is asked there are no reads: what others ask for is heard in their place
+        overheard = self.fetches.overheard
+        self._value_heard = self.reads.heard if overheard is None else overheard.heard
         self._own = own
         self._emit = emit
         self._policy = upkeep.policy
+        self._listens_only = upkeep.listens_only
         self._another = another or self.become_another
         self._is_vehicle_doubted = is_vehicle_doubted
         self._known_as: str | None = None  # the key of the identity that was reported

@@ -111,6 +111,13 @@ class Presence:
         self.heard_at = now
         return silence
 
+    def age(self, seconds: float) -> None:
+        """So much time has passed that the clock did not count."""
+        self.heard_at -= seconds
+        self.beat_at -= seconds
+        self._boot_beat_at -= seconds
+        self._boot_ms_at -= seconds
+
     def heartbeat(self, message: Heartbeat, now: float) -> bool:
         """Take a heartbeat; true when it shows that the component has started again."""
         interval = now - self.beat_at

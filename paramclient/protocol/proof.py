@@ -26,10 +26,18 @@ class Proof:
         self.before: Announcement | None = None
         self.meanwhile: Announcement | None = None
         self._table = table
+        self._is_old = False
 
     def forget(self) -> None:
         """What was announced is about another table."""
         self.before = self.meanwhile = None
+        self._is_old = False
+
+    def doubt(self) -> None:
+        """The vehicle was away for a while: what it announced before proves nothing by itself."""
+        self.before = self.before if self.meanwhile is None else self.meanwhile
+        self.meanwhile = None
+        self._is_old = True
 
     def is_given(self, count: int) -> bool:
         """Whether what was announced so far proves the table, which has so many parameters.
@@ -37,7 +45,7 @@ class Proof:
         Then it is what the vehicle had at that moment, and the hash need not be waited for again.
         """
         announced = self.before if self.meanwhile is None else self.meanwhile
-        if announced is None or announced.count != count:
+        if announced is None or announced.count != count or (self._is_old and self.meanwhile is None):
             return False
         table = self._table
         volatile, is_proven = find_volatile(table.listed(), announced.hash, believed=table.volatile)

@@ -11,7 +11,8 @@ from paramclient.errors import NoReply, ParamErrorCode, Refused, TypeMismatch, U
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.pacing import Pace, Share
 from paramclient.protocol.timing import FEWEST_TRIES, LONGEST_SILENCE, MEMORY, MOST_TRIES, RoundTrip
-from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
+from paramclient.protocol.trace import Trace, silent
+from paramclient.protocol.wire import MOST_PARAMETERS, Message, ParamError, ParamRequestRead, ParamValue
 
 __all__ = ["Key", "Read", "Reads"]
 
@@ -71,6 +72,7 @@ class Reads:
 
     Attributes:
         pace: how fast requests may go out.
+        asked, retries: reads so far, and requests that were sent for another time.
         answered_at: when a read, or the index asked for with it, was answered last.
         list_runs_again: set while a list comes for another time: then it may answer reads by index, and that
             tells nothing of the round trip.
@@ -87,11 +89,14 @@ class Reads:
         send: Callable[[Message], None],
         is_known: Callable[[Key], bool],
         share: Share | None = None,
+        trace: Trace = silent,
     ) -> None:
         self._target = target
         self._round_trip = round_trip
         self._send = send
         self._is_known = is_known
+        self._trace = trace
+        self.asked = self.retries = 0
         self.pace = Pace(round_trip, share)
         self._open: dict[Key, Read] = {}
         self._flying: dict[Key, Read] = {}
@@ -122,6 +127,7 @@ class Reads:
         read = self._open.get(key)
         if read is None:
             read = Read(key, now)
+            self.asked += 1
             self._open[key] = read
             (self._urgent if urgent else self._patient).append(read)
         elif urgent and read in self._patient:
@@ -146,10 +152,17 @@ class Reads:
                 continue
             if read.attempts:
                 self._count_answer(read, now)
+                self._trace(
+                    "%s/%s %s: answered %.3f s after try %s",
+                    *self._target,
+                    read.key,
+                    now - read.sent_at,
+                    read.attempts,
+                )
             self._drop(read)
             read.finish(message, now)
             self._send_waiting(now)
-        if index < count:
+        if index < count <= MOST_PARAMETERS:
             self.control = index  # it exists, and is answered
         if index == self._control_index and self._control_at < math.inf:
             # one that was lost may have nobody left to ask again; then this is not its answer
@@ -214,8 +227,12 @@ class Reads:
                 self._round_trip.timed_out(read.attempts)
             if self._is_hopeless(read, now):
                 self._drop(read)
+                self._trace("%s/%s %s: given up after try %s", *self._target, read.key, read.attempts)
                 read.fail(self._silence(read, now), now)
             else:
+                self._trace(
+                    "%s/%s %s: no answer to try %s in %.3f s", *self._target, read.key, read.attempts, timeout
+                )
                 read.sent_at = math.inf
                 self._again.append(read)
         self._send_waiting(now)
@@ -326,6 +343,7 @@ class Reads:
 
     def _transmit(self, read: Read, now: float) -> None:
         read.attempts += 1
+        self.retries += read.attempts > 1
         read.copies = 0
         read.sent_at = now
         self._silent_since = min(self._silent_since, now)

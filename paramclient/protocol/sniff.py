@@ -7,14 +7,17 @@ speed does not matter: this runs only where somebody wants to look at the link i
 from __future__ import annotations
 
 import re
+from collections.abc import Hashable
 from typing import Final, NamedTuple
 
-from paramclient.protocol.wire import checksum
+from paramclient.protocol.wire import bears_key, checksum
 
-__all__ = ["Seen", "Sniffer"]
+__all__ = ["FrameCutter", "Seen", "Sniffer"]
 
 MOST_KEPT: Final = 4096
 """Bytes of a stream in which nothing was proven that are kept to see what follows them."""
+MOST_PEERS: Final = 256
+"""Peers of a stream whose unfinished frames are kept, by `FrameCutter`."""
 
 _MAGIC_V1 = 0xFE
 _MAGIC_V2 = 0xFD
@@ -31,6 +34,7 @@ class Seen(NamedTuple):
         size: of the whole frame, in bytes.
         is_signed: whether it carries a signature, which is not verified.
         is_known: false for an id that the dialect does not have, so that no checksum proves the frame.
+        data: the whole frame as it stood on the wire.
     """
 
     message_id: int
@@ -42,6 +46,7 @@ class Seen(NamedTuple):
     size: int
     is_signed: bool
     is_known: bool
+    data: bytes
 
 
 class Sniffer:
@@ -118,6 +123,40 @@ class Sniffer:
         return seen
 
 
+class FrameCutter:
+    """Cuts what a link delivers into whole frames, for those who pass them on as they are.
+
+    Damaged frames and bytes that belong to none are left out, and so are those that bear a key.
+
+    Args:
+        stream: whether a frame may be spread over several calls.
+    """
+
+    def __init__(self, *, stream: bool) -> None:
+        self._stream = stream
+        self._sniffers: dict[Hashable, Sniffer] = {}
+
+    def cut(self, data: bytes, peer: Hashable) -> list[bytes]:
+        """The frames that a chunk completes, in order. An empty one says that the peer's stream has ended."""
+        if not data:
+            sniffer = self._sniffers.pop(peer, None)
+            return [] if sniffer is None else self._clean(sniffer.flush())
+        key = peer if self._stream else None
+        sniffer = self._sniffers.get(key)
+        if sniffer is None:
+            sniffer = self._sniffers[key] = Sniffer(stream=self._stream)
+            if len(self._sniffers) > MOST_PEERS:
+                del self._sniffers[next(iter(self._sniffers))]
+        return self._clean(sniffer.receive(data))
+
+    def flush(self) -> list[bytes]:
+        """The link is away, or closed: give what stands in the unfinished ends."""
+        return [data for peer in list(self._sniffers) for data in self.cut(b"", peer)]
+
+    def _clean(self, frames: list[Seen]) -> list[bytes]:
+        return [seen.data for seen in frames if not bears_key(seen.data)]
+
+
 _MAGICS = (bytes((_MAGIC_V1,)), bytes((_MAGIC_V2,)))
 
 
@@ -128,14 +167,18 @@ def _frame_at(data: bytes, at: int) -> Seen | None:
         size, sequence, system, component, message_id = data[at + 1 : at + 6]
         payload = data[at + 6 : at + 6 + size]
         known = checksum(message_id, b"") is not None
-        return Seen(message_id, system, component, sequence, payload, 1, size + 8, False, known)
+        whole = size + 8
+        frame = data[at : at + whole]
+        return Seen(message_id, system, component, sequence, payload, 1, whole, False, known, frame)
     if magic == _MAGIC_V2 and at + 10 <= len(data):
         size, flags, _, sequence, system, component = data[at + 1 : at + 7]
         message_id = int.from_bytes(data[at + 7 : at + 10], "little")
         payload = data[at + 10 : at + 10 + size]
         whole = size + 12 + (_SIGNATURE_LENGTH if flags else 0)
         known = flags in (0, _SIGNED) and checksum(message_id, b"") is not None
-        return Seen(message_id, system, component, sequence, payload, 2, whole, flags == _SIGNED, known)
+        is_signed = flags == _SIGNED
+        frame = data[at : at + whole]
+        return Seen(message_id, system, component, sequence, payload, 2, whole, is_signed, known, frame)
     return None
 
 

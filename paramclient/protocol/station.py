@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Iterable, Sequence
-from heapq import heappop, heappush
+from heapq import heapify, heappop, heappush
 from typing import Final, TypeAlias
 
 from paramclient.errors import LinkError, UsageError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.download import present_of
-from paramclient.protocol.events import ComponentHeard, Event
+from paramclient.protocol.events import ComponentForgotten, ComponentHeard, Event
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.result import Policy
 from paramclient.protocol.sync import Upkeep
+from paramclient.protocol.table import Room
+from paramclient.protocol.trace import Told, Trace, silent
 from paramclient.protocol.traffic import Traffic
 from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import (
@@ -51,15 +53,21 @@ Peer: TypeAlias = Hashable
 """Who sent something, as the link tells them apart."""
 
 HEARTBEAT_INTERVAL: Final = 1.0
+NOBODY: Final = (0, 0)
+"""Who we are where we only listen: then whoever has our ids is somebody else."""
 MOST_COMPONENTS: Final = 1_000
-"""Components followed on one link: more than 250 systems with a few each have. Further ones are not heard."""
+"""Components followed on one link: more than 250 systems with a few each have. Further ones are heard
+when one that is lost and has told of no parameter can be forgotten for them."""
 MOST_PAST: Final = 8
 """Deadlines of the past that are kept for each component before they are sorted out."""
+SEARCH_INTERVAL: Final = 0.5
+"""Seconds between two searches for one that can be forgotten, where there was none: each looks at all."""
 MOST_PEERS: Final = 256
 """Stream peers whose unfinished frames are kept."""
 HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
 """The message ids that matter here: HEARTBEAT, SYSTEM_TIME, PARAM_VALUE, PARAM_SET (of others), COMMAND_ACK,
 FILE_TRANSFER_PROTOCOL, AUTOPILOT_VERSION, HIGH_LATENCY2, STATUSTEXT, PARAM_ERROR."""
+_SETS: Final = frozenset({23})
 
 
 class Station:
@@ -76,12 +84,16 @@ class Station:
         encoding: for all components, where the user knows better; None: judged by the evidence.
         upkeep: what is done for tables without being asked; by default nothing.
         counts_traffic: whether everything on the link is counted, which takes time for each frame.
+        trace: is told of each step.
 
     Attributes:
         components: every component heard, by (system, component).
-        bytes_received, bytes_sent: on this link, by this station.
+        bytes_received, bytes_sent, frames_sent: on this link, by this station.
         traffic: the counts, or None where they are not wanted.
         policy: what may be asked to bring tables up to date.
+        listens_only: whether nothing is ever sent.
+        is_log: whether the link is a log, which ends: then no time-out means anything, and nobody is lost.
+        is_over: whether nothing more will come, as at the end of a log.
         verifier: looks at signatures; None where there is no key, and they count for nothing.
     """
 
@@ -95,13 +107,19 @@ class Station:
         encoding: Encoding | None = None,
         upkeep: Upkeep | None = None,
         counts_traffic: bool = False,
+        trace: Trace = silent,
     ) -> None:
         self.traffic = Traffic(is_stream=is_stream) if counts_traffic else None
         self.link = link
-        self.own: Address = (system, component)
+        self.listens_only = upkeep is not None and upkeep.listens_only
+        self.is_log = upkeep is not None and upkeep.is_log
+        self.is_over = False
+        self.own: Address = NOBODY if self.listens_only else (system, component)
         self.components: dict[Address, ComponentMachine] = {}
         self.bytes_received = 0
-        self.bytes_sent = 0
+        self.bytes_sent = self.frames_sent = 0
+        self._trace = trace
+        self._frames = self._skipped = self._damaged = 0  # of framers that are gone
         self._is_stream = is_stream
         self._encoding = encoding
         self.policy = Policy.AUTO if upkeep is None else upkeep.policy
@@ -115,7 +133,7 @@ class Station:
         self._signer: Signer | None = None
         self._is_watched = counts_traffic  # one look in the hot path for both
         self.verifier: Verifier | None = None
-        self._heartbeat_at = -math.inf
+        self._heartbeat_at = math.inf if self.listens_only else -math.inf
         self._is_paused = False
         self._turns = Turns()
         self._of_system: dict[int, list[ComponentMachine]] = {}
@@ -123,6 +141,8 @@ class Station:
         self._touched: dict[ComponentMachine, None] = {}  # whose deadline may be another than was noted
         self._deadlines: dict[ComponentMachine, float] = {}  # as noted
         self._order: list[tuple[float, int, int]] = []  # a heap of these, with some that are of the past
+        self._room = Room()
+        self._full_until = -math.inf
 
     def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
         """From now on sign what is sent and take what the verifier accepts; before anything has come."""
@@ -159,7 +179,15 @@ class Station:
 
     def touch(self, machine: ComponentMachine) -> None:
         """Something was asked of a component, or is no longer."""
-        self._touched[machine] = None
+        if self.components.get((machine.system, machine.component)) is machine:
+            self._touched[machine] = None
+
+    def overhear(self, data: bytes, now: float) -> None:
+        """Take note of a frame that another program sends to the vehicles over this link: who sets what."""
+        for frame in Framer(_SETS, stream=False).receive(data):
+            message = decode(frame)
+            if isinstance(message, ParamSet):
+                self._receive_foreign_set(message, (frame.system, frame.component), now)
 
     def tick(self, now: float, *, everyone: bool = True) -> None:
         """Do what is due: our heartbeat, and every component's time-outs.
@@ -167,7 +195,7 @@ class Station:
         Without `everyone`, only components that were heard or touched, or whose deadline has come, are
         looked at: a share of the link that has become larger meanwhile is then used a little later.
         """
-        if self._is_paused:
+        if self._is_paused or self.is_log:
             return
         if self._signer is not None:
             self._signer.advance(now)
@@ -189,8 +217,11 @@ class Station:
             self.traffic.sent(self.bytes_sent, now)
 
     def next_deadline(self, *, everyone: bool = True) -> float:
-        """When `tick` has something to do, or infinity while the link is away. `everyone` is as there."""
-        if self._is_paused:
+        """When `tick` has something to do, or infinity while the link is away, and in a log.
+
+        `everyone` is as there.
+        """
+        if self._is_paused or self.is_log:
             return math.inf
         if everyone:
             self._touch_all(self.components.values())
@@ -223,7 +254,8 @@ class Station:
         """The link is away: time stands still for whatever waits."""
         self._is_paused = True
         self._outbox.clear()
-        self._framers.clear()
+        for peer in list(self._framers):
+            self._retire(peer)
         if self.traffic is not None:
             self.traffic.pause()
         self._peers.clear()  # the link that comes back has others
@@ -231,11 +263,44 @@ class Station:
     def resume(self, now: float) -> None:
         """The link is back: our heartbeat goes out, and whatever waits is asked for again."""
         self._is_paused = False
-        self._heartbeat_at = now
+        if not self.listens_only:
+            self._heartbeat_at = now
         self._turns.resume(now)
         self._touch_all(self.components.values())
         for machine in self.components.values():
             machine.resume(now)
+
+    def stood_still(self, unseen: float, now: float) -> None:
+        """Nobody was at work here, as when the computer slept: that others were silent means nothing.
+
+        Where it was as long as it takes to get lost, every component is looked at anew, as after an absence
+        of the link. Whatever waits is asked for again.
+
+        Args:
+            unseen: seconds of it that have passed for everyone else, but not in `now`.
+            now: the time.
+        """
+        for machine in self.components.values():
+            machine.presence.age(unseen)
+        if not self._is_paused:
+            self._outbox.clear()  # for whoever was there before
+            self.resume(now)
+
+    def over(self, now: float) -> None:
+        """Nothing more will come: whoever waits gets what there is."""
+        self.is_over = True
+        for machine in self.components.values():
+            machine.fetches.over(now)
+
+    @property
+    def framing(self) -> tuple[int, int, int]:
+        """Frames that came, bytes that belonged to none, and frames with a wrong checksum among these."""
+        framers = [self._framer, *self._framers.values()]
+        return (
+            self._frames + sum(framer.frames for framer in framers),
+            self._skipped + sum(framer.skipped for framer in framers),
+            self._damaged + sum(framer.damaged for framer in framers),
+        )
 
     @property
     def is_waiting(self) -> bool:
@@ -274,12 +339,26 @@ class Station:
                 return machine
         return None
 
+    def find(self, system: int | None, component: int | None) -> ComponentMachine | None:
+        """The first component with this address, as far as it is given; without its id, an autopilot."""
+        if component is None:
+            for machine in self.components.values():
+                if system in (None, machine.system) and machine.who.is_autopilot:
+                    return self.autopilot_of(machine.system) or machine
+            return None
+        for address, found in self.components.items():
+            if address[1] == component and system in (None, address[0]) and found.who.has_spoken:
+                return found
+        return None
+
     def check_refresh(self, refresh: bool) -> None:
         """See whether a fetch may download what the cache has.
 
         Raises:
-            UsageError: the policy says no.
+            UsageError: the policy says no, or nothing is sent at all.
         """
+        if refresh and self.listens_only:
+            raise UsageError("nothing can be downloaded where nothing is sent, so not with refresh")
         if refresh and self.policy is not Policy.AUTO:
             raise UsageError(f"the policy is {self.policy}: nothing may be downloaded, so not with refresh")
 
@@ -292,7 +371,7 @@ class Station:
         fetched, none may give it as a file, and no other list runs, the list is asked for once, of all.
         """
         is_new = self._turns.is_free and not any(
-            machine.fetch is not None or machine.overheard.is_running(now) for machine in machines
+            machine.fetch is not None or machine.following.is_running(now) for machine in machines
         )
         may_list = self.policy is Policy.AUTO
         is_fresh = refresh or not any(m.can_hit or present_of(m.table, m.reads) for m in machines)
@@ -323,11 +402,19 @@ class Station:
             framer = self._framers[peer] = Framer(HEARD)
             framer.guard = self._framer.guard
             if len(self._framers) > MOST_PEERS:
-                del self._framers[next(iter(self._framers))]
+                self._retire(next(iter(self._framers)))
         if data:
             return framer.receive(data)
-        self._framers.pop(peer, None)
-        return framer.flush()
+        frames = framer.flush()
+        self._retire(peer)
+        return frames
+
+    def _retire(self, peer: Peer) -> None:
+        """Part with the framer of a peer, and keep what it has counted."""
+        framer = self._framers.pop(peer)
+        self._frames += framer.frames
+        self._skipped += framer.skipped
+        self._damaged += framer.damaged
 
     def _receive_other(self, frame: Frame, peer: Peer, now: float) -> None:
         """Take a frame that is no value of a known component."""
@@ -338,22 +425,22 @@ class Station:
         if isinstance(message, ParamSet):
             self._receive_foreign_set(message, sender, now)
             return
-        machine = self.components.get(sender) or self._meet(sender, message)
+        machine = self.components.get(sender) or self._meet(sender, message, now)
         if machine is not None:
             self._touch_all(self._of_system[machine.system])  # what one says of the vehicle counts for all
             machine.receive(message, now, version=frame.version)
 
-    def _meet(self, sender: Address, message: Message) -> ComponentMachine | None:
+    def _meet(self, sender: Address, message: Message, now: float) -> ComponentMachine | None:
         """A component that was not heard before; only what shows that it has parameters makes it one."""
         is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue)
-        if not is_sign or len(self.components) >= MOST_COMPONENTS:
+        if not is_sign or not self._has_room(now):
             return None
         system, component = sender
         machine: ComponentMachine | None = None
 
         def send(message: Message) -> None:
             if machine is not None:
-                self._touched[machine] = None
+                self.touch(machine)
             self._send(message, system, 2 if machine is None else machine.version)
 
         machine = ComponentMachine(
@@ -369,11 +456,43 @@ class Station:
             is_vehicle_doubted=lambda: self._autopilot_is_doubted(system),
             another=lambda now: self._become_another(system, now),
             turns=self._turns,
+            room=self._room,
+            trace=self._trace,
         )
         self.components[sender] = machine
         self._of_system.setdefault(system, []).append(machine)
         self._events.append(ComponentHeard(machine))
         return machine
+
+    def _has_room(self, now: float) -> bool:
+        """Whether one more component can be followed.
+
+        Where there are too many, the first one goes that is lost, has told of no parameter, and that nobody
+        waits for: who sends heartbeats in many names must not keep out those that come later.
+        """
+        if len(self.components) < MOST_COMPONENTS:
+            return True
+        if now < self._full_until:
+            return False
+        for machine in self.components.values():
+            if machine.presence.is_lost and not machine.table.params and not machine.is_waiting:
+                self._forget(machine)
+                return True
+        self._full_until = now + SEARCH_INTERVAL
+        return False
+
+    def _forget(self, machine: ComponentMachine) -> None:
+        """Part with a component, and with what was noted of it: another one may take its address."""
+        address = (machine.system, machine.component)
+        del self.components[address]
+        self._of_system[machine.system].remove(machine)
+        self._touched.pop(machine, None)
+        self._deadlines.pop(machine, None)
+        self._last_waiting = None
+        self._order = [each for each in self._order if each[1:] != address]
+        heapify(self._order)
+        machine.reads.pace.idle()
+        self._events.append(ComponentForgotten(machine))
 
     def _become_another(self, system: int, now: float) -> None:
         """Another vehicle has taken a system id, with all of its components."""
@@ -393,6 +512,8 @@ class Station:
                 machine.foreign_set(message.param_id, station, now)
 
     def _send(self, message: Message, system: int | None, version: int) -> None:
+        if self.listens_only:
+            return
         own_system, own_component = self.own
         data = encode(
             message, system=own_system, component=own_component, sequence=self._sequence, version=version
@@ -401,4 +522,7 @@ class Station:
             data = sign_frame(data, self._signer)
         self._sequence = (self._sequence + 1) & 0xFF
         self.bytes_sent += len(data)
+        self.frames_sent += 1
+        if system is not None:
+            self._trace("to system %s: %s", system, Told(message))
         self._outbox.append((data, None if system is None else self._peers.get(system)))

@@ -10,11 +10,11 @@ from functools import partial
 from typing import Final
 
 from paramclient.errors import UnknownParameter, UsageError
-from paramclient.protocol.fetch import FRESH_HASH, Fetch
+from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.result import Announcement, FetchResult, Policy
-from paramclient.protocol.table import Change, Table
+from paramclient.protocol.table import MOST_NAMES, Change, Table
 from paramclient.protocol.wire import HASH_CHECK, ParamValue
 from paramclient.values import Trust
 
@@ -63,19 +63,35 @@ class Upkeep:
         without_hash: whether that goes for every vehicle without a hash too: its whole table is then fetched.
             It goes anyway for those that give it as a file in no time.
         policy: what may be asked.
+        listens_only: nothing is sent at all, for whatever reason; the policy is then "cache-only".
+        is_log: the link is a log, in which nobody can be asked and which ends.
     """
 
     interval: float = math.inf
     without_hash: bool = False
     policy: Policy = Policy.AUTO
+    listens_only: bool = False
+    is_log: bool = False
 
     @classmethod
-    def chosen(cls, interval: float | None, policy: Policy | str) -> Upkeep:
+    def chosen(
+        cls,
+        interval: float | None,
+        policy: Policy | str,
+        *,
+        listen_only: bool = False,
+        is_log: bool = False,
+    ) -> Upkeep:
         """What a user's choice means; see `ParamClient`.
 
         Raises:
-            UsageError: there is no such policy, or the interval is too short.
+            UsageError: there is no such policy, the interval is too short, or either is chosen where nothing
+                may be asked.
         """
+        if listen_only or is_log:
+            if interval or policy != Policy.AUTO:
+                raise UsageError("watch_interval and policy are for clients that ask; here nothing is sent")
+            return cls(policy=Policy.CACHE_ONLY, listens_only=True, is_log=is_log)
         try:
             policy = Policy(policy)
         except ValueError:
@@ -199,7 +215,7 @@ class Sync:
             self._moved_by_us_alone &= change.by == "us"
             if self.announced is not None and self.announced.at != -math.inf:
                 self.announced = replace(self.announced, at=-math.inf)
-        if self._has_fallen or self._resync is not None:
+        if (self._has_fallen or self._resync is not None) and len(self._moved) < MOST_NAMES:
             self._moved[name] = None
 
     def count_moved(self, now: float) -> None:
@@ -256,6 +272,10 @@ class Sync:
             self._read_unhashed(result.hash, now)
         return True
 
+    def contradicted(self) -> None:
+        """A hash has come that is not the table's, and nothing can be done about it."""
+        self._not_confirmed()
+
     def forget(self) -> None:
         """Another vehicle has taken the address: nothing that is known is about it."""
         self.announced = None
@@ -274,7 +294,7 @@ class Sync:
     def compare(self, now: float) -> bool:
         """Whether the vehicle has just announced the hash that belongs to the table; then it is confirmed."""
         table, announced = self._table, self.announced
-        if announced is None or now - announced.at > FRESH_HASH or announced.hash != table.hash:
+        if announced is None or not announced.is_fresh(now) or announced.hash != table.hash:
             return False
         if not table.complete or announced.count != len(table.listed()):
             return False

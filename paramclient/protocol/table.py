@@ -6,13 +6,23 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Final, NamedTuple
 
-from paramclient.protocol.wire import NO_INDEX, ParamValue
+from paramclient.protocol.wire import MOST_PARAMETERS, NO_INDEX, ParamValue
 from paramclient.values import Encoding, Param, Trust, Value, as_sent, decode, from_bits, known_type, px4_hash
 
-__all__ = ["Change", "Table"]
+__all__ = ["MOST_NAMES", "Change", "Room", "Table"]
 
 MOST_NAMES: Final = 65_535
-"""Names that one table may hold. No more can have an index; a component that invents further ones is ill."""
+"""Names that one table may hold: as many as can have an index, and as many again of parameters that are not
+in use and have none. A component that invents further ones is ill."""
+
+ENOUGH_NAMES: Final = 2_000
+"""Names that every table may hold, whatever the others of its link do: more than autopilots have."""
+MOST_NAMES_OF_LINK: Final = 400_000
+"""Names that all tables of one link may hold together before each is held to `ENOUGH_NAMES`: 250 vehicles
+with 1,600 parameters each. A name takes about half a kilobyte."""
+MOST_GONE: Final = MOST_NAMES
+"""Names that have changed or gone and wait to be told to the cache, above which further gone ones are not
+told: the next whole table that is kept is without them."""
 
 _EXACT = 1 << 24  # up to here every integer is a float32
 _LIVE = Trust.LIVE  # each look into an enumeration takes a tenth of what a value takes here
@@ -36,8 +46,29 @@ class Change(NamedTuple):
     by: str = "vehicle"
 
 
+class Room:
+    """How many names the tables of one link hold together.
+
+    Attributes:
+        taken: so many.
+    """
+
+    __slots__ = ("taken",)
+
+    def __init__(self) -> None:
+        self.taken = 0
+
+    def has_some(self, held: int) -> bool:
+        """Whether a table that holds so many names may take another one."""
+        return held < MOST_NAMES and (held < ENOUGH_NAMES or self.taken < MOST_NAMES_OF_LINK)
+
+
 class Table:
     """All that is known of a component's parameters.
+
+    Args:
+        encoding: how the component writes values, as far as known.
+        room: what all tables of the link share; None for one that is alone.
 
     Attributes:
         params: by name, in the order in which they were first heard. Shared with readers; never replaced.
@@ -54,7 +85,8 @@ class Table:
         dirty: names whose value, type or index changed since `take_dirty` was called last.
     """
 
-    def __init__(self, encoding: Encoding = Encoding.BYTEWISE) -> None:
+    def __init__(self, encoding: Encoding = Encoding.BYTEWISE, room: Room | None = None) -> None:
+        self._room = Room() if room is None else room
         self.params: dict[str, Param] = {}
         self.count: int | None = None
         self.volatile: frozenset[str] = frozenset()
@@ -125,11 +157,12 @@ class Table:
         old = params.get(name)
         if given == NO_INDEX:
             index = None if old is None else old.index
-        elif count == NO_INDEX or given >= count:
+        elif count > MOST_PARAMETERS or given >= count:
             index = None
         if old is None:
-            if len(params) >= MOST_NAMES:
+            if not self._room.has_some(len(params)):
                 return None
+            self._room.taken += 1
         elif old.type == number and self._wire.get(name) == raw and not is_exact:
             if old.index != index:
                 params[name] = Param(name, old.value, old.type, index, old.bits, Trust.LIVE, old.default)
@@ -173,6 +206,10 @@ class Table:
         kind = known_type(number)
         initial = None if default is None else from_bits(default, number)
         old = self.params.get(name)
+        if old is None:
+            if not self._room.has_some(len(self.params)):
+                return None
+            self._room.taken += 1
         raw = as_sent(bits, number, self._encoding)
         if is_older and old is not None and (old.type != number or self._wire.get(name) != raw):
             self.params[name] = replace(old, index=index, default=initial)
@@ -238,7 +275,7 @@ class Table:
             if volatile_known:
                 self.rehash()  # what is in the table counts, not what stood beside it
             elif any(
-                not self.params[name].same_value(param)
+                name not in self.params or not self.params[name].same_value(param)
                 for name, param in params.items()
                 if name not in volatile
             ):
@@ -260,7 +297,8 @@ class Table:
             if old is not None:
                 if old.type == param.type and name not in self._filed:
                     changes += self._complement(old, param)
-            else:
+            elif self._room.has_some(len(self.params)):
+                self._room.taken += 1
                 new = param.with_trust(Trust.CACHED)
                 if not placed and new.index is not None:
                     new = self._displaced(new)
@@ -339,9 +377,11 @@ class Table:
             del self.params[param.name]
             self._wire.pop(param.name, None)
             self._filed.discard(param.name)
-            self.dirty[param.name] = "vehicle"
+            if param.name in self.dirty or len(self.dirty) < MOST_GONE:
+                self.dirty[param.name] = "vehicle"
             if self._hash is not None:
                 self._moved(param.name)
+        self._room.taken -= len(gone)
         return [Change(param.name, param, None) for param in gone]
 
     def forget(self) -> list[Change]:

@@ -176,6 +176,16 @@ class Traffic:
         for peer in list(self._sniffers):
             self._forget(peer)
 
+    @property
+    def lost(self) -> int:
+        """Frames of all components that have not come."""
+        return sum(source.lost for source in self._sources.values())
+
+    @property
+    def repeated(self) -> int:
+        """Frames of all components that came twice."""
+        return sum(source.repeated for source in self._sources.values())
+
     def report(self, now: float) -> TrafficReport:
         """How it stands."""
         began = now if self._began is None else self._began
@@ -261,6 +271,14 @@ class _Source:
             assert isinstance(message, Heartbeat)
             self._heartbeat = message
             self._heartbeat_at = now
+
+    @property
+    def lost(self) -> int:
+        return self._lost.total
+
+    @property
+    def repeated(self) -> int:
+        return self._repeated.total
 
     def report(self, began: float, now: float) -> ComponentTraffic:
         system, component = self._address

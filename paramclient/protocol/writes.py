@@ -11,6 +11,7 @@ from paramclient.errors import NoReply, ParamErrorCode, TypeMismatch, UsageError
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.trace import Trace, silent
 from paramclient.protocol.wire import Message, ParamError, ParamSet, ParamValue
 from paramclient.values import (
     Encoding,
@@ -93,6 +94,7 @@ class Writes:
 
     Attributes:
         queues: by name, those that are open, the one under way first; no name has an empty one.
+        asked, retries: writes so far, and PARAM_SETs that were sent for another time.
     """
 
     def __init__(
@@ -104,6 +106,7 @@ class Writes:
         params: dict[str, Param],
         encoding: Callable[[], Encoding],
         is_certain: Callable[[], bool],
+        trace: Trace = silent,
     ) -> None:
         self._target = target
         self._round_trip = round_trip
@@ -112,6 +115,8 @@ class Writes:
         self._params = params
         self._encoding = encoding
         self._is_certain = is_certain
+        self._trace = trace
+        self.asked = self.retries = 0
         self.queues: dict[str, deque[Write]] = {}
 
     def __len__(self) -> int:
@@ -124,6 +129,7 @@ class Writes:
     def set(self, name: str, value: Value, now: float) -> Write:
         """Begin a write, behind those to the same name that are open."""
         write = Write(name, value, now)
+        self.asked += 1
         queue = self.queues.setdefault(name, deque())
         queue.append(write)
         if len(queue) == 1:
@@ -297,6 +303,7 @@ class Writes:
         value, bits = decode(raw, write.number, encoding)
         write.wanted = Param(write.name, value, write.number, None, bits)
         write.attempts += 1
+        self.retries += write.attempts > 1
         write.sent_at = now
         write.is_answered = False
         write.verify_at = math.inf
@@ -342,10 +349,12 @@ class Writes:
         status = "accepted" if exact else "adjusted"
         result = SetResult(write.name, status, write.value, actual.value, actual, write.attempts)
         self._leave(write, now)
+        self._trace("%s/%s %s: %s after try %s", *self._target, write.name, status, write.attempts)
         write.finish(result, now)
 
     def _fail(self, write: Write, error: Exception, now: float) -> None:
         self._leave(write, now)
+        self._trace("%s/%s %s: not written: %s", *self._target, write.name, error)
         write.fail(error, now)
 
     def _leave(self, write: Write, now: float) -> None:

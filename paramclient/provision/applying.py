@@ -17,7 +17,11 @@ from paramclient.provision.outcome import ApplyProgress, ApplyResult
 from paramclient.provision.planning import ParamInfo, Plan
 from paramclient.provision.run import Run
 
-__all__ = ["apply", "restore"]
+__all__ = ["BEFORE_APPLY", "BEFORE_RESTORE", "apply", "restore", "restored"]
+
+BEFORE_APPLY: Final = "before apply"
+BEFORE_RESTORE: Final = "before restore"
+"""What a snapshot of the state before says it is for."""
 
 RESTORED: Final = ("identity", "hardware", "calibration", OUT_OF_RANGE)
 """What is included when a vehicle gets back a state of its own."""
@@ -82,12 +86,9 @@ async def apply(
         skip_invalid=skip_invalid,
         backup=backup,
         progress=progress,
+        reason=BEFORE_APPLY,
     )
-    with anyio.move_on_after(timeout):
-        await run.prepare()
-        await run.work()
-        return run.result()
-    return run.ended_by_time()
+    return await _done(run, timeout)
 
 
 async def restore(
@@ -117,20 +118,38 @@ async def restore(
         ParamClientError: as from `apply`.
     """
     given = (include,) if isinstance(include, str) else tuple(include)
-    await identified(component)
-    whose, own = state.identity, component.identity
-    is_own = whose is not None and whose.is_same_vehicle(own)
-    if whose is not None and not is_own and None not in (whose.uid, own.uid) and whose.uid != own.uid:
-        raise UsageError(f"the state is that of another vehicle: {whose}; this one is {own}")
-    return await apply(
+    run = Run(
         component,
         state,
-        include=(*(RESTORED if is_own else (OUT_OF_RANGE,)), *given),
+        include=(*await restored(component, state), *given),
         info=info,
         reboot=reboot,
         allow_armed=allow_armed,
         skip_invalid=True,
         backup=backup,
-        timeout=timeout,
         progress=progress,
+        reason=BEFORE_RESTORE,
     )
+    return await _done(run, timeout)
+
+
+async def restored(component: Component, state: ParamSet) -> tuple[str, ...]:
+    """What `restore` includes of this state although the list leaves it out.
+
+    Raises:
+        UsageError: it is the state of another vehicle.
+    """
+    await identified(component)
+    whose, own = state.identity, component.identity
+    is_own = whose is not None and whose.is_same_vehicle(own)
+    if whose is not None and not is_own and None not in (whose.uid, own.uid) and whose.uid != own.uid:
+        raise UsageError(f"the state is that of another vehicle: {whose}; this one is {own}")
+    return RESTORED if is_own else (OUT_OF_RANGE,)
+
+
+async def _done(run: Run, timeout: float | None) -> ApplyResult:
+    with anyio.move_on_after(timeout):
+        await run.prepare()
+        await run.work()
+        return run.result()
+    return run.ended_by_time()

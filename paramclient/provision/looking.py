@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import time
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
-from time import time
 from typing import Final
 
 import anyio
@@ -12,15 +12,16 @@ import anyio
 from paramclient.component import Component
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.paramset import ParamSet
+from paramclient.protocol.result import FetchResult
 from paramclient.provision.planning import ParamInfo, Plan, check_component, plan
 from paramclient.values import Param, Trust
 
-__all__ = ["Seen", "identified", "look", "plan_for", "prepare", "verify"]
+__all__ = ["LOOKING_PACE", "Seen", "identified", "look", "plan_for", "prepare", "verify"]
 
 IDENTITY_PATIENCE: Final = 10.0
 """Seconds for a vehicle to say who it is. It is asked a few times, and mostly given up sooner."""
 LOOKING_PACE: Final = 0.05
-"""Seconds between two looks whether it has."""
+"""Seconds between two looks whether a vehicle has said something of itself."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,40 +41,52 @@ class Seen:
     absent: frozenset[str]
 
 
-async def look(component: Component, wanted: Iterable[str], absent: frozenset[str] = frozenset()) -> Seen:
+async def look(
+    component: Component,
+    wanted: Iterable[str],
+    absent: frozenset[str] = frozenset(),
+    *,
+    whole: bool = False,
+) -> Seen:
     """Bring the table up to date, and ask by name for what is wanted and not in it.
 
     Vehicles have parameters that are in no list: those that PX4 does not use yet, those of a group that
-    ArduPilot hides. They can be read and set by name.
+    ArduPilot hides. They can be read and set by name. So is asked what was heard earlier on this link and
+    has not been told again: what the hash says nothing about, or an incomplete list has left out. What does
+    not come then either counts as not there.
 
     Args:
         component: the vehicle.
         wanted: names.
         absent: those that the vehicle is known not to have, unless they are in the list by now.
+        whole: ask again for everything that has not been told again, not only for what is wanted.
 
     Raises:
         NoReply: it did not answer.
         LinkError: the link failed, or the client was closed.
     """
+    heard = {name for name, param in component.params.items() if param.trust is Trust.LIVE}
     fetched = await component.fetch_all()
     await component.refreshed()
-    table = {
-        name: param
-        for name, param in component.params.items()
-        if param.trust is not Trust.CACHED and param.index is not None
-    }
-    asked = [name for name in wanted if name not in table and name not in absent]
-    found, unknown = await _ask(component, asked)
+    listed = {name: param for name, param in component.params.items() if param.index is not None}
+    table = {name: param for name, param in listed.items() if param.trust is not Trust.CACHED}
+    missing = frozenset(fetched.missing)
+    given_up = {name for name, param in table.items() if param.index in missing}
+    unsure = given_up | heard.intersection(table, _not_covered(component, fetched))
+    asked = [name for name in wanted if name in unsure or (name not in table and name not in absent)]
+    if whole:
+        asked += unsure.difference(asked)
+    found, unknown = await _ask(component, asked, given_up)
     return Seen(
         ParamSet.of(
-            (table | found).values(),
+            (param for name, param in (table | found).items() if name not in unknown),
             component=component.component,
             system=component.system,
             identity=component.identity,
-            at=time(),
+            at=time.time(),
             source=f"vehicle {component.system}/{component.component}",
         ),
-        fetched.complete,
+        fetched.complete and len(table) == len(listed),
         fetched.hash,
         (absent | unknown).difference(table),
     )
@@ -82,7 +95,8 @@ async def look(component: Component, wanted: Iterable[str], absent: frozenset[st
 async def identified(component: Component) -> None:
     """Wait until the vehicle has said who it is, or will not: what is stored goes under its name."""
     with anyio.move_on_after(IDENTITY_PATIENCE):
-        while component._client._identity_of(component._machine) is None:  # noqa: ASYNC110 - nobody tells
+        station = component._client._station
+        while station.identity_of(component._machine) is None:  # noqa: ASYNC110 - nobody tells
             await anyio.sleep(LOOKING_PACE)
 
 
@@ -106,7 +120,8 @@ async def prepare(
     """
     check_component(wanted, component.component)
     given = (include,) if isinstance(include, str) else tuple(include)
-    plan({}, wanted, include=given)  # what cannot be right is told before the vehicle is asked
+    # what cannot be right is told before the vehicle is asked
+    plan({}, wanted, include=given, autopilot=component.autopilot)
     await identified(component)
     seen = await look(component, wanted)
     return plan_for(component, seen.table, wanted, given, info)
@@ -147,8 +162,22 @@ def plan_for(
     )
 
 
-async def _ask(component: Component, names: Iterable[str]) -> tuple[dict[str, Param], frozenset[str]]:
-    """Read parameters by name: those that are there, and those that the vehicle does not have."""
+def _not_covered(component: Component, fetched: FetchResult) -> Collection[str]:
+    """The names of whose values a fetch says nothing, but for what is missing in it."""
+    if fetched.source != "cache" and not fetched.resumed:
+        return ()
+    if fetched.hash is None:  # the policy allowed no more, or some of it came before
+        return component.params.keys()
+    return component._machine.table.unhashed()
+
+
+async def _ask(
+    component: Component, names: Iterable[str], given_up: Collection[str]
+) -> tuple[dict[str, Param], frozenset[str]]:
+    """Read parameters by name: those that are there, and those that the vehicle does not have or tell.
+
+    Of `given_up`, which were asked for already, no answer is one; else it ends the asking.
+    """
     found: dict[str, Param] = {}
     unknown: set[str] = set()
     failed: list[NoReply | LinkError] = []
@@ -159,6 +188,9 @@ async def _ask(component: Component, names: Iterable[str]) -> tuple[dict[str, Pa
         except (VehicleError, UsageError):  # a name that cannot be is not there either
             unknown.add(name)
         except (NoReply, LinkError) as error:
+            if isinstance(error, NoReply) and name in given_up:
+                unknown.add(name)
+                return
             failed.append(error)
             asking.cancel_scope.cancel()
 

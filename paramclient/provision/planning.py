@@ -246,7 +246,8 @@ def plan(
         encoding: how values are sent; None: as the autopilot does.
 
     Raises:
-        UsageError: `include` names no category and is no glob, or the two are of different components.
+        UsageError: `include` names no category and is no glob, or the two are of different components or
+            autopilots.
     """
     identity = None
     if isinstance(current, ParamSet):
@@ -254,6 +255,7 @@ def plan(
         if autopilot is None and identity is not None:
             autopilot = autopilot_name(identity.autopilot)
         check_component(wanted, current.component)
+    _check_autopilot(wanted, autopilot)
     given = (include,) if isinstance(include, str) else tuple(include)
     if encoding is None:
         encoding = Encoding.C_CAST if autopilot == "ardupilot" else Encoding.BYTEWISE
@@ -296,6 +298,22 @@ def check_component(wanted: ParamSet, component: int | None) -> None:
         )
 
 
+def _check_autopilot(wanted: ParamSet, autopilot: str | None) -> None:
+    """See that parameters are not those of another autopilot: many share a name, and mean something else.
+
+    Raises:
+        UsageError: they say that they are.
+    """
+    if wanted.identity is None:
+        return
+    meant = autopilot_name(wanted.identity.autopilot)
+    if {meant, autopilot} == {"px4", "ardupilot"}:
+        raise UsageError(
+            f"the parameters{f' of {wanted.source}' if wanted.source else ''} are those of a vehicle with "
+            f"{meant}, not with {autopilot}"
+        )
+
+
 class _Planner:
     def __init__(
         self,
@@ -332,6 +350,8 @@ class _Planner:
         if info is not None and info.is_read_only and not self._choice.has(name, READ_ONLY):
             return verdict(PlanStatus.SKIPPED, READ_ONLY, "left out: it can only be read")
         wrong = self._wrong(name, wanted.value, kind, info)
+        if wrong is None and isinstance(wanted.value, bytes) and not isinstance(before, bytes):
+            wrong = WRONG, f"{format_value(wanted.value)} are raw bytes, and the vehicle gives a number"
         if wrong is None or (wrong[0] == OUT_OF_RANGE and self._choice.has(name, OUT_OF_RANGE)):
             return verdict(PlanStatus.SET)
         return verdict(PlanStatus.INVALID, *wrong)

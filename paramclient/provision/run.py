@@ -24,7 +24,7 @@ from paramclient.errors import (
 from paramclient.identity import SHARED_UIDS, Identity
 from paramclient.paramset import ParamSet
 from paramclient.provision.cautions import cautions_for
-from paramclient.provision.looking import Seen, identified, look, plan_for
+from paramclient.provision.looking import LOOKING_PACE, Seen, identified, look, plan_for
 from paramclient.provision.outcome import ApplyProgress, ApplyResult, ApplyRow, ApplyStatus
 from paramclient.provision.planning import (
     MISSING,
@@ -51,10 +51,10 @@ MOST_SILENT: Final = 3
 """Writes without an answer, and none with one between them, after which no further is begun."""
 RESET_SYSTEM: Final = 1
 """The system id that a PX4 has after SYS_AUTOCONFIG: MAV_SYS_ID is not among what its start script keeps."""
+HEARTBEAT_PATIENCE: Final = 3.0
+"""Seconds for a heartbeat to say whether the vehicle is armed; there is one a second, and some are lost."""
 FOLLOW_PATIENCE: Final = 10.0
 """Seconds for a vehicle to be heard under its new system id; ArduPilot sends its next heartbeat under it."""
-REASON: Final = "before apply"
-"""What a snapshot of the state before says it is for."""
 
 
 class Run:
@@ -84,6 +84,7 @@ class Run:
         skip_invalid: bool,
         backup: str | os.PathLike[str] | None,
         progress: Callable[[ApplyProgress], None] | None,
+        reason: str,
     ) -> None:
         self._component = component
         self._planned_for: Identity | None = None
@@ -99,6 +100,7 @@ class Run:
         self._skip_invalid = skip_invalid
         self._backup = backup
         self._progress = progress
+        self._reason = reason
         self._cautions = cautions_for("")
         self._began = anyio.current_time()
         self.rows: dict[str, ApplyRow] = {}
@@ -116,13 +118,13 @@ class Run:
     async def prepare(self) -> None:
         """Look at the vehicle, plan, and store what it has. Nothing is written if that fails."""
         check_component(self._wanted, self._component.component)
-        plan({}, self._wanted, include=self._include)
+        plan({}, self._wanted, include=self._include, autopilot=self._component.autopilot)
         await identified(self._component)
         self._cautions = cautions_for(self._component.autopilot)
         whose, own = self._planned_for, self._component.identity
         if whose is not None and not whose.is_same_vehicle(own):
             raise UsageError(f"the plan is one for another vehicle: {whose}; this one is {own}")
-        self._check_armed()
+        await self._check_armed()
         await self._look()
         self._first, self._first_plan = self.seen, self.plan
         self._first_identity = self._component.identity
@@ -138,7 +140,7 @@ class Run:
             while True:
                 stages = self._to_do()
                 for stage in stages:
-                    self._check_armed()
+                    await self._check_armed()
                     await self._write_stage(stage)
                 if self._has_to_start(stages):
                     await self._restart()
@@ -223,7 +225,7 @@ class Run:
     async def _look(self) -> None:
         self._tell("reading")
         absent = self.seen.absent if self._first is not None else frozenset[str]()
-        self.seen = await look(self._component, self._wanted, absent)
+        self.seen = await look(self._component, self._wanted, absent, whole=self._first is None)
         self._check_it_is_the_same()
         self.plan = plan_for(self._component, self.seen.table, self._wanted, self._include, self._info)
         self._is_proven = True
@@ -324,7 +326,7 @@ class Run:
 
     async def _restart(self) -> None:
         """Start the vehicle again, and go on with it; under its new system id if it has been given one."""
-        self._check_armed()
+        await self._check_armed()
         self._tell("rebooting")
         system = self._system_to_come() if self._new_system is None else self._new_system
         self._component = await self._component.reboot(system=system)
@@ -340,14 +342,22 @@ class Run:
 
     # Before anything is sent
 
-    def _check_armed(self) -> None:
-        if self._component.is_armed and not self._allow_armed:
-            component = self._component
-            raise VehicleArmed(
-                f"{self._address} is armed; nothing is set then",
-                system=component.system,
-                component=component.component,
-            )
+    async def _check_armed(self) -> None:
+        """See that no part of the vehicle says that it is armed, and that the one that is set says so."""
+        if self._allow_armed:
+            return
+        component = self._component
+        with anyio.move_on_after(HEARTBEAT_PATIENCE):
+            while component.is_armed is None and component.state != "lost":  # noqa: ASYNC110 - nobody tells
+                await anyio.sleep(LOOKING_PACE)
+        parts = [each for each in component._client.components.values() if each.system == component.system]
+        if any(each.is_armed for each in parts):
+            words = f"{self._address} is armed; nothing is set then"
+        elif component.is_armed is None and component.state != "lost":
+            words = f"{self._address} does not say whether it is armed; nothing is set then"
+        else:
+            return
+        raise VehicleArmed(words, system=component.system, component=component.component)
 
     def _check_resets(self) -> None:
         """What takes others back at the next start may only be set where that start follows at once."""
@@ -373,7 +383,7 @@ class Run:
                     component.identity,
                     component.component,
                     seen.table,
-                    reason=REASON,
+                    reason=self._reason,
                     hash=seen.hash,
                     complete=seen.complete,
                 )
@@ -434,6 +444,10 @@ class Run:
             return row(ApplyStatus.SET if name in self.sent else ApplyStatus.UNCHANGED)
         if (settled := self.rows.get(name)) is not None:
             return replace(settled, actual=actual) if self._is_proven else settled
+        answered = "acknowledged" if name in self.written else "sent, not acknowledged"
+        if name in self.sent and actual is None:
+            reason = f"{answered}, and the vehicle does not tell it any more"
+            return replace(row(ApplyStatus.UNPROVEN, reason), nearest=())
         if planned.status in (PlanStatus.SKIPPED, PlanStatus.INVALID):
             return row(ApplyStatus.SKIPPED, planned.reason, planned.category)
         if planned.status is PlanStatus.LATER:
@@ -441,7 +455,6 @@ class Run:
         if name not in self.sent:
             return row(ApplyStatus.FAILED, "not reached")
         if not self._is_proven:
-            answered = "acknowledged" if name in self.written else "sent, not acknowledged"
             return row(ApplyStatus.UNPROVEN, f"{answered}, and not read back")
         if self._is_action(name):
             return row(ApplyStatus.SET, "done by the vehicle")

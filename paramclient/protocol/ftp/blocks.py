@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Final
 
 __all__ = ["Blocks"]
+
+MOST_GAPS: Final = 8_192
+"""Gaps that are kept: more than a burst of ArduPilot has blocks. A piece that would leave another one is
+passed over, and is asked for again: each piece that comes is compared with every gap."""
 
 
 class Blocks:
@@ -35,6 +40,11 @@ class Blocks:
         return b"".join(self._pieces[at] for at in sorted(self._pieces))
 
     @property
+    def pieces(self) -> int:
+        """How many pieces it has come in."""
+        return len(self._pieces)
+
+    @property
     def beginning(self) -> bytes:
         """The first piece; b"" where that has not come."""
         return self._pieces.get(0, b"")
@@ -46,6 +56,8 @@ class Blocks:
             stop = min(stop, self.end)
         before = self.received
         if offset > self.reached and offset < stop:
+            if len(self._gaps) >= MOST_GAPS:
+                return False
             self._gaps.append((self.reached, offset))
             self.reached = offset
         gaps = []

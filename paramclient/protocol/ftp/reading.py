@@ -59,6 +59,10 @@ can tell whether it is open."""
 SESSION_LOST = frozenset((FileErrorCode.INVALID_SESSION, FileErrorCode.FILE_NOT_FOUND))
 """What servers say to a read in a session that is not open."""
 ROUNDING: Final = 1e-9
+SMALLEST_SHARE: Final = 4
+SPARE_PIECES: Final = 1_000
+"""A file may come in so many times as many pieces as its largest size has blocks, and some more: each piece
+takes memory, however short it is, and some servers give less than was asked for."""
 
 
 class _Flight(NamedTuple):
@@ -438,19 +442,26 @@ class FileRead(Job[bytes]):
     def _keep(self, packet: Packet, offset: int, now: float) -> bool:
         """Take what has come; whether anything in it is new."""
         if offset + len(packet.data) > self._limit:
-            system, component = self._line.target
-            self.fail(
-                FileTransferError(
-                    f"{self.path} of {system}/{component} is longer than {self._limit} bytes",
-                    system=system,
-                    component=component,
-                    path=self.path,
-                    code=FileErrorCode.INVALID_DATA_SIZE,
-                ),
-                now,
-            )
+            self._is_no_file(f"is longer than {self._limit} bytes", now)
+            return False
+        if self._blocks.pieces > SMALLEST_SHARE * self._limit // self._read_size + SPARE_PIECES:
+            self._is_no_file("comes in too many pieces", now)
             return False
         return self._blocks.take(offset, packet.data)
+
+    def _is_no_file(self, why: str, now: float) -> None:
+        """What comes is more than a file can be."""
+        system, component = self._line.target
+        self.fail(
+            FileTransferError(
+                f"{self.path} of {system}/{component} {why}",
+                system=system,
+                component=component,
+                path=self.path,
+                code=FileErrorCode.INVALID_DATA_SIZE,
+            ),
+            now,
+        )
 
     def _does_not_read(self, packet: Packet, now: float) -> None:
         """The server refuses; where the session is lost, as when another station resets all, begin anew."""

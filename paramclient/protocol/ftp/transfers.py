@@ -112,7 +112,7 @@ class FileList(Job[tuple[DirectoryEntry, ...]]):
         if items and self._passed < MOST_ENTRIES:
             self.begin(now)
         else:
-            self.finish(tuple(self._entries), now)
+            self.finish(tuple(self._entries[:MOST_ENTRIES]), now)
 
 
 class FileChecksum(Job[int]):

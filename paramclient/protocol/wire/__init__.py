@@ -12,11 +12,13 @@ from paramclient.protocol.wire.codec import (
 from paramclient.protocol.wire.frames import (
     Frame,
     Framer,
+    bears_key,
     build_frame,
     checksum,
     enum_word,
     message_name,
     sign_frame,
+    unsign_frame,
 )
 from paramclient.protocol.wire.messages import (
     AUTOPILOT_COMPONENT,
@@ -42,6 +44,7 @@ from paramclient.protocol.wire.messages import (
     MAV_STATE_ACTIVE,
     MAV_STATE_BOOT,
     MAV_TYPE_GCS,
+    MOST_PARAMETERS,
     NO_INDEX,
     PARAM_VALUE_ID,
     AutopilotVersion,
@@ -105,6 +108,7 @@ __all__ = [
     "MAV_STATE_ACTIVE",
     "MAV_STATE_BOOT",
     "MAV_TYPE_GCS",
+    "MOST_PARAMETERS",
     "Message",
     "NO_INDEX",
     "PARAM_VALUE_ID",
@@ -124,6 +128,7 @@ __all__ = [
     "SystemTime",
     "UNDERSTOOD",
     "Verifier",
+    "bears_key",
     "build_frame",
     "checksum",
     "decode",
@@ -132,6 +137,7 @@ __all__ = [
     "enum_word",
     "message_name",
     "sign_frame",
+    "unsign_frame",
     "text_of",
     "timestamp_of",
 ]

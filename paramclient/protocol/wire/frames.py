@@ -16,7 +16,17 @@ from pymavlink.dialects.v20 import all as dialect
 
 from paramclient.protocol.wire.signing import SIGNATURE_LENGTH, Signer
 
-__all__ = ["Frame", "Framer", "build_frame", "checksum", "enum_word", "message_name", "sign_frame"]
+__all__ = [
+    "Frame",
+    "Framer",
+    "bears_key",
+    "build_frame",
+    "checksum",
+    "enum_word",
+    "message_name",
+    "sign_frame",
+    "unsign_frame",
+]
 
 _MAGIC_V1 = 0xFE
 _MAGIC_V2 = 0xFD
@@ -25,8 +35,10 @@ _SIGNED_FLAG = bytes((_SIGNED,))
 _MAGIC = re.compile(b"[\xfd\xfe]").search
 _START = struct.Struct("<BBBxBBB3s").unpack_from  # a header of MAVLink 2; version 1 shares two bytes
 _CRC_AT = struct.Struct("<H").unpack_from
-_PADDING = bytes(10)  # behind the data: a header can be read at its last byte
+_HEADER_LENGTH = 10  # of MAVLink 2
+_PADDING = bytes(_HEADER_LENGTH)  # behind the data: a header can be read at its last byte
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
+_SETUP_SIGNING = (256).to_bytes(3, "little")
 _NO_KEY = b""  # of no message
 
 
@@ -66,6 +78,7 @@ class Framer:
     Attributes:
         frames: frames that were found whole, wanted or not.
         skipped: bytes that belonged to no such frame.
+        damaged: what looked like a frame of a known id and had a wrong checksum.
     """
 
     def __init__(self, wanted: Collection[int] | None = None, *, stream: bool = True) -> None:
@@ -77,6 +90,7 @@ class Framer:
         self._tail = b""
         self.frames = 0
         self.skipped = 0
+        self.damaged = 0
 
     @property
     def guard(self) -> Callable[[bytes], bool] | None:
@@ -107,12 +121,15 @@ class Framer:
         number_of = self._number_of
         extra_of = _EXTRA_BY_ID_BYTES.get
         length = len(data)
-        padded = data + _PADDING
+        last_header_at = length - _HEADER_LENGTH
         good = 0
         skipped = 0
         at = 0
         while at < length:
-            magic, size, flags, sequence, system, component, key = _START(padded, at)
+            if at > last_header_at:
+                data += _PADDING
+                last_header_at = length
+            magic, size, flags, sequence, system, component, key = _START(data, at)
             if magic == _MAGIC_V2:
                 crc_at = at + 10 + size
                 end = crc_at + 2
@@ -123,7 +140,7 @@ class Framer:
             elif magic == _MAGIC_V1:
                 crc_at = at + 6 + size
                 end = crc_at + 2
-                key = padded[at + 5 : at + 6] + b"\0\0"
+                key = data[at + 5 : at + 6] + b"\0\0"
             else:
                 crc_at = end = at
                 key = _NO_KEY
@@ -133,7 +150,7 @@ class Framer:
                 if may_go_on and (header_is_cut or extra is not None):
                     break
                 if self._guard is not None and extra is not None:
-                    self._show_if_cut_off(data[at:], crc_at - at, extra)
+                    self._show_if_cut_off(data[at:length], crc_at - at, extra)
             elif extra is not None and _CRC_AT(data, crc_at)[0] == mcrf4xx(data[at + 1 : crc_at] + extra):
                 good += 1
                 number = number_of(key)
@@ -151,6 +168,8 @@ class Framer:
                         found.append(_frame_of(number, data[at:crc_at]))
                 at = end
                 continue
+            if extra is not None and end <= length:
+                self.damaged += 1
             candidate = _MAGIC(data, at + 1)
             next_at = candidate.start() if candidate else length
             skipped += next_at - at
@@ -158,7 +177,7 @@ class Framer:
         self.frames += good
         if skipped:
             self.skipped += skipped
-        self._tail = data[at:]
+        self._tail = data[at:length]
         return found
 
     def flush(self) -> list[Frame]:
@@ -198,6 +217,24 @@ def sign_frame(frame: bytes, signer: Signer) -> bytes:
     body = frame[1:2] + _SIGNED_FLAG + frame[3:-2]
     crc: int = mcrf4xx(body + _EXTRA_BY_ID_BYTES[frame[7:10]])
     return signer.sign(frame[:1] + body + crc.to_bytes(2, "little"))
+
+
+def unsign_frame(frame: bytes) -> bytes:
+    """The same frame as if it had never been signed; one with an id that the dialect does not have, as it is.
+
+    The guide to message signing asks for that in logs: signatures in numbers help who looks for the key.
+    """
+    extra = _EXTRA_BY_ID_BYTES.get(frame[7:10])
+    if frame[0] != _MAGIC_V2 or frame[2] != _SIGNED or extra is None:
+        return frame
+    body = frame[1:2] + b"\0" + frame[3 : -2 - SIGNATURE_LENGTH]
+    crc: int = mcrf4xx(body + extra)
+    return frame[:1] + body + crc.to_bytes(2, "little")
+
+
+def bears_key(frame: bytes) -> bool:
+    """Whether it is a SETUP_SIGNING, with a key in clear: the guide asks not to log and not to forward it."""
+    return frame[0] == _MAGIC_V2 and frame[7:10] == _SETUP_SIGNING
 
 
 def checksum(message_id: int, body: bytes) -> int | None:

@@ -38,6 +38,7 @@ __all__ = [
     "MAV_STATE_ACTIVE",
     "MAV_STATE_BOOT",
     "MAV_TYPE_GCS",
+    "MOST_PARAMETERS",
     "Message",
     "NO_INDEX",
     "PARAM_VALUE_ID",
@@ -54,6 +55,9 @@ __all__ = [
 NO_INDEX: Final = 65535
 """param_index of a PARAM_VALUE that has no place in the list (PX4: `_HASH_CHECK` and parameters not in use;
 ArduPilot: replies by name and unasked updates)."""
+MOST_PARAMETERS: Final = 32_768
+"""Parameters that a component can have: param_index of PARAM_REQUEST_READ is signed, so that no index above
+32767 can be asked for. A param_count above this is none."""
 HASH_CHECK: Final = "_HASH_CHECK"
 """param_id under which PX4 gives the hash of its table."""
 COMP_ID_ALL: Final = 0

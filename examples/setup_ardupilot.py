@@ -1,0 +1,76 @@
+"""Set ArduPilot vehicles up: from a file what all share, over it what is each one's own; back if that fails.
+
+python examples/setup_ardupilot.py [LINK [FILE]]
+"""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from paramclient import Component, NoReply, ParamClient, ParamClientError, ParamSet, WrittenParam, read_file
+from paramclient.provision import apply_all, overlay, restore, verify_all
+
+FILE = Path(__file__).parent / "parameters/ardupilot/copter.param"
+
+OWN: dict[int, dict[str, int | float]] = {
+    1: {"BATT_CAPACITY": 5200},
+    2: {"BATT_CAPACITY": 3300, "WPNAV_SPEED": 500.0},
+}
+"""By system id, what is not the same for all."""
+
+
+async def main(link: str, file: Path) -> bool:
+    shared = read_file(file).choose()
+
+    def wanted(vehicle: Component) -> ParamSet:
+        own = OWN.get(vehicle.system, {})
+        return overlay(shared, ParamSet({name: WrittenParam(name, value) for name, value in own.items()}))
+
+    def backup(vehicle: Component) -> Path:
+        return Path(tempfile.gettempdir()) / f"before-{vehicle.system}-{started}.yaml"
+
+    started = time.strftime("%Y%m%dT%H%M%S")
+    async with ParamClient(link) as client:
+        await client.component()
+        await asyncio.sleep(1.5)  # each of them is heard once a second
+        vehicles = [each for each in client.autopilots if each.autopilot == "ardupilot"]
+        if not vehicles:
+            raise NoReply("an ArduPilot", attempts=0, waited=1.5)
+        applied = await apply_all(vehicles, wanted, reboot=True, backup=backup)
+        for (system, _), error in applied.errors.items():
+            print(f"{system}: nothing was set: {error}")
+        for (system, component), result in applied.results.items():
+            print(f"{system}: {result}")
+            for row in result.rows.values():
+                if row.reason:
+                    print(f"{system}: {row}")
+            if result.complete:
+                continue
+            vehicle = await client.component(result.system, component)
+            back = await restore(vehicle, result.before, reboot=True)
+            print(
+                f"{system}: as it was before"
+                if back.complete
+                else f"{system}: NEITHER ONE NOR THE OTHER: {back}"
+            )
+        verified = await verify_all(vehicles, wanted)
+        for (system, _), plan in verified.results.items():
+            print(f"{system}: {'as it shall be' if plan.is_met else 'NOT as it shall be'}")
+        return applied.complete and verified.is_met
+
+
+if __name__ == "__main__":
+    try:
+        is_done = asyncio.run(
+            main(
+                sys.argv[1] if len(sys.argv) > 1 else "sim:ardupilot",
+                Path(sys.argv[2]) if len(sys.argv) > 2 else FILE,
+            )
+        )
+    except ParamClientError as error:
+        sys.exit(str(error))
+    sys.exit(not is_done)

@@ -1,0 +1,168 @@
+"""The framers, held against a third one that takes no short cut."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from pymavlink.dialects.v20 import all as dialect
+from pymavlink.generator.mavcrc import x25crc
+
+from fuzz.draw import Draw
+from paramclient.protocol import wire
+from paramclient.protocol.sniff import MOST_KEPT, Sniffer
+from paramclient.protocol.wire import Frame, Framer, Signer, SigningKey, SigningPolicy, Verifier
+
+__all__ = ["LONGEST", "run"]
+
+LONGEST: Final = 1024
+"""Bytes of an input: longer ones take their time and say nothing new."""
+
+LONGEST_FRAME = 280
+IDS = (0, 2, 20, 21, 22, 23, 76, 77, 110, 148, 235, 253, 256, 345, 397, 1, 33, 12915)
+"""What whole frames are made of: the messages that are understood, and a few others."""
+
+EXTRAS = {number: message.crc_extra for number, message in dialect.mavlink_map.items()} | {397: 182}
+KEY = SigningKey(bytes(range(32)))
+
+
+def run(data: bytes) -> None:
+    """Frames, parts of frames and noise, cut anywhere: each framer finds what stands there, and no more."""
+    draw = Draw(data)
+    chunks: list[bytes] = [b""]
+    while not draw.is_over:
+        piece, is_cut = _piece(draw)
+        chunks[-1] += piece
+        if is_cut:
+            chunks.append(b"")
+    _check_datagrams(chunks)
+    _check_stream(chunks)
+    _check_sniffer(chunks)
+
+
+def _check_datagrams(chunks: list[bytes]) -> None:
+    framer, chosen, guarded = (Framer(ids, stream=False) for ids in (None, wire.UNDERSTOOD, None))
+    guarded.guard = Verifier(Signer(KEY, timestamp=0), SigningPolicy.ACCEPT_ALL).accepts
+    for chunk in chunks:
+        frames = _frames_of(chunk)
+        before = framer.skipped
+        assert framer.receive(chunk) == [frame for frame, _ in frames]
+        assert framer.skipped - before == len(chunk) - sum(size for _, size in frames)
+        assert guarded.receive(chunk) == [frame for frame, _ in frames]
+        understood = [frame for frame, _ in frames if frame.message_id in wire.UNDERSTOOD]
+        assert chosen.receive(chunk) == understood
+        for frame in understood:
+            _check_codec(frame)
+
+
+def _check_stream(chunks: list[bytes]) -> None:
+    framer = Framer()
+    found: list[Frame] = []
+    for chunk in chunks:
+        found += framer.receive(chunk)
+        assert len(framer._tail) < LONGEST_FRAME
+    found += framer.flush()
+    frames = _frames_of(b"".join(chunks))
+    assert found == [frame for frame, _ in frames]
+    assert framer.frames == len(frames)
+    assert framer.skipped == sum(map(len, chunks)) - sum(size for _, size in frames)
+
+
+def _check_sniffer(chunks: list[bytes]) -> None:
+    sniffer = Sniffer(stream=True)
+    seen = []
+    for chunk in chunks:
+        seen += sniffer.receive(chunk)
+        assert len(sniffer._tail) <= MOST_KEPT + LONGEST_FRAME
+    seen += sniffer.flush()
+    data = b"".join(chunks)
+    # what nothing proves may count as a frame, but never in the place of one that is proven
+    proven = [Frame(*each[:6]) for each in seen if each.is_known]
+    assert proven == [frame for frame, _ in _frames_of(data)]
+    assert sum(each.size for each in seen) + sniffer.other_bytes <= len(data)
+
+
+def _check_codec(frame: Frame) -> None:
+    message = wire.decode(frame)
+    assert message is not None
+    options = {"system": frame.system, "component": frame.component, "sequence": frame.sequence}
+    data = wire.encode(message, **options)
+    (again,) = Framer(stream=False).receive(data)
+    told = wire.decode(again)
+    assert told is not None
+    assert wire.encode(told, **options) == data
+
+
+def _frames_of(data: bytes) -> list[tuple[Frame, int]]:
+    """The frames in bytes that are all there, each with its size: byte by byte, with pymavlink's CRC."""
+    found = []
+    at = 0
+    while at < len(data):
+        frame = _frame_at(data, at)
+        if frame is not None:
+            found.append(frame)
+        at += 1 if frame is None else frame[1]
+    return found
+
+
+def _frame_at(data: bytes, at: int) -> tuple[Frame, int] | None:
+    if data[at] == 0xFE and len(data) >= at + 8:
+        size, sequence, system, component, number = data[at + 1 : at + 6]
+        start, signature, version = at + 6, 0, 1
+    elif data[at] == 0xFD and len(data) >= at + 12 and data[at + 2] in (0, 1):
+        size, flags, _, sequence, system, component = data[at + 1 : at + 7]
+        number = int.from_bytes(data[at + 7 : at + 10], "little")
+        start, signature, version = at + 10, 13 * flags, 2
+    else:
+        return None
+    end = start + size
+    extra = EXTRAS.get(number)
+    if extra is None or len(data) < end + 2 + signature:
+        return None
+    crc = x25crc(data[at + 1 : end])
+    crc.accumulate(bytes((extra,)))
+    if data[end : end + 2] != crc.crc.to_bytes(2, "little"):
+        return None
+    frame = Frame(number, system, component, sequence, data[start:end], version)
+    return frame, end + 2 + signature - at
+
+
+def _piece(draw: Draw) -> tuple[bytes, bool]:
+    """What comes next, and whether a chunk ends behind it."""
+    kind = draw.number()
+    is_cut = bool(kind & 0x80)
+    match kind % 8:
+        case 0 | 1:
+            return draw.take(draw.number() % 40), is_cut
+        case 2:
+            return b"\xfd" + draw.take(draw.number() % 16), is_cut
+        case 3:
+            return b"\xfe" + draw.take(draw.number() % 16), is_cut
+        case _ as much:
+            return _damaged(_frame(draw), much, draw), is_cut
+
+
+def _frame(draw: Draw) -> bytes:
+    number = draw.one_of(IDS)
+    version = 1 if number < 256 and draw.number() % 4 == 0 else 2
+    payload = draw.take(draw.number() % 60)
+    system, component, sequence = draw.take(3)
+    return wire.build_frame(
+        number, payload, system=system, component=component, sequence=sequence, version=version
+    )
+
+
+def _damaged(frame: bytes, much: int, draw: Draw) -> bytes:
+    """A frame as it is; signed; cut off; or with a byte that was another one."""
+    match much:
+        case 5 if frame[0] == 0xFD:
+            body = frame[1:2] + b"\x01" + frame[3:-2]
+            number = int.from_bytes(frame[7:10], "little")
+            crc = wire.checksum(number, body)
+            assert crc is not None
+            return b"\xfd" + body + crc.to_bytes(2, "little") + draw.take(13)
+        case 6:
+            return frame[: draw.number() % len(frame)]
+        case 7:
+            at = draw.number() % len(frame)
+            return frame[:at] + draw.take(1) + frame[at + 1 :]
+    return frame

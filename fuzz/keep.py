@@ -1,0 +1,66 @@
+"""Keep of many inputs the few that reach everything: `python -m fuzz.keep component FOUND`.
+
+Of the inputs in the corpus of a target and in a folder, the smallest ones stay in the corpus that together
+take every step from one line of the package to another that any of them takes.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import importlib
+import sys
+from pathlib import Path
+from types import FrameType
+from typing import Any, Final
+
+HERE: Final = Path(__file__).parent
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(prog="fuzz.keep", description="Keep the inputs that reach everything.")
+    parser.add_argument("target")
+    parser.add_argument("found", type=Path, nargs="?", help="a folder with more inputs")
+    asked = parser.parse_args()
+    corpus = HERE / "corpus" / asked.target
+    target = importlib.import_module(f"fuzz.{asked.target}")
+    folders = [corpus] if asked.found is None else [corpus, asked.found]
+    inputs = {path.read_bytes() for folder in folders for path in folder.iterdir() if path.is_file()}
+    reached: set[tuple[str, int, int]] = set()
+    kept = []
+    for data in sorted(inputs, key=lambda each: (len(each), each)):
+        steps = steps_of(target, data)
+        if len(data) <= target.LONGEST and not steps <= reached:
+            kept.append(data)
+            reached |= steps
+    for path in corpus.iterdir():
+        path.unlink()
+    for data in kept:
+        (corpus / hashlib.sha1(data).hexdigest()).write_bytes(data)
+    sys.stdout.write(f"{len(kept)} of {len(inputs)} inputs are kept, {sum(map(len, kept))} bytes\n")
+
+
+def steps_of(target: Any, data: bytes) -> set[tuple[str, int, int]]:
+    """The steps from line to line that an input takes."""
+    steps: set[tuple[str, int, int]] = set()
+    lines: dict[int, int] = {}
+
+    def line(frame: FrameType, _event: str, _arg: Any) -> Any:
+        steps.add((frame.f_code.co_filename, lines.get(id(frame), 0), frame.f_lineno))
+        lines[id(frame)] = frame.f_lineno
+        return line
+
+    def call(frame: FrameType, _event: str, _arg: Any) -> Any:
+        lines[id(frame)] = 0
+        return line if "/paramclient/" in frame.f_code.co_filename else None
+
+    sys.settrace(call)
+    try:
+        target.run(data)
+    finally:
+        sys.settrace(None)
+    return steps
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,36 @@
+"""Descriptions of parameters, of a file or a vehicle: only MetadataError comes, and all of it can be used."""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from typing import Final
+
+from paramclient.errors import MetadataError, UsageError
+from paramclient.metadata import read_content
+
+__all__ = ["LONGEST", "run"]
+
+LONGEST: Final = 3000
+"""Bytes of an input: longer ones take their time and say nothing new."""
+
+VALUES = (0, 1, -1, 255, 1 << 31, 0.0, 1.5, -0.0, math.nan, math.inf, 1e39, b"\1\2\3\4")
+WORDS = ("", "0", "1.5", "0x10", "Enabled", "a,b", "1+2", "nan")
+
+
+def run(data: bytes) -> None:
+    """The bytes of a file."""
+    try:
+        known = read_content(data, source="fuzz")
+    except MetadataError as error:
+        assert str(error).startswith("fuzz")
+        return
+    assert len(known) == len(list(known))
+    for name, info in list(known.items())[:20]:
+        assert name in known
+        for value in VALUES:
+            info.text(value)
+            info.problem(value)
+        for word in WORDS:
+            with suppress(UsageError):
+                info.parse(word)

@@ -1,0 +1,76 @@
+"""A lock on the folder of a cache, for what must not be done by two processes at once."""
+
+from __future__ import annotations
+
+import errno
+import os
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Final
+
+from paramclient.errors import CacheError
+
+if sys.platform == "win32":
+    import msvcrt
+else:
+    import fcntl
+
+__all__ = ["BUSY_TIMEOUT", "locked"]
+
+BUSY_TIMEOUT: Final = 5.0
+"""Seconds to wait for another process. Its transactions take milliseconds; who holds the file for longer is
+stuck, and the cache is not worth the wait."""
+
+_LOCK_POLL: Final = 0.01
+_LOCK_FILE: Final = ".paramclient.lock"
+"""What is locked on Windows, where a folder cannot be: it stays in the folder, empty."""
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """Hold the folder against every other process and thread that would open, create or rename a cache.
+
+    Raises:
+        OSError: there is no such folder.
+        CacheError: another process holds it for longer than `BUSY_TIMEOUT`.
+    """
+    descriptor = _open(folder)
+    try:
+        deadline = time.monotonic() + BUSY_TIMEOUT
+        while not _try_to_lock(descriptor):
+            if time.monotonic() > deadline:
+                raise CacheError(f"another process holds the folder {folder}")
+            time.sleep(_LOCK_POLL)
+        yield
+    finally:
+        os.close(descriptor)  # and the lock goes with it
+
+
+if sys.platform == "win32":
+
+    def _open(folder: Path) -> int:
+        return os.open(folder / _LOCK_FILE, os.O_RDWR | os.O_CREAT | os.O_NOINHERIT, 0o600)
+
+    def _try_to_lock(descriptor: int) -> bool:
+        try:
+            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
+        except OSError as error:
+            if error.errno not in (errno.EACCES, errno.EDEADLK):
+                raise
+            return False
+        return True
+
+else:
+
+    def _open(folder: Path) -> int:
+        return os.open(folder, os.O_RDONLY)
+
+    def _try_to_lock(descriptor: int) -> bool:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True

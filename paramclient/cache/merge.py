@@ -1,0 +1,206 @@
+"""What was observed in the past, brought into what is kept: the later observation counts."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+from paramclient.cache import earlier
+from paramclient.cache.records import BY_VEHICLE, CachedSummary, CachedVehicle, StoredParam, TableUpdate
+from paramclient.cache.rows import Row
+from paramclient.cache.tables import (
+    HISTORY_LINES,
+    applied,
+    hashed,
+    save,
+    stored_rows,
+    summaries,
+    vehicles,
+    write_rows,
+)
+
+__all__ = ["merge"]
+
+SAME_CHANGE: Final = 2.0
+"""Seconds between two lines of history that tell of one change: who heard it live wrote it up to a quarter of
+a second later, or as much later as a slow disk took."""
+
+_LINE: Final = "at, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
+
+
+def merge(
+    connection: sqlite3.Connection,
+    updates: Sequence[TableUpdate],
+    based_on: Mapping[tuple[str, int], float],
+) -> None:
+    """Write past updates, in the order of their times; see `ParamCache.merge`."""
+    tables: dict[tuple[str, int], _Past] = {}
+    for update in updates:
+        key = (update.identity.key, update.component)
+        past = tables.get(key)
+        if past is None:
+            past = tables[key] = _Past(connection, based_on.get(key))
+        past.take(update)
+    for past in tables.values():
+        past.finish()
+
+
+@dataclass
+class _Past:
+    """What a log holds of one table.
+
+    Attributes:
+        based_on: `updated_at` of the table that the updates go on from, or None.
+        owner: of the table in the database, once it is there.
+        goes_on: whether the kept table is the one that the updates know.
+        overtaken: by name, the last observation of which a later one is kept.
+        lines: of history, to be put in their places.
+    """
+
+    connection: sqlite3.Connection
+    based_on: float | None
+    owner: int | None = None
+    goes_on: bool = False
+    overtaken: dict[str, StoredParam] = field(default_factory=dict)
+    lines: list[tuple[Any, ...]] = field(default_factory=list)
+
+    def take(self, update: TableUpdate) -> None:
+        """Bring in one update."""
+        vehicle, found = _standing(self.connection, update)
+        if found is None:
+            self.goes_on = True
+            self._save(update, vehicle)
+            return
+        self.owner, table = found
+        if update.at < table.updated_at:
+            self._bring_in(update, table)
+            self._widen(update, vehicle)
+            return
+        self.goes_on |= update.replace or self.based_on == table.updated_at
+        if not self.goes_on:
+            update = replace(update, table=None)
+        self.catch_up(item.param.name for item in update.params)
+        self._save(update, vehicle)
+
+    def catch_up(self, names: Iterable[str]) -> None:
+        """Tell of the change between the last observation that was overtaken, and what is kept."""
+        found = [self.overtaken.pop(name) for name in names if name in self.overtaken]
+        if self.owner is None or not found:
+            return
+        kept = stored_rows(self.connection, self.owner)
+        for item in found:
+            name = item.param.name
+            old, new = _row(item), kept.get(name)
+            if new is None or old.same_value(new) or self._lines(name, item.heard_at, new.heard_at):
+                continue
+            self.lines.append((new.heard_at, name, BY_VEHICLE, *old.value, *new.value))
+
+    def finish(self) -> None:
+        """Put the lines of history in their places by time."""
+        self.catch_up(list(self.overtaken))
+        if not self.lines:
+            return
+        assert self.owner is not None
+        connection, owner = self.connection, self.owner
+        kept = connection.execute(
+            f"SELECT id, {_LINE} FROM history WHERE owner = ? ORDER BY id", (owner,)
+        ).fetchall()
+        lines: list[tuple[int | None, tuple[Any, ...]]] = [(number, line) for number, *line in kept]
+        for new in self.lines:
+            later = (place for place, (_, line) in enumerate(lines) if line[0] > new[0])
+            lines.insert(next(later, len(lines)), (None, new))
+        [(last,)] = connection.execute("SELECT ifnull(max(id), 0) FROM history")
+        dropped, lines = lines[:-HISTORY_LINES], lines[-HISTORY_LINES:]
+        connection.execute("DELETE FROM history WHERE owner = ?", (owner,))
+        connection.executemany(
+            f"INSERT INTO history (id, owner, {_LINE}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            [(last + number, owner, *line) for number, (_, line) in enumerate(lines, start=1)],
+        )
+        self._renumber(
+            {old: last + number for number, (old, _) in enumerate(lines, start=1) if old is not None}
+        )
+        if dropped:
+            earlier.forget(connection, owner, max(line[0] for _, line in dropped))
+
+    def _renumber(self, places: Mapping[int, int]) -> None:
+        """Names that appeared did so behind a line of history, which has another number now."""
+        lines = self.connection.execute("SELECT DISTINCT line FROM birth WHERE owner = ?", (self.owner,))
+        # from the last one on: a new number is above every old one
+        for (line,) in sorted(lines.fetchall(), reverse=True):
+            behind = max((new for old, new in places.items() if old <= line), default=0)
+            self.connection.execute(
+                "UPDATE OR REPLACE birth SET line = ? WHERE owner = ? AND line = ?",
+                (behind, self.owner, line),
+            )
+
+    def _save(self, update: TableUpdate, vehicle: CachedVehicle | None) -> None:
+        if vehicle is not None and vehicle.last_seen > update.at:
+            update = replace(update, identity=vehicle.identity)
+        save(self.connection, [update])
+        self._widen(update, vehicle)
+
+    def _widen(self, update: TableUpdate, vehicle: CachedVehicle | None) -> None:
+        """The vehicle has been seen from the first time to the last, whichever was written first."""
+        if vehicle is not None:
+            self.connection.execute(
+                "UPDATE vehicle SET first_seen = ?, last_seen = ? WHERE key = ?",
+                (min(vehicle.first_seen, update.at), max(vehicle.last_seen, update.at), vehicle.key),
+            )
+
+    def _bring_in(self, update: TableUpdate, table: CachedSummary) -> None:
+        """Bring in what an update has of values that are not kept of a later time."""
+        assert self.owner is not None
+        before = stored_rows(self.connection, self.owner)
+        gone_since = table.synced_at if table.complete and table.synced_at is not None else float("-inf")
+        later: list[StoredParam] = []
+        for item in update.params:
+            name = item.param.name
+            row = before.get(name)
+            if (gone_since if row is None else row.heard_at) < item.heard_at:
+                # its place is that of another count, perhaps
+                later.append(replace(item, param=replace(item.param, index=None)))
+                continue
+            before_it = self.overtaken.get(name)
+            self.overtaken[name] = item
+            if row is not None and before_it is not None:
+                self.lines += self._line(before_it, item)
+        self.catch_up(item.param.name for item in later)
+        after, changes, births = applied(replace(update, params=later, removed=(), replace=False), before)
+        if after != before:
+            write_rows(self.connection, self.owner, before, after)
+            if hashed(before) != hashed(after):
+                self.connection.execute("UPDATE component SET hash = NULL WHERE id = ?", (self.owner,))
+        earlier.write_births(self.connection, self.owner, births)
+        self.lines += changes
+
+    def _line(self, old_item: StoredParam, item: StoredParam) -> Iterator[tuple[Any, ...]]:
+        """The line of a change between two observations, unless it is there."""
+        old, new = _row(old_item), _row(item)
+        if old.same_value(new):
+            return
+        around = self._lines(item.param.name, item.heard_at - SAME_CHANGE, item.heard_at + SAME_CHANGE)
+        if new.value not in around:
+            yield (item.heard_at, item.param.name, item.by, *old.value, *new.value)
+
+    def _lines(self, name: str, after: float, until: float) -> list[tuple[Any, ...]]:
+        """What a parameter became in a time, by its lines of history."""
+        return self.connection.execute(
+            "SELECT new_type, new_bits, new_is_raw FROM history"
+            " WHERE owner = ? AND name = ? AND at > ? AND at <= ?",
+            (self.owner, name, after, until),
+        ).fetchall()
+
+
+def _standing(
+    connection: sqlite3.Connection, update: TableUpdate
+) -> tuple[CachedVehicle | None, tuple[int, CachedSummary] | None]:
+    """The vehicle and the table that are kept, as far as they are."""
+    key = update.identity.key
+    vehicle = next((each for each in vehicles(connection) if each.key == key), None)
+    return vehicle, next(iter(summaries(connection, key, update.component)), None)
+
+
+def _row(item: StoredParam) -> Row:
+    return Row.of(item.param, None, False, item.heard_at)

@@ -1,0 +1,99 @@
+"""What commands make of telemetry logs: import, and a cache that holds no more than one log."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, Final
+
+import anyio
+
+from paramclient.cache import ParamCache
+from paramclient.cli.options import CacheOptions
+from paramclient.cli.outcome import ExitCode, code_of
+from paramclient.cli.output import hash_text, print_json, print_table, report
+from paramclient.errors import ParamClientError
+from paramclient.identity import autopilot_name
+from paramclient.links import LinkKind, parse_link
+from paramclient.logs import ImportedTable, import_log
+
+__all__ = ["cache_of_log", "import_"]
+
+_DEFAULTS: Final = CacheOptions()
+
+
+async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS) -> ExitCode:
+    """Bring what telemetry logs hold into the cache: vehicles, tables and changes, with the logs' times.
+
+    What the cache has of a later time stays as it is, so neither order nor repetition matter. All files are
+    tried even if one cannot be read.
+
+    Args:
+        file: A telemetry log (.tlog).
+        files: More of them.
+    """
+    found: list[tuple[Path, ImportedTable]] = []
+    code = ExitCode.DONE
+    with ParamCache(options.cache) as cache:
+        for each in (file, *files):
+            try:
+                tables = await import_log(each, cache)
+            except ParamClientError as error:
+                report(str(error))
+                code = max(code, code_of(error))
+                continue
+            found += ((each, table) for table in tables)
+            if not tables:
+                report(f"{each} holds no parameters")
+    if options.json:
+        print_json({"tables": [_as_json(*each) for each in found]})
+    elif found:
+        columns = ["file", "component", "autopilot", "params", "complete", "hash", "key"]
+        print_table(columns, (_cells(*each) for each in found), right="params")
+    return code
+
+
+@contextmanager
+def cache_of_log(url: str) -> Iterator[ParamCache]:
+    """A cache that holds what a log does, for the time of the block.
+
+    Raises:
+        UsageError: the link's name is none of a log.
+        LinkError: the file cannot be read, or is no telemetry log.
+    """
+    spec = parse_link(url)
+    assert spec.kind is LinkKind.REPLAY
+    with (
+        tempfile.TemporaryDirectory(prefix="paramclient-") as folder,
+        ParamCache(Path(folder) / "log.sqlite3") as cache,
+    ):
+        anyio.run(import_log, spec.host, cache)
+        yield cache
+
+
+def _as_json(file: Path, table: ImportedTable) -> dict[str, Any]:
+    return {
+        "file": str(file),
+        "key": table.key,
+        "system": table.system,
+        "component": table.component,
+        "autopilot": _autopilot(table),
+        "params": table.params,
+        "complete": table.complete,
+        "hash": hash_text(table.hash),
+    }
+
+
+def _cells(file: Path, table: ImportedTable) -> tuple[object, ...]:
+    address = f"{table.system}/{table.component}"
+    complete = "yes" if table.complete else "no"
+    return (
+        *(file.name, address, _autopilot(table), table.params),
+        *(complete, hash_text(table.hash), table.key),
+    )
+
+
+def _autopilot(table: ImportedTable) -> str | None:
+    return None if table.autopilot is None else autopilot_name(table.autopilot)

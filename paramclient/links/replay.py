@@ -1,0 +1,99 @@
+"""A telemetry log in the place of a link."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import BinaryIO, Final
+
+import anyio
+import anyio.lowlevel
+
+from paramclient.errors import LinkError
+from paramclient.links.base import Peer, reason
+from paramclient.links.names import LinkSpec
+from paramclient.links.tlog import Record, open_log, read_records
+
+__all__ = ["ReplayLink"]
+
+LOG_PEER: Final = "log"
+"""The one peer of a `ReplayLink`."""
+RECORDS_PER_READ: Final = 256
+"""Frames that one `receive` gives at most, so that other tasks get their turn."""
+LONGEST_PAUSE: Final = 60.0
+"""Seconds of the log after which a pause is cut short: logs may be joined, and nothing comes of waiting."""
+
+
+class ReplayLink:
+    """Delivers the frames of a log, those of every direction, at the times that they have in it.
+
+    Nothing can be sent to a log. Opened again, it begins anew.
+
+    Args:
+        spec: of a name such as `replay:flight.tlog?speed=10`: ten times as fast as it was; 0 is as fast as it
+            can be read, and nothing is as it was.
+    """
+
+    is_stream = False
+    reconnects = False
+
+    def __init__(self, spec: LinkSpec) -> None:
+        self.name = spec.name
+        self._path = spec.host
+        self._speed = dict(spec.options).get("speed", 1.0)
+        self._file: BinaryIO | None = None
+        self._records: Iterator[Record] = iter(())
+        self._next: Record | None = None
+        self._due = 0.0
+        self._is_over = False
+        self._closed = anyio.Event()
+
+    def __repr__(self) -> str:
+        return f"<{type(self).__name__} {self.name} {'closed' if self._file is None else 'open'}>"
+
+    async def open(self) -> None:
+        """See `Link.open`."""
+        await anyio.lowlevel.checkpoint()
+        await self.close()
+        self._file = open_log(self._path, self.name)
+        self._records = read_records(self._file)
+        self._closed = anyio.Event()
+        self._due = anyio.current_time()
+        self._is_over = False
+        self._next = next(self._records)
+
+    async def receive(self) -> list[tuple[Peer, bytes]]:
+        """See `Link.receive`."""
+        await anyio.lowlevel.checkpoint()
+        if self._next is not None and self._due > anyio.current_time():
+            with anyio.CancelScope(deadline=self._due):
+                await self._closed.wait()
+        elif self._is_over:
+            await self._closed.wait()
+        if self._file is None:
+            raise LinkError(f"{self.name}: not open", link=self.name)
+        found: list[tuple[Peer, bytes]] = []
+        while self._next is not None and self._due <= anyio.current_time() and len(found) < RECORDS_PER_READ:
+            found.append((LOG_PEER, self._next.data))
+            self._advance(self._next)
+        self._is_over = not found
+        return found
+
+    async def send(self, data: bytes, peer: Peer | None) -> None:
+        """See `Link.send`; a log hears nothing."""
+        await anyio.lowlevel.checkpoint()
+
+    async def close(self) -> None:
+        """See `Link.close`."""
+        self._closed.set()
+        self._records = iter(())
+        if self._file is not None:
+            self._file.close()
+            self._file = None
+
+    def _advance(self, before: Record) -> None:
+        try:
+            self._next = next(self._records, None)
+        except OSError as error:
+            raise LinkError(f"{self.name}: cannot read: {reason(error)}", link=self.name) from error
+        if self._next is not None and self._speed:
+            self._due += min(max(self._next.at - before.at, 0.0), LONGEST_PAUSE) / self._speed

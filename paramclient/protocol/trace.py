@@ -1,0 +1,48 @@
+"""What the core says of its steps, for those who look for a fault: made up only where it is wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeAlias
+
+from paramclient.protocol.wire import (
+    CommandLong,
+    FileTransfer,
+    Message,
+    ParamRequestList,
+    ParamRequestRead,
+    ParamSet,
+)
+
+__all__ = ["Told", "Trace", "silent"]
+
+Trace: TypeAlias = Callable[..., None]
+"""Takes a %-format and what belongs into it, as `logging.Logger.debug` does."""
+
+
+def silent(text: str, *details: object) -> None:
+    """Nobody looks."""
+
+
+class Told:
+    """A message in words, when they are wanted; of what is not named here, such as a key, only the kind."""
+
+    __slots__ = ("_message",)
+
+    def __init__(self, message: Message) -> None:
+        self._message = message
+
+    def __str__(self) -> str:
+        match self._message:
+            case ParamRequestRead(param_id=name, param_index=index):
+                return f"PARAM_REQUEST_READ {name if index < 0 else index}"
+            case ParamRequestList():
+                return "PARAM_REQUEST_LIST"
+            case ParamSet(param_id=name, raw=raw, param_type=number):
+                return f"PARAM_SET {name} to {raw.hex()} of type {number}"
+            case CommandLong(command=command, params=params):
+                return f"COMMAND_LONG {command} ({params[0]:g})"
+            case FileTransfer(payload=payload):
+                return f"FILE_TRANSFER_PROTOCOL operation {payload[3]}"
+            case message:
+                return type(message).__name__

@@ -1,0 +1,87 @@
+"""What a fuzzer has found, played again: the inputs in `fuzz/`, through the same functions."""
+
+from __future__ import annotations
+
+import importlib
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from unittest import mock
+
+import pytest
+
+from paramclient.protocol import component, reads, table
+
+ROOT = Path(__file__).parent.parent
+FUZZ = ROOT / "fuzz"
+TARGETS = ("cache", "component", "files", "framer", "metadata", "pack")
+LARGEST_CORPUS = 300_000
+"""Bytes of all inputs together: they are read at each test run, and by everyone who looks at a change."""
+
+
+def target(name: str) -> Callable[[bytes], None]:
+    run: Callable[[bytes], None] = importlib.import_module(f"fuzz.{name}").run
+    return run
+
+
+def inputs(kind: str, name: str) -> list[Path]:
+    return sorted(path for path in (FUZZ / kind / name).glob("*") if path.is_file())
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_what_is_kept_finds_no_fault(name: str) -> None:
+    """The corpus, all of it in one test: each input takes a millisecond."""
+    run = target(name)
+    kept = inputs("corpus", name)
+    assert kept
+    for path in kept:
+        try:
+            run(path.read_bytes())
+        except Exception as error:
+            raise AssertionError(f"{path.relative_to(ROOT)} finds a fault") from error
+
+
+FOUND = [pytest.param(name, path, id=path.name) for name in TARGETS for path in inputs("findings", name)]
+
+
+@pytest.mark.parametrize(("name", "path"), FOUND)
+def test_what_was_found_once_is_mended(name: str, path: Path) -> None:
+    target(name)(path.read_bytes())
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_any_input_will_do(name: str) -> None:
+    """Nothing in the harness itself depends on what the input is."""
+    run = target(name)
+    for data in (b"", b"\0", b"\xff" * 40, bytes(range(256))):
+        run(data)
+
+
+def test_a_fault_is_found() -> None:
+    """Without what mends them, the faults of old show again: the harness looks at what it should."""
+    found = FUZZ / "findings" / "component"
+    with (
+        mock.patch.object(component, "_in_capitals", str.upper),
+        pytest.raises(UnicodeEncodeError),
+    ):
+        target("component")((found / "capital-beyond-latin-1").read_bytes())
+    with (
+        mock.patch.object(component, "MOST_PARAMETERS", 65535),
+        mock.patch.object(table, "MOST_PARAMETERS", 65535),
+        mock.patch.object(reads, "MOST_PARAMETERS", 65535),
+        pytest.raises(Exception, match="short format requires"),
+    ):
+        target("component")((found / "index-beyond-32767").read_bytes())
+
+
+def test_every_target_is_tested_and_its_corpus_is_small() -> None:
+    rooms = {path.stem for path in FUZZ.glob("*.py")} - {"__init__", "__main__", "draw", "keep"}
+    assert rooms == set(TARGETS)
+    assert {path.name for path in (FUZZ / "corpus").iterdir()} == set(TARGETS)
+    assert sum(path.stat().st_size for path in FUZZ.rglob("*") if path.is_file()) < LARGEST_CORPUS
+
+
+def test_the_fuzzer_is_no_dependency_of_the_tests() -> None:
+    groups = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["dependency-groups"]
+    assert any(each.startswith("atheris") for each in groups["fuzz"])
+    assert not any(each.startswith("atheris") for each in groups["test"])

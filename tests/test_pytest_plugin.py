@@ -1,0 +1,212 @@
+"""The pytest plugin: its fixtures under every runner, what they keep away from, and what it costs others."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from paramclient import ParamClient, UsageError
+from paramclient.sim import Air, Endpoint, Vehicle
+from paramclient.testing import SimVehicle, sim_ardupilot, sim_px4
+from tests.shell import swiftly
+
+pytest_plugins = ("pytester",)
+
+ROOT = Path(__file__).parent.parent
+TABLE = {"MC_ROLL_P": 6.5, "SYS_AUTOSTART": 4001, "BAT_LOW_THR": 0.25}
+
+Suite = Callable[..., pytest.RunResult]
+
+
+@pytest.fixture
+def suite(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> Suite:
+    """Runs tests, given as text, with the plugin in a process of their own; no warning may be left."""
+    monkeypatch.setenv("PYTHONPATH", str(ROOT))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(pytester.path / "user"))
+
+    def run(*arguments: str, **modules: str) -> pytest.RunResult:
+        pytester.makeini("[pytest]\nasyncio_default_fixture_loop_scope = function\nfilterwarnings = error\n")
+        pytester.makepyfile(**modules)
+        options = ("-p", "pytest_paramclient", "-p", "no:cacheprovider", "-p", "no:xdist")
+        return pytester.runpytest_subprocess(*options, *arguments, timeout=60)
+
+    return run
+
+
+RUNNERS = """
+import asyncio
+from pathlib import Path
+
+import pytest
+
+from paramclient import ParamCache, ParamClient
+
+BEFORE = ParamCache().path
+
+
+async def session(px4, param_client, param_cache):
+    async with param_client(px4) as client:
+        vehicle = await client.component()
+        assert (await vehicle.fetch_all()).source == "stream"
+        await vehicle.set("MC_ROLL_P", 7.0)
+    assert px4.vehicle.values == {"MC_ROLL_P": 7.0, "SYS_AUTOSTART": 4001}
+    async with ParamClient(px4) as client:
+        vehicle = await client.component()
+        assert (await vehicle.fetch_all()).source == "cache"
+        assert client.cache.path == param_cache.path
+    assert len(param_cache.vehicles()) == 1
+
+
+@pytest.fixture
+def px4(sim_px4):
+    return sim_px4(table={"MC_ROLL_P": 6.5, "SYS_AUTOSTART": 4001}, autosave=0.0)
+
+
+@pytest.mark.asyncio
+async def test_with_pytest_asyncio(px4, param_client, param_cache):
+    await session(px4, param_client, param_cache)
+
+
+@pytest.mark.anyio
+@pytest.mark.parametrize("anyio_backend", ["asyncio"])
+async def test_with_anyio(px4, param_client, param_cache, anyio_backend):
+    await session(px4, param_client, param_cache)
+
+
+def test_with_neither(px4, param_client, param_cache):
+    asyncio.run(session(px4, param_client, param_cache))
+
+
+def test_of_ardupilot(sim_ardupilot):
+    copter = sim_ardupilot(table={"RTL_ALT": 1500})
+
+    async def session():
+        async with ParamClient(copter) as client:
+            vehicle = await client.component()
+            assert (await vehicle.get("RTL_ALT")).value == 1500
+
+    asyncio.run(session())
+
+
+def test_the_users_cache_is_the_users_again():
+    assert ParamCache().path == BEFORE
+    assert not BEFORE.exists()
+"""
+
+LATE = """
+import sys
+
+
+def test_nothing_is_loaded():
+    assert "pytest_paramclient" in sys.modules
+    assert not [name for name in sys.modules if name.split(".")[0] in ("paramclient", "pymavlink")]
+
+
+def test_now_it_is(sim_px4):
+    assert "paramclient.sim" in sys.modules
+"""
+
+
+def test_the_fixtures_serve_every_runner(suite: Suite) -> None:
+    """With pytest-asyncio, with anyio's plugin and with neither; the programs of the page among them."""
+    page = (ROOT / "docs/testing.md").read_text(encoding="utf-8")
+    programs = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    modules = {f"test_of_page_{number}": program for number, program in enumerate(programs)}
+    modules["test_runners"] = RUNNERS
+    tests = [re.findall(r"^(?:async )?def test_", module, re.MULTILINE) for module in modules.values()]
+    assert len(tests) >= 4
+    assert all(tests)
+    suite(**modules).assert_outcomes(passed=sum(map(len, tests)))
+
+
+def test_the_package_loads_with_the_first_test_that_asks(suite: Suite) -> None:
+    """A suite that uses nothing of it does not wait for it, and coverage begins before it."""
+    result = suite("--cov=paramclient.version", "--cov-report=term-missing", test_late=LATE)
+    result.assert_outcomes(passed=2)
+    result.stdout.re_match_lines([r".*paramclient/version\.py +\d+ +0 .*100%"])
+
+
+# the makers themselves
+
+
+@swiftly
+async def test_a_radio_loses_what_it_is_asked_to() -> None:
+    px4 = sim_px4(table=TABLE, loss=0.3, seed=3)
+    async with ParamClient(px4, cache=False) as client:
+        vehicle = await client.component()
+        for number in range(20):
+            await vehicle.set("MC_ROLL_P", float(number))
+    assert px4.vehicle.values["MC_ROLL_P"] == 19.0
+    for direction in (px4.air.uplink, px4.air.downlink):
+        assert 0.1 < direction.lost / direction.sent < 0.5
+
+
+@swiftly
+async def test_a_delay_is_that_of_each_way() -> None:
+    async with ParamClient(sim_px4(table=TABLE, delay=0.1), cache=False) as client:
+        vehicle = await client.component()
+        await vehicle.get("MC_ROLL_P")
+        assert vehicle.round_trip == pytest.approx(0.2, abs=0.01)
+
+
+@pytest.mark.parametrize("make", [sim_px4, partial(sim_ardupilot, ftp=False)])
+@pytest.mark.parametrize("pace", [40.0, 333.0, 5000.0])
+@swiftly
+async def test_a_pace_is_that_of_the_list(make: Callable[..., SimVehicle[Vehicle]], pace: float) -> None:
+    vehicle = make(pace=pace, table={f"P{number:03}": number for number in range(400)})
+    async with ParamClient(vehicle, cache=False) as client:
+        result = await (await client.component()).fetch_all()
+    assert result.source == "stream"
+    assert result.elapsed == pytest.approx(400 / pace, rel=0.05, abs=0.4)
+
+
+@pytest.mark.parametrize("make", [sim_px4, sim_ardupilot])
+def test_the_same_seed_loses_the_same(make: Callable[..., SimVehicle[Vehicle]]) -> None:
+    def losses(seed: int) -> list[int]:
+        vehicle = make(table=TABLE, loss=0.5, seed=seed)
+        lost = []
+        for second in range(60):
+            vehicle.tick(float(second))
+            vehicle.data_to_send()
+            lost.append(vehicle.air.downlink.lost)
+        return lost
+
+    assert losses(1) == losses(1) != losses(2)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "problem"),
+    [
+        ({"loss": 2.0}, "loss is a share"),
+        ({"pace": 0.0}, "pace is a number of values per second"),
+        ({"pace": float("nan")}, "pace is a number of values per second"),
+        ({"pace": 40.0, "burst": 3}, "pace stands for burst and period"),
+        ({"system": 0}, "system is a number from 1 to 255"),
+    ],
+)
+def test_what_cannot_be_is_said(arguments: dict[str, Any], problem: str) -> None:
+    with pytest.raises(UsageError, match=problem):
+        sim_px4(**arguments)
+
+
+def test_there_are_no_arguments_that_nobody_reads() -> None:
+    with pytest.raises(TypeError, match="los"):
+        sim_px4(los=0.1)
+
+
+def test_a_vehicle_says_what_it_is() -> None:
+    assert repr(sim_ardupilot(system=7, table={})) == "<SimVehicle ArduPilotVehicle 7/1>"
+
+
+@swiftly
+async def test_several_share_a_channel() -> None:
+    """Each behind its own radio, and all of them endpoints of one `Air`."""
+    vehicles: list[Endpoint] = [sim_px4(system=1, table=TABLE), sim_ardupilot(system=2, table={})]
+    async with ParamClient(Air(vehicles), cache=False) as client:
+        await client.fetch_all()
+        assert {system for system, _ in client.components} == {1, 2}
