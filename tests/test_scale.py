@@ -12,6 +12,7 @@ import pytest
 
 from paramclient import ParamCache, ParamClient
 from paramclient.cache import CachedComponent
+from paramclient.protocol import station as station_room
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.fetch import Fetch
@@ -90,6 +91,33 @@ def test_what_was_asked_of_one_goes_out_when_it_was_touched() -> None:
     station.touch(machine)
     assert station.next_deadline(everyone=False) == pytest.approx(machine.reads.pace.next_at())
     assert station.next_deadline(everyone=False) == station.next_deadline()
+
+
+def test_who_was_forgotten_leaves_no_deadline_to_whoever_comes_in_its_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One that is lost makes room for another, and is asked for a parameter although it is gone."""
+    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 2)
+    station = Station(link="x", is_stream=False)
+    hear(station, 1, 0.0)
+    hear(station, 2, 0.0)
+    gone = station.components[1, 1]
+    for second in range(1, 20):
+        hear(station, 2, float(second))
+        station.tick(float(second), everyone=False)
+        station.next_deadline(everyone=False)
+    assert gone.presence.is_lost
+    station.touch(gone)
+    hear(station, 3, 20.0)
+    gone.reads.ask("A", 20.0)
+    station.touch(gone)
+    hear(station, 2, 20.0)
+    for second in range(20, 60):
+        station.tick(float(second), everyone=False)
+        assert station.next_deadline(everyone=False) > second
+    assert [*station.components] == [(2, 1), (3, 1)]
+    assert all(machine.presence.is_lost for machine in station.components.values()), "by their own deadlines"
+    assert station.autopilot_of(1) is None
 
 
 @pytest.mark.parametrize("loss", [0.0, 0.2])

@@ -157,7 +157,7 @@ class ComponentMachine(Parts):
         fetch = self.fetches.current
         if fetch is not None:
             fetch.heard(message, now)
-        else:
+        elif not self.reads.awaits(message):
             self.following.heard(message, now)
         if writes.queues:
             writes.heard(message, now)

@@ -126,7 +126,8 @@ class Fetch(Operation[FetchResult]):
             self.file.heard(message)
         download = self.download
         if download is None:
-            self._means.following.heard(message, now)
+            if not self._reads.awaits(message):  # else it comes because we have asked
+                self._means.following.heard(message, now)
         elif not download.done:
             if self._first_value_at > now:
                 self._first_value_at = now
