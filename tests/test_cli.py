@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import pty
 import re
@@ -16,16 +15,16 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NoReturn, Self
+from typing import Any, Self
 
 import pytest
 
 import paramclient
-from paramclient import LinkError, ParamCache, ParamClient, ParamErrorCode, ParamType, Policy
-from paramclient.cli import run, session
+from paramclient import LinkError, ParamCache, ParamErrorCode, ParamType, Policy
+from paramclient.cli import run
 from paramclient.cli import vehicle as vehicle_commands
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.outcome import ExitCode, code_of, status_of
@@ -35,6 +34,7 @@ from paramclient.links import Peer, SimLink
 from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.sim.table import Entry
+from tests.commands import Command, Outcome, Put, behind, in_process, strict
 from tests.shell import swiftly
 
 ROOT = Path(__file__).parent.parent
@@ -51,63 +51,16 @@ HASH = "cf579589"
 """Of the simulated PX4 vehicle's table, as the recordings of the real one have it."""
 
 
-def strict(text: str) -> Any:
-    """Read JSON as a parser does that knows no NaN."""
-
-    def refuse(constant: str) -> NoReturn:
-        raise AssertionError(f"{constant} is not JSON")
-
-    return json.loads(text, parse_constant=refuse)
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a command ended, and what it printed."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def json(self) -> Any:
-        """The one object on the one line of stdout."""
-        assert self.out.endswith("\n")
-        assert self.out.count("\n") == 1
-        return strict(self.out)
-
-    @property
-    def rows(self) -> list[list[str]]:
-        """The cells of the table on stdout."""
-        return [line.split() for line in self.out.splitlines()]
-
-
-Command = Callable[..., Outcome]
-
-
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str]) -> Command:
     """Runs the command in this process."""
-
-    def call(*arguments: object) -> Outcome:
-        code = run([str(argument) for argument in arguments])
-        printed = capsys.readouterr()
-        return Outcome(code, printed.out, printed.err)
-
-    return call
+    return in_process(capsys)
 
 
 @pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Callable[[Endpoint], str]:
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
     """Puts a simulated vehicle, or any link, behind every URL; gives a URL."""
-
-    def place(far_end: Endpoint | SimLink) -> str:
-        def client(url: str, **options: Any) -> ParamClient:
-            return ParamClient(far_end if isinstance(far_end, SimLink) else SimLink(far_end, url), **options)
-
-        monkeypatch.setattr(session, "ParamClient", client)
-        return "sim:custom"
-
-    return place
+    return behind(monkeypatch, "sim:custom")
 
 
 @pytest.fixture(scope="session")
@@ -264,7 +217,7 @@ def test_every_value_is_strict_json(command: Command, put: Callable[[Endpoint], 
 def test_people_see_a_table_and_a_summary(command: Command, warm: Path) -> None:
     fetched = command("fetch", "sim:px4", "--cache", warm)
     assert fetched.code == 0
-    header, *rows = fetched.rows
+    header, *rows = fetched.words
     assert header == ["name", "value", "type", "index", "trust"]
     assert len(rows) == 903
     by_name = {row[0]: row[1:] for row in rows}
@@ -372,7 +325,7 @@ def test_get_tells_what_failed_beside_what_came(command: Command) -> None:
     assert got.err == f"paramclient: {got.json['errors']['NOPE']}\n"
 
     table = command("get", "sim:px4?param_error=1", "NOPE", "MC_ROLL_P", "--no-cache")
-    assert table.rows == [["name", "value", "type", "index"], ["MC_ROLL_P", "4.0", "REAL32", "547"]]
+    assert table.words == [["name", "value", "type", "index"], ["MC_ROLL_P", "4.0", "REAL32", "547"]]
 
 
 # set
@@ -388,7 +341,7 @@ def test_set_tells_what_the_vehicle_made_of_it(command: Command) -> None:
         ]
     }
     table = command("set", "sim:ardupilot", "RTL_ALT", 1234.7, "--no-cache")
-    assert table.rows == [
+    assert table.words == [
         ["name", "requested", "actual", "status"],
         ["RTL_ALT", "1234.7", "1234", "adjusted"],
     ]
@@ -543,7 +496,7 @@ def test_fetch_may_ask_for_little(
         assert vehicle.requests["PARAM_REQUEST_READ"] == 0
     assert vehicle.requests["PARAM_REQUEST_LIST"] == 0
     shown = command("fetch", url, "--cache", cache, "--policy", policy)
-    assert [row[-1] for row in shown.rows[1:]] == [
+    assert [row[-1] for row in shown.words[1:]] == [
         "verified" if policy == "hash-only" else "cached",
         "cached",
     ]
@@ -563,9 +516,9 @@ def test_a_policy_and_refresh_exclude_each_other(command: Command) -> None:
 def test_fetch_prints_what_differs_from_the_defaults(command: Command) -> None:
     shown = command("fetch", "sim:ardupilot", "--changed", "--no-cache")
     assert shown.code == 0
-    assert shown.rows[0] == ["name", "value", "type", "index", "trust", "default"]
-    assert len(shown.rows) == 42
-    assert ["RELAY1_FUNCTION", "1", "INT8", "61", "live", "0"] in shown.rows
+    assert shown.words[0] == ["name", "value", "type", "index", "trust", "default"]
+    assert len(shown.words) == 42
+    assert ["RELAY1_FUNCTION", "1", "INT8", "61", "live", "0"] in shown.words
     found = command("fetch", "sim:ardupilot", "--changed", "--json", "--no-cache").json
     assert list(found) == FETCH_KEYS
     assert (found["count"], found["received"], len(found["params"])) == (1382, 1382, 41)
@@ -593,16 +546,16 @@ def test_show_prints_what_differs_from_the_defaults(command: Command, tmp_path: 
     assert command("fetch", "sim:ardupilot", "--cache", cache).code == 0
     shown = command("show", "--changed", "--cache", cache)
     assert shown.code == 0
-    assert shown.rows[0] == ["name", "value", "default", "type", "index", "heard"]
-    assert [row[:5] for row in shown.rows if row[0] == "RELAY1_FUNCTION"] == [
+    assert shown.words[0] == ["name", "value", "default", "type", "index", "heard"]
+    assert [row[:5] for row in shown.words if row[0] == "RELAY1_FUNCTION"] == [
         ["RELAY1_FUNCTION", "1", "0", "INT8", "61"]
     ]
-    assert len(shown.rows) == 42
+    assert len(shown.words) == 42
     assert "41 of 1382 parameters differ" in shown.err
     (table,) = command("show", "--changed", "--json", "--cache", cache).json["components"]
     assert len(table["params"]) == 41
     assert table["params"]["RELAY1_FUNCTION"]["default"] == 0
-    assert len(command("show", "--cache", cache).rows) == 1383
+    assert len(command("show", "--cache", cache).words) == 1383
 
 
 # fetch with a sample
@@ -953,15 +906,15 @@ def test_show_gives_the_table_as_it_was(command: Command, warm: Path) -> None:
     assert component["params"] == fetched["params"]
 
     table = command("show", "--cache", warm)
-    assert table.rows[0] == ["name", "value", "type", "index", "heard"]
-    assert len(table.rows) == 904
+    assert table.words[0] == ["name", "value", "type", "index", "heard"]
+    assert len(table.words) == 904
     assert table.err.startswith(f"903 parameters of 1/1 px4 ({key_of(warm)}), synced 20")
 
 
 def test_show_lists_several_vehicles_and_finds_one(command: Command, warm: Path) -> None:
     assert command("get", "sim:ardupilot?system=2", "RTL_ALT", "--cache", warm).code == 0
     listed = command("show", "--cache", warm)
-    assert [row[:2] for row in listed.rows] == [
+    assert [row[:2] for row in listed.words] == [
         ["component", "autopilot"],
         ["2/1", "ardupilot"],
         ["1/1", "px4"],
@@ -973,7 +926,7 @@ def test_show_lists_several_vehicles_and_finds_one(command: Command, warm: Path)
         [component] = command("show", name, "--json", "--cache", warm).json["components"]
         assert (component["system"], component["synced_at"]) == (2, None)
         assert list(component["params"]) == ["RTL_ALT"]
-    assert [row[0] for row in command("show", "2", "--cache", warm).rows] == ["name", "RTL_ALT"]
+    assert [row[0] for row in command("show", "2", "--cache", warm).words] == ["name", "RTL_ALT"]
 
 
 def test_show_says_when_there_is_nothing(command: Command, warm: Path, tmp_path: Path) -> None:
@@ -1007,7 +960,7 @@ def test_the_cache_can_be_looked_into(command: Command, warm: Path) -> None:
     assert listed["path"] == str(warm)
     [summary] = listed["components"]
     assert (summary["key"], summary["size"], summary["complete"]) == (key_of(warm), 903, True)
-    assert command("cache", "list", "--cache", warm).rows[1][-1] == key_of(warm)
+    assert command("cache", "list", "--cache", warm).words[1][-1] == key_of(warm)
 
     entries = command("cache", "history", "1", "--json", "--cache", warm).json["history"]
     assert [list(entry) for entry in entries] == [["time", "component", "name", "old", "new", "by"]] * 2
@@ -1018,7 +971,7 @@ def test_the_cache_can_be_looked_into(command: Command, warm: Path) -> None:
         assert entry == entries[1]
     other = command("cache", "history", "1", "--component", 9, "--json", "--cache", warm)
     assert other.json == {"history": []}
-    assert command("cache", "history", "1", "MC_ROLL_P", "--cache", warm).rows[1][2:] == [
+    assert command("cache", "history", "1", "MC_ROLL_P", "--cache", warm).words[1][2:] == [
         *("MC_ROLL_P", "4.0", "6.5", "us")
     ]
 
@@ -1387,7 +1340,7 @@ def test_nothing_from_the_wire_reaches_the_terminal_as_it_came(
     shown = ["\\x1b[2J\\x1b]0;own\\x07", "[red]B[/red]", "\\x9b31mC\\x0d\\x0a", "D\\xe9\\x7f:boom:"]
     for outcome in (command("fetch", url, "--cache", cache), command("show", "--cache", cache)):
         assert outcome.code == 0
-        assert [row[0] for row in outcome.rows[1:]] == shown
+        assert [row[0] for row in outcome.words[1:]] == shown
         assert (outcome.out + outcome.err).replace("\n", "").isprintable()
         assert (outcome.out + outcome.err).isascii()
     fetched = command("fetch", url, "--json", "--cache", cache)
@@ -1403,7 +1356,7 @@ def test_a_hash_has_8_digits() -> None:
 
 def test_a_narrow_terminal_does_not_narrow_a_pipe(warm: Path) -> None:
     listed = run_process("cache", "list", "--cache", warm, env={**PLAIN, "COLUMNS": "20"})
-    assert listed.rows[1][-1] == key_of(warm)
+    assert listed.words[1][-1] == key_of(warm)
 
 
 def test_unprintable_text_is_escaped() -> None:

@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ from paramclient.sim import GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from paramclient.sim.table import Entry
 from paramclient.values import Param, Value, bits_of, from_bits
 from tests.caches import NOW, PX4, update
+from tests.commands import Command, in_process
 
 ROOT = Path(__file__).parent.parent
 PATIENCE = 60.0  # seconds after which a test gives up; nothing waits that long when all is well
@@ -40,27 +41,6 @@ THIRD = replace(PX4, system=3, uid="cc00000000000003")
 Content = dict[str, tuple[Value, int] | tuple[Value, int, Value]]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """How a command ended, and what it printed."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def json(self) -> Any:
-        return json.loads(self.out)
-
-    @property
-    def rows(self) -> list[list[str]]:
-        """The cells of the table on stdout; none of them has two blanks in it."""
-        return [[cell.strip() for cell in line.split("  ") if cell.strip()] for line in self.out.splitlines()]
-
-
-Command = Callable[..., Outcome]
-
-
 @pytest.fixture
 def cache(tmp_path: Path) -> Path:
     return tmp_path / "cache.sqlite3"
@@ -69,13 +49,7 @@ def cache(tmp_path: Path) -> Path:
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], cache: Path) -> Command:
     """Runs the command in this process, with a cache of its own."""
-
-    def call(*arguments: object) -> Outcome:
-        code = run([*map(str, arguments), "--cache", str(cache)])
-        printed = capsys.readouterr()
-        return Outcome(code, printed.out, printed.err)
-
-    return call
+    return in_process(capsys, "--cache", str(cache))
 
 
 def keep(

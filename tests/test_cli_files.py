@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import pytest
 
-from paramclient import FileForm, ParamCache, ParamClient, ParamType, read_file
-from paramclient.cli import run, session
+from paramclient import FileForm, ParamCache, ParamType, read_file
 from paramclient.cli.sources import names_vehicle
-from paramclient.links import SimLink
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
+from tests.commands import Command, Put, behind, in_process
 
 ODD = [
     SimParam("BIG", ParamType.INT32, 16777217),
@@ -23,42 +20,16 @@ ODD = [
 ]
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """How a command ended, and what it printed."""
-
-    code: int
-    out: str
-    err: str
-
-
-Command = Callable[..., Outcome]
-
-
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str]) -> Command:
     """Runs the command in this process."""
-
-    def call(*arguments: object) -> Outcome:
-        code = run([str(argument) for argument in arguments])
-        printed = capsys.readouterr()
-        return Outcome(code, printed.out, printed.err)
-
-    return call
+    return in_process(capsys)
 
 
 @pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Callable[[Endpoint], str]:
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
     """Puts a simulated vehicle behind every URL; gives a URL."""
-
-    def place(far_end: Endpoint) -> str:
-        def client(url: str, **options: Any) -> ParamClient:
-            return ParamClient(SimLink(far_end, url), **options)
-
-        monkeypatch.setattr(session, "ParamClient", client)
-        return "sim:px4"
-
-    return place
+    return behind(monkeypatch, "sim:px4")
 
 
 def test_save_writes_what_the_vehicle_has(

@@ -2,41 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime, timedelta, timezone
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from paramclient.cache import BY_US, ParamCache, TableState
-from paramclient.cli import run
 from paramclient.cli.output import time_text
 from paramclient.cli.when import parse_time, parse_when
 from paramclient.errors import UsageError
 from paramclient.values import ParamType, bits_of
 from tests.caches import NOW, PX4, stored, update, whole_table
+from tests.commands import Command, in_process
 
 DONE = TableState(complete=True)
 EAST = timezone(timedelta(hours=2))
-
-
-@dataclass(frozen=True)
-class Outcome:
-    code: int
-    out: str
-    err: str
-
-    @property
-    def json(self) -> Any:
-        return json.loads(self.out)
-
-    @property
-    def rows(self) -> list[list[str]]:
-        return [line.split() for line in self.out.splitlines()]
 
 
 @pytest.fixture
@@ -45,12 +27,9 @@ def path(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def command(path: Path, capsys: pytest.CaptureFixture[str]) -> Callable[..., Outcome]:
-    def command(*arguments: object) -> Outcome:
-        code = run([*map(str, arguments), "--cache", str(path)])
-        return Outcome(code, *capsys.readouterr())
-
-    return command
+def command(path: Path, capsys: pytest.CaptureFixture[str]) -> Command:
+    """Runs the command in this process, with a cache of its own."""
+    return in_process(capsys, "--cache", str(path))
 
 
 # Moments
@@ -151,7 +130,7 @@ def known(path: Path) -> None:
 
 
 @pytest.mark.usefixtures("known")
-def test_changes_are_told_as_in_the_cache_and_since_a_moment(command: Callable[..., Outcome]) -> None:
+def test_changes_are_told_as_in_the_cache_and_since_a_moment(command: Command) -> None:
     for words in (["history"], ["cache", "history"]):
         found = command(*words, "1", "--json").json["history"]
         assert [(each["component"], each["name"], each["old"], each["new"]) for each in found] == [
@@ -159,7 +138,7 @@ def test_changes_are_told_as_in_the_cache_and_since_a_moment(command: Callable[.
         ]  # fmt: skip
     first = time_text(HOUR_AGO + 600)
     assert found[0] == {"time": first, "component": 1, "name": "A", "old": 1, "new": 2, "by": "us"}
-    assert command("history", "1", "A").rows == [
+    assert command("history", "1", "A").words == [
         ["time", "component", "name", "old", "new", "by"],
         [first, "1", "A", "1", "2", "us"],
     ]
@@ -171,7 +150,7 @@ def test_changes_are_told_as_in_the_cache_and_since_a_moment(command: Callable[.
 
 
 @pytest.mark.usefixtures("known")
-def test_snapshots_are_listed_with_their_numbers(command: Callable[..., Outcome]) -> None:
+def test_snapshots_are_listed_with_their_numbers(command: Command) -> None:
     first, second = (time_text(HOUR_AGO + after) for after in (1500, 1900))
     found = command("history", "0002", "--snapshots", "--json").json["snapshots"]
     assert found == [
@@ -184,7 +163,7 @@ def test_snapshots_are_listed_with_their_numbers(command: Callable[..., Outcome]
             "hash": None, "reason": "by hand",
         },
     ]  # fmt: skip
-    assert command("history", "1", "--snapshots").rows == [
+    assert command("history", "1", "--snapshots").words == [
         ["id", "time", "component", "params", "hash", "reason"],
         ["1", first, "1", "2", "before", "apply", "\\x1b[31m.parm"],
         ["2", second, "154", "1", "by", "hand", "(not", "complete)"],
@@ -207,7 +186,7 @@ def test_snapshots_are_listed_with_their_numbers(command: Callable[..., Outcome]
     ],
 )
 def test_what_cannot_be_told_is_an_error(
-    command: Callable[..., Outcome], arguments: list[str], code: int, text: str
+    command: Command, arguments: list[str], code: int, text: str
 ) -> None:
     failed = command("history", *arguments)
     assert (failed.code, failed.out) == (code, "")
@@ -235,13 +214,13 @@ def three(path: Path) -> None:
         cache.save(whole_table(1, second, component=154))
 
 
-def test_who_differs_is_told_and_since_when(path: Path, command: Callable[..., Outcome]) -> None:
+def test_who_differs_is_told_and_since_when(path: Path, command: Command) -> None:
     three(path)
     same = command("fleet", "diff", "F")
     assert (same.code, same.out, same.err) == (0, "", "no parameter differs among 3 vehicles\n")
     table = command("fleet", "diff", "*")
     assert table.code == 1
-    assert table.rows == [
+    assert table.words == [
         ["name", "value", "vehicles", "since", "vehicle"],
         ["A", "1", "1", "of", "3", "before", "2026-11-18T11:06:40.000Z", "1", "(uid:0001)"],
         ["5", "1", "of", "3", "2026-11-18T11:07:40.000Z", "2", "(uid:0002)"],
@@ -252,12 +231,12 @@ def test_who_differs_is_told_and_since_when(path: Path, command: Callable[..., O
     assert (alone.code, alone.err) == (0, "no parameter differs among 1 vehicle\n")
 
 
-def test_most_of_them_are_one_line(path: Path, command: Callable[..., Outcome]) -> None:
+def test_most_of_them_are_one_line(path: Path, command: Command) -> None:
     three(path)
     with ParamCache(path) as cache:
         cache.save(update(stored("A", 1), identity=replace(PX4, system=4, uid="0004")))
         cache.save(update(identity=replace(PX4, system=5, uid="0005")))
-    assert command("fleet", "diff", "A").rows[1:] == [
+    assert command("fleet", "diff", "A").words[1:] == [
         ["A", "1", "2", "of", "5", "most"],
         ["5", "1", "of", "5", "2026-11-18T11:07:40.000Z", "2", "(uid:0002)"],
         ["lacks", "it", "1", "of", "5", "3", "(uid:0003)"],
@@ -265,15 +244,13 @@ def test_most_of_them_are_one_line(path: Path, command: Callable[..., Outcome]) 
     ]
 
 
-def test_vehicles_are_held_against_a_file(
-    path: Path, tmp_path: Path, command: Callable[..., Outcome]
-) -> None:
+def test_vehicles_are_held_against_a_file(path: Path, tmp_path: Path, command: Command) -> None:
     three(path)
     file = tmp_path / "wanted.param"
     file.write_text("A,5\nF,0.1\nNONE,1\n")
     table = command("fleet", "diff", file)
     assert table.code == 1
-    assert table.rows[1:5] == [
+    assert table.words[1:5] == [
         ["A", "5", "1", "of", "3", "wanted"],
         ["1", "1", "of", "3", "before", "2026-11-18T11:06:40.000Z", "1", "(uid:0001)"],
         ["lacks", "it", "1", "of", "3", "3", "(uid:0003)"],
@@ -285,7 +262,7 @@ def test_vehicles_are_held_against_a_file(
     assert command("fleet", "diff", file).code == 1
 
 
-def test_the_same_for_programs(path: Path, tmp_path: Path, command: Callable[..., Outcome]) -> None:
+def test_the_same_for_programs(path: Path, tmp_path: Path, command: Command) -> None:
     three(path)
     told = command("fleet", "diff", "A", "F", "--json")
     assert told.code == 1
@@ -330,7 +307,7 @@ def test_the_same_for_programs(path: Path, tmp_path: Path, command: Callable[...
     ],
 )
 def test_what_cannot_be_compared_is_an_error(
-    path: Path, command: Callable[..., Outcome], words: list[str], code: int, text: str
+    path: Path, command: Command, words: list[str], code: int, text: str
 ) -> None:
     three(path)
     failed = command("fleet", "diff", *words)

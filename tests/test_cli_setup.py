@@ -9,20 +9,18 @@ import re
 import signal
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import anyio
 import pytest
 
-from paramclient import ParamCache, ParamClient, ParamType, read_file
-from paramclient.cli import run, session
-from paramclient.links import SimLink
+from paramclient import ParamCache, ParamType, read_file
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle
 from paramclient.sim.table import Entry
 from paramclient.values import Value
 from paramclient.worker import Worker
+from tests.commands import Command, Put, behind, in_process
 from tests.shell import SwiftLoop, swift_loop
 
 TABLE: dict[str, Value | tuple[ParamType, Value]] = {
@@ -40,28 +38,6 @@ WPNAV_SPEED,750.5
 WPNAV_ACCEL,100
 COMPASS_OFS_X,12.5
 """
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """How a command ended, and what it printed."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def json(self) -> Any:
-        assert self.out.count("\n") == 1
-        return json.loads(self.out)
-
-    @property
-    def rows(self) -> list[list[str]]:
-        """The cells of the table on stdout; none of them has two blanks in it."""
-        return [[cell.strip() for cell in line.split("  ") if cell.strip()] for line in self.out.splitlines()]
-
-
-Command = Callable[..., Outcome]
 
 
 @pytest.fixture
@@ -95,28 +71,13 @@ def in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], cache: Path, in_no_time: None) -> Command:
     """Runs the command in this process, with a cache of its own."""
-
-    def call(*arguments: object) -> Outcome:
-        words = [*map(str, arguments)]
-        code = run([*words, *([] if "--no-cache" in words else ["--cache", str(cache)])])
-        printed = capsys.readouterr()
-        return Outcome(code, printed.out, printed.err)
-
-    return call
+    return in_process(capsys, "--cache", str(cache))
 
 
 @pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Callable[[Endpoint], str]:
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
     """Puts simulated vehicles behind every URL; gives a URL."""
-
-    def place(far_end: Endpoint) -> str:
-        def client(url: str, **options: Any) -> ParamClient:
-            return ParamClient(SimLink(far_end, url), **options)
-
-        monkeypatch.setattr(session, "ParamClient", client)
-        return "udpin:0.0.0.0:14550"
-
-    return place
+    return behind(monkeypatch, "udpin:0.0.0.0:14550")
 
 
 @pytest.fixture

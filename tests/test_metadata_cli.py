@@ -3,60 +3,31 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import pytest
 
-from paramclient import ParamClient
-from paramclient.cli import run, session
-from paramclient.links import SimLink
 from paramclient.metadata import MetadataStore
-from paramclient.sim import ArduPilotVehicle, Endpoint, PX4Vehicle, SimParam
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.sim.metadata import PARAMETER_FILE
 from paramclient.values import ParamType
+from tests.commands import Command, Put, behind, in_process
 
 DATA = Path(__file__).parent / "data"
 XML = DATA / "apm.pdef.xml"
 
 
-class Printed(NamedTuple):
-    """How a command ended."""
-
-    code: int
-    out: str
-    err: str
-
-    @property
-    def json(self) -> Any:
-        return json.loads(self.out)
-
-
-Command = Callable[..., Printed]
-
-
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str]) -> Command:
-    def call(*arguments: object) -> Printed:
-        code = run([str(argument) for argument in arguments])
-        printed = capsys.readouterr()
-        return Printed(code, printed.out, printed.err)
-
-    return call
+    """Runs the command in this process."""
+    return in_process(capsys)
 
 
 @pytest.fixture
-def put(monkeypatch: pytest.MonkeyPatch) -> Callable[[Endpoint], str]:
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
     """Puts a simulated vehicle behind every URL; gives a URL."""
-
-    def place(vehicle: Endpoint) -> str:
-        monkeypatch.setattr(
-            session, "ParamClient", lambda url, **options: ParamClient(SimLink(vehicle, url), **options)
-        )
-        return "sim:custom"
-
-    return place
+    return behind(monkeypatch, "sim:custom")
 
 
 def quad(*, metadata: bool = True, ftp: bool = False) -> PX4Vehicle:

@@ -389,6 +389,25 @@ def test_a_component_belongs_to_the_vehicle_that_its_autopilot_names() -> None:
     assert identity.uid == "0000000000000007"
 
 
+def test_a_write_that_met_a_short_doubt_is_begun_all_the_same() -> None:
+    """The camera has not spoken between the doubt about its vehicle and the end of that."""
+    station = a_station()
+    hear(station, PX4, 1, 1)
+    hear(station, AutopilotVersion(0, uid=7), 1, 1)
+    hear(station, CAMERA, 1, 100)
+    hear(station, AutopilotVersion(0, uid=7), 1, 100)
+    hear(station, param_value("A", 1.0), 1, 100)
+    autopilot, camera = station.components[1, 1], station.components[1, 100]
+    station.tick(0.1)
+    autopilot.who.doubt(0.1)
+    assert autopilot.who.is_doubted
+    camera.write("A", 2.5, 0.2)
+    hear(station, AutopilotVersion(0, uid=7), 1, 1, now=0.3)
+    sent(station)
+    station.tick(1.2)
+    assert [message.param_id for message, _, _ in sent(station) if isinstance(message, ParamSet)] == ["A"]
+
+
 def test_a_component_alone_speaks_for_itself() -> None:
     station = a_station()
     hear(station, CAMERA, 1, 100)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 
 from paramclient.protocol.timing import (
@@ -177,3 +179,15 @@ def test_a_component_that_is_gone_is_not_asked_for_ever() -> None:
     assert not trip.is_hopeless(FEWEST_TRIES, 99.0 + LONGEST_SILENCE)
     assert trip.is_hopeless(FEWEST_TRIES, 100.0 + LONGEST_SILENCE)
     assert not trip.is_hopeless(FEWEST_TRIES - 1, 100.0 + LONGEST_SILENCE)
+
+
+def test_an_answer_to_what_was_sent_at_no_known_time_tells_nothing_of_the_round_trip() -> None:
+    """One such number would make every time-out none."""
+    for known in (False, True):
+        trip = RoundTrip()
+        if known:
+            trip.answered(1.0, 1.2, 1)
+        before = trip.timeout
+        for sent_at in (-math.inf, math.inf):
+            trip.answered(sent_at, 5.0, 1)
+            assert trip.timeout == before

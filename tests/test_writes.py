@@ -139,6 +139,38 @@ def test_a_cached_type_is_not_enough_but_a_verified_one_is() -> None:
     assert desk.table.params["B"].trust is Trust.VERIFIED
 
 
+@pytest.mark.parametrize("is_known", [True, False])
+def test_what_has_to_wait_says_so_until_it_is_begun(is_known: bool) -> None:
+    """Whoever may be written again, for however short a time it was not, looks at that."""
+    desk = Desk()
+    if is_known:
+        desk.knows("A", 1.0)
+        desk.is_certain = False
+        desk.set("A", 2.5)
+    else:  # it becomes uncertain while the type is asked for
+        desk.set("A", 2.5)
+        assert desk.take() == ["read A"]
+        desk.is_certain = False
+        desk.hear("A", 1.0, at=0.1)
+    assert desk.take() == []
+    assert desk.writes.is_held
+    desk.is_certain = True
+    desk.writes.proceed(0.2)
+    assert desk.take() == ["set A 2.5 REAL32"]
+    assert not desk.writes.is_held
+
+
+def test_a_value_that_comes_while_nothing_may_be_sent_again_leaves_the_time_outs_as_they_are() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", 2.5)
+    desk.is_certain = False
+    desk.writes.resume(3.0)
+    desk.hear("A", 2.5, at=4.0)
+    assert write.done
+    assert desk.round_trip.smoothed is None
+
+
 def test_nothing_is_sent_before_the_encoding_is_certain() -> None:
     desk = Desk()
     desk.knows("A", 1, INT32)

@@ -37,6 +37,7 @@ from paramclient.values import Param, Trust
 
 __all__ = [
     "check_link",
+    "choose",
     "confirmed",
     "is_file",
     "names_vehicle",
@@ -204,6 +205,16 @@ def open_file(path: str) -> ParamFile:
     return file
 
 
+def choose(file: ParamFile, component: int | None, system: int | None) -> ParamSet:
+    """What a file has for a component; the system counts only in a file that has several.
+
+    Raises:
+        FileError: it has nothing for it.
+    """
+    is_of_several = len({each.system for each in file.sets}) > 1
+    return file.choose(component, system=system if is_of_several else None)
+
+
 def vehicle_key(cache: ParamCache, vehicle: str) -> str:
     """The key of the vehicle that the user means: by its system id, the beginning of its hardware id, or key.
 
@@ -227,9 +238,7 @@ def vehicle_key(cache: ParamCache, vehicle: str) -> str:
 
 
 def _from_file(path: str, options: LinkOptions) -> ParamSet:
-    file = open_file(path)
-    is_of_several = len({each.system for each in file.sets}) > 1
-    return file.choose(options.component, system=options.system if is_of_several else None)
+    return choose(open_file(path), options.component, options.system)
 
 
 def _from_cache(vehicle: str, options: LinkOptions) -> ParamSet:

@@ -12,7 +12,7 @@ import anyio
 
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.session import HEARING_PATIENCE, Deadline, connect
-from paramclient.cli.sources import is_file, open_file, resolve
+from paramclient.cli.sources import choose, is_file, open_file, resolve
 from paramclient.client import ParamClient
 from paramclient.component import Component
 from paramclient.errors import FileError, NoReply, UsageError
@@ -112,8 +112,7 @@ class Source:
         return overlay(base, self._choose(open_file(path), vehicle))
 
     def _choose(self, file: ParamFile, vehicle: Component) -> ParamSet:
-        is_of_several = len({each.system for each in file.sets}) > 1
-        return file.choose(self._options.component, system=vehicle.system if is_of_several else None)
+        return choose(file, self._options.component, vehicle.system)
 
 
 async def of_vehicle(pattern: str, vehicle: Component) -> str:

@@ -46,12 +46,18 @@ class Authors:
 
     def changed(self, name: str, now: float, is_written: bool) -> None:
         """A value changed: the second time in a short while, the one that came last may be the older one."""
-        before = self._changed_at.pop(name, -math.inf)
-        if now - before <= DOUBT and not is_written and len(self._doubts) < MOST_CHANGES:
+        changed_at = self._changed_at
+        before = changed_at.pop(name, None)
+        if (
+            before is not None
+            and now - before <= DOUBT
+            and not is_written
+            and len(self._doubts) < MOST_CHANGES
+        ):
             self._doubts.setdefault(name, now + DOUBT / 2)
-        self._changed_at[name] = now
-        if len(self._changed_at) > MOST_CHANGES:
-            del self._changed_at[next(iter(self._changed_at))]
+        changed_at[name] = now
+        if len(changed_at) > MOST_CHANGES:
+            del changed_at[next(iter(changed_at))]
 
     def forget(self, now: float) -> None:
         """Let go of what is too old to matter; once a second will do."""

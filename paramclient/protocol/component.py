@@ -474,10 +474,8 @@ class ComponentMachine(Parts):
         if self.who.settled and self._known_as != self.identity.key:
             self._known_as = self.identity.key
             self._emit(events.ComponentIdentified(self))
-        may_write = self.may_be_written
-        if may_write and not self._may_write:
+        if self.writes.is_held and self.may_be_written:
             self.writes.proceed(now)
-        self._may_write = may_write
 
     def _doubt_identity(self, now: float) -> None:
         """The table is not what it was: it may be another vehicle that answers by now."""

@@ -131,7 +131,6 @@ class Parts(ABC):
         self._another = another or self.become_another
         self._is_vehicle_doubted = is_vehicle_doubted
         self._known_as: str | None = None  # the key of the identity that was reported
-        self._may_write = False
         self._saved_at = -math.inf  # when all that we have written will have been saved
         self._authors = Authors()
 

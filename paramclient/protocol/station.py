@@ -208,7 +208,7 @@ class Station:
                 _, system, component = heappop(self._order)
                 self._touched[self.components[system, component]] = None
         for machine in list(self.components.values() if everyone else self._touched):
-            if machine.next_deadline() <= now:
+            if machine.next_deadline() <= now or machine.writes.is_held:  # for another component's word
                 machine.tick(now)
                 self._touched[machine] = None
         if self._turns.tick(now):
@@ -231,7 +231,7 @@ class Station:
             if deadline != deadlines.get(machine):
                 deadlines[machine] = deadline
                 heappush(order, (deadline, machine.system, machine.component))
-        self._touched.clear()
+        self._touched = {each: None for each in self._touched if each.writes.is_held}  # till another speaks
         if len(order) > MOST_PAST * (len(deadlines) + 1):
             self._order = order = sorted((at, each.system, each.component) for each, at in deadlines.items())
         while order and deadlines[self.components[order[0][1:]]] != order[0][0]:

@@ -35,6 +35,8 @@ LOW_BANDWIDTH_GAP: Final = 0.1
 """Seconds from one value of the list to the next that tell of a low-bandwidth mode: PX4's sends 8 a second, a
 57600-baud radio carries 40."""
 
+_PAST: Final = -math.inf  # when something was announced that is no longer so
+
 
 class SyncState(StrEnum):
     """How the table of a component stands to the vehicle's.
@@ -210,11 +212,13 @@ class Sync:
 
     def changed(self, change: Change) -> None:
         """A parameter has changed: the hash that was announced is of the past, unless that leaves it out."""
-        name = change.name
+        name, _, _, by = change
         if name not in self._table.volatile:
-            self._moved_by_us_alone &= change.by == "us"
-            if self.announced is not None and self.announced.at != -math.inf:
-                self.announced = replace(self.announced, at=-math.inf)
+            if by != "us":
+                self._moved_by_us_alone = False
+            announced = self.announced
+            if announced is not None and announced.at != _PAST:
+                self.announced = replace(announced, at=_PAST)
         if (self._has_fallen or self._resync is not None) and len(self._moved) < MOST_NAMES:
             self._moved[name] = None
 
@@ -242,7 +246,7 @@ class Sync:
         self._fall()
         self.stop()
         if self.announced is not None:
-            self.announced = replace(self.announced, at=-math.inf)
+            self.announced = replace(self.announced, at=_PAST)
 
     def check(self, now: float) -> None:
         """It is there again: see whether the table still holds, as soon as the link is idle."""

@@ -133,13 +133,16 @@ class RoundTrip:
         return attempts >= self.tries or (is_gone and attempts >= FEWEST_TRIES)
 
     def answered(self, sent_at: float, now: float, attempts: int) -> None:
-        """A request got its answer; it had been sent `attempts` times, the last time at `sent_at`."""
+        """A request got its answer; it had been sent `attempts` times, the last time at `sent_at`.
+
+        Where that is infinite, as after an absence, nobody knows: it tells nothing of the round trip.
+        """
         self._was_answered = True
         if attempts <= 2:
             self._answered = self._answered * MEMORY + 1
             self._unanswered *= MEMORY
         sample = now - sent_at
-        if attempts != 1:
+        if attempts != 1 or not math.isfinite(sample):
             if sample >= LIKELY * (self.smoothed or math.inf):
                 # it may well be the answer to the last of them
                 self._silences = 0

@@ -94,6 +94,7 @@ class Writes:
 
     Attributes:
         queues: by name, those that are open, the one under way first; no name has an empty one.
+        is_held: whether one waits for that.
         asked, retries: writes so far, and PARAM_SETs that were sent for another time.
     """
 
@@ -117,6 +118,7 @@ class Writes:
         self._is_certain = is_certain
         self._trace = trace
         self.asked = self.retries = 0
+        self.is_held = False
         self.queues: dict[str, deque[Write]] = {}
 
     def __len__(self) -> int:
@@ -148,6 +150,7 @@ class Writes:
 
     def proceed(self, now: float) -> None:
         """It is certain now how the component writes values: begin what had to wait for that."""
+        self.is_held = False
         for queue in list(self.queues.values()):
             if queue and not queue[0].attempts and queue[0].read is None:
                 self._start(queue[0], now)
@@ -275,6 +278,7 @@ class Writes:
     def _start(self, write: Write, now: float) -> None:
         known = self._params.get(write.name)
         if not self._is_certain():
+            self.is_held = True
             return
         if known is not None and known.trust is not Trust.CACHED:
             self._begin(write, known, now)
@@ -289,6 +293,7 @@ class Writes:
     def _transmit(self, write: Write, now: float) -> None:
         if not self._is_certain():
             # whoever may be there now is not meant: as soon as it is known, it is begun, or overdue
+            self.is_held = True
             write.sent_at = -math.inf
             write.is_answered = False
             write.verify_at = math.inf

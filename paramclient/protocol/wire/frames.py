@@ -31,7 +31,6 @@ __all__ = [
 _MAGIC_V1 = 0xFE
 _MAGIC_V2 = 0xFD
 _SIGNED = 0x01
-_SIGNED_FLAG = bytes((_SIGNED,))
 _MAGIC = re.compile(b"[\xfd\xfe]").search
 _START = struct.Struct("<BBBxBBB3s").unpack_from  # a header of MAVLink 2; version 1 shares two bytes
 _CRC_AT = struct.Struct("<H").unpack_from
@@ -191,6 +190,13 @@ class Framer:
             self._guard(data)
 
 
+def _flagged(frame: bytes, flags: int) -> bytes:
+    """A frame of MAVLink 2, given without its checksum, with these flags and the checksum to them."""
+    body = frame[1:2] + bytes((flags,)) + frame[3:]
+    crc: int = mcrf4xx(body + _EXTRA_BY_ID_BYTES[frame[7:10]])
+    return frame[:1] + body + crc.to_bytes(2, "little")
+
+
 def build_frame(
     message_id: int, payload: bytes, *, system: int, component: int, sequence: int, version: int = 2
 ) -> bytes:
@@ -214,9 +220,7 @@ def sign_frame(frame: bytes, signer: Signer) -> bytes:
     """The same frame with a signature; one of MAVLink 1, which has no place for it, as it is."""
     if frame[0] != _MAGIC_V2:
         return frame
-    body = frame[1:2] + _SIGNED_FLAG + frame[3:-2]
-    crc: int = mcrf4xx(body + _EXTRA_BY_ID_BYTES[frame[7:10]])
-    return signer.sign(frame[:1] + body + crc.to_bytes(2, "little"))
+    return signer.sign(_flagged(frame[:-2], _SIGNED))
 
 
 def unsign_frame(frame: bytes) -> bytes:
@@ -224,12 +228,9 @@ def unsign_frame(frame: bytes) -> bytes:
 
     The guide to message signing asks for that in logs: signatures in numbers help who looks for the key.
     """
-    extra = _EXTRA_BY_ID_BYTES.get(frame[7:10])
-    if frame[0] != _MAGIC_V2 or frame[2] != _SIGNED or extra is None:
+    if frame[0] != _MAGIC_V2 or frame[2] != _SIGNED or frame[7:10] not in _EXTRA_BY_ID_BYTES:
         return frame
-    body = frame[1:2] + b"\0" + frame[3 : -2 - SIGNATURE_LENGTH]
-    crc: int = mcrf4xx(body + extra)
-    return frame[:1] + body + crc.to_bytes(2, "little")
+    return _flagged(frame[: -2 - SIGNATURE_LENGTH], 0)
 
 
 def bears_key(frame: bytes) -> bool:

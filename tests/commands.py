@@ -1,0 +1,81 @@
+"""The command as tests run it: in this process, and with simulated vehicles behind every link."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NoReturn, TypeAlias
+
+import pytest
+
+from paramclient import ParamClient
+from paramclient.cli import run, session
+from paramclient.links import SimLink
+from paramclient.sim import Endpoint
+
+
+def strict(text: str) -> Any:
+    """Read JSON as a parser does that knows no NaN."""
+
+    def refuse(constant: str) -> NoReturn:
+        raise AssertionError(f"{constant} is not JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a command ended, and what it printed."""
+
+    code: int
+    out: str
+    err: str
+
+    @property
+    def json(self) -> Any:
+        """The one object on the one line of stdout."""
+        assert self.out.endswith("\n")
+        assert self.out.count("\n") == 1
+        return strict(self.out)
+
+    @property
+    def words(self) -> list[list[str]]:
+        """The words of each line on stdout."""
+        return [line.split() for line in self.out.splitlines()]
+
+    @property
+    def rows(self) -> list[list[str]]:
+        """The cells of the table on stdout; none of them has two blanks in it."""
+        return [[cell.strip() for cell in line.split("  ") if cell.strip()] for line in self.out.splitlines()]
+
+
+Command: TypeAlias = Callable[..., Outcome]
+"""Takes the words of a command, of any type."""
+Put: TypeAlias = Callable[[Endpoint | SimLink], str]
+"""Takes a simulated vehicle, or a link; gives the URL behind which it is."""
+
+
+def in_process(capsys: pytest.CaptureFixture[str], *cache: str) -> Command:
+    """Runs the command in this process, with these words behind its own unless it is to have no cache."""
+
+    def call(*arguments: object) -> Outcome:
+        words = [*map(str, arguments)]
+        code = run([*words, *(() if "--no-cache" in words else cache)])
+        printed = capsys.readouterr()
+        return Outcome(code, printed.out, printed.err)
+
+    return call
+
+
+def behind(monkeypatch: pytest.MonkeyPatch, url: str) -> Put:
+    """Puts what it is given behind every URL; gives this one."""
+
+    def place(far_end: Endpoint | SimLink) -> str:
+        def client(url: str, **options: Any) -> ParamClient:
+            return ParamClient(far_end if isinstance(far_end, SimLink) else SimLink(far_end, url), **options)
+
+        monkeypatch.setattr(session, "ParamClient", client)
+        return url
+
+    return place
