@@ -347,6 +347,19 @@ def test_to_import_again_changes_nothing_where_the_clock_was_set_back(tmp_path: 
     assert kept() == before
 
 
+def test_to_import_again_changes_nothing_where_a_name_went_and_came_back(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    log = whole(A=1, B=2).say(wire.AutopilotVersion(0, uid=0xDEADBEEF, flight_sw_version=8))  # an update
+    del log.values["B"]
+    log.list().wait(9.0).list(B=5).wait(9.0).change("A", 3).wait(1.0).beat()
+    imported(log.write(tmp_path / "flight.tlog"), cache=cache)
+    before = (kept_values(cache), lines(cache))
+    assert before[0] == {"A": 3, "B": 5}
+    assert [each[:3] for each in before[1]] == [("B", 2, None), ("A", 1, 3)]
+    imported(tmp_path / "flight.tlog", cache=cache)
+    assert (kept_values(cache), lines(cache)) == before
+
+
 @pytest.mark.parametrize("is_reversed", [False, True])
 def test_the_order_of_logs_does_not_matter(is_reversed: bool, tmp_path: Path) -> None:
     first = whole(A=1, B=2).wait(9.0).change("A", 3).wait(1.0).beat()

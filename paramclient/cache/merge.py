@@ -156,6 +156,9 @@ class _Past:
         before = stored_rows(self.connection, self.owner)
         whole_at = table.synced_at if table.complete and table.synced_at is not None else float("-inf")
         later: list[StoredParam] = []
+        heard = {item.param.name for item in update.params}
+        for name in set(self.overtaken) - heard if update.replace else update.removed:
+            self.overtaken.pop(name, None)  # what comes under it later is another parameter
         for item in update.params:
             name = item.param.name
             row = before.get(name)
