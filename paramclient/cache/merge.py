@@ -74,13 +74,13 @@ class _Past:
             self._save(update, vehicle)
             return
         self.owner, table = found
-        goes_on = self.goes_on or update.replace or self.based_on == table.updated_at
+        goes_on = self.goes_on or self.based_on == table.updated_at
         if update.at < table.updated_at or (update.at == table.updated_at and not goes_on):
             self._bring_in(update, table)
             self._widen(update, vehicle)
             return
-        self.goes_on = goes_on
-        if not goes_on:
+        self.goes_on = goes_on or update.replace
+        if not self.goes_on:
             update = replace(update, table=None)
         self.catch_up(item.param.name for item in update.params)
         self._save(update, vehicle)
