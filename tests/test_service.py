@@ -263,6 +263,47 @@ async def test_what_a_call_has_changed_is_told_before_it_is_answered() -> None:
         assert params["seq"] >= number
 
 
+@swiftly
+async def test_how_the_component_stands_after_a_call_is_told_before_it_is_answered() -> None:
+    """Also where it was told a moment before, and would else wait for its turn."""
+    async with service(SimLink(small_px4())) as (hub, browser):
+        await met(browser)
+        await browser.post(f"{C}/fetch", json={})
+        for value in (21, 22, 23):
+            listener = hub.feed.listen()
+            done = await browser.put(f"{C}/params/PARAM_01", json={"value": value})
+            now = (await browser.get(C)).json()["hash"]
+            await asyncio.sleep(0.01)
+            news = await listener.next(1)
+            assert news is not None
+            told = [json.loads(text) for _, text in news[0].texts]
+            last = [each for each in told if each["type"] == "component"][-1]
+            assert last["component_doc"]["hash"] == now
+            assert last["seq"] <= int(done.headers["x-seq"].partition("-")[2])
+
+
+def test_a_value_that_comes_again_is_as_young_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = iter(range(2_000_000_000, 2_000_000_100))
+
+    @swiftly
+    async def ask() -> None:
+        async with service(SimLink(generic())) as (_, browser):
+            await met(browser)
+
+            async def age() -> float:
+                return float((await browser.get(f"{C}/params/PARAM_01")).json()["heard_at"])
+
+            await browser.post(f"{C}/fetch", json={})
+            first = await age()
+            monkeypatch.setattr(following, "_now", lambda: next(times))
+            await browser.post(f"{C}/fetch", json={"refresh": True})
+            fetched = await age()
+            await browser.post(f"{C}/params/PARAM_01/read", json={})
+            assert first < 2_000_000_000 <= fetched < await age()
+
+    ask()
+
+
 @pytest.mark.parametrize("most_told_singly", [0, 32])
 def test_values_of_before_are_cached_with_their_age_until_the_hash_confirms_them(
     most_told_singly: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
