@@ -12,10 +12,11 @@ from paramclient.cli.options import LinkOptions
 from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import NO_DEFAULTS, Coloured, print_json, print_table, printable, say
 from paramclient.cli.sources import resolve_all
-from paramclient.cli.written import bits_written, described, origin_json, value_text, written_json
+from paramclient.cli.written import described, origin_json, value_text, written_json
 from paramclient.compare import Comparison, Difference, Moved, Standing, compare, defaults_of
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
+from paramclient.notation import bits_written
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.values import type_name
 

@@ -9,16 +9,9 @@ from typing import Any, Final
 from paramclient.cache import FleetDiff, FleetVehicle, Holder, NameSpread, ParamCache
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import (
-    bits_text,
-    print_json,
-    print_table,
-    report,
-    say,
-    time_text,
-    value_json,
-)
+from paramclient.cli.output import print_json, print_table, report, say
 from paramclient.errors import UsageError
+from paramclient.notation import bits_text, time_text, value_json
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.values import Param, ParamType, check_name, format_value, type_name
 

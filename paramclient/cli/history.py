@@ -12,10 +12,11 @@ from cyclopts.validators import Number
 from paramclient.cache import HistoryEntry, ParamCache, SnapshotSummary
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import hash_text, print_json, print_table, time_text, value_json
+from paramclient.cli.output import print_json, print_table
 from paramclient.cli.sources import vehicle_key
 from paramclient.cli.when import parse_time
 from paramclient.errors import UsageError
+from paramclient.notation import hash_text, time_text, value_json
 from paramclient.values import Param, check_name, format_value
 
 __all__ = ["history"]

@@ -13,11 +13,12 @@ from cyclopts import Parameter
 
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import param_json, print_line, printable, say, value_json
+from paramclient.cli.output import param_json, print_line, printable, say
 from paramclient.cli.session import Session
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of, read_metadata
 from paramclient.metadata.info import number_of
+from paramclient.notation import value_json
 from paramclient.paramset import ParamSet
 from paramclient.values import Param, ParamType, Value, check_name, format_value
 

@@ -23,20 +23,19 @@ from paramclient.cli.output import (
     NO_DEFAULTS,
     by_index,
     default_text,
-    hash_text,
     print_json,
     print_line,
     print_table,
     printable,
     report,
     say,
-    time_text,
 )
 from paramclient.cli.sources import is_file, open_file, vehicle_key
 from paramclient.cli.written import show_file
 from paramclient.errors import CacheError, UsageError
 from paramclient.identity import autopilot_name
 from paramclient.metadata import Metadata
+from paramclient.notation import hash_text, time_or_none, time_text
 from paramclient.values import Param, check_name, format_value, type_name
 
 __all__ = ["cache_list", "cache_path", "cache_remove", "show", "tables_of"]
@@ -216,7 +215,7 @@ def _table_json(view: _View) -> dict[str, Any]:
         "autopilot": autopilot_name(table.autopilot),
         "uid": table.identity.uid,
         "hash": hash_text(table.hash),
-        "synced_at": _time(table.synced_at),
+        "synced_at": time_or_none(table.synced_at),
         "params": described_json(view.params, view.metadata, whole=bool(view.names)),
     }
 
@@ -232,8 +231,8 @@ def _summary_json(summary: CachedSummary) -> dict[str, Any]:
         "count": summary.count,
         "complete": summary.complete,
         "hash": hash_text(summary.hash),
-        "synced_at": _time(summary.synced_at),
-        "updated_at": _time(summary.updated_at),
+        "synced_at": time_or_none(summary.synced_at),
+        "updated_at": time_or_none(summary.updated_at),
     }
 
 
@@ -244,7 +243,7 @@ def _print_summaries(summaries: Sequence[CachedSummary]) -> None:
             autopilot_name(each.autopilot),
             each.size,
             hash_text(each.hash),
-            _time(each.synced_at),
+            time_or_none(each.synced_at),
             each.key,
         )
         for each in summaries
@@ -283,7 +282,3 @@ def _print_table(view: _View) -> None:
 
 def _value(param: Param) -> str:
     return format_value(param.value, param.type)
-
-
-def _time(at: float | None) -> str | None:
-    return None if at is None else time_text(at)

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 from typing import Any, Final, TypeAlias
 
 from paramclient.cli.outcome import ExitCode, code_of
-from paramclient.cli.output import Coloured, print_table, printable, report, say, value_json
+from paramclient.cli.output import Coloured, print_table, printable, report, say
+from paramclient.notation import value_json
 from paramclient.provision import (
     MISSING,
     ApplyResult,

@@ -33,7 +33,6 @@ from paramclient.cli.output import (
     as_json,
     by_index,
     default_text,
-    hash_text,
     milliseconds,
     print_json,
     print_line,
@@ -41,15 +40,13 @@ from paramclient.cli.output import (
     printable,
     progress_bar,
     report,
-    rounded,
     say,
-    time_text,
-    value_json,
 )
 from paramclient.cli.session import Session, connect
 from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError, ValueNotApplied
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
 from paramclient.metadata import Metadata
+from paramclient.notation import hash_text, rounded, time_text, value_json
 from paramclient.protocol.result import FetchResult, Policy
 from paramclient.protocol.sampling import SAMPLE_SIZE, Sample
 from paramclient.protocol.table import Change

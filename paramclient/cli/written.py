@@ -6,25 +6,16 @@ from dataclasses import replace
 from typing import Any, Final
 
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import (
-    NO_DEFAULTS,
-    print_json,
-    print_table,
-    printable,
-    report,
-    say,
-    time_text,
-    value_json,
-)
+from paramclient.cli.output import NO_DEFAULTS, print_json, print_table, printable, report, say
 from paramclient.compare import same_value
-from paramclient.errors import UsageError
 from paramclient.files import ParamFile
 from paramclient.files.model import address
 from paramclient.identity import autopilot_name
+from paramclient.notation import bits_written, time_or_none, time_text, value_written
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.values import ParamType, Value, format_value, type_name
 
-__all__ = ["bits_written", "described", "origin_json", "show_file", "value_text", "written_json"]
+__all__ = ["described", "origin_json", "show_file", "value_text", "written_json"]
 
 
 def show_file(file: ParamFile, component: int | None, *, changed: bool, json: bool) -> ExitCode:
@@ -67,7 +58,7 @@ def origin_json(params: ParamSet) -> dict[str, Any]:
         "component": params.component,
         "autopilot": None if identity is None else autopilot_name(identity.autopilot),
         "uid": None if identity is None else identity.uid,
-        "at": None if params.at is None else time_text(params.at),
+        "at": time_or_none(params.at),
         "count": len(params),
     }
 
@@ -78,7 +69,7 @@ def written_json(param: WrittenParam) -> dict[str, Any]:
     Without a type, `value` is the number as it is written, and there are no `bits`.
     """
     return {
-        "value": _json(param.value, param),
+        "value": value_written(param.value, param),
         "type": None if param.type is None else type_name(param.type),
         "bits": bits_written(param),
     }
@@ -87,22 +78,6 @@ def written_json(param: WrittenParam) -> dict[str, Any]:
 def value_text(param: WrittenParam) -> str:
     """A parameter's value for people."""
     return _text(param.value, param)
-
-
-def bits_written(param: WrittenParam) -> str | None:
-    """The value's bits as hexadecimal digits; None where no type stands beside it, or one that it exceeds."""
-    if param.type is None:
-        return None
-    try:
-        bits = (
-            int.from_bytes(param.value, "little")
-            if isinstance(param.value, bytes)
-            else param.bits_as(param.type)
-        )
-    except UsageError:
-        return None
-    is_wide = isinstance(param.type, ParamType) and param.type.size == 8
-    return f"{bits:0{16 if is_wide else 8}x}"
 
 
 _COLUMNS: Final = ("name", "value", "default", "type", "comment")
@@ -140,7 +115,7 @@ def _set_json(params: ParamSet) -> dict[str, Any]:
 def _param_json(param: WrittenParam) -> dict[str, Any]:
     return {
         **written_json(param),
-        **({} if param.default is None else {"default": _json(param.default, param)}),
+        **({} if param.default is None else {"default": value_written(param.default, param)}),
         **({"comment": param.comment} if param.comment else {}),
     }
 
@@ -153,10 +128,6 @@ def _changed(params: ParamSet) -> ParamSet:
         if param.default is not None and not same_value(param, replace(param, value=param.default))
     }
     return replace(params, params=differing)
-
-
-def _json(value: Value, param: WrittenParam) -> int | float | str:
-    return value_json(value, ParamType.REAL64 if param.type is None else param.type)
 
 
 def _text(value: Value, param: WrittenParam) -> str:
