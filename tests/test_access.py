@@ -7,7 +7,7 @@ import logging
 import os
 import traceback
 from collections.abc import Iterable, MutableMapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ import pytest
 
 from paramclient.errors import UsageError
 from paramclient.service import access
-from paramclient.service.access import AccessMiddleware, AccessSettings, asker_of, may_write, role_of
+from paramclient.service.access import AccessMiddleware, AccessSettings, may_write
 from paramclient.service.request import SESSION_PATH
 from paramclient.service.tokens import (
     GUESSES,
@@ -28,6 +28,7 @@ from paramclient.service.tokens import (
     Holder,
     Sessions,
     Tokens,
+    add_token,
     new_token,
     token_line,
     tokens_from,
@@ -245,6 +246,26 @@ def test_tokens_come_from_a_file_or_the_environment(tmp_path: Path) -> None:
         tokens_from(path, {})
 
 
+def test_a_token_is_made_and_kept_as_its_digest(tmp_path: Path) -> None:
+    path = tmp_path / "tokens"
+    anna, ben = add_token(path, "anna", "write"), add_token(path, "ben", "read")
+    path.write_text(path.read_text().rstrip("\n"))
+    eve = add_token(path, "eve", "write")
+    tokens = Tokens.read(path)
+    found = [tokens.holder(token.encode()) for token in (anna, ben, eve)]
+    assert found == [Holder("anna", "write"), Holder("ben", "read"), Holder("eve", "write")]
+    kept = path.read_text()
+    assert not any(token in kept for token in (anna, ben, eve))
+    assert path.stat().st_mode & 0o777 == 0o600 or os.name != "posix"
+    with pytest.raises(UsageError, match="tokens: two tokens have the same name"):
+        add_token(path, "anna", "read")
+    with pytest.raises(UsageError, match="a name has 1 to 32 letters"):
+        add_token(path, "an na", "read")
+    with pytest.raises(UsageError, match="the token cannot be kept: Is a directory"):
+        add_token(tmp_path, "anna", "read")
+    assert path.read_text() == kept
+
+
 @pytest.mark.skipif(os.name != "posix", reason="there are no such modes")
 def test_a_file_of_tokens_is_its_owners_alone(tmp_path: Path) -> None:
     path = tmp_path / "tokens"
@@ -285,6 +306,12 @@ def test_beyond_this_machine_it_does_not_start_without_a_token(options: dict[str
     assert AccessSettings(**options, tokens=TOKENS).tokens is TOKENS
 
 
+def test_hosts_are_the_same_when_they_are_taken_over() -> None:
+    settings = AccessSettings(hosts=["Companion.Local.", "[2001:DB8::1]", "10.0.0.1"], tokens=TOKENS)
+    assert settings.hosts == {"companion.local", "2001:db8::1", "10.0.0.1"}
+    assert replace(settings, listen="0.0.0.0").hosts == settings.hosts
+
+
 @pytest.mark.parametrize("origin", ["*", "null", "station.example", "https://a/b", "https://*", "file://x"])
 def test_origins_are_named_one_by_one(origin: str) -> None:
     with pytest.raises(UsageError, match="is no origin of pages"):
@@ -304,8 +331,8 @@ def test_hosts_are_named_one_by_one(host: str) -> None:
 async def test_without_tokens_whoever_is_on_this_machine_may_write() -> None:
     door = Door()
     assert (await door.request("POST", WRITE, body=b"{}")).status == 200
-    asked = Asked(door.seen[-1][0])
-    assert (asker_of(asked), role_of(asked), may_write(asked)) == ("local", "write", True)
+    assert door.state == {"asker": "local", "name": "local", "role": "write", "read_only": False}
+    assert may_write(Asked(door.seen[-1][0]))
     await door.request(raw=[(b"x-asker", b"calibrate.py")])
     assert door.state["asker"] == "local (calibrate.py)"
 
@@ -343,7 +370,12 @@ async def test_a_token_says_who_asks_and_goes_no_further() -> None:
     door = Door(GUARDED)
     cookie = (b"cookie", b"other=1; paramclient-8765=nonsense")
     assert (await door.request(token=ANNA, raw=[(b"x-asker", b"web page"), cookie])).status == 200
-    assert door.state == {"asker": "anna@10.0.0.2 (web page)", "role": "write", "read_only": False}
+    assert door.state == {
+        "asker": "anna@10.0.0.2 (web page)",
+        "name": "anna",
+        "role": "write",
+        "read_only": False,
+    }
     assert (await door.request(token=BEN, client=("::ffff:10.0.0.9", 1))).status == 200
     assert (door.state["asker"], door.state["role"]) == ("ben@10.0.0.9", "read")
     assert (await door.request(token=BEN, client=("fe80::1%eth0", 1))).status == 200

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from pathlib import Path
 
 import pytest
@@ -30,7 +29,11 @@ def test_two_files_that_belong_together() -> None:
         (CERT, DATA, f"{DATA}: the private key cannot be read: Is a directory"),
         (KEY, CERT, f"{KEY}: there is no certificate in PEM in this file"),
         (CERT, CERT, f"{CERT}: there is no private key in PEM in this file"),
-        (CERT, DATA / "tls_other.key", f"tls_other.key: this private key does not belong to the certificate {CERT}"),
+        (
+            CERT,
+            DATA / "tls_other.key",
+            f"tls_other.key: this private key does not belong to the certificate {CERT}",
+        ),
         (CERT, DATA / "tls_locked.key", "tls_locked.key: the private key is encrypted"),
     ],
 )
@@ -47,12 +50,3 @@ def test_a_file_that_is_damaged_is_named(tmp_path: Path) -> None:
     cert.write_text("-----BEGIN CERTIFICATE-----\nAAAA\n-----END CERTIFICATE-----\n")
     with pytest.raises(UsageError, match=r"cert\.pem with .*tls_station\.key: no certificate with its key"):
         tls_of(cert, KEY)
-
-
-@pytest.mark.skipif(os.name != "posix" or os.geteuid() == 0, reason="whoever is root may read everything")
-def test_a_key_that_may_not_be_read_is_named(tmp_path: Path) -> None:
-    key = tmp_path / "key.pem"
-    key.write_bytes(KEY.read_bytes())
-    key.chmod(0)
-    with pytest.raises(UsageError, match=r"key\.pem: the private key cannot be read: Permission denied"):
-        tls_of(CERT, key)

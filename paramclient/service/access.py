@@ -1,7 +1,7 @@
 """Who may do what: every request passes here before anything else sees it.
 
 Pure ASGI, and independent of the framework behind it. What is let through has in `scope["state"]` who asks
-(`asker`), what that one may do (`role`, `read_only`), and neither token nor cookie in its headers.
+(`asker`, `name`), what that one may do (`role`, `read_only`), and neither token nor cookie in its headers.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import logging
 import math
 import time
 from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, MutableMapping
+from contextlib import suppress
 from dataclasses import dataclass
 from ipaddress import ip_address
 from typing import Any, Final, TypeAlias
@@ -22,7 +23,7 @@ from paramclient.protocol.authors import LONGEST_ASKER
 from paramclient.service.request import ASK, HOST, SESSION_PATH, Denied, Request, Scope
 from paramclient.service.tokens import SESSION_AGE, Guesses, Holder, Sessions, Tokens
 
-__all__ = ["AccessMiddleware", "AccessSettings", "asker_of", "may_write", "role_of"]
+__all__ = ["AccessMiddleware", "AccessSettings", "may_write"]
 
 logger = logging.getLogger(__name__)
 
@@ -133,6 +134,7 @@ class AccessMiddleware:
         self._check_role(request, holder)
         state = request.scope.setdefault("state", {})
         state["asker"] = _asker(request, holder if self._settings.tokens is not None else None)
+        state["name"] = None if holder is None else holder.name
         state["role"] = None if holder is None else holder.role
         state["read_only"] = self._settings.read_only
         if request.has_body:
@@ -284,19 +286,11 @@ class AccessMiddleware:
         return bytes(body)
 
 
-def asker_of(request: Any) -> str:
-    """For whom a request is: what `Component.set` is told. Takes anything with a `scope`."""
-    return str(request.scope["state"]["asker"])
-
-
-def role_of(request: Any) -> str | None:
-    """What a request's token allows: "read", "write", or None for one that needs none and has none."""
-    role: str | None = request.scope["state"]["role"]
-    return role
-
-
 def may_write(request: Any) -> bool:
-    """Whether a request may change something. `AccessMiddleware` has asked that of all that do."""
+    """Whether a request may change something, where its address alone does not tell whether it does.
+
+    Takes anything with the `scope` of a request.
+    """
     state = request.scope["state"]
     return state["role"] == "write" and not state["read_only"]
 
@@ -412,10 +406,13 @@ def _token_in(body: bytes) -> bytes:
 
 
 def _host_name(text: str) -> str:
-    found = HOST.fullmatch(text)
+    name = text.strip("[]").lower().removesuffix(".")
+    with suppress(ValueError):
+        return str(ip_address(name))
+    found = HOST.fullmatch(name)
     if found is None or found["port"] is not None:
         raise UsageError(f"{text!r:.100} is no name of a host, such as companion.local")
-    return found["name"].strip("[]").lower().removesuffix(".")
+    return name
 
 
 def _origin(text: str) -> str:

@@ -11,12 +11,23 @@ from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from ipaddress import IPv6Address, ip_address
+from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
 from paramclient.errors import UsageError
 from paramclient.signing import read_private
 
-__all__ = ["Guesses", "Holder", "Role", "Sessions", "Tokens", "new_token", "token_line", "tokens_from"]
+__all__ = [
+    "Guesses",
+    "Holder",
+    "Role",
+    "Sessions",
+    "Tokens",
+    "add_token",
+    "new_token",
+    "token_line",
+    "tokens_from",
+]
 
 Role: TypeAlias = Literal["read", "write"]
 """What a token allows: to see everything, or to change it too."""
@@ -170,6 +181,29 @@ def token_line(name: str, role: str, token: str) -> str:
     """
     holder, digest = _of_line([name, role, token])
     return f"{holder.name} {holder.role} {DIGEST}{digest.hex()}"
+
+
+def add_token(path: str | os.PathLike[str], name: str, role: Role) -> str:
+    """Make a token, and add its line to a file, which is made for its owner alone if it is not there.
+
+    Raises:
+        UsageError: the file cannot be written, is open to others, holds something else, or has the name.
+    """
+    token = new_token()
+    line = token_line(name, role, token)
+    try:
+        os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600))
+        before = read_private(path, "file of tokens", LONGEST_FILE + 1).decode("utf-8", "replace")
+        gap = "" if before.endswith("\n") or not before else "\n"
+        try:
+            Tokens.of_text(f"{before}{gap}{line}")
+        except UsageError as error:
+            raise UsageError(f"{os.fspath(path)}: {error}") from None
+        with Path(path).open("a", encoding="ascii") as file:
+            file.write(f"{gap}{line}\n")
+    except OSError as error:
+        raise UsageError(f"{os.fspath(path)}: the token cannot be kept: {error.strerror}") from error
+    return token
 
 
 class Sessions:
