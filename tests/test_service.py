@@ -128,7 +128,9 @@ async def test_ids_that_two_links_carry_need_the_link_beside_them() -> None:
 @swiftly
 async def test_who_is_not_heard_in_time_is_a_problem_that_says_so() -> None:
     async with service(SimLink(generic())) as (_, browser):
-        told = problem(await browser.post("/api/v1/find", json={"system": 7, "timeout_s": 2}), 504, "no-reply")
+        told = problem(
+            await browser.post("/api/v1/find", json={"system": 7, "timeout_s": 2}), 504, "no-reply"
+        )
         assert told["error"] == "NoReply"
         assert told["waited"] == pytest.approx(2, abs=0.01)
         assert "system id 7" in told["detail"]
@@ -235,7 +237,7 @@ async def test_values_of_every_kind_are_written() -> None:
         assert known["I"].value == -1
         assert (await put("B", {"bits": "000000ff"}))["param"]["value"] == 255
 
-        for name, value in {"B": 256, "I": 0.5, "F": "fast", "b%07": 1}.items():
+        for name, value in {"B": 256, "I": 0.5, "F": "fast", "b\u00e9": 1}.items():
             problem(await browser.put(f"{C}/params/{name}", json={"value": value}), 422, "usage")
         problem(await browser.put(f"{C}/params/B", json={"value": {"bits": "100"}}), 422, "usage")
         for value in (None, True, [], {}, {"bits": "xyz"}, {"raw": "00"}):
@@ -372,7 +374,10 @@ async def test_a_fetch_is_a_job_that_can_be_looked_at_and_cancelled() -> None:
         assert (await browser.delete(another)).status_code == 204
         await asyncio.sleep(0.1)
         cancelled = (await browser.get(another)).json()
-        assert (cancelled["state"], cancelled["problem"]["type"]) == ("cancelled", "urn:paramclient:cancelled")
+        assert (cancelled["state"], cancelled["problem"]["type"]) == (
+            "cancelled",
+            "urn:paramclient:cancelled",
+        )
         await asyncio.sleep(5)
         done = (await browser.get(place)).json()
         assert done["state"] == "done"
@@ -506,7 +511,7 @@ async def test_its_numbers_are_in_the_format_of_prometheus() -> None:
                 numbers[line.rpartition(" ")[0]] = float(line.rpartition(" ")[2])
         link = r'{link="sim:\"odd\\one\""}'
         assert numbers[f"paramclient_link_downloads_total{link}"] == 1
-        assert numbers[f"paramclient_component_parameters{link[:-1]},system=\"1\",component=\"1\"}}"] == 25
+        assert numbers[f'paramclient_component_parameters{link[:-1]},system="1",component="1"}}'] == 25
 
 
 @swiftly
@@ -560,5 +565,3 @@ async def test_every_answer_forbids_a_browser_to_make_a_program_of_it() -> None:
             assert headers["x-content-type-options"] == "nosniff"
             assert headers["content-security-policy"].startswith("default-src 'none'")
             assert headers["x-seq"] == str(hub.feed.place)
-
-

@@ -80,7 +80,7 @@ class HealthDoc(Document):
 
 
 class MeDoc(Document):
-    """Who asks, by the name of the token, and whether that one may write; nobody may where it is `read_only`."""
+    """Who asks, by the name of the token, and what that allows; where it is `read_only`, nobody may write."""
 
     name: str
     role: Literal["read", "write"]

@@ -14,11 +14,10 @@ from paramclient.documents.call import FetchedAllDoc, FetchResultDoc, SilentDoc
 from paramclient.documents.job import JobDoc, JobsDoc
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.protocol.sampling import SAMPLE_SIZE
-from paramclient.service import access
-from paramclient.service.asking import LinkName, Seconds, Target, TheHub, answered, asker_of
+from paramclient.service.asking import LinkName, Seconds, Target, TheHub, answered, asker_of, may_write
 from paramclient.service.hub import Hub
 from paramclient.service.jobs import Job
-from paramclient.service.problems import ServiceError, problem_of
+from paramclient.service.problems import problem_of
 
 __all__ = ["accepted", "awaited", "router"]
 
@@ -93,8 +92,8 @@ async def one_job(hub: TheHub, job: str) -> JobDoc:
 async def cancel(request: Request, hub: TheHub, job: str) -> Response:
     """Cancel it. A download goes on for as long as somebody else waits for it."""
     found = hub.jobs.find(job)
-    if found.kind != "fetch" and not access.may_write(request):
-        raise ServiceError(403, "forbidden", "This token allows to read only.")
+    if found.kind != "fetch":
+        await may_write(request)
     found.cancel()
     return Response(status_code=204)
 

@@ -17,7 +17,7 @@ router = APIRouter(tags=["service"])
 @router.get("/health")
 async def health(request: Request, hub: TheHub) -> HealthDoc:
     """That the service answers. Which links it has is for those alone who may know."""
-    is_known = request.scope.get("state", {}).get("role", "write") is not None
+    is_known = request.scope["state"]["role"] is not None
     links = [HealthLinkDoc(name=line.name, state=line.state) for line in hub.lines.values()]
     return HealthDoc(
         status="ok", version=__version__, up_s=round(hub.age, 1), links=links if is_known else None
