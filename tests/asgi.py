@@ -1,4 +1,4 @@
-"""An ASGI application as an httpx transport: what it answers comes as it is sent, also where that has no end."""
+"""An ASGI application as an httpx transport: its answers come as they are sent, also those without an end."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from starlette.types import ASGIApp, Message
 __all__ = ["ASGITransport", "a_browser"]
 
 HIGH_WATER: Final = 65_536
-"""Bytes that an application may have sent and nobody has read before its next `send` waits, as with uvicorn."""
+"""Bytes that an application may have sent, and nobody has read, before `send` waits, as with uvicorn."""
 
 
 class ASGITransport(httpx.AsyncBaseTransport):

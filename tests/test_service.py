@@ -1,16 +1,13 @@
-"""The service over HTTP, in this process: what it tells of vehicles, what it does when asked, how it fails."""
+"""The service over HTTP, in this process: what it tells of vehicles, what it does, how it fails."""
 
 from __future__ import annotations
 
 import asyncio
 import json
 import re
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
-import httpx
 import pytest
 
 from paramclient import ParamCache, UsageError
@@ -22,40 +19,8 @@ from paramclient.service import Hub, create_app, following
 from paramclient.sim import Air, ArduPilotVehicle, SimParam
 from paramclient.values import ParamType
 from tests.asgi import a_browser
+from tests.served import C, met, problem, service
 from tests.shell import VALUES, FlakyLink, Tap, generic, settled, small_px4, swiftly
-
-C = "/api/v1/components/1/1"
-
-
-@asynccontextmanager
-async def service(*links: Any, **options: Any) -> AsyncIterator[tuple[Hub, httpx.AsyncClient]]:
-    """An open hub and a client of it; without a cache, and without fetches that nobody asked for."""
-    async with (
-        Hub(links, **{"cache": False, "fetches": False} | options) as hub,
-        a_browser(create_app(hub)) as browser,
-    ):
-        yield hub, browser
-
-
-async def met(browser: httpx.AsyncClient, **sought: Any) -> dict[str, Any]:
-    """The component that is heard first."""
-    answer = await browser.post("/api/v1/find", json=sought)
-    assert answer.status_code == 200, answer.text
-    found: dict[str, Any] = answer.json()
-    return found
-
-
-def problem(answer: httpx.Response, status: int, kind: str) -> dict[str, Any]:
-    """What an answer says that is a problem of this kind."""
-    assert answer.status_code == status, answer.text
-    assert answer.headers["content-type"] == "application/problem+json"
-    told: dict[str, Any] = answer.json()
-    assert told["type"] == f"urn:paramclient:{kind}"
-    assert told["status"] == status
-    assert told["title"]
-    assert told["detail"]
-    return told
-
 
 # links and components
 
@@ -475,7 +440,7 @@ async def test_what_fails_inside_tells_nothing_of_the_inside(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     async with service() as (hub, browser):
-        monkeypatch.setattr(type(hub), "followed", property(lambda _: {}["the secret"]))
+        monkeypatch.setattr(type(hub), "followed", property(lambda _: dict[str, str]()["the secret"]))
         told = problem(await browser.get("/api/v1/components"), 500, "internal")
         assert "secret" not in json.dumps(told)
         assert "the secret" in caplog.text
