@@ -20,6 +20,8 @@ from paramclient.values import Param, format_value, type_name
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from paramclient.documents import Document
+
 __all__ = [
     "Coloured",
     "NO_DEFAULTS",
@@ -29,6 +31,7 @@ __all__ = [
     "live_view",
     "milliseconds",
     "param_json",
+    "print_document",
     "print_json",
     "print_line",
     "print_table",
@@ -105,6 +108,11 @@ def as_json(params: Iterable[Param]) -> dict[str, dict[str, Any]]:
 def print_json(result: object) -> None:
     """Print one object on one line, at once."""
     print(json.dumps(result, allow_nan=False), flush=True)
+
+
+def print_document(document: Document) -> None:
+    """Print a document of `paramclient.documents` on one line, at once."""
+    print_json(document.as_json())
 
 
 # for people

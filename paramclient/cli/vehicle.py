@@ -17,7 +17,6 @@ from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
     MetadataChoice,
     described_cells,
-    described_json,
     from_file,
     known_of_session,
     needs_reboot,
@@ -34,6 +33,7 @@ from paramclient.cli.output import (
     by_index,
     default_text,
     milliseconds,
+    print_document,
     print_json,
     print_line,
     print_table,
@@ -142,9 +142,9 @@ async def get(
         if described is None:
             described = await known_of_session(session, metadata)
     if options.json:
-        texts = {each: str(error) for each, error in errors.items()}
-        found = described_json(params, described, whole=True)
-        print_json({"params": found, **({"errors": texts} if texts else {})})
+        from paramclient.documents import GotDoc  # only here: loads pydantic
+
+        print_document(GotDoc.of(params, described, errors))
     elif params and described is None:
         print_table(_COLUMNS, map(_cells, params), right="value index")
     elif params and described is not None:

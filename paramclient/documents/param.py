@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from paramclient.documents.base import Document, Maybe, Scalar
@@ -9,10 +10,11 @@ from paramclient.notation import bits_text, bits_written, value_json, value_writ
 from paramclient.values import Param, ParamType, format_value, type_name
 
 if TYPE_CHECKING:
-    from paramclient.metadata import ParamInfo
+    from paramclient.errors import ParamClientError
+    from paramclient.metadata import Metadata, ParamInfo
     from paramclient.paramset import WrittenParam
 
-__all__ = ["InfoDoc", "ParamDoc", "WrittenParamDoc"]
+__all__ = ["GotDoc", "InfoDoc", "ParamDoc", "WrittenParamDoc"]
 
 
 class InfoDoc(Document):
@@ -137,6 +139,28 @@ class WrittenParamDoc(Document):
             bits=bits_written(param),
             default=None if param.default is None else value_written(param.default, param),
             comment=param.comment or None,
+        )
+
+
+class GotDoc(Document):
+    """Parameters that were asked for, by name, and why some did not come."""
+
+    params: dict[str, ParamDoc]
+    errors: Maybe[dict[str, str]] = None
+
+    @classmethod
+    def of(
+        cls, params: Iterable[Param], metadata: Metadata | None, errors: Mapping[str, ParamClientError]
+    ) -> GotDoc:
+        """What came, with all that is known of it, and the errors by name."""
+        return cls(
+            params={
+                param.name: ParamDoc.of(
+                    param, None if metadata is None else metadata.find(param.name), whole=True
+                )
+                for param in params
+            },
+            errors={name: str(error) for name, error in errors.items()} or None,
         )
 
 

@@ -134,6 +134,16 @@ class ApplyResult:
         """The rows with this status, in order."""
         return [row for row in self.rows.values() if row.status is status]
 
+    @property
+    def news(self) -> list[ApplyRow]:
+        """The rows with something to see: not what was so already, or is left out and no different."""
+        return [row for row in self.rows.values() if self._is_news(row)]
+
+    def _is_news(self, row: ApplyRow) -> bool:
+        if row.status is ApplyStatus.SKIPPED:
+            return not row.is_as_wanted or self.plan.rows[row.name].differs
+        return row.status is not ApplyStatus.UNCHANGED
+
     def __repr__(self) -> str:
         counts = ", ".join(f"{count} {status}" for status, count in self.counts.items())
         end = f", ended by {self.error}" if self.error is not None else ""
