@@ -114,14 +114,7 @@ def known_of_sets(sets: Sequence[ParamSet], options: LinkOptions) -> list[Metada
     if options.place is False:
         return [None] * len(sets)
     store = MetadataStore.beside(ParamCache(options.cache).path)
-    own = [
-        None
-        if params.identity is None or params.component is None
-        else store.known(params.identity, params.component)
-        for params in sets
-    ]
-    first = next(filter(None, own), None)
-    return [first if each is None else each for each in own]
+    return store.known_of_sets(sets)
 
 
 # what is to be set

@@ -19,7 +19,6 @@ from paramclient.cli.metadata import (
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import (
-    NO_DEFAULTS,
     by_index,
     default_text,
     print_document,
@@ -35,6 +34,7 @@ from paramclient.errors import CacheError, UsageError
 from paramclient.identity import autopilot_name
 from paramclient.metadata import Metadata
 from paramclient.notation import hash_text, time_or_none, time_text
+from paramclient.taken import NO_DEFAULTS
 from paramclient.values import Param, check_name, format_value, type_name
 
 if TYPE_CHECKING:

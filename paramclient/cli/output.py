@@ -24,7 +24,6 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Coloured",
-    "NO_DEFAULTS",
     "as_json",
     "by_index",
     "default_text",
@@ -41,10 +40,6 @@ __all__ = [
     "say",
 ]
 
-NO_DEFAULTS: Final = (
-    "the firmware's defaults are not known, so nor is what differs from them: they come with the parameter "
-    "file over MAVFTP, which ArduPilot and PX4 from 1.18 on serve"
-)
 UNLIMITED: Final = 10_000
 """Columns of an output that is no terminal: nothing is wrapped or cut there."""
 

@@ -6,7 +6,6 @@ import sys
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, TypeAlias, TypeVar
 
@@ -49,18 +48,19 @@ from paramclient.cli.targets import (
 from paramclient.cli.when import parse_when
 from paramclient.cli.written import described
 from paramclient.component import Component
-from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError
+from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.metadata import Metadata
 from paramclient.paramset import ParamSet
 from paramclient.protocol.result import Progress
-from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, ApplyStatus, Plan, verify_all
+from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, verify_all
 from paramclient.provision import apply_all as apply_to_all
 from paramclient.provision import restore as restore_to
-from paramclient.provision.applying import BEFORE_APPLY, restored
+from paramclient.provision.applying import restored
 from paramclient.provision.looking import identified
+from paramclient.taken import before_last_apply
 
 if TYPE_CHECKING:
-    from paramclient.documents import VehicleDoc
+    from paramclient.documents import SetUpDoc
 
 __all__ = ["apply", "restore", "verify"]
 
@@ -282,12 +282,7 @@ async def _state(found: Targets, vehicle: Component, when: str | None, options: 
 
 def _kept(cache: ParamCache, key: str, component: int, moment: float | None) -> ParamSet:
     if moment is None:
-        kept = [each for each in cache.snapshots(key, component) if each.reason == BEFORE_APPLY]
-        if not kept:
-            raise CacheError(
-                f"the cache knows of no apply to {key}; name the moment whose state is to come back"
-            )
-        moment = kept[-1].id
+        return before_last_apply(cache, key, component)
     return cache.state_at(key, component, moment)
 
 
@@ -414,7 +409,7 @@ class _Show:
                     vehicle = self._vehicles[component.system, component.component]
                     steps[vehicle] = (how_far.done, how_far.total)
                     if how_far.row is not None:
-                        rows.setdefault(vehicle, {})[how_far.row.name] = _so_far(how_far.row)
+                        rows.setdefault(vehicle, {})[how_far.row.name] = how_far.row.so_far
                         began = began or anyio.current_time()
                     if draw is not None and began:
                         done, total = (sum(numbers) for numbers in zip(*steps.values(), strict=True))
@@ -438,7 +433,7 @@ class _Show:
         results: Mapping[Vehicle, Result],
         errors: Mapping[Vehicle, ParamClientError],
         show: Callable[[], None],
-        as_document: Callable[..., VehicleDoc],
+        as_document: Callable[..., SetUpDoc],
         code: Callable[[Result], ExitCode],
     ) -> ExitCode:
         """Print it in one form or the other; an error of a vehicle that is alone is the command's."""
@@ -455,7 +450,7 @@ class _Show:
         return max(codes, default=ExitCode.DONE)
 
     def _print_documents(
-        self, told: Sequence[VehicleDoc], errors: Mapping[Vehicle, ParamClientError] | None = None
+        self, told: Sequence[SetUpDoc], errors: Mapping[Vehicle, ParamClientError] | None = None
     ) -> None:
         if not self._is_fleet:
             print_document(told[0])
@@ -464,10 +459,3 @@ class _Show:
 
         failed = {(vehicle.system, vehicle.component): error for vehicle, error in (errors or {}).items()}
         print_document(FleetSetupDoc.of(told, failed))
-
-
-def _so_far(row: ApplyRow) -> ApplyRow:
-    """What has become of a parameter, where nobody will read it back any more."""
-    if row.status is not ApplyStatus.SET:
-        return row
-    return replace(row, status=ApplyStatus.UNPROVEN, reason="acknowledged, and not read back")

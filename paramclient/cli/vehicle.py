@@ -28,7 +28,6 @@ from paramclient.cli.metadata import (
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.outcome import ExitCode, code_of, status_of
 from paramclient.cli.output import (
-    NO_DEFAULTS,
     as_json,
     by_index,
     default_text,
@@ -50,6 +49,7 @@ from paramclient.notation import hash_text, rounded, time_text, value_json
 from paramclient.protocol.result import FetchResult, Policy
 from paramclient.protocol.sampling import SAMPLE_SIZE, Sample
 from paramclient.protocol.table import Change
+from paramclient.taken import NO_DEFAULTS
 from paramclient.values import Param, ParamType, Trust, Value, check_name, format_value, type_name
 
 __all__ = ["fetch", "get", "set_", "watch"]

@@ -6,13 +6,14 @@ from dataclasses import replace
 from typing import Final
 
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import NO_DEFAULTS, print_document, print_table, printable, report, say
+from paramclient.cli.output import print_document, print_table, printable, report, say
 from paramclient.compare import same_value
 from paramclient.files import ParamFile
 from paramclient.files.model import address
 from paramclient.identity import autopilot_name
 from paramclient.notation import time_text
 from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.taken import NO_DEFAULTS
 from paramclient.values import ParamType, Value, format_value, type_name
 
 __all__ = ["described", "show_file", "value_text"]

@@ -13,6 +13,8 @@ from paramclient.documents.cached import (
     CachedTablesDoc,
     PlaceDoc,
     RemovedDoc,
+    VehicleDoc,
+    VehiclesDoc,
 )
 from paramclient.documents.diff import ComparedDoc, DiffDoc, DifferenceDoc
 from paramclient.documents.fleet import FleetDiffDoc, FleetValueDoc, HolderDoc, NameSpreadDoc
@@ -35,13 +37,13 @@ from paramclient.documents.setup import (
     InterruptedDoc,
     PlanDoc,
     PlanRowDoc,
+    SetUpDoc,
     StageDoc,
     StepDoc,
-    VehicleDoc,
     VerifiedDoc,
     VerifiedRowDoc,
 )
-from paramclient.documents.written import FileDoc, OriginDoc, SetDoc
+from paramclient.documents.written import FileDoc, FormDoc, FormsDoc, OriginDoc, SetDoc, UploadedDoc
 
 __all__ = [
     "AddressDoc",
@@ -63,6 +65,8 @@ __all__ = [
     "FleetDiffDoc",
     "FleetSetupDoc",
     "FleetValueDoc",
+    "FormDoc",
+    "FormsDoc",
     "GotDoc",
     "HistoryDoc",
     "HistoryEntryDoc",
@@ -79,11 +83,14 @@ __all__ = [
     "RemovedDoc",
     "Scalar",
     "SetDoc",
+    "SetUpDoc",
     "SnapshotDoc",
     "SnapshotsDoc",
     "StageDoc",
     "StepDoc",
+    "UploadedDoc",
     "VehicleDoc",
+    "VehiclesDoc",
     "VerifiedDoc",
     "VerifiedRowDoc",
     "WholeSnapshotDoc",

@@ -11,11 +11,20 @@ from paramclient.identity import autopilot_name
 from paramclient.notation import hash_text, time_or_none
 
 if TYPE_CHECKING:
-    from paramclient.cache import CachedComponent, CachedSummary
+    from paramclient.cache import CachedComponent, CachedSummary, CachedVehicle
     from paramclient.metadata import Metadata
     from paramclient.values import Param
 
-__all__ = ["CachedListDoc", "CachedSummaryDoc", "CachedTableDoc", "CachedTablesDoc", "PlaceDoc", "RemovedDoc"]
+__all__ = [
+    "CachedListDoc",
+    "CachedSummaryDoc",
+    "CachedTableDoc",
+    "CachedTablesDoc",
+    "PlaceDoc",
+    "RemovedDoc",
+    "VehicleDoc",
+    "VehiclesDoc",
+]
 
 
 class CachedSummaryDoc(Document):
@@ -113,6 +122,37 @@ class CachedTablesDoc(Document):
     """The tables of a vehicle, or of all."""
 
     components: list[CachedTableDoc]
+
+
+class VehicleDoc(Document):
+    """A vehicle of which tables are kept; see `CachedVehicle`. Times are in unix seconds."""
+
+    key: str
+    system: int
+    autopilot: str
+    uid: str | None
+    first_seen: float
+    last_seen: float
+    components: list[CachedSummaryDoc]
+
+    @classmethod
+    def of(cls, vehicle: CachedVehicle, tables: Iterable[CachedSummary]) -> VehicleDoc:
+        """A vehicle with those of these tables that are its own."""
+        return cls(
+            key=vehicle.key,
+            system=vehicle.identity.system,
+            autopilot=autopilot_name(vehicle.identity.autopilot),
+            uid=vehicle.identity.uid,
+            first_seen=vehicle.first_seen,
+            last_seen=vehicle.last_seen,
+            components=[CachedSummaryDoc.of(each) for each in tables if each.key == vehicle.key],
+        )
+
+
+class VehiclesDoc(Document):
+    """Every vehicle that was ever heard."""
+
+    vehicles: list[VehicleDoc]
 
 
 class PlaceDoc(Document):

@@ -6,12 +6,14 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
 from paramclient.documents.base import Document, Maybe, Scalar
-from paramclient.documents.written import SetDoc
+from paramclient.documents.param import WrittenParamDoc
+from paramclient.identity import autopilot_name
 from paramclient.notation import bits_text, hash_text, time_text, value_json
 from paramclient.values import type_name
 
 if TYPE_CHECKING:
-    from paramclient.cache import HistoryEntry, Snapshot, SnapshotSummary
+    from paramclient.cache import HistoryEntry, SnapshotSummary
+    from paramclient.paramset import ParamSet
 
 __all__ = ["ExactDoc", "HistoryDoc", "HistoryEntryDoc", "SnapshotDoc", "SnapshotsDoc", "WholeSnapshotDoc"]
 
@@ -62,12 +64,14 @@ class HistoryDoc(Document):
     """Changes of values, the newest last. `before` is what to ask with for those that came before them."""
 
     history: list[HistoryEntryDoc]
-    before: Maybe[str] = None
+    before: Maybe[float] = None
 
     @classmethod
-    def of(cls, entries: Iterable[HistoryEntry]) -> HistoryDoc:
+    def of(
+        cls, entries: Iterable[HistoryEntry], *, exact: bool = False, before: float | None = None
+    ) -> HistoryDoc:
         """Lines of history."""
-        return cls(history=[HistoryEntryDoc.of(entry) for entry in entries])
+        return cls(history=[HistoryEntryDoc.of(entry, exact=exact) for entry in entries], before=before)
 
 
 class SnapshotDoc(Document):
@@ -109,11 +113,23 @@ class SnapshotsDoc(Document):
 
 
 class WholeSnapshotDoc(SnapshotDoc):
-    """A snapshot with its parameters."""
+    """A snapshot with its parameters by name, and who the vehicle was then."""
 
-    state: SetDoc
+    source: str
+    system: int | None
+    autopilot: str | None
+    uid: str | None
+    params: dict[str, WrittenParamDoc]
 
     @classmethod
-    def whole(cls, snapshot: Snapshot) -> WholeSnapshotDoc:
+    def whole(cls, summary: SnapshotSummary, params: ParamSet) -> WholeSnapshotDoc:
         """All of it."""
-        return cls(**SnapshotDoc.of(snapshot, exact=True).model_dump(), state=SetDoc.of(snapshot.params))
+        identity = params.identity
+        return cls(
+            **SnapshotDoc.of(summary, exact=True).model_dump(),
+            source=params.source,
+            system=params.system,
+            autopilot=None if identity is None else autopilot_name(identity.autopilot),
+            uid=None if identity is None else identity.uid,
+            params={name: WrittenParamDoc.of(param) for name, param in params.items()},
+        )

@@ -30,7 +30,7 @@ __all__ = [
     "PlanRowDoc",
     "StageDoc",
     "StepDoc",
-    "VehicleDoc",
+    "SetUpDoc",
     "VerifiedDoc",
     "VerifiedRowDoc",
 ]
@@ -279,19 +279,19 @@ class FailedVehicleDoc(Document):
     error: str
 
 
-VehicleDoc: TypeAlias = ApplyResultDoc | PlanDoc | VerifiedDoc | InterruptedDoc
+SetUpDoc: TypeAlias = ApplyResultDoc | PlanDoc | VerifiedDoc | InterruptedDoc
 """What a set-up tells of one vehicle."""
 
 
 class FleetSetupDoc(Document):
     """What came of a command for several vehicles."""
 
-    vehicles: list[VehicleDoc]
+    vehicles: list[SetUpDoc]
     errors: list[FailedVehicleDoc]
 
     @classmethod
     def of(
-        cls, vehicles: Iterable[VehicleDoc], errors: Mapping[tuple[int, int], ParamClientError]
+        cls, vehicles: Iterable[SetUpDoc], errors: Mapping[tuple[int, int], ParamClientError]
     ) -> FleetSetupDoc:
         """What is told of each, and the errors by address."""
         failed = [

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from paramclient.errors import ParamClientError
@@ -67,6 +67,13 @@ class ApplyRow:
         if self.status is ApplyStatus.SKIPPED:
             return self.category in _ON_PURPOSE
         return self.status in (ApplyStatus.SET, ApplyStatus.UNCHANGED)
+
+    @property
+    def so_far(self) -> ApplyRow:
+        """The same where nobody will read it back any more."""
+        if self.status is not ApplyStatus.SET:
+            return self
+        return replace(self, status=ApplyStatus.UNPROVEN, reason="acknowledged, and not read back")
 
     def __str__(self) -> str:
         kind = ParamType.REAL32 if self.type is None else self.type
