@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from paramclient.metadata import Metadata, ParamInfo
     from paramclient.paramset import WrittenParam
 
-__all__ = ["GotDoc", "InfoDoc", "ParamDoc", "WrittenParamDoc"]
+__all__ = ["DescribedDoc", "GotDoc", "InfoDoc", "InfosDoc", "ParamDoc", "WrittenParamDoc"]
 
 
 class InfoDoc(Document):
@@ -162,6 +162,29 @@ class GotDoc(Document):
             },
             errors={name: str(error) for name, error in errors.items()} or None,
         )
+
+
+class InfosDoc(Document):
+    """What is known of parameters, by name; `source` is where it comes from."""
+
+    source: str
+    params: dict[str, InfoDoc]
+
+    @classmethod
+    def of(cls, metadata: Metadata, names: Iterable[str]) -> InfosDoc:
+        """What there is of these names."""
+        found = {name: metadata.find(name) for name in names}
+        return cls(
+            source=metadata.source,
+            params={name: InfoDoc.of(info) for name, info in found.items() if info is not None},
+        )
+
+
+class DescribedDoc(Document):
+    """How many parameters, or groups of them, are described, and where that comes from."""
+
+    count: int
+    source: str
 
 
 def _number(number: int | float | None) -> Scalar | None:
