@@ -23,9 +23,9 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import MAV_AUTOPILOT_PX4, Heartbeat
-from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam, Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, SimParam, Vehicle
 from paramclient.values import ParamType
-from tests.shell import swiftly
+from tests.shell import Tap, swiftly
 
 MANY = 250
 PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
@@ -372,3 +372,64 @@ async def test_what_is_new_is_written_in_portions(tmp_path: Path, monkeypatch: p
         assert [sum(each.values()) for each in cache.given] == [300, 300, 300, 150]
         assert sorted(system for each in cache.given for system in each) == [*range(1, 8)]
         assert len(cache.components()) == 7
+
+
+class Busy(Tap):
+    """A vehicle that does nothing for a while when its parameters are asked for: it has others to see to.
+
+    Args:
+        vehicle: who is asked.
+        seconds: for so long it does not speak, from the first time on; half a second later it hears, too.
+        beats: whether its heartbeats come all the same.
+    """
+
+    def __init__(self, vehicle: Vehicle, seconds: float, *, beats: bool) -> None:
+        super().__init__(vehicle)
+        self._vehicle = vehicle
+        self._seconds = seconds
+        self._beats = beats
+        self._until: float | None = None
+        self._waiting: list[bytes] = []
+
+    def receive(self, data: bytes, now: float) -> None:
+        self.is_deaf = True
+        super().receive(data, now)
+        if self.messages(wire.ParamRequestList) and self._until is None:
+            self._until = now + self._seconds
+        self._waiting.append(data)
+        self.tick(now)
+
+    def tick(self, now: float) -> None:
+        until = -1.0 if self._until is None else self._until
+        self.is_mute = now < until and not self._beats
+        if now >= until + 0.5:
+            waiting, self._waiting = self._waiting, []
+            for data in waiting:
+                self._vehicle.receive(data, now)
+        super().tick(now)
+
+    def next_deadline(self) -> float | None:
+        deadline = super().next_deadline()
+        if not self._waiting or self._until is None:
+            return deadline
+        return min(self._until + 0.5, math.inf if deadline is None else deadline)
+
+
+@swiftly
+async def test_who_answers_no_sooner_than_others_is_waited_for() -> None:
+    """Where another one took a while as well, an answer that is late says nothing."""
+    vehicles = [Busy(small(1), 0.3, beats=True), Busy(small(2), 2.3, beats=True)]
+    async with ParamClient(Air.symmetric(vehicles), cache=False) as client:
+        everything = await client.fetch_all()
+        assert everything.complete
+        assert everything.results.keys() == {(1, 1), (2, 1)}
+
+
+@swiftly
+async def test_who_is_not_heard_at_all_for_a_while_is_waited_for() -> None:
+    """It owes its heartbeats as well, and is not lost."""
+    vehicles: list[Endpoint] = [small(1), *(Busy(small(system), 3.5, beats=False) for system in (2, 3))]
+    async with ParamClient(Air.symmetric(vehicles), cache=False) as client:
+        everything = await client.fetch_all()
+        assert everything.complete
+        assert everything.results.keys() == {(1, 1), (2, 1), (3, 1)}
