@@ -22,7 +22,7 @@ MOST_NAMES_OF_LINK: Final = 400_000
 """Names that all tables of one link may hold together before each is held to `ENOUGH_NAMES`: 250 vehicles
 with 1,600 parameters each. A name takes about half a kilobyte."""
 MOST_OVERWRITTEN: Final = 1_024
-"""Values of ours that were replaced before the cache was told: between two writes to the disk some tens fit."""
+"""What we wrote and was replaced before the cache was told: some tens fit between two writes to the disk."""
 MOST_GONE: Final = MOST_NAMES
 """Names that have changed or gone and wait to be told to the cache, above which further gone ones are not
 told: the next whole table that is kept is without them."""
