@@ -125,6 +125,7 @@ class WriteThrough:
         if kept is not None:
             del self._kept[machine]
             machine.table.take_dirty()
+            machine.table.take_overwritten()
         return False
 
     async def bring(self, machine: ComponentMachine, identity: Identity) -> bool:
@@ -320,6 +321,7 @@ class WriteThrough:
         if not (table.dirty or kept.is_whole or state != kept.state):
             return []
         dirty = table.take_dirty()
+        overwritten = table.take_overwritten()
         is_whole, kept.is_whole = kept.is_whole, False
         kept.state = state
         kept.written_at = anyio.current_time()
@@ -331,19 +333,20 @@ class WriteThrough:
             at=now,
             table=state,
             params=[
-                StoredParam(
-                    table.params[name],
-                    now,
-                    name in table.volatile if knows_volatile else None,
-                    dirty.get(name, "vehicle"),
+                StoredParam(param, now, param.name in table.volatile if knows_volatile else None, by)
+                for param, by in (
+                    *overwritten,
+                    *(
+                        (table.params[name], dirty.get(name, "vehicle"))
+                        for name in (table.params if is_whole else dirty)
+                        if name in table.params
+                    ),
                 )
-                for name in (table.params if is_whole else dirty)
-                if name in table.params
             ],
             removed=[name for name in dirty if name not in table.params],
             replace=is_whole,
         )
-        return [_News(kept, dirty, update, is_synced)]
+        return [_News(kept, dirty, overwritten, update, is_synced)]
 
     def _state(self, machine: ComponentMachine, kept: _Kept) -> TableState:
         table = machine.table
@@ -386,13 +389,16 @@ class _News:
 
     kept: _Kept
     dirty: dict[str, str]
+    overwritten: list[tuple[Param, str]]
     update: TableUpdate
     is_synced: bool
 
     def take_back(self) -> None:
         """It has not arrived: it is news again."""
         self.kept.is_synced |= self.is_synced
-        self.kept.machine.table.dirty = self.dirty | self.kept.machine.table.dirty
+        table = self.kept.machine.table
+        table.dirty = self.dirty | table.dirty
+        table.overwritten = self.overwritten + table.overwritten
         self.kept.is_whole |= self.update.replace
         self.kept.state = None
 

@@ -21,12 +21,12 @@ from paramclient.files import FileForm, dumps, loads
 from paramclient.links import SimLink
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.protocol import wire
-from paramclient.service import Hub, create_app
+from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
 from paramclient.service.hub import MOST_READINGS
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.sim.vehicle import Vehicle
 from paramclient.values import ParamType
-from tests.asgi import ASGITransport, a_browser
+from tests.asgi import a_browser
 from tests.caches import NOW, PX4, stored
 from tests.published import Published
 from tests.shell import Tap, swiftly, until
@@ -52,6 +52,7 @@ def ardupilot(**options: Any) -> ArduPilotVehicle:
     return ArduPilotVehicle(**{"table": rows, "groups": {}, "live": ()} | options)
 
 
+A_FILE = {"content-type": "application/octet-stream"}
 BOTH = pytest.mark.parametrize("vehicle", [px4, ardupilot])
 
 
@@ -64,6 +65,8 @@ class Checked:
 
     async def ask(self, method: str, path: str, status: int = 200, **options: Any) -> Any:
         """What is answered, as JSON; the status must be this one."""
+        if "content" in options:
+            options["headers"] = A_FILE
         answer = await self.client.request(method, path, **options)
         assert answer.status_code == status, answer.text
         assert answer.headers["content-type"] in ("application/json", "application/problem+json")
@@ -506,7 +509,7 @@ async def test_files_are_read_one_after_the_other_and_not_without_end() -> None:
         answers = []
 
         async def upload() -> None:
-            answer = await service.client.post("/api/v1/files?name=a.param", content=b"A,1\n")
+            answer = await service.client.post("/api/v1/files?name=a.param", content=b"A,1\n", headers=A_FILE)
             answers.append(answer.status_code)
 
         async with anyio.create_task_group() as tasks:
@@ -663,11 +666,13 @@ async def test_who_may_only_read_changes_nothing(tmp_path: Path) -> None:
     on_board = px4()
     async with Hub([on_board], cache=False) as hub:
         await until(lambda: hub.followed, pause=0.1)
-        transport = ASGITransport(create_app(hub), state={"role": "read", "asker": "guest"})
-        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1:8765") as client:
+        tokens = Tokens.of_text("guest read guest-may-read-only-0123")
+        app = create_app(hub, Settings(access=AccessSettings(tokens=tokens)))
+        async with a_browser(app) as client:
+            client.headers["authorization"] = "Bearer guest-may-read-only-0123"
             body = {"wanted": {"values": {"MODE": 4}}}
             for path in ("apply", "restore", "snapshots"):
                 assert (await client.post(f"{HERE}/{path}", json=body)).status_code == 403
-            assert (await client.put(f"{HERE}/metadata", content=b"{}")).status_code == 403
+            assert (await client.put(f"{HERE}/metadata", json={})).status_code == 403
             assert (await client.post(f"{HERE}/plan", json=body)).status_code == 200
     assert on_board.values["MODE"] == 3
