@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -23,6 +24,8 @@ from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.protocol import wire
 from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
 from paramclient.service.hub import MOST_READINGS
+from paramclient.service.routes.files import attachment
+from paramclient.service.wanted import LARGEST_UPLOAD
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.sim.vehicle import Vehicle
 from paramclient.values import ParamType
@@ -438,6 +441,18 @@ async def test_a_table_comes_as_a_file_of_every_form_and_goes_back(vehicle: Call
 
 
 @swiftly
+async def test_the_name_of_a_file_is_safe_whoever_the_vehicle_is() -> None:
+    whose = replace(PX4, autopilot=200, system=9)
+    params = ParamSet(
+        {"A": WrittenParam("A", 1, ParamType.INT32)}, system=9, component=1, identity=whose, at=NOW
+    )
+    async with Hub([], cache=False) as hub:
+        answer = await attachment(hub, params, FileForm.QGC)
+    name = "autopilot_200-9-1-20261118-110640.params"
+    assert answer.headers["content-disposition"] == f'attachment; filename="{name}"'
+
+
+@swiftly
 async def test_an_earlier_state_comes_as_a_file_too(tmp_path: Path) -> None:
     async with serving(px4(), place=tmp_path) as service:
         kept = await service.ask("POST", f"{HERE}/snapshots", 201, json={"reason": "as it came"})
@@ -491,7 +506,11 @@ async def test_a_file_is_read_and_its_faults_are_told_by_line() -> None:
         assert (await upload(b"", 422))["error"] == "FileError"
         assert (await upload(b"{" * 100_000, 422, form="json"))["error"] == "FileError"
         assert (await upload(b"- " * 50_000, 422, form="yaml"))["error"] == "FileError"
-        assert (await upload(b"\0" * 17_000_000, 413))["type"] == "urn:paramclient:too-large"
+        assert (await upload(b"A,1\n" * (LARGEST_UPLOAD // 4 + 1), 413))[
+            "type"
+        ] == "urn:paramclient:too-large"
+        large = {"file": {"name": "a.param", "text": "A,1\n" * (LARGEST_UPLOAD // 4 + 1)}}
+        assert (await service.post(f"{HERE}/plan", {"wanted": large}, 413))["most"] == LARGEST_UPLOAD
         several = dumps(
             [
                 ParamSet({"A": WrittenParam("A", 1, ParamType.INT32)}, component=each, system=1)
