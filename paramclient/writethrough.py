@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -23,11 +24,13 @@ __all__ = ["WriteThrough", "chosen_cache"]
 
 FLUSH_INTERVAL: Final = 0.25
 """Seconds that changes are gathered for before they are written. A download fills several batches."""
-DOWNLOAD_INTERVAL: Final = 2.0
+DOWNLOAD_INTERVAL: Final = 10.0
 FEW_FETCHES: Final = 8
 """Seconds for which what a fetch under way brings is gathered, and the number of fetches above which that is
 done: most are over by then, and each table is written once, where parts of it would take several times as
-long."""
+long. So much of a download is lost where the process is killed in its course."""
+LEAST_NEW: Final = 0.5
+"""The share of a table that must be new for a part of it to be written: that costs as much as all of it."""
 PORTION: Final = 2_000
 """Parameters after which a transaction ends, of those that are written together: to gather so many takes a
 few milliseconds, in which nothing else is done."""
@@ -223,7 +226,13 @@ class WriteThrough:
 
     def _is_for_later(self, kept: _Kept) -> bool:
         """Whether a fetch brings more of it that is better written together."""
-        return kept.machine.fetch is not None and anyio.current_time() < kept.written_at + DOWNLOAD_INTERVAL
+        fetch, table = kept.machine.fetch, kept.machine.table
+        if fetch is None:
+            return False
+        if len(table.dirty) < LEAST_NEW * len(table.params):
+            return True
+        began_at = fetch.first_value_at if fetch.first_value_at < math.inf else fetch.begun_at
+        return anyio.current_time() < max(kept.written_at, began_at) + DOWNLOAD_INTERVAL
 
     async def _write(self, news: list[_News]) -> bool:
         """Write what was gathered; false when the cache could not take it."""
