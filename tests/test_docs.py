@@ -18,6 +18,7 @@ import paramclient
 import paramclient.links
 import paramclient.metadata
 import paramclient.provision
+import paramclient.remote
 import paramclient.sim
 import paramclient.testing
 
@@ -114,7 +115,7 @@ def test_every_page_is_in_the_table_of_contents() -> None:
     "module",
     [
         *(paramclient, paramclient.links, paramclient.metadata, paramclient.provision),
-        *(paramclient.sim, paramclient.testing),
+        *(paramclient.remote, paramclient.sim, paramclient.testing),
     ],
     ids=lambda m: m.__name__,
 )
