@@ -1,5 +1,7 @@
 /** The service: requests, and its stream of events. */
 
+/** What this page calls itself with every write, so that it knows its own changes among those of others. */
+export const ASKER = `page-${crypto.getRandomValues(new Uint16Array(1))[0].toString(16).padStart(4, "0")}`;
 const BASE = "/api/v1";
 const PATIENCE = 15_000;
 const PULSE = 10_000;
@@ -53,7 +55,7 @@ export const addressOf = (address) => BASE + address;
 
 async function attempt(method, address, body, patience, signal) {
   const ends = AbortSignal.timeout(patience);
-  const options = { method, signal: signal ? AbortSignal.any([signal, ends]) : ends, headers: {}, cache: "no-store" };
+  const options = { method, signal: signal ? AbortSignal.any([signal, ends]) : ends, headers: { "X-Asker": ASKER }, cache: "no-store" };
   if (body instanceof Blob) {
     options.body = body;
     options.headers["Content-Type"] = "application/octet-stream";

@@ -10,7 +10,7 @@ import { Grid } from "./grid.js";
 import { nameOf, review, told, undo } from "./review.js";
 import { NEWS_FOR, store } from "./store.js";
 import { defaultOf, many, parse } from "./values.js";
-import { complain, drawActions, drawVehicles } from "./vehicles.js";
+import { complain, drawActions, drawVehicles, offerDescriptions } from "./vehicles.js";
 
 const FILTERS = {
   all: { text: "All", has: () => true },
@@ -66,6 +66,7 @@ function drawTable() {
   drawChips();
   drawEmpty(chosen.length, rows.length);
   drawBar();
+  offerDescriptions();
   const active = grid.active;
   details.refresh(table.rows.get(details.name));
   if (editor.row) editor.refresh(table.rows.get(editor.row.name));
@@ -200,7 +201,7 @@ store.on("news", ({ key, row }) => {
   if (!news.length) {
     setTimeout(() => {
       const [first] = news;
-      announce(news.length === 1 ? `${first.name} is ${first.text} now, by ${first.news?.by ?? "the vehicle"}.` : `${news.length} parameters were changed by others.`);
+      announce(news.length === 1 ? `${first.name} is ${first.text} now, by ${first.news?.by}.` : `${news.length} parameters were changed by others.`);
       news.length = 0;
     }, 1000);
   }

@@ -114,7 +114,7 @@ function fill(list, items, nothing, parts) {
 function otherOf(label, params, source, isPartial, notes = []) {
   const values = new Map();
   for (const [name, param] of Object.entries(params)) {
-    values.set(name, { text: valueText(param, param.type ?? typeOf(name)), send: param.bits ? { bits: param.bits } : param.value });
+    values.set(name, { text: valueText(param, param.type ?? typeOf(name)) });
   }
   return { label, values, source, isPartial, notes };
 }
@@ -188,10 +188,9 @@ export async function takeOver() {
     cancel.replaceChildren(el("span", { text: "Stop" }));
     cancel.onclick = null;
     summary.textContent = "Applying …";
-    const wanted = { values: Object.fromEntries(chosen.map((line) => [line.name, line.send])) };
-    const include = chosen.filter((line) => line.status === "skipped").map((line) => line.name);
+    const include = chosen.filter((line) => line.status === "skipped").map((line) => exactly(line.name));
     try {
-      job = await request("POST", at(component, "/apply"), { wanted, include, allow_armed: component.is_armed === true, skip_invalid: true, wait: false });
+      job = await request("POST", at(component, "/apply"), { wanted: other.source, only: chosen.map((line) => exactly(line.name)), include, allow_armed: component.is_armed === true, skip_invalid: true, wait: false });
       const ended = await followJob(job, (progress) => {
         if (progress?.total) summary.textContent = `${PHASES[progress.phase] ?? "Applying"}: ${progress.done} of ${progress.total}`;
       });
@@ -246,6 +245,9 @@ export async function takeOver() {
   await opened;
 }
 
+/** A pattern that means this name alone. */
+const exactly = (name) => name.replace(/[*?[]/g, "[$&]");
+
 const PHASES = { reading: "Reading", writing: "Writing", rebooting: "Starting again" };
 const MUST_NOT = new Set(["invalid"]);
 
@@ -265,7 +267,7 @@ function linesOf(plan, table, other, refresh) {
       const remark = el("td", { class: "remark" }, status !== "set" && el("b", { class: "outcome quiet", text: isOut ? "cannot be set" : "left out" }), ` ${planned.reason || (status === "set" ? (purposes.get(name) ?? "") : "")}`);
       const element = el("tr", { class: isOut ? "out" : "" }, el("td", {}, box), el("th", { scope: "row", text: name }), el("td", { text: row?.text ?? "" }), el("td", { class: "new", text: numberText(planned.wanted, row?.type ?? planned.type) }), remark);
       const restore = row?.document.bits ? { bits: row.document.bits } : row?.document.value;
-      return { name, status, box, remark, element, before: row?.text ?? "", restore, send: other.values.get(name)?.send ?? planned.wanted };
+      return { name, status, box, remark, element, before: row?.text ?? "", restore };
     });
 }
 

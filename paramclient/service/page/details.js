@@ -3,7 +3,7 @@
 import { at, get } from "./api.js";
 import { button, byId, el, isNarrow } from "./dom.js";
 import { editorOf } from "./editor.js";
-import { store } from "./store.js";
+import { authorOf, store } from "./store.js";
 import { defaultOf, meaningOf, moment, numberText, parse, rangeOf, span, textOf } from "./values.js";
 
 const MOST_HISTORY = 20;
@@ -99,7 +99,7 @@ export class Details {
     this.value.replaceChildren(
       el("b", { text: row.text }),
       el("span", { text: row.meaning || info?.units || "" }),
-      !row.news ? "" : el("em", { text: `was ${row.news.before}, changed ${span((Date.now() - row.news.at) / 1000)} ago by ${row.news.by ?? "the vehicle"}` }),
+      !row.news ? "" : el("em", { text: `was ${row.news.before}, changed ${span((Date.now() - row.news.at) / 1000)} ago by ${row.news.by}` }),
     );
     const standard = defaultOf(known);
     const facts = [
@@ -145,7 +145,7 @@ export class Details {
       "li",
       {},
       el("span", { class: "step", text: `${old} → ${now}` }),
-      el("small", { text: `${moment(timeOf(entry))} · ${entry.by}` }),
+      el("small", { text: `${moment(timeOf(entry))} · ${authorOf(entry.by)}` }),
       store.mayWrite &&
         button("Take", () => {
           const read = parse(old, row.type);

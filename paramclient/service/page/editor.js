@@ -62,7 +62,7 @@ export function editorOf(row, pending, { stage, leave, isCompact = true }) {
   );
   form.first = input.first;
   form.refresh = (now) => {
-    if (!sameText(now.text, row.text, type)) news.textContent = `Meanwhile it is ${now.text}${now.news?.by ? `, by ${now.news.by}` : ""}.`;
+    if (!sameText(now.text, row.text, type)) news.textContent = `Meanwhile it is ${now.text}${now.news ? `, by ${now.news.by}` : ""}.`;
   };
   return form;
 }

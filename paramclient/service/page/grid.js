@@ -23,7 +23,7 @@ export class Grid {
     this.name = null;
     this.made = new Map();
     this.spare = [];
-    this.root.addEventListener("scroll", () => this.draw(), { passive: true });
+    this.root.addEventListener("scroll", () => this.draw(false), { passive: true });
     this.root.addEventListener("keydown", (event) => this.key(event));
     this.body.addEventListener("click", (event) => this.click(event));
     this.body.addEventListener("dblclick", (event) => this.click(event, true));
@@ -39,6 +39,7 @@ export class Grid {
   measure() {
     this.height = isNarrow() ? 58 : 32;
     this.view = this.root.clientHeight;
+    this.top = this.head.offsetHeight;
     for (const made of this.made.values()) made.at = -1;
     this.resize();
     this.draw();
@@ -59,9 +60,9 @@ export class Grid {
     setAttribute(this.root, "aria-rowcount", this.rows.length + 1);
   }
 
-  /** Draws what is in sight: rows that go out of sight are used again for those that come in. */
-  draw() {
-    const top = Math.max(0, this.root.scrollTop - this.head.offsetHeight);
+  /** Draws what is in sight, or of that what has come into sight: rows that went out are used again for it. */
+  draw(isAnew = true) {
+    const top = Math.max(0, this.root.scrollTop - this.top);
     const from = Math.max(0, Math.floor(top / this.height) - SPARE);
     const to = Math.min(this.rows.length, Math.ceil((top + this.view) / this.height) + SPARE);
     for (const [index, made] of this.made) {
@@ -72,6 +73,7 @@ export class Grid {
     }
     for (let index = from; index < to; index++) {
       let made = this.made.get(index);
+      if (made && !isAnew) continue;
       if (!made) {
         made = this.spare.pop() ?? this.make();
         this.made.set(index, made);
@@ -133,7 +135,7 @@ export class Grid {
     if (element.className !== kind) element.className = kind;
     setAttribute(element, "aria-selected", index === this.index);
     setAttribute(made.value, "aria-description", said(row, pending));
-    setAttribute(element, "title", row.news ? `${row.news.before} → ${textOf(row.document)}, changed by ${row.news.by ?? "the vehicle"}` : null);
+    setAttribute(element, "title", row.news ? `${row.news.before} → ${textOf(row.document)}, changed by ${row.news.by}` : null);
   }
 
   /** Goes to a row and keeps it in sight. */
@@ -142,9 +144,9 @@ export class Grid {
     this.index = Math.max(0, Math.min(this.rows.length - 1, index));
     this.name = this.rows[this.index].name;
     const top = this.index * this.height;
-    const head = this.head.offsetHeight;
+    const bottom = top + this.height + this.top - this.view;
     if (top < this.root.scrollTop) this.root.scrollTop = top;
-    else if (top + this.height + head > this.root.scrollTop + this.view) this.root.scrollTop = top + this.height + head - this.view;
+    else if (bottom > this.root.scrollTop) this.root.scrollTop = bottom;
     this.draw();
     this.moved(this.active);
   }
@@ -192,7 +194,7 @@ function said(row, pending) {
   const words = [
     pending && `staged: ${pending.text}`,
     row.isChanged && "changed from default",
-    row.news && `was ${row.news.before}, changed by ${row.news.by ?? "the vehicle"}`,
+    row.news && `was ${row.news.before}, changed by ${row.news.by}`,
     row.document.trust === "cached" && "from the cache, not confirmed",
   ];
   return words.filter(Boolean).join("; ") || null;

@@ -1,6 +1,6 @@
 /** What the page knows: vehicles, tables, what is to be sent, what was sent. It draws nothing. */
 
-import { at, get } from "./api.js";
+import { ASKER, at, get } from "./api.js";
 import { isChanged, meaningOf, sameText, textOf } from "./values.js";
 
 /** Changes of others are marked for so long, in milliseconds. */
@@ -105,7 +105,7 @@ class Table {
     const isTrust = event.old && sameText(textOf(event.old), textOf(event.new), row.type);
     row.take(document);
     if (isTrust || sameText(before, row.text, row.type)) return null;
-    row.news = { at: Date.now(), by: event.by, before };
+    row.news = { at: Date.now(), by: authorOf(event.by), before };
     return row;
   }
 
@@ -163,13 +163,12 @@ class Store {
       table.isLoaded = false;
       table.early = null;
     }
-    const [me, links, found] = await Promise.all([get("/me"), get("/links"), get("/components")]);
+    const [me, links, found] = await Promise.all([get("/me").catch(() => ({ role: "write", read_only: false })), get("/links"), get("/components")]);
     if (load !== this.loads) return;
     this.me = me;
     this.links = new Map(links.links.map((link) => [link.name, link]));
     const documents = new Map(found.components.map((each) => [keyOf(each), each]));
     this.components = documents;
-    for (const key of this.tables.keys()) if (!documents.has(key)) this.tables.delete(key);
     this.seq = found.seq;
     const early = this.early;
     this.early = null;
@@ -192,7 +191,13 @@ class Store {
     table.isLoaded = false;
     table.early = [];
     const load = ++table.loads;
-    const found = await get(at(component, "/params", { metadata: "true" }));
+    table.isLoading = true;
+    let found;
+    try {
+      found = await get(at(component, "/params", { metadata: "true" }));
+    } finally {
+      table.isLoading = load !== table.loads;
+    }
     if (load !== table.loads) return;
     table.load(found.params, found.seq);
     if (key === this.selected) this.tell("table");
@@ -230,7 +235,8 @@ class Store {
     if (event.seq <= this.seq) return;
     if (event.why === "forgotten") {
       this.components.delete(key);
-      this.tables.delete(key);
+      const table = this.tables.get(key);
+      if (table) table.isLoaded = false; // what was staged waits for the vehicle to come back
     } else {
       const document = event.component_doc;
       const before = this.components.get(key);
@@ -238,6 +244,8 @@ class Store {
       if (before && Boolean(before.is_armed) !== Boolean(document.is_armed)) this.tell("armed", document);
       if (before && before.is_lost !== document.is_lost) this.tell("lost", document);
     }
+    const isBack = key === this.selected && event.why !== "forgotten" && !this.table.isLoaded && !this.table.isLoading;
+    if (isBack) this.loadTable(key).catch(() => {});
     if (!this.component) {
       const key = first(this.components);
       if (key) this.select(key);
@@ -249,9 +257,9 @@ class Store {
     const table = this.tables.get(key);
     if (!table) return;
     const row = table.change(event);
-    if (row) {
-      const sent = table.sent?.names.has(row.name) && isOurs(event.by);
-      if (sent) row.news = null;
+    if (row?.info?.is_volatile) row.news = null;
+    else if (row) {
+      if (event.by?.includes(ASKER)) row.news = null;
       else this.tell("news", { key, row });
     }
     if (key === this.selected) this.tell("table");
@@ -284,8 +292,13 @@ class Store {
 
 const NO_TABLE = new Table();
 
-/** Whether a change was asked for at the service, by whomever; what this page sent is known by its names. */
-const isOurs = (by) => typeof by === "string" && by.startsWith("us");
+/** Who changed a value, in words. */
+export function authorOf(by) {
+  if (!by || by === "vehicle") return "the vehicle";
+  if (by.includes(ASKER)) return "you";
+  if (by === "us") return "the service";
+  return by.startsWith("us for ") ? by.slice(7) : by;
+}
 
 /** Autopilots go before cameras and the like. */
 function first(components) {

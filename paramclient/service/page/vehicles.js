@@ -16,6 +16,8 @@ const STATES = {
   fetching: "fetching",
   lost: "lost",
 };
+/** A file of descriptions may have 100 kB, and the radio 2 kB a second. */
+const DESCRIPTION_PATIENCE = 300_000;
 const KINDS = { new: "idle", cached: "warn", partial: "warn", synced: "good", fetching: "busy", lost: "bad" };
 /** The kinds of vehicle of MAV_TYPE that have parameters worth a name. */
 const TYPES = { 1: "plane", 2: "quadrotor", 3: "coaxial", 4: "helicopter", 10: "rover", 11: "boat", 12: "submarine", 13: "hexarotor", 14: "octorotor", 15: "tricopter", 19: "tailsitter", 20: "tailsitter", 21: "tiltrotor", 22: "VTOL", 26: "gimbal", 30: "camera" };
@@ -111,6 +113,7 @@ export function drawActions() {
   const actions = [
     button("Compare", () => chooseOther(), { drawing: "compare" }),
     button("Save", save, { drawing: "save" }),
+    button("Describe", describe, { drawing: "help", label: "Ask the vehicle what its parameters mean", id: "describe", hidden: true }),
     store.mayWrite && button("Snapshot", keepState, { drawing: "keep", label: "Snapshot: keep the present state, to compare with and go back to" }),
     button("Fetch", fetchAll, { drawing: "refresh", label: "Fetch all parameters from the vehicle" }),
   ];
@@ -126,6 +129,44 @@ async function fetchAll() {
   } catch (error) {
     complain(error);
   }
+}
+
+/** Gets descriptions of the parameters, from the vehicle, which may take a while over a radio, or from a file. */
+async function describe() {
+  const { component } = store;
+  const fault = el("p", { class: "fault", role: "alert" });
+  const state = el("p", { role: "status" });
+  const attempt = async (method, body) => {
+    fault.textContent = "";
+    state.textContent = "Reading …";
+    try {
+      const { count } = await request(method, at(component, "/metadata"), body, { patience: DESCRIPTION_PATIENCE });
+      await store.loadTable(keyOf(component));
+      closeDialog();
+      announce(`${many(count, "parameter")} described.`);
+    } catch (error) {
+      fault.textContent = error.message;
+    }
+    state.textContent = "";
+  };
+  const input = el("input", { type: "file", id: "file", on: { change: () => input.files[0] && attempt("PUT", input.files[0]) } });
+  const ask = button("Ask the vehicle", () => attempt("POST", {}), { kind: "strong" });
+  const content = el(
+    "div",
+    {},
+    el("p", { text: "Units, ranges and the names of values are not known here yet. A vehicle with PX4 can tell them; for others there is a file of their firmware." }),
+    el("h3", { text: "From a file" }),
+    el("label", { class: "drop", for: "file" }, el("span", { text: "apm.pdef.xml, parameters.json or the like" }), input),
+    state,
+    fault,
+  );
+  await openDialog(`Describe the parameters of ${nameOf(component)}`, content, [button("Cancel", closeDialog, { kind: "quiet" }), ask], { focus: ask });
+}
+
+/** Offers that where nothing is described. */
+export function offerDescriptions() {
+  const { table } = store;
+  byId("describe").hidden = !table.isLoaded || !table.rows.size || table.sorted.some((row) => row.info);
 }
 
 async function stopFetch() {
