@@ -15,6 +15,7 @@ from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.events import Changes
 from paramclient.identity import Identity, autopilot_name
 from paramclient.params import ParamMap
+from paramclient.protocol.authors import check_asker
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.operation import Operation
@@ -195,6 +196,7 @@ class Component:
         value: SupportsIndex | SupportsFloat | bytes,
         *,
         timeout: float | None = None,
+        asker: str | None = None,
     ) -> SetResult:
         """Write one parameter and prove by its value that the vehicle has taken it.
 
@@ -205,13 +207,15 @@ class Component:
             name: param_id.
             value: a number; or the 4 bytes of the message for what cannot be said as a number.
             timeout: as in `get`.
+            asker: for whom it is done, in printable ASCII: the change, and its line of history, are then by
+                "us for ASKER".
 
         Returns:
             Accepted, or adjusted: the vehicle made another value of it.
 
         Raises:
-            UsageError: the name or the value cannot be right, or the client only listens. Nothing was
-                written.
+            UsageError: the name, the value or the asker cannot be right, or the client only listens. Nothing
+                was written.
             UnknownParameter: the vehicle does not have it.
             Refused: it gave a reason.
             TypeMismatch: it holds the parameter in another type.
@@ -223,7 +227,7 @@ class Component:
             raise UsageError(f"{HASH_CHECK} is no parameter: it can be read, and not written")
         machine = self._machine
         self._client._check_open()
-        write = machine.write(name, check_value(value), anyio.current_time())
+        write = machine.write(name, check_value(value), anyio.current_time(), check_asker(asker))
         try:
             what = f"PARAM_SET {name} to {self.system}/{self.component}"
             return await self._wait(write, timeout, lambda: (what, write.attempts))

@@ -144,8 +144,10 @@ class ComponentMachine(Parts):
             self._count_moved(count, now)
         authors = self._authors
         writes = self.writes
-        is_ours = bool(writes.queues) and name in writes
-        by = "us" if is_ours else authors.of(name, now) if authors.foreign_sets else "vehicle"
+        by = writes.author(name) if writes.queues else None
+        is_ours = by is not None
+        if by is None:
+            by = authors.of(name, now) if authors.foreign_sets else "vehicle"
         change = table.hear(message, by, is_exact=is_ours and writes.wants(message))
         if change is not None:
             authors.changed(name, now, is_ours)
@@ -216,8 +218,8 @@ class ComponentMachine(Parts):
         read.is_of_caller = True
         return read
 
-    def write(self, name: str, value: Value, now: float) -> Write:
-        """Write one parameter.
+    def write(self, name: str, value: Value, now: float, asker: str | None = None) -> Write:
+        """Write one parameter, for somebody.
 
         Raises:
             UsageError: the type is known and the value does not fit it. Nothing was sent.
@@ -228,7 +230,7 @@ class ComponentMachine(Parts):
         known = self.table.params.get(name)
         if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
             encode(value, known.type, self.table.encoding)
-        write = self.writes.set(name, value, now)
+        write = self.writes.set(name, value, now, asker)
         write.on_done.append(lambda: self._write_ended(write.ended_at))
         return write
 

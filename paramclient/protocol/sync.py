@@ -10,6 +10,7 @@ from functools import partial
 from typing import Final
 
 from paramclient.errors import UnknownParameter, UsageError
+from paramclient.protocol.authors import is_ours
 from paramclient.protocol.fetch import FRESH_HASH, Fetch
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.refresh import Refresh
@@ -214,7 +215,7 @@ class Sync:
         """A parameter has changed: the hash that was announced is of the past, unless that leaves it out."""
         name, _, _, by = change
         if name not in self._table.volatile:
-            if by != "us":
+            if not is_ours(by):
                 self._moved_by_us_alone = False
             announced = self.announced
             if announced is not None and announced.at != _PAST:

@@ -1,0 +1,113 @@
+"""The application: routers, problems, the pages, and what every answer carries."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import MutableMapping
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any, Final
+
+from fastapi import FastAPI, Request, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from paramclient.service import problems
+from paramclient.service.hub import Hub
+from paramclient.service.problems import RESPONSES, ServiceError
+from paramclient.service.routes import ROUTERS
+from paramclient.version import __version__
+
+__all__ = ["Settings", "create_app"]
+
+CONTENT_SECURITY_POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+HEADERS: Final = (
+    (b"content-security-policy", CONTENT_SECURITY_POLICY.encode()),
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+)
+"""What every answer carries, so that a text from a vehicle can never become a program in a browser."""
+MEDIA_TYPES: Final = {
+    "html": "text/html; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "svg": "image/svg+xml",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """How the application is to be."""
+
+
+def create_app(hub: Hub, settings: Settings | None = None) -> ASGIApp:
+    """The application over a hub, which is opened and closed by whoever has made it."""
+    app = FastAPI(
+        title="paramclient",
+        version=__version__,
+        summary="MAVLink parameters of everyone who is heard on the links of this service",
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+        responses=RESPONSES,
+    )
+    app.state.hub = hub
+    problems.install(app)
+    for router in ROUTERS:
+        app.include_router(router)
+    _add_files(app, "page", index="/", prefix="/page/")
+    _add_files(app, "reference", index="/docs", prefix="/docs/")
+    return _Stamped(app, hub)
+
+
+class _Stamped:
+    """Gives every answer the number of the newest event, and the headers that are the same for all."""
+
+    def __init__(self, app: ASGIApp, hub: Hub) -> None:
+        self._app = app
+        self._feed = hub.feed
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+
+        async def stamped(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                given = list(message.get("headers", ()))
+                names = {name for name, _ in given}
+                given.extend(header for header in HEADERS if header[0] not in names)
+                if b"cache-control" not in names:
+                    given.append((b"cache-control", b"no-store"))
+                given.append((b"x-seq", str(self._feed.place).encode()))
+                message["headers"] = given
+            await send(message)
+
+        await self._app(scope, receive, stamped)
+
+
+def _add_files(app: FastAPI, folder: str, *, index: str, prefix: str) -> None:
+    """Serve the files of a folder of this package as they are; they are few and small, and stay in memory."""
+    files: MutableMapping[str, tuple[bytes, str, str]] = {}
+    place = resources.files("paramclient.service").joinpath(folder)
+    for file in place.iterdir() if place.is_dir() else ():
+        media_type = MEDIA_TYPES.get(file.name.rpartition(".")[2])
+        if media_type is not None:
+            content = file.read_bytes()
+            files[file.name] = (content, media_type, f'"{hashlib.sha256(content).hexdigest()[:16]}"')
+
+    async def answer(request: Request) -> Response:
+        name: Any = request.path_params.get("name", "index.html")
+        if name not in files:
+            raise ServiceError(404, "not-found", "There is nothing at this address.")
+        content, media_type, tag = files[name]
+        headers = {"etag": tag, "cache-control": "no-cache"}
+        if request.headers.get("if-none-match") == tag:
+            return Response(status_code=304, headers=headers)
+        return Response(content, media_type=media_type, headers=headers)
+
+    app.add_route(index, answer, methods=["GET"], include_in_schema=False)
+    app.add_route(f"{prefix}{{name}}", answer, methods=["GET"], include_in_schema=False)
