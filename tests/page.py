@@ -36,7 +36,6 @@ HOSTILE: dict[str, Value | tuple[ParamType, Value]] = {
     "<img src=x>": (ParamType.INT32, 2),
     "'\"></script>": (ParamType.INT32, 3),
     "A/../B?c#d%41": (ParamType.INT32, 4),
-    "WIDE": (ParamType.INT64, 2**62 + 1),
     "NOT_A_NUMBER": float("nan"),
 }
 HIGHEST = 3000

@@ -8,7 +8,7 @@ import { announce, button, byId, el, isNarrow, onceAFrame, setText } from "./dom
 import { CellEditor } from "./editor.js";
 import { Grid } from "./grid.js";
 import { nameOf, review, told, undo } from "./review.js";
-import { NEWS_FOR, store } from "./store.js";
+import { NEWS_FOR, OTHERS, store } from "./store.js";
 import { defaultOf, many, parse } from "./values.js";
 import { complain, drawActions, drawVehicles, offerDescriptions } from "./vehicles.js";
 
@@ -94,7 +94,7 @@ function drawGroups() {
   if (list.dataset.shown === key) return;
   list.dataset.shown = key;
   const hadFocus = list.contains(document.activeElement);
-  const names = [...groups.keys()].sort((a, b) => a.localeCompare(b));
+  const names = [...groups.keys()].sort((a, b) => Number(a === OTHERS) - Number(b === OTHERS) || a.localeCompare(b));
   const total = rows.size;
   const item = (group, text, count) =>
     el("li", {}, el("button", { type: "button", class: `group${group === shown.group ? " chosen" : ""}`, "aria-current": group === shown.group ? "true" : null, on: { click: () => choose({ group }) } }, el("span", { text }), waiting.has(group) && el("i", { class: "dot warn" }), el("small", { text: String(count) })));

@@ -3,14 +3,15 @@
 import { onToken, request } from "./api.js";
 import { button, byId, el } from "./dom.js";
 
-let ended = null;
+let asking = null;
+let end = () => {};
 
 /** Opens the dialog with this content; what it returns ends when it is closed. Esc closes unless `isHeld()`. */
 export function openDialog(title, content, buttons, { isHeld = () => false, kind = "", focus = null } = {}) {
   const dialog = byId("dialog");
-  if (dialog.open) dialog.close();
+  closeDialog();
   const heading = el("h2", { id: "dialog-title", text: title });
-  const close = button("", () => isHeld() || dialog.close(), { kind: "quiet only", drawing: "close", label: "Close" });
+  const close = button("", () => isHeld() || closeDialog(), { kind: "quiet only", drawing: "close", label: "Close" });
   dialog.className = kind;
   dialog.replaceChildren(el("header", {}, heading, close), el("div", { class: "scroll" }, content), el("footer", {}, buttons));
   dialog.oncancel = (event) => {
@@ -18,24 +19,30 @@ export function openDialog(title, content, buttons, { isHeld = () => false, kind
   };
   return new Promise((resolve) => {
     const back = document.activeElement;
-    dialog.onclose = () => {
+    end = () => {
+      end = () => {};
       dialog.replaceChildren();
       if (back?.isConnected) back.focus({ preventScroll: true });
       resolve();
     };
+    dialog.onclose = () => dialog.open || end();
     dialog.showModal();
     (focus ?? dialog.querySelector("footer .strong") ?? close).focus();
   });
 }
 
-export const closeDialog = () => byId("dialog").close();
+/** Ends it at once: the browser tells of its end later, when there may be another one. */
+export function closeDialog() {
+  byId("dialog").close();
+  end();
+}
 
 /** Asks for the token; all who wait for one wait for the same answer. */
 function askForToken() {
-  ended ??= ask().finally(() => {
-    ended = null;
+  asking ??= ask().finally(() => {
+    asking = null;
   });
-  return ended;
+  return asking;
 }
 
 async function ask() {

@@ -11,7 +11,8 @@ const OTHER = "other";
  */
 export function editorOf(row, pending, { stage, leave, isCompact = true }) {
   const { info, type } = row;
-  const value = pending?.text ?? row.text;
+  const before = row.text;
+  const value = pending?.text ?? before;
   const hint = el("p", { class: "hint", id: `hint-${isCompact ? "cell" : "sheet"}`, text: hints(row) });
   const fault = el("p", { class: "fault", role: "alert" });
   const doubts = el("p", { class: "doubt", role: "status" });
@@ -62,7 +63,7 @@ export function editorOf(row, pending, { stage, leave, isCompact = true }) {
   );
   form.first = input.first;
   form.refresh = (now) => {
-    if (!sameText(now.text, row.text, type)) news.textContent = `Meanwhile it is ${now.text}${now.news ? `, by ${now.news.by}` : ""}.`;
+    if (!sameText(now.text, before, type)) news.textContent = `Meanwhile it is ${now.text}${now.news ? `, by ${now.news.by}` : ""}.`;
   };
   return form;
 }

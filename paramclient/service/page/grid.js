@@ -7,6 +7,7 @@ import { byId, el, isNarrow, setAttribute, setText } from "./dom.js";
 import { defaultOf, textOf } from "./values.js";
 
 const SPARE = 10;
+const SETTLED = 120;
 
 export class Grid {
   /** `open(row)` edits, `show(row)` tells all of it, `moved(row)` says where the person stands; `table()` is what is shown. */
@@ -81,8 +82,16 @@ export class Grid {
       this.fill(made, index);
     }
     for (const made of this.spare) made.row.hidden = true;
+    clearTimeout(this.settling);
+    this.settling = setTimeout(() => this.settle(), SETTLED);
     const shown = this.made.get(this.index);
     setAttribute(this.root, "aria-activedescendant", shown ? shown.row.id : null);
+  }
+
+  /** Once it lies still, puts the rows into their order for those who read them one after the other. */
+  settle() {
+    const wanted = [...this.made].sort(([a], [b]) => a - b).map(([, made]) => made.row);
+    if (wanted.some((row, place) => this.body.children[place] !== row)) this.body.prepend(...wanted);
   }
 
   make() {

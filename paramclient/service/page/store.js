@@ -6,7 +6,7 @@ import { isChanged, meaningOf, sameText, textOf } from "./values.js";
 /** Changes of others are marked for so long, in milliseconds. */
 export const NEWS_FOR = 600_000;
 const FEWEST_OF_A_GROUP = 2;
-const OTHERS = "Others";
+export const OTHERS = "Others";
 
 export const keyOf = (component) => `${component.link} ${component.system}/${component.component}`;
 

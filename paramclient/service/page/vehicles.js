@@ -114,7 +114,7 @@ export function drawActions() {
     button("Compare", () => chooseOther(), { drawing: "compare" }),
     button("Save", save, { drawing: "save" }),
     button("Describe", describe, { drawing: "help", label: "Ask the vehicle what its parameters mean", id: "describe", hidden: true }),
-    store.mayWrite && button("Snapshot", keepState, { drawing: "keep", label: "Snapshot: keep the present state, to compare with and go back to" }),
+    store.mayWrite && button("Snapshot", keepState, { drawing: "keep", label: "Snapshot: keep the present state, to go back to" }),
     button("Fetch", fetchAll, { drawing: "refresh", label: "Fetch all parameters from the vehicle" }),
   ];
   byId("actions").replaceChildren(...actions.filter(Boolean));
