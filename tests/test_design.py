@@ -228,7 +228,8 @@ def test_only_the_service_loads_its_libraries(module: str) -> None:
             assert is_service, f"{module}:{each.line} imports {each.module}"
     for target, each in own_imports_of(module):
         if room_of(target).split(".")[0] == SERVICE and not is_service:
-            assert is_command(module) and not each.runs_at_import, f"{module}:{each.line} imports {target}"
+            assert is_command(module), f"{module}:{each.line} imports {target}"
+            assert not each.runs_at_import, f"{module}:{each.line} imports {target}"
 
 
 @EVERY_MODULE

@@ -75,7 +75,10 @@ class _Stamped:
             await self._app(scope, receive, send)
             return
 
+        is_answered = False
+
         async def stamped(message: Message) -> None:
+            nonlocal is_answered
             if message["type"] == "http.response.start":
                 given = list(message.get("headers", ()))
                 names = {name for name, _ in given}
@@ -85,8 +88,13 @@ class _Stamped:
                 given.append((b"x-seq", str(self._feed.place).encode()))
                 message["headers"] = given
             await send(message)
+            is_answered = message["type"] == "http.response.body" and not message.get("more_body", False)
 
-        await self._app(scope, receive, stamped)
+        try:
+            await self._app(scope, receive, stamped)
+        except Exception:
+            if not is_answered:  # else it is a problem that was answered and logged
+                raise
 
 
 def _add_files(app: FastAPI, folder: str, *, index: str, prefix: str) -> None:

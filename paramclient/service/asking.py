@@ -35,7 +35,7 @@ __all__ = [
 Result = TypeVar("Result")
 
 
-def hub_of(request: Request) -> Hub:
+async def hub_of(request: Request) -> Hub:
     """The hub of the application that a request has come to."""
     hub: Hub = request.app.state.hub
     return hub
@@ -52,7 +52,7 @@ Seconds = Annotated[
 ]
 
 
-def target_of(
+async def target_of(
     hub: TheHub,
     system: Annotated[int, Path(ge=1, le=255)],
     component: Annotated[int, Path(ge=0, le=255)],
@@ -71,7 +71,7 @@ def asker_of(request: Request) -> str:
     return asker
 
 
-def may_write(request: Request) -> None:
+async def may_write(request: Request) -> None:
     """Refuse those who may only read.
 
     Raises:

@@ -81,6 +81,7 @@ class Hub:
         self._began = time.monotonic()
         self._options = options
         self._worker = Worker("paramclient service")
+        self._closing = anyio.Event()
         self._tasks: anyio.abc.TaskGroup | None = None
         self._line_tasks: anyio.abc.TaskGroup | None = None
         for link in links:
@@ -117,6 +118,7 @@ class Hub:
         assert tasks is not None
         assert lines is not None
         self.feed.end()
+        self._closing.set()
         try:
             lines.cancel_scope.cancel()
             await lines.__aexit__(None, None, None)
@@ -185,6 +187,7 @@ class Hub:
         self._check_link(link)
         chosen = [line for line in self.lines.values() if link in (None, line.name)]
         found: list[Followed] = []
+        is_ending = False
         began = anyio.current_time()
         with anyio.move_on_after(timeout):
             async with anyio.create_task_group() as tasks:
@@ -195,8 +198,11 @@ class Hub:
 
                 for line in chosen:
                     tasks.start_soon(look, line)
-                if not chosen:
-                    await anyio.sleep_forever()
+                await self._closing.wait()
+                is_ending = True
+                tasks.cancel_scope.cancel()
+        if is_ending:
+            raise ServiceError(503, "closing", "The service is ending.")
         if not found:
             reasons = [f"; {line.error}" for line in chosen if line.state == "failed" and line.error]
             awaited = address_in_words(system, component) + "".join(reasons)

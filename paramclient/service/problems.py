@@ -10,9 +10,10 @@ from collections.abc import Iterable, Mapping
 from http import HTTPStatus
 from typing import Any, Final
 
-from fastapi import FastAPI, Request
-from fastapi.exceptions import RequestValidationError
+from fastapi import FastAPI, Request, WebSocket
+from fastapi.exceptions import RequestValidationError, WebSocketRequestValidationError
 from starlette.exceptions import HTTPException
+from starlette.requests import HTTPConnection
 from starlette.responses import Response
 
 from paramclient.documents.problem import Problem
@@ -84,6 +85,7 @@ def problem_response(problem: Problem, headers: Mapping[str, str] | None = None)
 def install(app: FastAPI) -> None:
     """Let an application answer with nothing else, in place of its own handlers."""
     app.add_exception_handler(RequestValidationError, _invalid)
+    app.add_exception_handler(WebSocketRequestValidationError, _invalid)
     app.add_exception_handler(HTTPException, _refused)
     app.add_exception_handler(ParamClientError, _failed)
     app.add_exception_handler(ServiceError, _failed)
@@ -100,14 +102,14 @@ RESPONSES: Final[dict[int | str, dict[str, Any]]] = {
 """What every route may answer besides, for the document of the API."""
 
 
-async def _invalid(_: Request, error: Exception) -> Response:
-    assert isinstance(error, RequestValidationError)
+async def _invalid(request: HTTPConnection, error: Exception) -> Response:
+    assert isinstance(error, RequestValidationError | WebSocketRequestValidationError)
     faults = [
         {"where": _where(fault.get("loc", ())), "what": str(fault.get("msg", ""))}
         for fault in error.errors()[:MOST_FAULTS]
     ]
     told = "; ".join(f"{fault['where']}: {fault['what']}" for fault in faults)
-    return problem_response(_problem(422, "invalid-request", told, {"faults": faults}))
+    return await _answer(request, _problem(422, "invalid-request", told, {"faults": faults}))
 
 
 async def _refused(_: Request, error: Exception) -> Response:
@@ -117,11 +119,19 @@ async def _refused(_: Request, error: Exception) -> Response:
     return problem_response(problem, error.headers)
 
 
-async def _failed(request: Request, error: Exception) -> Response:
+async def _failed(request: HTTPConnection, error: Exception) -> Response:
     problem = problem_of(error)
     if problem.status == 500:
-        logger.error("%s %s failed", request.method, request.url.path, exc_info=error)
-    return problem_response(problem)
+        logger.error("%s failed", request.url.path, exc_info=error)
+    return await _answer(request, problem)
+
+
+async def _answer(request: HTTPConnection, problem: Problem) -> Response:
+    """Answer with a problem; a WebSocket that is not open yet is refused with it."""
+    response = problem_response(problem)
+    if isinstance(request, WebSocket):
+        await request.send_denial_response(response)
+    return response
 
 
 def _problem(status: int, kind: str, detail: str, members: Mapping[str, Any]) -> Problem:

@@ -176,7 +176,7 @@ async def _write(
     target: Followed, name: str, given: ValueGiven, timeout: float | None, asker: str
 ) -> SetResultDoc:
     value = await value_of(target, name, given)
-    result = await target.component.set(name, value, timeout=timeout)
+    result = await target.component.set(name, value, timeout=timeout, asker=asker)
     target.was_heard(result.param.name)
     return SetResultDoc.of(result)
 

@@ -12,7 +12,7 @@ from starlette.types import Receive, Scope, Send
 from paramclient.service.asking import LinkName, TheHub
 from paramclient.service.feed import Listener, Place, Wanted
 from paramclient.service.hub import Hub
-from paramclient.service.problems import ServiceError, problem_of, problem_response
+from paramclient.service.problems import ServiceError
 
 __all__ = ["router"]
 
@@ -62,11 +62,7 @@ async def websocket(
 ) -> None:
     """The same events as text frames."""
     hub: Hub = socket.app.state.hub
-    try:
-        listener = _listener(hub, after, _wanted(types, link, system, component))
-    except ServiceError as error:
-        await socket.send_denial_response(problem_response(problem_of(error)))
-        return
+    listener = _listener(hub, after, _wanted(types, link, system, component))
     await socket.accept()
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(_cancel_when, "websocket.disconnect", socket.receive, tasks.cancel_scope)
