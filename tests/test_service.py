@@ -202,7 +202,7 @@ async def test_values_of_every_kind_are_written() -> None:
         assert known["I"].value == -1
         assert (await put("B", {"bits": "000000ff"}))["param"]["value"] == 255
 
-        for name, value in {"B": 256, "I": 0.5, "F": "fast", "b%07": 1}.items():
+        for name, value in {"B": 256, "I": 0.5, "F": "fast", "b\u00e9": 1}.items():
             problem(await browser.put(f"{C}/params/{name}", json={"value": value}), 422, "usage")
         problem(await browser.put(f"{C}/params/B", json={"value": {"bits": "100"}}), 422, "usage")
         for value in (None, True, [], {}, {"bits": "xyz"}, {"raw": "00"}):

@@ -29,6 +29,7 @@ from paramclient.cli.serve import serve
 from paramclient.cli.setup import apply, restore, verify
 from paramclient.cli.signing import disable, setup
 from paramclient.cli.simulate import sim
+from paramclient.cli.token import token
 from paramclient.cli.vehicle import fetch, get, set_, watch
 from paramclient.errors import ParamClientError
 from paramclient.version import __version__
@@ -271,6 +272,10 @@ _app.command(
         "serve udpin:0.0.0.0:14550",
         "serve serial:/dev/ttyACM0:57600 udpin:0.0.0.0:14550 --listen 127.0.0.1:0",
     ),
+)
+_app.command(
+    token,
+    help_epilogue=_examples("token anna --file tokens", "token wall-display --file tokens --read"),
 )
 _app.command(_cache)
 _app.command(ports, help_epilogue=_examples("ports", "ports --json"))

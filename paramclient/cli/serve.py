@@ -34,6 +34,10 @@ async def serve(
     no_cache: bool = False,
     fetch: Annotated[bool, Parameter(negative="--no-fetch")] = True,
     listen_only: bool = False,
+    token_file: Path | None = None,
+    read_only: bool = False,
+    host: tuple[str, ...] = (),
+    allow_origin: tuple[str, ...] = (),
     system_id: Id = None,
     component_id: Id = None,
     tls_cert: Path | None = None,
@@ -53,6 +57,14 @@ async def serve(
         no_cache: Neither read nor write a cache.
         fetch: Bring the tables of everyone who is heard up to date without being asked to.
         listen_only: Send nothing to vehicles, and take what others on the links ask for.
+        token_file: The tokens of those who may use it, see `paramclient token`. Without one, and without
+            PARAMCLIENT_SERVICE_TOKEN_FILE or PARAMCLIENT_SERVICE_TOKEN in the environment, only this machine
+            can connect.
+        read_only: Change nothing on any vehicle, whoever asks.
+        host: A name by which browsers and programs call this service, such as companion.local; may be given
+            several times.
+        allow_origin: A page elsewhere that may use it from a browser, such as https://station.example; may be
+            given several times.
         system_id: Our own system id on the links, 255 without it.
         component_id: Our own component id, 190 without it.
         tls_cert: A certificate in PEM, to be served over TLS.
@@ -78,9 +90,17 @@ async def serve(
         traffic=True,
     )
     listening = service.Listening.at(listen, tls_cert=tls_cert, tls_key=tls_key)
+    access = service.AccessSettings(
+        listen=listening.host,
+        tokens=service.tokens_from(token_file),
+        hosts=host,
+        origins=allow_origin,
+        read_only=read_only,
+    )
+    settings = service.Settings(access=access)
     with _stopping() as stop:
         await service.serve(
-            hub, listening=listening, stop=stop, listens=lambda url: print_line(f"serving on {url}")
+            hub, settings, listening=listening, stop=stop, listens=lambda url: print_line(f"serving on {url}")
         )
     return ExitCode.DONE
 

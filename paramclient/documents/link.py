@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from paramclient.documents.base import Document, Maybe
 
 if TYPE_CHECKING:
     from paramclient.stats import ClientStats
 
-__all__ = ["HealthDoc", "HealthLinkDoc", "LinkDoc", "LinksDoc", "StatsDoc"]
+__all__ = ["HealthDoc", "HealthLinkDoc", "LinkDoc", "LinksDoc", "MeDoc", "StatsDoc"]
 
 
 class StatsDoc(Document):
@@ -77,3 +77,11 @@ class HealthDoc(Document):
     version: str
     up_s: float
     links: Maybe[list[HealthLinkDoc]] = None
+
+
+class MeDoc(Document):
+    """Who asks, by the name of the token, and what that allows; where it is `read_only`, nobody may write."""
+
+    name: str
+    role: Literal["read", "write"]
+    read_only: bool

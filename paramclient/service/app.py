@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import MutableMapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any, Final
 
@@ -12,6 +12,7 @@ from fastapi import FastAPI, Request, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from paramclient.service import problems
+from paramclient.service.access import AccessMiddleware, AccessSettings
 from paramclient.service.hub import Hub
 from paramclient.service.problems import RESPONSES, ServiceError
 from paramclient.service.routes import ROUTERS
@@ -19,17 +20,6 @@ from paramclient.version import __version__
 
 __all__ = ["Settings", "create_app"]
 
-CONTENT_SECURITY_POLICY: Final = (
-    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
-    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
-)
-HEADERS: Final = (
-    (b"content-security-policy", CONTENT_SECURITY_POLICY.encode()),
-    (b"x-content-type-options", b"nosniff"),
-    (b"referrer-policy", b"no-referrer"),
-    (b"cross-origin-resource-policy", b"same-origin"),
-)
-"""What every answer carries, so that a text from a vehicle can never become a program in a browser."""
 MEDIA_TYPES: Final = {
     "html": "text/html; charset=utf-8",
     "css": "text/css; charset=utf-8",
@@ -40,7 +30,13 @@ MEDIA_TYPES: Final = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Settings:
-    """How the application is to be."""
+    """How the application is to be.
+
+    Attributes:
+        access: who is let in; without it, those on this machine.
+    """
+
+    access: AccessSettings = field(default_factory=AccessSettings)
 
 
 def create_app(hub: Hub, settings: Settings | None = None) -> ASGIApp:
@@ -60,11 +56,12 @@ def create_app(hub: Hub, settings: Settings | None = None) -> ASGIApp:
         app.include_router(router)
     _add_files(app, "page", index="/", prefix="/page/")
     _add_files(app, "reference", index="/docs", prefix="/docs/")
-    return _Stamped(app, hub)
+    access = Settings().access if settings is None else settings.access
+    return AccessMiddleware(_Stamped(app, hub), access)
 
 
 class _Stamped:
-    """Gives every answer the number of the newest event, and the headers that are the same for all."""
+    """Gives every answer the number of the newest event."""
 
     def __init__(self, app: ASGIApp, hub: Hub) -> None:
         self._app = app
@@ -81,10 +78,6 @@ class _Stamped:
             nonlocal is_answered
             if message["type"] == "http.response.start":
                 given = list(message.get("headers", ()))
-                names = {name for name, _ in given}
-                given.extend(header for header in HEADERS if header[0] not in names)
-                if b"cache-control" not in names:
-                    given.append((b"cache-control", b"no-store"))
                 given.append((b"x-seq", str(self._feed.place).encode()))
                 message["headers"] = given
             await send(message)

@@ -13,6 +13,7 @@ from pydantic import Field, StrictFloat, StrictInt
 from paramclient.documents.base import Body
 from paramclient.errors import UsageError
 from paramclient.metadata.info import number_of
+from paramclient.service import access
 from paramclient.service.following import Followed
 from paramclient.service.hub import Hub
 from paramclient.service.problems import ServiceError
@@ -67,17 +68,17 @@ Target = Annotated[Followed, Depends(target_of)]
 
 def asker_of(request: Request) -> str:
     """Who asks, as the history names them."""
-    asker: str = request.scope.get("state", {}).get("asker", "local")
+    asker: str = request.scope["state"]["asker"]
     return asker
 
 
 async def may_write(request: Request) -> None:
-    """Refuse those who may only read.
+    """Refuse those who may only read, where the address alone does not tell what is asked for.
 
     Raises:
         ServiceError: this is one of them.
     """
-    if request.scope.get("state", {}).get("role", "write") != "write":
+    if not access.may_write(request):
         raise ServiceError(403, "forbidden", "This may be done by those only who may write.")
 
 

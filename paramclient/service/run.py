@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
 
@@ -14,7 +14,9 @@ import uvicorn
 
 from paramclient.errors import LinkError, UsageError
 from paramclient.service.app import Settings, create_app
+from paramclient.service.connections import Connection
 from paramclient.service.hub import Hub
+from paramclient.service.tls import tls_of
 
 __all__ = ["Listening", "serve"]
 
@@ -54,8 +56,6 @@ class Listening:
         is_number = port.isascii() and port.isdecimal() and int(port) < 1 << 16
         if not (colon and bare and is_number) or (":" in bare and bare == host):
             raise UsageError(f"where to listen is HOST:PORT, such as 127.0.0.1:8765 or [::1]:0, not {text!r}")
-        if (tls_cert is None) != (tls_key is None):
-            raise UsageError("a certificate and its key go together")
         return cls(bare, int(port), tls_cert, tls_key)
 
     @property
@@ -103,9 +103,11 @@ async def serve(
 
     Raises:
         LinkError: nobody can listen there.
-        UsageError: the certificate cannot be used.
+        UsageError: the certificate cannot be used, or others could connect and there are no tokens.
     """
     listening = Listening() if listening is None else listening
+    settings = Settings() if settings is None else settings
+    settings = replace(settings, access=replace(settings.access, listen=listening.host))
     stop = anyio.Event() if stop is None else stop
     opened = _open(listening)
     try:
@@ -125,10 +127,12 @@ async def serve(
         opened.close()
 
 
-def _config(hub: Hub, settings: Settings | None, listening: Listening) -> uvicorn.Config:
-    config = uvicorn.Config(
+def _config(hub: Hub, settings: Settings, listening: Listening) -> uvicorn.Config:
+    tls = tls_of(listening.tls_cert, listening.tls_key)
+    return uvicorn.Config(
         create_app(hub, settings),
         lifespan="off",
+        http=Connection,
         ws="websockets-sansio",
         ws_max_size=LARGEST_FRAME,
         ws_per_message_deflate=False,
@@ -139,14 +143,9 @@ def _config(hub: Hub, settings: Settings | None, listening: Listening) -> uvicor
         backlog=BACKLOG,
         timeout_keep_alive=int(KEEP_ALIVE),
         timeout_graceful_shutdown=int(ENDING_TIME),
-        ssl_certfile=listening.tls_cert,
-        ssl_keyfile=listening.tls_key,
+        ssl_certfile=None if tls is None else tls.cert,
+        ssl_keyfile=None if tls is None else tls.key,
     )
-    try:
-        config.load()
-    except OSError as error:  # also ssl.SSLError
-        raise UsageError(f"the certificate {listening.tls_cert} cannot be used: {error}") from error
-    return config
 
 
 def _open(listening: Listening) -> socket.socket:

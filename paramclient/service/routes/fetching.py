@@ -14,7 +14,7 @@ from paramclient.documents.call import FetchedAllDoc, FetchResultDoc, SilentDoc
 from paramclient.documents.job import JobDoc, JobsDoc
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.protocol.sampling import SAMPLE_SIZE
-from paramclient.service.asking import LinkName, Seconds, Target, TheHub, answered, asker_of
+from paramclient.service.asking import LinkName, Seconds, Target, TheHub, answered, asker_of, may_write
 from paramclient.service.hub import Hub
 from paramclient.service.jobs import Job
 from paramclient.service.problems import problem_of
@@ -89,9 +89,12 @@ async def one_job(hub: TheHub, job: str) -> JobDoc:
 
 
 @router.delete("/jobs/{job}", status_code=204)
-async def cancel(hub: TheHub, job: str) -> Response:
+async def cancel(request: Request, hub: TheHub, job: str) -> Response:
     """Cancel it. A download goes on for as long as somebody else waits for it."""
-    hub.jobs.find(job).cancel()
+    found = hub.jobs.find(job)
+    if found.kind != "fetch":
+        await may_write(request)
+    found.cancel()
     return Response(status_code=204)
 
 
