@@ -59,11 +59,13 @@ class Bench:
     Attributes:
         url: where it is.
         px4, ardupilot, odd: the vehicles; what is done to them goes through `do`.
+        token: what other programs show to the service, where it wants one.
     """
 
     def __init__(self, portal: anyio.from_thread.BlockingPortal, url: str, **links: SimVehicle[Any]) -> None:
         self._portal = portal
         self.url = url
+        self.token = ""
         self.px4: Vehicle = links["px4"].vehicle
         self.ardupilot: Vehicle = links["ardupilot"].vehicle
         self.odd: Vehicle = links["odd"].vehicle
@@ -78,7 +80,7 @@ class Bench:
             f"{self.url}/api/v1{address}",
             method=method,
             data=None if body is None else json.dumps(body).encode(),
-            headers={"Content-Type": "application/json"},
+            headers={"Content-Type": "application/json", "Authorization": f"Bearer {self.token}"},
         )
         with urllib.request.urlopen(request, timeout=20) as answer:
             return json.loads(answer.read() or b"null")

@@ -12,6 +12,9 @@ from urllib.parse import urlsplit
 import pytest
 from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
 
+from paramclient.service import Settings
+from paramclient.service.access import AccessSettings
+from paramclient.service.tokens import Tokens
 from tests.page import BROWSER, BROWSER_OPTIONS, HIGHEST, HOSTILE, Bench, at_work
 
 FILES = Path(__file__).parent.parent / "paramclient/service/page"
@@ -567,6 +570,33 @@ def test_a_service_that_goes_and_comes_back(
         expect(sight.value("MC_PITCH_P")).to_contain_text("3.25")
         sight.send()  # what was staged has waited
         assert second.px4.values["MC_ROLL_P"] == 7.5
+
+
+@needs_browser
+def test_a_token_is_asked_for_and_who_may_only_read_sees_that(
+    visit: Callable[..., Sight], tmp_path: Path
+) -> None:
+    reader, writer = "r" * 32, "w" * 32
+    tokens = Tokens.of_text(f"visitor read {reader}\npilot write {writer}\n")
+    with at_work(tmp_path, Settings(access=AccessSettings(tokens=tokens))) as bench:
+        bench.token = reader
+        until(lambda: bench.is_synced(1))
+        sight = visit(bench.url, None)
+        field = sight.dialog.get_by_label("Token")
+        field.fill("x" * 32)
+        field.press("Enter")
+        expect(sight.dialog.get_by_role("alert")).to_have_text("The service does not know this token.")
+        field.fill(reader)
+        field.press("Enter")
+        expect(sight.page.locator("#role")).to_have_text("read-only")
+        sight.find("MC_ROLL_P")
+        sight.value("MC_ROLL_P").click()
+        expect(sight.details).to_contain_text("REAL32")
+        expect(sight.details.get_by_role("textbox")).to_have_count(0)
+        expect(sight.page.get_by_role("button", name="Snapshot")).to_have_count(0)
+        sight.page.reload()  # the token is in a cookie, which no script can read
+        expect(sight.page.locator("#role")).to_have_text("read-only")
+        assert sight.page.evaluate("document.cookie + JSON.stringify(localStorage)").find(reader) < 0
 
 
 @needs_browser
