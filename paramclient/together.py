@@ -62,8 +62,11 @@ class FetchTogether:
         self._fetches: dict[Address, Fetch] = {}
         self._is_cache_awaited = False
 
-    def join(self, now: float) -> None:
-        """Begin the fetches of components that have none yet, as soon as their cached table is there."""
+    def join(self, now: float) -> bool:
+        """Begin the fetches of components that have none yet, as soon as their cached table is there.
+
+        Gives whether any has begun.
+        """
         self._is_cache_awaited = False
         ready: dict[int, list[ComponentMachine]] = {}
         for address, component in self._components.items():
@@ -80,6 +83,7 @@ class FetchTogether:
             begun = self._station.begin_fetches(machines, now, refresh=self._refresh)
             for machine, fetch in zip(machines, begun, strict=True):
                 self._fetches[machine.system, machine.component] = fetch
+        return bool(ready)
 
     def is_worth_waiting(self, now: float, *, listen_until: float, hear_until: float) -> bool:
         """Whether more may come.

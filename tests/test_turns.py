@@ -123,7 +123,14 @@ def test_where_values_come_in_bursts_it_goes_faster() -> None:
         road.run()
         if road.running != seen[-1]:
             seen.append(road.running)
-    assert seen == [1, FAST_GROWTH, FAST_GROWTH**2, 100]
+    assert seen == [
+        1,
+        FAST_GROWTH,
+        FAST_GROWTH * GROWTH,
+        FAST_GROWTH * GROWTH**2,
+        FAST_GROWTH * GROWTH**3,
+        100,
+    ]
 
 
 def test_nobody_follows_before_those_that_run_have_shown_how_they_come() -> None:

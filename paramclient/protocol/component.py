@@ -68,6 +68,7 @@ class ComponentMachine(Parts):
         table: its parameters.
         round_trip: what its answers tell of the link.
         presence: whether it is there.
+        following: the list that another station has asked for, while none of ours comes.
         sync: whether the table is still the vehicle's.
         files: its files.
         descriptions: where it says that what it has to say of itself lies.
@@ -158,6 +159,8 @@ class ComponentMachine(Parts):
         fetch = self.fetches.current
         if fetch is not None:
             fetch.heard(message, now)
+        elif not self.reads.awaits(message):
+            self.following.heard(message, now)
         if writes.queues:
             writes.heard(message, now)
         self._value_heard(message, now)
@@ -385,6 +388,7 @@ class ComponentMachine(Parts):
         self._report(self.table.forget())
         self.sync.forget()
         self.fetches.forget()
+        self.following.forget()
         self._known_as = None
         if self.restart is not None:
             self.restart.another(now)
@@ -455,6 +459,7 @@ class ComponentMachine(Parts):
         """The vehicle has started again: what it had not saved is gone, and its list begins anew."""
         self._emit(events.ComponentRebooted(self))
         self._doubt()
+        self.following.forget()
         self._authors.clear()
         self.sync.check(now)
         self.who.doubt(now)

@@ -11,7 +11,7 @@ from typing import Final
 
 from paramclient.errors import UnknownParameter, UsageError
 from paramclient.protocol.authors import is_ours
-from paramclient.protocol.fetch import FRESH_HASH, Fetch
+from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.result import Announcement, FetchResult, Policy
@@ -299,7 +299,7 @@ class Sync:
     def compare(self, now: float) -> bool:
         """Whether the vehicle has just announced the hash that belongs to the table; then it is confirmed."""
         table, announced = self._table, self.announced
-        if announced is None or now - announced.at > FRESH_HASH or announced.hash != table.hash:
+        if announced is None or not announced.is_fresh(now) or announced.hash != table.hash:
             return False
         if not table.complete or announced.count != len(table.listed()):
             return False
