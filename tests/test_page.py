@@ -23,6 +23,8 @@ DESKTOP = {"width": 1280, "height": 800}
 PHONE = {"width": 390, "height": 844}
 PATIENCE = 15_000.0
 
+expect.set_options(timeout=PATIENCE)
+
 needs_browser = pytest.mark.skipif(
     BROWSER is None, reason="no Chromium is here to look at the page with: apt install chromium"
 )

@@ -121,7 +121,9 @@ export function told(outcomes) {
     const { text } = OUTCOMES[status] ?? { text: status };
     counts.set(text, (counts.get(text) ?? 0) + 1);
   }
-  return `${[...counts].map(([text, count]) => `${count} ${text}`).join(", ")}.`;
+  const order = Object.values(OUTCOMES).map(({ text }) => text);
+  const sorted = [...counts].sort(([a], [b]) => order.indexOf(a) - order.indexOf(b));
+  return `${sorted.map(([text, count]) => `${count} ${text}`).join(", ")}.`;
 }
 
 /** A vehicle as it is called. */
