@@ -18,6 +18,7 @@ __all__ = [
     "rounded",
     "time_or_none",
     "time_text",
+    "typed",
     "value_json",
     "value_written",
 ]
@@ -43,6 +44,17 @@ def value_json(value: Value, number: ParamType | int) -> Scalar:
 def value_written(value: Value, param: WrittenParam) -> Scalar:
     """The same for a parameter that may have no type: then it is the number as it is written."""
     return value_json(value, ParamType.REAL64 if param.type is None else param.type)
+
+
+def typed(value: Value, number: ParamType | int | None) -> tuple[Value, ParamType | int]:
+    """A value that was written for a parameter of this type, and the type in which to say it.
+
+    A whole number that was written for a float is the float that it is. Where the type is not known, it is
+    said as a REAL32.
+    """
+    kind = ParamType.REAL32 if number is None else number
+    is_float = number in (ParamType.REAL32, ParamType.REAL64)
+    return (float(value) if is_float and isinstance(value, int) else value), kind
 
 
 def bits_text(param: Param) -> str:

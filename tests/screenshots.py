@@ -15,7 +15,7 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 from tests.page import BROWSER, BROWSER_OPTIONS, Bench, at_work
 
 IMAGES = Path(__file__).parent.parent / "docs/images"
-DESKTOP: Any = {"viewport": {"width": 1280, "height": 720}}
+DESKTOP: Any = {"viewport": {"width": 1180, "height": 640}}
 PHONE: Any = {"viewport": {"width": 390, "height": 760}, "has_touch": True, "is_mobile": True}
 DESCRIBED = {
     "MC_ROLL_P": ("Gain from the roll angle's error to the roll rate", "1/s", 6.5, 0, 12),

@@ -20,15 +20,17 @@ from paramclient.values import Param, format_value, type_name
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from paramclient.documents import Document
+
 __all__ = [
     "Coloured",
-    "NO_DEFAULTS",
     "as_json",
     "by_index",
     "default_text",
     "live_view",
     "milliseconds",
     "param_json",
+    "print_document",
     "print_json",
     "print_line",
     "print_table",
@@ -38,10 +40,6 @@ __all__ = [
     "say",
 ]
 
-NO_DEFAULTS: Final = (
-    "the firmware's defaults are not known, so nor is what differs from them: they come with the parameter "
-    "file over MAVFTP, which ArduPilot and PX4 from 1.18 on serve"
-)
 UNLIMITED: Final = 10_000
 """Columns of an output that is no terminal: nothing is wrapped or cut there."""
 
@@ -105,6 +103,11 @@ def as_json(params: Iterable[Param]) -> dict[str, dict[str, Any]]:
 def print_json(result: object) -> None:
     """Print one object on one line, at once."""
     print(json.dumps(result, allow_nan=False), flush=True)
+
+
+def print_document(document: Document) -> None:
+    """Print a document of `paramclient.documents` on one line, at once."""
+    print_json(document.as_json())
 
 
 # for people

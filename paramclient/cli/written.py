@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import NO_DEFAULTS, print_json, print_table, printable, report, say
+from paramclient.cli.output import print_document, print_table, printable, report, say
 from paramclient.compare import same_value
 from paramclient.files import ParamFile
 from paramclient.files.model import address
 from paramclient.identity import autopilot_name
-from paramclient.notation import bits_written, time_or_none, time_text, value_written
+from paramclient.notation import time_text
 from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.taken import NO_DEFAULTS
 from paramclient.values import ParamType, Value, format_value, type_name
 
-__all__ = ["described", "origin_json", "show_file", "value_text", "written_json"]
+__all__ = ["described", "show_file", "value_text"]
 
 
 def show_file(file: ParamFile, component: int | None, *, changed: bool, json: bool) -> ExitCode:
@@ -26,9 +27,9 @@ def show_file(file: ParamFile, component: int | None, *, changed: bool, json: bo
     else:
         shown = [*sets]
     if json:
-        print_json(
-            {"file": file.source, "form": file.form, "components": [_set_json(each) for each in shown]}
-        )
+        from paramclient.documents import FileDoc  # only here: loads pydantic
+
+        print_document(FileDoc.of(file, shown))
     else:
         for each in shown:
             _print_set(each, changed=changed)
@@ -47,32 +48,6 @@ def described(params: ParamSet) -> str:
     ]
     at = "" if params.at is None else f", {time_text(params.at)}"
     return " ".join(filter(None, [_counted(len(params)), *who])) + at
-
-
-def origin_json(params: ParamSet) -> dict[str, Any]:
-    """Whose parameters a set has, for programs."""
-    identity = params.identity
-    return {
-        "source": params.source,
-        "system": params.system,
-        "component": params.component,
-        "autopilot": None if identity is None else autopilot_name(identity.autopilot),
-        "uid": None if identity is None else identity.uid,
-        "at": time_or_none(params.at),
-        "count": len(params),
-    }
-
-
-def written_json(param: WrittenParam) -> dict[str, Any]:
-    """A parameter's value for programs; its name is the key under which it stands.
-
-    Without a type, `value` is the number as it is written, and there are no `bits`.
-    """
-    return {
-        "value": value_written(param.value, param),
-        "type": None if param.type is None else type_name(param.type),
-        "bits": bits_written(param),
-    }
 
 
 def value_text(param: WrittenParam) -> str:
@@ -106,18 +81,6 @@ def _print_set(params: ParamSet, *, changed: bool) -> None:
         right="value default",
     )
     say(printable(f"{described(params)}{', those that differ from their default' if changed else ''}"))
-
-
-def _set_json(params: ParamSet) -> dict[str, Any]:
-    return {**origin_json(params), "params": {name: _param_json(param) for name, param in params.items()}}
-
-
-def _param_json(param: WrittenParam) -> dict[str, Any]:
-    return {
-        **written_json(param),
-        **({} if param.default is None else {"default": value_written(param.default, param)}),
-        **({"comment": param.comment} if param.comment else {}),
-    }
 
 
 def _changed(params: ParamSet) -> ParamSet:

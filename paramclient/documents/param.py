@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 from paramclient.documents.base import Document, Maybe, Scalar
@@ -9,10 +10,11 @@ from paramclient.notation import bits_text, bits_written, value_json, value_writ
 from paramclient.values import Param, ParamType, format_value, type_name
 
 if TYPE_CHECKING:
-    from paramclient.metadata import ParamInfo
+    from paramclient.errors import ParamClientError
+    from paramclient.metadata import Metadata, ParamInfo
     from paramclient.paramset import WrittenParam
 
-__all__ = ["InfoDoc", "ParamDoc", "WrittenParamDoc"]
+__all__ = ["DescribedDoc", "GotDoc", "InfoDoc", "InfosDoc", "ParamDoc", "WrittenParamDoc"]
 
 
 class InfoDoc(Document):
@@ -138,6 +140,51 @@ class WrittenParamDoc(Document):
             default=None if param.default is None else value_written(param.default, param),
             comment=param.comment or None,
         )
+
+
+class GotDoc(Document):
+    """Parameters that were asked for, by name, and why some did not come."""
+
+    params: dict[str, ParamDoc]
+    errors: Maybe[dict[str, str]] = None
+
+    @classmethod
+    def of(
+        cls, params: Iterable[Param], metadata: Metadata | None, errors: Mapping[str, ParamClientError]
+    ) -> GotDoc:
+        """What came, with all that is known of it, and the errors by name."""
+        return cls(
+            params={
+                param.name: ParamDoc.of(
+                    param, None if metadata is None else metadata.find(param.name), whole=True
+                )
+                for param in params
+            },
+            errors={name: str(error) for name, error in errors.items()} or None,
+        )
+
+
+class InfosDoc(Document):
+    """What is known of parameters, by name; `source` is where it comes from."""
+
+    source: str
+    params: dict[str, InfoDoc]
+
+    @classmethod
+    def of(cls, metadata: Metadata, names: Iterable[str]) -> InfosDoc:
+        """What there is of these names."""
+        found = {name: metadata.find(name) for name in names}
+        return cls(
+            source=metadata.source,
+            params={name: InfoDoc.of(info) for name, info in found.items() if info is not None},
+        )
+
+
+class DescribedDoc(Document):
+    """How many parameters, or groups of them, are described, and where that comes from."""
+
+    count: int
+    source: str
 
 
 def _number(number: int | float | None) -> Scalar | None:

@@ -38,6 +38,9 @@ __all__ = ["Hub"]
 OURSELVES: Final = "service"
 """Who has asked for what the service does by itself."""
 
+MOST_READINGS: Final = 8
+"""Files that are read, or wait for it: each may have megabytes, and take seconds."""
+
 Result = TypeVar("Result")
 
 
@@ -81,6 +84,8 @@ class Hub:
         self._began = time.monotonic()
         self._options = options
         self._worker = Worker("paramclient service")
+        self._reader = Worker("paramclient files")
+        self._readings = 0
         self._closing = anyio.Event()
         self._tasks: anyio.abc.TaskGroup | None = None
         self._line_tasks: anyio.abc.TaskGroup | None = None
@@ -129,10 +134,26 @@ class Hub:
             close = self.cache.close if self._owns_cache and self.cache is not None else _nothing
             with anyio.CancelScope(shield=True):
                 await self._worker.close(close)
+                await self._reader.close(_nothing)
 
     async def aside(self, work: Callable[[], Result]) -> Result:
         """Do what blocks, such as a look into the cache, in a thread. Cancelled, it is done all the same."""
         return await self._worker.run(work)
+
+    async def read_aside(self, work: Callable[[], Result]) -> Result:
+        """Read what somebody has sent, in a thread of its own: that may take seconds, and others look into
+        the cache.
+
+        Raises:
+            ServiceError: too many wait for that.
+        """
+        if self._readings >= MOST_READINGS:
+            raise ServiceError(429, "too-many", f"{MOST_READINGS} files are being read already.")
+        self._readings += 1
+        try:
+            return await self._reader.run(work)
+        finally:
+            self._readings -= 1
 
     def find(self, system: int, component: int, link: str | None = None) -> Followed:
         """The component of this address.

@@ -132,7 +132,7 @@ class Jobs:
             del self._jobs[name]
         job = Job(kind, followed, asked_by)
         self._jobs[job.id] = job
-        self._tell(job)
+        self.tell(job)
         self._tasks.start_soon(self._run, job, work, name=f"paramclient job {job.id}")
         return job
 
@@ -146,6 +146,10 @@ class Jobs:
         if job is None:
             raise ServiceError(404, "unknown-job", "There is no such job, or it ended long ago.")
         return job
+
+    def tell(self, job: Job) -> None:
+        """Publish how a job stands now."""
+        job.followed.tell("job", {"job": job.document(with_result=False).as_json()})
 
     async def _run(self, job: Job, work: Work) -> None:
         try:
@@ -161,8 +165,5 @@ class Jobs:
                 job.error = ServiceError(409, "cancelled", "It was cancelled before it had come to its end.")
             job.ended = time.time()
             job.followed.look()
-            self._tell(job)
+            self.tell(job)
             job._over.set()
-
-    def _tell(self, job: Job) -> None:
-        job.followed.tell("job", {"job": job.document(with_result=False).as_json()})

@@ -188,7 +188,7 @@ export async function takeOver() {
     cancel.replaceChildren(el("span", { text: "Stop" }));
     cancel.onclick = null;
     summary.textContent = "Applying …";
-    const include = chosen.filter((line) => line.status === "skipped").map((line) => exactly(line.name));
+    const include = chosen.filter((line) => line.status !== "set").map((line) => exactly(line.name));
     try {
       job = await request("POST", at(component, "/apply"), { wanted: other.source, only: chosen.map((line) => exactly(line.name)), include, allow_armed: component.is_armed === true, skip_invalid: true, wait: false });
       const ended = await followJob(job, (progress) => {
@@ -249,11 +249,10 @@ export async function takeOver() {
 const exactly = (name) => name.replace(/[*?[]/g, "[$&]");
 
 const PHASES = { reading: "Reading", writing: "Writing", rebooting: "Starting again" };
-const MUST_NOT = new Set(["invalid"]);
 
 /** The lines of a plan in the order in which they would be sent, then those that would be left out. */
 function linesOf(plan, table, other, refresh) {
-  const staged = plan.stages.flatMap((stage) => stage.steps.map((step) => [step.name, stage.purpose]));
+  const staged = plan.stages.flatMap(({ purpose, steps }) => steps.map(({ name }) => [name, purpose === "the others" ? "" : purpose]));
   const purposes = new Map(staged);
   const names = [...purposes.keys(), ...Object.keys(plan.params).filter((name) => !purposes.has(name))];
   return names
@@ -262,10 +261,17 @@ function linesOf(plan, table, other, refresh) {
     .map(({ name, planned }) => {
       const row = table.rows.get(name);
       const { status } = planned;
-      const isOut = MUST_NOT.has(status) || planned.category === "missing" || !row;
+      const isDoubtful = status === "invalid" && planned.category === "out-of-range";
+      const isOut = !row || planned.category === "missing" || (status === "invalid" && !isDoubtful);
       const box = el("input", { type: "checkbox", checked: status === "set", disabled: isOut, "aria-label": `Set ${name}`, on: { change: refresh } });
-      const remark = el("td", { class: "remark" }, status !== "set" && el("b", { class: "outcome quiet", text: isOut ? "cannot be set" : "left out" }), ` ${planned.reason || (status === "set" ? (purposes.get(name) ?? "") : "")}`);
-      const element = el("tr", { class: isOut ? "out" : "" }, el("td", {}, box), el("th", { scope: "row", text: name }), el("td", { text: row?.text ?? "" }), el("td", { class: "new", text: numberText(planned.wanted, row?.type ?? planned.type) }), remark);
+      const word = status === "set" ? "" : isOut ? "cannot be set" : isDoubtful ? "doubtful" : "left out";
+      const remark = el(
+        "td",
+        { class: "remark" },
+        word && el("b", { class: `outcome ${isDoubtful ? "warn" : "quiet"}`, text: word }),
+        ` ${(planned.reason || purposes.get(name) || "").replace(/^left out: /, "")}`,
+      );
+      const element = el("tr", { class: isOut ? "out" : "" }, el("td", { class: "pick" }, box), el("th", { scope: "row", text: name }), el("td", { class: "now", text: row?.text ?? "" }), el("td", { class: "new", text: numberText(planned.wanted, row?.type ?? planned.type) }), remark);
       const restore = row?.document.bits ? { bits: row.document.bits } : row?.document.value;
       return { name, status, box, remark, element, before: row?.text ?? "", restore };
     });

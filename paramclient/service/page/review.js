@@ -137,7 +137,6 @@ function lineOf(change, row, drop) {
   const { name, text } = change;
   const remarks = [];
   if (row && !sameText(row.text, change.before, row.type)) remarks.push(`It was ${change.before} when you edited it.`);
-  if (row) remarks.push(doubt(text, row.info, row.type));
   if (row?.info?.reboot_required) remarks.push("Counts from the next start on.");
   if (row?.info?.is_read_only) remarks.push("The vehicle sets it by itself.");
   const standard = row ? defaultOf(row.document) : null;
@@ -147,9 +146,10 @@ function lineOf(change, row, drop) {
     const meaning = meaningOf(value, row?.info, row?.type);
     return meaning ? `${value} ${meaning}` : `${value}${units}`;
   };
-  const remark = el("td", { class: "remark", text: remarks.filter(Boolean).join(" ") });
-  const away = el("td", {}, button("", drop, { kind: "quiet only", drawing: "close", label: `Drop ${name}` }));
-  const element = el("tr", {}, el("th", { scope: "row", text: name }), el("td", { text: in_words(row?.text ?? "") }), el("td", { class: "new", text: in_words(text) }), remark, away);
+  const doubts = row ? doubt(text, row.info, row.type) : "";
+  const remark = el("td", { class: "remark" }, doubts && el("b", { class: "outcome warn", text: `${doubts} ` }), remarks.join(" "));
+  const away = el("td", { class: "drop-it" }, button("", drop, { kind: "quiet only", drawing: "close", label: `Drop ${name}` }));
+  const element = el("tr", {}, el("th", { scope: "row", text: name }), el("td", { class: "now", text: in_words(row?.text ?? "") }), el("td", { class: "new", text: in_words(text) }), remark, away);
   return { change, row, element, remark, away };
 }
 

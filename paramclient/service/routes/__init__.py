@@ -6,7 +6,17 @@ from typing import Final
 
 from fastapi import APIRouter
 
-from paramclient.service.routes import components, fetching, params, stream, system
+from paramclient.service.routes import (
+    components,
+    described,
+    fetching,
+    files,
+    params,
+    past,
+    setup,
+    stream,
+    system,
+)
 
 __all__ = ["ROUTERS"]
 
@@ -14,6 +24,10 @@ ROUTERS: Final[tuple[APIRouter, ...]] = (
     system.router,
     components.router,
     params.router,
+    described.router,
     fetching.router,
+    setup.router,
+    files.router,
+    past.router,
     stream.router,
 )
