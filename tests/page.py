@@ -1,4 +1,4 @@
-"""What the tests of the page have in common: a service over simulated vehicles, and a browser that looks at it."""
+"""What the tests of the page have in common: a service over simulated vehicles, and the browser."""
 
 from __future__ import annotations
 

@@ -114,6 +114,8 @@ def _table(browser: Browser, bench: Bench) -> None:
 def _review(browser: Browser, bench: Bench) -> None:
     page = _open(browser, bench, "dark", DESKTOP)
     page.get_by_role("navigation").get_by_role("button", name="ArduPilot 2/1").click()
+    page.get_by_role("searchbox").fill("RTL_")
+    expect(page.locator("#rows .row", has_text="RTL_ALT_FINAL")).to_be_visible()
     for name, text in (("RTL_ALT", "5000"), ("RTL_SPEED", "800"), ("RTL_CLIMB_MIN", "200")):
         _stage(page, name, text)
     page.get_by_role("searchbox").fill("RTL_")

@@ -133,7 +133,7 @@ function drawEmpty(count, total) {
 function emptyText(count, total, component, table) {
   if (count) return "";
   if (!component) return store.isHeard ? "No vehicle has been heard yet. It appears here by itself." : "";
-  if (!total) return component.fetch ? "The parameters are on their way." : table.isLoaded ? "No parameters are known yet. Fetch asks the vehicle for them." : "";
+  if (!total) return component.fetch ? "The parameters are on their way." : table.isLoaded ? "No parameters are known yet. Fetch asks the vehicle for them." : "Loading …";
   if (shown.filter === "changed" && !shown.words.length) return table.sorted.some((row) => row.isChanged !== null) ? "Nothing is changed from its default." : "The defaults of this vehicle are not known.";
   return "Nothing fits what is searched for.";
 }
