@@ -178,13 +178,7 @@ def measure(sizes: Sizes, out: Connection) -> None:
     spawn = multiprocessing.get_context("spawn")
     stop = spawn.Event()
     here, there = spawn.Pipe()
-    probes = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(sizes.links)]
-    for probe in probes:
-        probe.bind(("127.0.0.1", 0))
-    ports = [probe.getsockname()[1] for probe in probes]
-    for probe in probes:
-        probe.close()
-    vehicles = spawn.Process(target=fly, args=(sizes, ports, stop, there))
+    vehicles = spawn.Process(target=fly, args=(sizes, stop, there))
     vehicles.start()
     try:
         here.recv()  # they are there
@@ -193,7 +187,7 @@ def measure(sizes: Sizes, out: Connection) -> None:
         before = resident()
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "cache.sqlite3"
-            phases = [anyio.run(fetch, sizes, ports, path, record, before, here) for _ in range(2)]
+            phases = [anyio.run(fetch, sizes, path, record, before, here) for _ in range(2)]
         out.send(phases)
     finally:
         stop.set()
@@ -249,8 +243,8 @@ class Watch:
 class RecordedLink(UdpIn):
     """A link that sets down what comes."""
 
-    def __init__(self, port: int, record: Record) -> None:
-        super().__init__(parse_link(f"udpin:127.0.0.1:{port}"))
+    def __init__(self, record: Record) -> None:
+        super().__init__(parse_link("udpin:127.0.0.1:0"))
         self._record = record
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
@@ -278,9 +272,7 @@ class TimedCache(ParamCache):
             self.seconds += time.thread_time() - start
 
 
-async def fetch(
-    sizes: Sizes, ports: Sequence[int], path: Path, record: Record, before: float, vehicles: Connection
-) -> Phase:
+async def fetch(sizes: Sizes, path: Path, record: Record, before: float, vehicles: Connection) -> Phase:
     """Fetch everything, with what the cache has."""
     per_link = sizes.systems // sizes.links
     results: list[FetchedAll] = []
@@ -292,10 +284,9 @@ async def fetch(
     async with AsyncExitStack() as stack:
         cache = TimedCache(path)
         stack.callback(cache.close)
-        clients = [
-            await stack.enter_async_context(ParamClient(RecordedLink(port, record), cache=cache))
-            for port in ports
-        ]
+        links = [RecordedLink(record) for _ in range(sizes.links)]
+        clients = [await stack.enter_async_context(ParamClient(link, cache=cache)) for link in links]
+        vehicles.send([link.address for link in links])
         for client in clients:
             with anyio.fail_after(60):
                 for system in range(1, per_link + 1):
@@ -364,8 +355,8 @@ def table_of(system: int, parameters: int) -> list[SimParam]:
     return [*table, *(SimParam(f"XTRA_{i}", ParamType.REAL32, dice.uniform(-9, 9)) for i in more)]
 
 
-def fly(sizes: Sizes, ports: Sequence[int], stop: Event, out: Connection) -> None:
-    """The vehicles, until told to stop; runs in a process of its own."""
+def fly(sizes: Sizes, stop: Event, out: Connection) -> None:
+    """The vehicles, until told to stop; runs in a process of its own. They speak when they are told where."""
     selector = selectors.DefaultSelector()
     due: list[tuple[float, int]] = []
     wake_at: list[float] = []
@@ -376,7 +367,6 @@ def fly(sizes: Sizes, ports: Sequence[int], stop: Event, out: Connection) -> Non
         vehicle = PX4Vehicle(system=system, uid=number + 1, table=table_of(system, sizes.parameters))
         vehicle.announced_hash()
         sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        sock.connect(("127.0.0.1", ports[number // per_link]))
         sock.setblocking(False)
         fleet.append((vehicle, sock))
         selector.register(sock, selectors.EVENT_READ, number)
@@ -389,7 +379,11 @@ def fly(sizes: Sizes, ports: Sequence[int], stop: Event, out: Connection) -> Non
         ready = [key.data for key, _ in selector.select(min(max(0.0, due[0][0] - time.monotonic()), 0.1))]
         now = time.monotonic()
         if None in ready:
-            out.recv()
+            addresses = out.recv()
+            for number, (_, sock) in enumerate(fleet if addresses else ()):
+                sock.connect(addresses[number // per_link])
+            if addresses:
+                continue
             every = [vehicle.requests for vehicle, _ in fleet]
             out.send(sum(each.total() - each["HEARTBEAT"] for each in every))
         turn = {number for number in ready if number is not None}
@@ -399,12 +393,12 @@ def fly(sizes: Sizes, ports: Sequence[int], stop: Event, out: Connection) -> Non
                 turn.add(number)
         for number in turn:
             vehicle, sock = fleet[number]
-            with suppress(BlockingIOError, ConnectionRefusedError):
+            with suppress(OSError):  # nobody is there, or takes it
                 while True:
                     vehicle.receive(sock.recv(65535), now)
             vehicle.tick(now)
             for data in vehicle.data_to_send():
-                with suppress(BlockingIOError, ConnectionRefusedError):
+                with suppress(OSError):  # nobody is there, or takes it
                     sock.send(data)
             wake_at[number] = vehicle.next_deadline() or now
             heapq.heappush(due, (wake_at[number], number))

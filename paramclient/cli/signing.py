@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from cyclopts import Parameter
 
@@ -47,6 +47,9 @@ class VehicleOptions(KeyOptions):
 
     json: bool = False
     """Print JSON, for programs."""
+
+    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False
+    """Tell on stderr what is done, step by step; never the key."""
 
 
 _DEFAULTS: Final = VehicleOptions()

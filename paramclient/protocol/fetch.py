@@ -59,6 +59,7 @@ class Fetch(Operation[FetchResult]):
         file: the download as a file, while that is tried and when it has come.
         file_failed: whether the component has no such file, once that is known: None before, and where it may
             be bad luck.
+        first_value_at: when the first value came of a download by list; infinity before.
     """
 
     def __init__(
@@ -90,7 +91,7 @@ class Fetch(Operation[FetchResult]):
         self._repeated: Repeated | None = None
         self._was_asked_meanwhile = False
         self._is_hash_unknown = False  # the vehicle answers, but not to that
-        self._first_value_at = math.inf
+        self.first_value_at = math.inf
         self._held_before = 0.0  # by a download that was begun anew
         self._listed = listed
         self._policy = policy
@@ -129,8 +130,8 @@ class Fetch(Operation[FetchResult]):
             if not self._reads.awaits(message):  # else it comes because we have asked
                 self._means.following.heard(message, now)
         elif not download.done:
-            if self._first_value_at > now:
-                self._first_value_at = now
+            if self.first_value_at > now:
+                self.first_value_at = now
             download.heard(message, now)
             is_unheard = self._proof.before is None and not self._was_asked_meanwhile
             if is_unheard and self._expects_hash() and not self.done:
@@ -191,8 +192,8 @@ class Fetch(Operation[FetchResult]):
         self._had_no_file = self._file_was_silent = False
         self._restarts += 1
         if self._restarts > MOST_RESTARTS:
-            system, component = self._target
-            what = f"the parameters of {system}/{component}, which has started again {self._restarts} times"
+            whose = "/".join(map(str, self._target))
+            what = f"the parameters of {whose}, which has started again {self._restarts} times"
             self.fail(NoReply(what, attempts=self._restarts, waited=now - self.begun_at), now)
             return
         self._held_before = held_up
@@ -217,10 +218,9 @@ class Fetch(Operation[FetchResult]):
             missing = () if file.done else tuple(range(file.count))
             return self._result("ftp", file.count, missing, None, now, (note,))
         if download is None or download.count is None:
-            system, component = self._target
+            what = "the parameters of " + "/".join(map(str, self._target))
             attempts = 1 if download is None else download.lists
-            waited = now - self.begun_at
-            raise NoReply(f"the parameters of {system}/{component}", attempts=attempts, waited=waited)
+            raise NoReply(what, attempts=attempts, waited=now - self.begun_at)
         return self._result("stream", download.count, download.missing, None, now, (note,))
 
     @property
@@ -244,7 +244,7 @@ class Fetch(Operation[FetchResult]):
             return self.file.progress(now)
         received, total = (0, self._table.count) if self.download is None else self.download.progress
         came = received - (0 if self.download is None else self.download.resumed)
-        return Progress.after(received, total, came, now - self._first_value_at)
+        return Progress.after(received, total, came, now - self.first_value_at)
 
     def _sample(self, sampled: Sampled, count: int, now: float) -> None:
         """Judge the cached table by some of its parameters."""

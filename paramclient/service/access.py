@@ -328,7 +328,7 @@ class _Answer:
         await self.respond(204, b"", headers)
 
     async def refuse(self, denied: Denied, receive: Receive) -> None:
-        """Say why not. What may still come of a body is not waited for: the connection ends."""
+        """Say why not. Where it is not certain where the next request begins, the connection ends."""
         if self.request.scope["type"] == "websocket":
             await receive()
             if "websocket.http.response" not in self.request.scope.get("extensions", {}):
@@ -341,7 +341,7 @@ class _Answer:
             "detail": denied.detail,
         }
         headers = [*denied.headers, (b"content-type", b"application/problem+json")]
-        if self.request.says_body:
+        if self.request.says_body or denied.status in _MISSHAPEN:
             headers.append((b"connection", b"close"))
         await self.respond(denied.status, json.dumps(problem).encode(), headers)
 
@@ -435,6 +435,7 @@ def _is_loopback(listen: str) -> bool:
 _LOOPBACK_NAMES: Final = frozenset({"localhost"})
 _LOCAL: Final = Holder("local", "write")
 _SECRET: Final = frozenset({b"authorization", b"cookie"})
+_MISSHAPEN: Final = (400, 414, 431)
 _JSON: Final = (b"content-type", b"application/json")
 _ALWAYS: Final = [
     (b"x-content-type-options", b"nosniff"),
