@@ -349,13 +349,14 @@ def test_an_armed_vehicle_wants_a_second_word(sight: Sight, bench: Bench) -> Non
         bench.px4.armed = is_armed
 
     try:
-        bench.do(arm, True)
-        expect(sight.page.locator("#badges")).to_contain_text("ARMED")
-        expect(sight.spoken).to_contain_text("PX4 1/1 is armed.")
         sight.stage("MC_YAW_P", "2.5")
         sight.review()
-        expect(sight.dialog.get_by_role("alert")).to_contain_text("The vehicle is armed.")
         send = sight.dialog.get_by_role("button", name="Send")
+        expect(send).to_be_enabled()
+        bench.do(arm, True)  # while somebody looks at what is to be sent
+        expect(sight.dialog.get_by_role("alert")).to_contain_text("The vehicle is armed.")
+        expect(sight.page.locator("#badges")).to_contain_text("ARMED")
+        expect(sight.spoken).to_contain_text("PX4 1/1 is armed.")
         expect(send).to_be_disabled()
         sight.dialog.get_by_role("checkbox", name="Send all the same").check()
         send.click()
@@ -470,7 +471,7 @@ def test_two_vehicles_are_compared(sight: Sight) -> None:
 def test_the_table_is_saved_as_a_file(sight: Sight, bench: Bench) -> None:
     sight.page.get_by_role("button", name="Save").click()
     with sight.page.expect_download() as saved:
-        sight.dialog.get_by_role("link", name=re.compile("QGroundControl|qgc")).click()
+        sight.dialog.get_by_role("button", name="QGroundControl").click()
     text = saved.value.path().read_text()
     assert sum(line.startswith("1\t1\t") for line in text.splitlines()) == len(bench.px4.values)
 
@@ -582,6 +583,22 @@ def test_a_service_that_goes_and_comes_back(visit: Callable[..., Sight], tmp_pat
         expect(sight.value("MC_PITCH_P")).to_contain_text("3.25")
         sight.send()  # what was staged has waited
         assert second.px4.values["MC_ROLL_P"] == 7.5
+
+
+@needs_browser
+def test_nobody_is_led_to_another_vehicle_unasked(sight: Sight) -> None:
+    """One that the service forgets, as when its link fails, stays in view, and what was staged waits."""
+    sight.stage("MC_ROLL_P", "7.5")
+    sight.page.evaluate(
+        """async () => {
+            const { store } = await import("/page/store.js");
+            const px4 = { link: "px4", system: 1, component: 1 };
+            store.take({ type: "component", why: "forgotten", seq: Infinity, ...px4 });
+        }"""
+    )
+    expect(sight.page.locator("#badges")).to_have_text("lost")
+    expect(sight.page.get_by_role("heading", level=1)).to_have_text("PX4 1/1")
+    expect(sight.bar).to_contain_text("1 change staged")
 
 
 @needs_browser

@@ -11,7 +11,11 @@ const KINDS = ["hello", "component", "change", "params", "resynced", "progress",
 /** What the service said went wrong, in a sentence; `status` 0 is a service that could not be reached. */
 export class Problem extends Error {
   constructor(status, document) {
-    super(document?.detail || document?.title || (status ? `The service answered ${status}.` : "The service cannot be reached."));
+    super(
+      document?.detail ||
+        document?.title ||
+        (status ? `The service answered ${status}.` : "The service cannot be reached."),
+    );
     this.status = status;
     this.document = document ?? {};
   }
@@ -34,28 +38,35 @@ export function at(component, what = "", query = {}) {
  * A request. Gives the JSON of the answer, or null where there is none. `body` is sent as JSON, a File as it is.
  * Where a token is wanted, the person is asked and the request made again.
  */
-export async function request(method, address, body, { patience = PATIENCE, signal = null } = {}) {
-  for (;;) {
-    const answer = await attempt(method, address, body, patience, signal);
-    if (answer.status === 401 && address !== "/session") {
-      await askForToken();
-      continue;
-    }
-    const type = answer.headers.get("content-type") ?? "";
-    const document = answer.status !== 204 && type.includes("json") ? await answer.json() : null;
-    if (!answer.ok) throw new Problem(answer.status, readable(document));
-    return document;
-  }
+export async function request(method, address, body, { patience = PATIENCE } = {}) {
+  const answer = await exchange(method, address, body, patience);
+  return isJson(answer) ? answer.json() : null;
 }
 
 export const get = (address) => request("GET", address);
 
-/** The full address of a file to be saved. */
-export const addressOf = (address) => BASE + address;
+/** A file that is to be saved: its name and its content. */
+export async function download(address, patience) {
+  const answer = await exchange("GET", address, undefined, patience);
+  const [, name] = /filename="?([^";]+)/.exec(answer.headers.get("content-disposition") ?? "") ?? [];
+  return { name: name ?? "parameters", content: await answer.blob() };
+}
 
-async function attempt(method, address, body, patience, signal) {
+const isJson = (answer) => answer.status !== 204 && (answer.headers.get("content-type") ?? "").includes("json");
+
+async function exchange(method, address, body, patience) {
+  for (;;) {
+    const answer = await attempt(method, address, body, patience);
+    if (answer.ok) return answer;
+    if (answer.status !== 401 || address === "/session")
+      throw new Problem(answer.status, isJson(answer) ? readable(await answer.json()) : null);
+    await askForToken();
+  }
+}
+
+async function attempt(method, address, body, patience) {
   const ends = AbortSignal.timeout(patience);
-  const options = { method, signal: signal ? AbortSignal.any([signal, ends]) : ends, headers: { "X-Asker": ASKER }, cache: "no-store" };
+  const options = { method, signal: ends, headers: { "X-Asker": ASKER }, cache: "no-store" };
   if (body instanceof Blob) {
     options.body = body;
     options.headers["Content-Type"] = "application/octet-stream";
@@ -65,9 +76,8 @@ async function attempt(method, address, body, patience, signal) {
   }
   try {
     return await fetch(BASE + address, options);
-  } catch (error) {
-    if (ends.aborted) throw new Problem(0, { detail: `The service did not answer in ${patience / 1000} s.` });
-    throw error.name === "AbortError" ? error : new Problem(0, null);
+  } catch {
+    throw new Problem(0, ends.aborted ? { detail: `The service did not answer in ${patience / 1000} s.` } : null);
   }
 }
 

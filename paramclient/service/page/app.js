@@ -1,7 +1,7 @@
 /** The page: joins what is known, what is shown, and what the person does. */
 
 import { Stream } from "./api.js";
-import { chooseOther, drawBanner, setOther } from "./compare.js";
+import { chooseOther, drawBanner } from "./compare.js";
 import { Details } from "./details.js";
 import { showKeys } from "./dialogs.js";
 import { announce, button, byId, el, isNarrow, onceAFrame, setText } from "./dom.js";
@@ -42,7 +42,10 @@ function edit(row) {
 function matches(row) {
   if (shown.group && row.group !== shown.group) return false;
   if (!FILTERS[shown.filter].has(row)) return false;
-  return shown.words.every((word) => row.words.includes(word) || row.text.toLowerCase() === word || (word.length > 1 && row.text.startsWith(word)));
+  return shown.words.every(
+    (word) =>
+      row.words.includes(word) || row.text.toLowerCase() === word || (word.length > 1 && row.text.startsWith(word)),
+  );
 }
 
 /** Those whose name begins with what is searched for go first, then those with it in the name. */
@@ -53,7 +56,10 @@ function ranked(rows) {
     const place = name.toLowerCase().indexOf(word);
     return place === 0 ? 0 : place > 0 ? 1 : 2;
   };
-  return rows.map((row) => [rank(row), row]).sort(([a], [b]) => a - b).map(([, row]) => row);
+  return rows
+    .map((row) => [rank(row), row])
+    .sort(([a], [b]) => a - b)
+    .map(([, row]) => row);
 }
 
 function drawTable() {
@@ -61,7 +67,10 @@ function drawTable() {
   const rows = table.sorted;
   const chosen = ranked(rows.filter(matches));
   grid.set(chosen);
-  setText(byId("count"), chosen.length === rows.length ? many(rows.length, "parameter") : `${chosen.length} of ${rows.length}`);
+  setText(
+    byId("count"),
+    chosen.length === rows.length ? many(rows.length, "parameter") : `${chosen.length} of ${rows.length}`,
+  );
   drawGroups();
   drawChips();
   drawEmpty(chosen.length, rows.length);
@@ -97,11 +106,29 @@ function drawGroups() {
   const names = [...groups.keys()].sort((a, b) => Number(a === OTHERS) - Number(b === OTHERS) || a.localeCompare(b));
   const total = rows.size;
   const item = (group, text, count) =>
-    el("li", {}, el("button", { type: "button", class: `group${group === shown.group ? " chosen" : ""}`, "aria-current": group === shown.group ? "true" : null, on: { click: () => choose({ group }) } }, el("span", { text }), waiting.has(group) && el("i", { class: "dot warn" }), el("small", { text: String(count) })));
+    el(
+      "li",
+      {},
+      el(
+        "button",
+        {
+          type: "button",
+          class: `group${group === shown.group ? " chosen" : ""}`,
+          "aria-current": group === shown.group ? "true" : null,
+          on: { click: () => choose({ group }) },
+        },
+        el("span", { text }),
+        waiting.has(group) && el("i", { class: "dot warn" }),
+        el("small", { text: String(count) }),
+      ),
+    );
   list.replaceChildren(item("", "All groups", total), ...names.map((name) => item(name, name, groups.get(name))));
   if (hadFocus) list.querySelector(".chosen")?.focus();
   const choice = byId("group-choice");
-  choice.replaceChildren(el("option", { value: "", text: `All groups (${total})` }), ...names.map((name) => el("option", { value: name, text: `${name} (${groups.get(name)})` })));
+  choice.replaceChildren(
+    el("option", { value: "", text: `All groups (${total})` }),
+    ...names.map((name) => el("option", { value: name, text: `${name} (${groups.get(name)})` })),
+  );
   choice.value = shown.group;
 }
 
@@ -109,15 +136,37 @@ function drawChips() {
   const { table } = store;
   const rows = table.sorted;
   const counts = {};
-  for (const kind of Object.keys(FILTERS)) counts[kind] = kind === "all" ? rows.length : rows.reduce((sum, row) => sum + Number(FILTERS[kind].has(row)), 0);
-  const kinds = Object.keys(FILTERS).filter((kind) => kind === "all" || kind === "changed" || kind === shown.filter || counts[kind] || (kind === "differs" && table.other));
+  for (const kind of Object.keys(FILTERS))
+    counts[kind] = kind === "all" ? rows.length : rows.reduce((sum, row) => sum + Number(FILTERS[kind].has(row)), 0);
+  const kinds = Object.keys(FILTERS).filter(
+    (kind) =>
+      kind === "all" ||
+      kind === "changed" ||
+      kind === shown.filter ||
+      counts[kind] ||
+      (kind === "differs" && table.other),
+  );
   const key = JSON.stringify([shown.filter, kinds.map((kind) => [kind, counts[kind]])]);
   const box = byId("chips");
   if (box.dataset.shown === key) return;
   box.dataset.shown = key;
   const focused = box.contains(document.activeElement) ? document.activeElement.dataset.kind : null;
-  box.replaceChildren(...kinds.map((kind) =>
-    el("button", { type: "button", class: `chip ${kind}`, data: { kind }, "aria-pressed": String(kind === shown.filter), on: { click: () => choose({ filter: kind }) } }, el("span", { text: FILTERS[kind].text }), kind !== "all" && el("small", { text: String(counts[kind]) }))));
+  box.replaceChildren(
+    ...kinds.map((kind) =>
+      el(
+        "button",
+        {
+          type: "button",
+          class: `chip ${kind}`,
+          data: { kind },
+          "aria-pressed": String(kind === shown.filter),
+          on: { click: () => choose({ filter: kind }) },
+        },
+        el("span", { text: FILTERS[kind].text }),
+        kind !== "all" && el("small", { text: String(counts[kind]) }),
+      ),
+    ),
+  );
   if (focused) [...box.children].find((chip) => chip.dataset.kind === focused)?.focus();
 }
 
@@ -133,8 +182,16 @@ function drawEmpty(count, total) {
 function emptyText(count, total, component, table) {
   if (count) return "";
   if (!component) return store.isHeard ? "No vehicle has been heard yet. It appears here by itself." : "";
-  if (!total) return component.fetch ? "The parameters are on their way." : table.isLoaded ? "No parameters are known yet. Fetch asks the vehicle for them." : "Loading …";
-  if (shown.filter === "changed" && !shown.words.length) return table.sorted.some((row) => row.isChanged !== null) ? "Nothing is changed from its default." : "The defaults of this vehicle are not known.";
+  if (!total)
+    return component.fetch
+      ? "The parameters are on their way."
+      : table.isLoaded
+        ? "No parameters are known yet. Fetch asks the vehicle for them."
+        : "Loading …";
+  if (shown.filter === "changed" && !shown.words.length)
+    return table.sorted.some((row) => row.isChanged !== null)
+      ? "Nothing is changed from its default."
+      : "The defaults of this vehicle are not known.";
   return "Nothing fits what is searched for.";
 }
 
@@ -156,10 +213,14 @@ function drawBar() {
     bar.replaceChildren(
       el("span", { text: `Sent: ${told(sent.outcomes)}` }),
       sent.outcomes.some((each) => each.isTaken) ? button("Undo …", undo, { kind: "quiet", drawing: "undo" }) : "",
-      button("", () => {
-        store.table.sent = null;
-        draw();
-      }, { kind: "quiet only", drawing: "close", label: "Close" }),
+      button(
+        "",
+        () => {
+          store.table.sent = null;
+          draw();
+        },
+        { kind: "quiet only", drawing: "close", label: "Close" },
+      ),
     );
   }
 }
@@ -192,7 +253,9 @@ store.on("other", () => {
   drawBanner();
   drawTable();
 });
-store.on("armed", (component) => announce(`${nameOf(component)} is ${component.is_armed ? "armed" : "not armed any more"}.`));
+store.on("armed", (component) =>
+  announce(`${nameOf(component)} is ${component.is_armed ? "armed" : "not armed any more"}.`),
+);
 store.on("lost", (component) => announce(`${nameOf(component)} ${component.is_lost ? "is lost" : "is heard again"}.`));
 
 const news = [];
@@ -201,29 +264,40 @@ store.on("news", ({ key, row }) => {
   if (!news.length) {
     setTimeout(() => {
       const [first] = news;
-      announce(news.length === 1 ? `${first.name} is ${first.text} now, by ${first.news?.by}.` : `${news.length} parameters were changed by others.`);
+      announce(
+        news.length === 1
+          ? `${first.name} is ${first.text} now, by ${first.news?.by}.`
+          : `${news.length} parameters were changed by others.`,
+      );
       news.length = 0;
     }, 1000);
   }
   news.push(row);
 });
 setInterval(() => {
-  for (const table of store.tables.values()) for (const row of table.rows.values()) if (row.news && Date.now() - row.news.at > NEWS_FOR) row.news = null;
+  for (const table of store.tables.values())
+    for (const row of table.rows.values()) if (row.news && Date.now() - row.news.at > NEWS_FOR) row.news = null;
   draw();
 }, 60_000);
 
 const stream = new Stream({
-  begin: () => store.begin().catch((error) => {
-    complain(error);
-    setTimeout(() => stream.open(), 2000);
-  }),
+  begin: () =>
+    store.begin().catch((error) => {
+      complain(error);
+      setTimeout(() => stream.open(), 2000);
+    }),
   take: (event) => store.take(event),
   standing: (isOpen) => {
     if (store.isHeard === isOpen) return;
     const before = store.isHeard;
     store.isHeard = isOpen;
     byId("away").hidden = isOpen;
-    setText(byId("away"), isOpen ? "" : "The service does not answer. What is shown may be old; the page goes on by itself when it is back.");
+    setText(
+      byId("away"),
+      isOpen
+        ? ""
+        : "The service does not answer. What is shown may be old; the page goes on by itself when it is back.",
+    );
     setText(byId("standing"), isOpen ? "" : "not connected");
     if (isOpen && before === false) announce("The service answers again.");
     drawState();
@@ -271,7 +345,11 @@ const KEYS = {
     byId("search").select();
   },
   "?": showKeys,
-  g: () => (isNarrow() ? byId("group-choice") : (byId("groups").querySelector(".chosen") ?? byId("groups").querySelector("button"))).focus(),
+  g: () =>
+    (isNarrow()
+      ? byId("group-choice")
+      : (byId("groups").querySelector(".chosen") ?? byId("groups").querySelector("button"))
+    ).focus(),
   v: () => (isNarrow() ? byId("vehicle-choice") : byId("vehicles").querySelector(".chosen"))?.focus(),
   d: () => take((row) => defaultOf(row.document)),
   t: () => take((row) => store.table.other?.values.get(row.name)?.text ?? null),

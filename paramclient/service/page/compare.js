@@ -4,7 +4,7 @@ import { Problem, at, get, request } from "./api.js";
 import { announce, button, byId, el } from "./dom.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
-import { OUTCOMES, caution, nameOf, told } from "./review.js";
+import { Caution, OUTCOMES, nameOf, told } from "./review.js";
 import { keyOf, store } from "./store.js";
 import { many, moment, numberText } from "./values.js";
 
@@ -27,7 +27,11 @@ export async function chooseOther(file = null) {
       fault.textContent = error.message;
     }
   };
-  const input = el("input", { type: "file", id: "file", on: { change: () => input.files[0] && attempt(() => fromFile(input.files[0])) } });
+  const input = el("input", {
+    type: "file",
+    id: "file",
+    on: { change: () => input.files[0] && attempt(() => fromFile(input.files[0])) },
+  });
   const snapshots = el("ul", { class: "choices" }, el("li", { class: "nothing", text: "Looking …" }));
   const vehicles = el("ul", { class: "choices" }, el("li", { class: "nothing", text: "Looking …" }));
   const content = el(
@@ -35,7 +39,12 @@ export async function chooseOther(file = null) {
     {},
     fault,
     el("h3", { text: "A file" }),
-    el("label", { class: "drop", for: "file" }, el("span", { text: "A parameter file of any ground station; it can be dropped onto the page as well." }), input),
+    el(
+      "label",
+      { class: "drop", for: "file" },
+      el("span", { text: "A parameter file of any ground station; it can be dropped onto the page as well." }),
+      input,
+    ),
     el("h3", { text: "An earlier state" }),
     snapshots,
     el("h3", { text: "Another vehicle" }),
@@ -44,7 +53,9 @@ export async function chooseOther(file = null) {
   if (file) attempt(() => fromFile(file));
   fillSnapshots(component, snapshots, attempt);
   fillVehicles(component, vehicles, attempt);
-  await openDialog(`Compare ${nameOf(component)} with …`, content, [button("Cancel", closeDialog, { kind: "quiet" })], { focus: input });
+  await openDialog(`Compare ${nameOf(component)} with …`, content, [button("Cancel", closeDialog, { kind: "quiet" })], {
+    focus: input,
+  });
 }
 
 /** What it is compared with, or null for nothing any more. */
@@ -55,7 +66,8 @@ export function setOther(other) {
 }
 
 async function fromFile(file) {
-  if (file.size > LARGEST_FILE) throw new Problem(0, { detail: `${file.name} has ${file.size} bytes; that is no parameter file.` });
+  if (file.size > LARGEST_FILE)
+    throw new Problem(0, { detail: `${file.name} has ${file.size} bytes; that is no parameter file.` });
   const read = await request("POST", `/files?${new URLSearchParams({ name: file.name })}`, file);
   const source = { file: { name: file.name, base64: await base64(file) } };
   return otherOf(file.name, read.params, source, true, read.notes ?? []);
@@ -68,10 +80,11 @@ async function fillSnapshots(component, list, attempt) {
     fill(list, kept, "No earlier state is kept.", (each) => [
       `${moment(each.at ?? each.time)}`,
       `${each.reason}, ${many(each.size, "parameter")}`,
-      () => attempt(async () => {
-        const state = await get(at(component, `/snapshots/${each.id}`));
-        return otherOf(`state of ${moment(each.at ?? each.time)}`, state.params, { snapshot: each.id }, false);
-      }),
+      () =>
+        attempt(async () => {
+          const state = await get(at(component, `/snapshots/${each.id}`));
+          return otherOf(`state of ${moment(each.at ?? each.time)}`, state.params, { snapshot: each.id }, false);
+        }),
     ]);
   } catch (error) {
     list.replaceChildren(el("li", { class: "nothing", text: error.message }));
@@ -90,15 +103,25 @@ async function fillVehicles(component, list, attempt) {
   }
   cached = cached.filter(({ vehicle, each }) => !keys.has(`${vehicle.key} ${each.component}`));
   const choices = [
-    ...live.map((each) => [nameOf(each), `on ${each.link}`, () => attempt(async () => {
-      const { params } = await get(at(each, "/params"));
-      const source = { component: { system: each.system, component: each.component, link: each.link } };
-      return otherOf(nameOf(each), params, source, false);
-    })]),
-    ...cached.map(({ vehicle, each }) => [`${vehicle.autopilot ?? ""} ${vehicle.key}`.trim(), `component ${each.component}, in the cache`, () => attempt(async () => {
-      const { params } = await get(`/vehicles/${encodeURIComponent(vehicle.key)}/${each.component}/params`);
-      return otherOf(vehicle.key, params, { vehicle: { key: vehicle.key, component: each.component } }, false);
-    })]),
+    ...live.map((each) => [
+      nameOf(each),
+      `on ${each.link}`,
+      () =>
+        attempt(async () => {
+          const { params } = await get(at(each, "/params"));
+          const source = { component: { system: each.system, component: each.component, link: each.link } };
+          return otherOf(nameOf(each), params, source, false);
+        }),
+    ]),
+    ...cached.map(({ vehicle, each }) => [
+      `${vehicle.autopilot ?? ""} ${vehicle.key}`.trim(),
+      `component ${each.component}, in the cache`,
+      () =>
+        attempt(async () => {
+          const { params } = await get(`/vehicles/${encodeURIComponent(vehicle.key)}/${each.component}/params`);
+          return otherOf(vehicle.key, params, { vehicle: { key: vehicle.key, component: each.component } }, false);
+        }),
+    ]),
   ];
   fill(list, choices, "No other vehicle is known.", (each) => each);
 }
@@ -106,7 +129,16 @@ async function fillVehicles(component, list, attempt) {
 function fill(list, items, nothing, parts) {
   const made = items.map((item) => {
     const [name, remark, choose] = parts(item);
-    return el("li", {}, el("button", { type: "button", class: "choice", on: { click: choose } }, el("b", { text: name }), el("small", { text: remark })));
+    return el(
+      "li",
+      {},
+      el(
+        "button",
+        { type: "button", class: "choice", on: { click: choose } },
+        el("b", { text: name }),
+        el("small", { text: remark }),
+      ),
+    );
   });
   list.replaceChildren(...(made.length ? made : [el("li", { class: "nothing", text: nothing })]));
 }
@@ -140,9 +172,18 @@ export function drawBanner() {
   const there = names.filter((name) => !table.rows.has(name)).length;
   const differ = [...table.rows.values()].filter((row) => table.standing(row) === "differs").length;
   const here = [...table.rows.values()].filter((row) => table.standing(row) === "here").length;
-  const counts = [`${differ} differ`, here && `${here} only here`, there && `${there} only there`].filter(Boolean).join(", ");
+  const counts = [`${differ} differ`, here && `${here} only here`, there && `${there} only there`]
+    .filter(Boolean)
+    .join(", ");
   banner.replaceChildren(
-    el("span", {}, "Compared with ", el("b", { text: other.label }), `: ${counts}.`, other.notes.map((note) => el("small", { text: ` ${typeof note === "string" ? note : (note.text ?? "")}` }))),
+    el(
+      "span",
+      {},
+      "Compared with ",
+      el("b", { text: other.label }),
+      `: ${counts}.`,
+      other.notes.map((note) => el("small", { text: ` ${typeof note === "string" ? note : (note.text ?? "")}` })),
+    ),
     store.mayWrite && button("Take over …", takeOver, { kind: "strong", disabled: !differ && !there }),
     button("", () => setOther(null), { kind: "quiet only", drawing: "close", label: "End the comparison" }),
   );
@@ -156,43 +197,71 @@ export async function takeOver() {
   const summary = el("p", { class: "summary", role: "status", text: "Working out what would be set …" });
   const body = el("tbody");
   const apply = button("Apply", () => go(), { kind: "strong", disabled: true });
-  const cancel = button("Not now", closeDialog, { kind: "quiet" });
+  const cancel = button("Not now", () => (hasBegun ? stop() : closeDialog()), { kind: "quiet" });
   const buttons = el("div", { class: "buttons" }, cancel, apply);
-  const armed = caution(component, () => refresh());
-  const all = el("input", { type: "checkbox", "aria-label": "All that would be set", on: { change: () => {
-    for (const line of lines) if (!line.box.disabled && (line.status === "set" || !all.checked)) line.box.checked = all.checked;
-    refresh();
-  } } });
+  const armed = new Caution(component, () => refresh());
+  const all = el("input", {
+    type: "checkbox",
+    "aria-label": "All that would be set",
+    on: {
+      change: () => {
+        for (const line of lines)
+          if (!line.box.disabled && (line.status === "set" || !all.checked)) line.box.checked = all.checked;
+        refresh();
+      },
+    },
+  });
   const table_ = el(
     "table",
     { class: "changes" },
-    el("thead", {}, el("tr", {}, el("th", {}, all), ...["Name", "Now", "New", "Remark"].map((text) => el("th", { scope: "col", text })))),
+    el(
+      "thead",
+      {},
+      el(
+        "tr",
+        {},
+        el("th", {}, all),
+        ...["Name", "Now", "New", "Remark"].map((text) => el("th", { scope: "col", text })),
+      ),
+    ),
     body,
   );
   let lines = [];
   let job = null;
+  let hasBegun = false;
+  let isOver = false;
 
   function refresh() {
     const count = lines.filter((line) => line.box.checked).length;
     const whole = lines.filter((line) => line.status === "set").length;
     all.checked = count > 0 && count >= whole;
     all.indeterminate = count > 0 && count < whole;
-    apply.disabled = !count || (armed !== null && !armed.box.checked);
+    if (hasBegun) return;
+    apply.disabled = !count || armed.forbids;
     apply.replaceChildren(el("span", { text: `Apply ${many(count, "value")}` }));
   }
 
   async function go() {
     const chosen = lines.filter((line) => line.box.checked);
+    if (hasBegun || armed.forbids) return;
+    hasBegun = true;
     for (const line of lines) line.box.disabled = true;
     all.disabled = apply.disabled = true;
     cancel.replaceChildren(el("span", { text: "Stop" }));
-    cancel.onclick = null;
     summary.textContent = "Applying …";
     const include = chosen.filter((line) => line.status !== "set").map((line) => exactly(line.name));
     try {
-      job = await request("POST", at(component, "/apply"), { wanted: other.source, only: chosen.map((line) => exactly(line.name)), include, allow_armed: component.is_armed === true, skip_invalid: true, wait: false });
+      job = await request("POST", at(component, "/apply"), {
+        wanted: other.source,
+        only: chosen.map((line) => exactly(line.name)),
+        include,
+        allow_armed: armed.isArmed,
+        skip_invalid: true,
+        wait: false,
+      });
       const ended = await followJob(job, (progress) => {
-        if (progress?.total) summary.textContent = `${PHASES[progress.phase] ?? "Applying"}: ${progress.done} of ${progress.total}`;
+        if (progress?.total)
+          summary.textContent = `${PHASES[progress.phase] ?? "Applying"}: ${progress.done} of ${progress.total}`;
       });
       show(ended, chosen);
     } catch (error) {
@@ -200,6 +269,7 @@ export async function takeOver() {
       summary.textContent = "";
     }
     job = null;
+    isOver = true;
     buttons.replaceChildren(button("Done", closeDialog, { kind: "strong" }));
     buttons.querySelector(".strong").focus();
   }
@@ -211,10 +281,19 @@ export async function takeOver() {
       const row = result.params?.[line.name] ?? { status: ended.state === "done" ? "unchanged" : "failed" };
       const word = OUTCOMES[row.status] ?? { text: row.status, kind: "warn" };
       const made = row.status === "adjusted" ? `The vehicle made ${numberText(row.actual, row.type)} of it. ` : "";
-      line.remark.replaceChildren(el("b", { class: `outcome ${word.kind}`, text: word.text }), ` ${made}${row.reason ?? ""}`);
+      line.remark.replaceChildren(
+        el("b", { class: `outcome ${word.kind}`, text: word.text }),
+        ` ${made}${row.reason ?? ""}`,
+      );
       const known = table.rows.get(line.name)?.document;
       const isTaken = ["set", "adjusted", "unproven"].includes(row.status);
-      outcomes.push({ name: line.name, status: row.status, isTaken, before: line.before, restore: line.restore ?? known?.value });
+      outcomes.push({
+        name: line.name,
+        status: row.status,
+        isTaken,
+        before: line.before,
+        restore: line.restore ?? known?.value,
+      });
     }
     table.sent = { names: new Set(chosen.map((line) => line.name)), outcomes, at: Date.now() };
     const late = result.reboot_required ?? [];
@@ -225,18 +304,26 @@ export async function takeOver() {
     store.tell("table");
   }
 
-  const stop = () => {
-    if (job) request("DELETE", `/jobs/${encodeURIComponent(job.id)}`).catch((error) => (fault.textContent = error.message));
-  };
-  cancel.addEventListener("click", stop);
-  const opened = openDialog(`Take over from ${other.label}`, el("div", {}, armed?.element, fault, summary, table_), buttons, { isHeld: () => job !== null, kind: "wide", focus: cancel });
+  function stop() {
+    if (job)
+      request("DELETE", `/jobs/${encodeURIComponent(job.id)}`).catch((error) => (fault.textContent = error.message));
+  }
+
+  const opened = openDialog(
+    `Take over from ${other.label}`,
+    el("div", {}, armed.element, fault, summary, table_),
+    buttons,
+    { isHeld: () => hasBegun && !isOver, kind: "wide", focus: cancel },
+  );
   try {
     const plan = await request("POST", at(component, "/plan"), { wanted: other.source }, { patience: PLAN_PATIENCE });
     lines = linesOf(plan, table, other, refresh);
     body.replaceChildren(...lines.map((line) => line.element));
     const count = lines.filter((line) => line.status === "set").length;
     const left = lines.length - count;
-    summary.textContent = count ? `${many(count, "value")} would be set${left ? `; ${left} would be left out unless you choose them` : ""}.` : "Nothing would be set.";
+    summary.textContent = count
+      ? `${many(count, "value")} would be set${left ? `; ${left} would be left out unless you choose them` : ""}.`
+      : "Nothing would be set.";
     refresh();
   } catch (error) {
     summary.textContent = "";
@@ -252,18 +339,29 @@ const PHASES = { reading: "Reading", writing: "Writing", rebooting: "Starting ag
 
 /** The lines of a plan in the order in which they would be sent, then those that would be left out. */
 function linesOf(plan, table, other, refresh) {
-  const staged = plan.stages.flatMap(({ purpose, steps }) => steps.map(({ name }) => [name, purpose === "the others" ? "" : purpose]));
+  const staged = plan.stages.flatMap(({ purpose, steps }) =>
+    steps.map(({ name }) => [name, purpose === "the others" ? "" : purpose]),
+  );
   const purposes = new Map(staged);
   const names = [...purposes.keys(), ...Object.keys(plan.params).filter((name) => !purposes.has(name))];
   return names
     .map((name) => ({ name, planned: plan.params[name] }))
-    .filter(({ name, planned }) => planned && planned.status !== "unchanged" && (table.rows.has(name) || planned.category === "missing"))
+    .filter(
+      ({ name, planned }) =>
+        planned && planned.status !== "unchanged" && (table.rows.has(name) || planned.category === "missing"),
+    )
     .map(({ name, planned }) => {
       const row = table.rows.get(name);
       const { status } = planned;
       const isDoubtful = status === "invalid" && planned.category === "out-of-range";
       const isOut = !row || planned.category === "missing" || (status === "invalid" && !isDoubtful);
-      const box = el("input", { type: "checkbox", checked: status === "set", disabled: isOut, "aria-label": `Set ${name}`, on: { change: refresh } });
+      const box = el("input", {
+        type: "checkbox",
+        checked: status === "set",
+        disabled: isOut,
+        "aria-label": `Set ${name}`,
+        on: { change: refresh },
+      });
       const word = status === "set" ? "" : isOut ? "cannot be set" : isDoubtful ? "doubtful" : "left out";
       const remark = el(
         "td",
@@ -271,7 +369,15 @@ function linesOf(plan, table, other, refresh) {
         word && el("b", { class: `outcome ${isDoubtful ? "warn" : "quiet"}`, text: word }),
         ` ${(planned.reason || purposes.get(name) || "").replace(/^left out: /, "")}`,
       );
-      const element = el("tr", { class: isOut ? "out" : "" }, el("td", { class: "pick" }, box), el("th", { scope: "row", text: name }), el("td", { class: "now", text: row?.text ?? "" }), el("td", { class: "new", text: numberText(planned.wanted, row?.type ?? planned.type) }), remark);
+      const element = el(
+        "tr",
+        { class: isOut ? "out" : "" },
+        el("td", { class: "pick" }, box),
+        el("th", { scope: "row", text: name }),
+        el("td", { class: "now", text: row?.text ?? "" }),
+        el("td", { class: "new", text: numberText(planned.wanted, row?.type ?? planned.type) }),
+        remark,
+      );
       const restore = row?.document.bits ? { bits: row.document.bits } : row?.document.value;
       return { name, status, box, remark, element, before: row?.text ?? "", restore };
     });

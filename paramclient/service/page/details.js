@@ -35,7 +35,11 @@ export class Details {
     this.root.hidden = false;
     document.body.classList.toggle("with-sheet", isNarrow());
     if (this.name !== row.name || this.key !== store.selected) this.draw(row);
-    if (isWanted) (this.form && isNarrow() ? this.root.querySelector("h2") : (this.form?.first ?? this.root.querySelector("h2"))).focus();
+    if (isWanted)
+      (this.form && isNarrow()
+        ? this.root.querySelector("h2")
+        : (this.form?.first ?? this.root.querySelector("h2"))
+      ).focus();
   }
 
   /** The person stands on another row: what is open follows, what is closed stays so. */
@@ -77,7 +81,9 @@ export class Details {
         el("h2", { tabindex: "-1", text: row.name }),
         button("", () => this.close(), { kind: "quiet only", drawing: "close", label: "Close" }),
       ),
-      el("div", { class: "scroll" },
+      el(
+        "div",
+        { class: "scroll" },
         info?.short_description && el("p", { class: "short", text: info.short_description }),
         this.value,
         this.form,
@@ -99,7 +105,11 @@ export class Details {
     this.value.replaceChildren(
       el("b", { text: row.text }),
       el("span", { text: row.meaning || info?.units || "" }),
-      !row.news ? "" : el("em", { text: `was ${row.news.before}, changed ${span((Date.now() - row.news.at) / 1000)} ago by ${row.news.by}` }),
+      !row.news
+        ? ""
+        : el("em", {
+            text: `was ${row.news.before}, changed ${span((Date.now() - row.news.at) / 1000)} ago by ${row.news.by}`,
+          }),
     );
     const standard = defaultOf(known);
     const facts = [
@@ -117,7 +127,9 @@ export class Details {
       ["Changes", info?.is_volatile && "by itself, now and then"],
     ];
     const shown = facts.filter(([, text]) => text !== null && text !== undefined && text !== false && text !== "");
-    this.facts.replaceChildren(...shown.flatMap(([word, text]) => [el("dt", { text: word }), el("dd", { text: String(text) })]));
+    this.facts.replaceChildren(
+      ...shown.flatMap(([word, text]) => [el("dt", { text: word }), el("dd", { text: String(text) })]),
+    );
     if (row.news && row.news.at !== this.newsAt) {
       this.newsAt = row.news.at;
       this.loadPast(row);
@@ -147,10 +159,14 @@ export class Details {
       el("span", { class: "step", text: `${old} → ${now}` }),
       el("small", { text: `${moment(timeOf(entry))} · ${authorOf(entry.by)}` }),
       store.mayWrite &&
-        button("Take", () => {
-          const read = parse(old, row.type);
-          if (!read.error) store.stage(row.name, read.text, read.send);
-        }, { kind: "quiet", label: `Take ${old} again` }),
+        button(
+          "Take",
+          () => {
+            const read = parse(old, row.type);
+            if (!read.error) store.stage(row.name, read.text, read.send);
+          },
+          { kind: "quiet", label: `Take ${old} again` },
+        ),
     );
   }
 }

@@ -13,7 +13,11 @@ export function openDialog(title, content, buttons, { isHeld = () => false, kind
   const heading = el("h2", { id: "dialog-title", text: title });
   const close = button("", () => isHeld() || closeDialog(), { kind: "quiet only", drawing: "close", label: "Close" });
   dialog.className = kind;
-  dialog.replaceChildren(el("header", {}, heading, close), el("div", { class: "scroll" }, content), el("footer", {}, buttons));
+  dialog.replaceChildren(
+    el("header", {}, heading, close),
+    el("div", { class: "scroll" }, content),
+    el("footer", {}, buttons),
+  );
   dialog.oncancel = (event) => {
     if (isHeld()) event.preventDefault();
   };
@@ -61,7 +65,8 @@ async function ask() {
             isDone = true;
             closeDialog();
           } catch (error) {
-            fault.textContent = error.status === 401 || error.status === 403 ? "The service does not know this token." : error.message;
+            fault.textContent =
+              error.status === 401 || error.status === 403 ? "The service does not know this token." : error.message;
             field.select();
           }
         },
@@ -96,6 +101,10 @@ export function showKeys() {
     ["v", "go to the vehicles"],
     ["?", "this list"],
   ];
-  const list = el("dl", { class: "keys" }, keys.flatMap(([key, text]) => [el("dt", {}, el("kbd", { text: key })), el("dd", { text })]));
+  const list = el(
+    "dl",
+    { class: "keys" },
+    keys.flatMap(([key, text]) => [el("dt", {}, el("kbd", { text: key })), el("dd", { text })]),
+  );
   return openDialog("Keys", list, [button("Close", closeDialog, { kind: "strong" })]);
 }

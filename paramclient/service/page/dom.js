@@ -38,7 +38,14 @@ export function icon(name) {
 export function button(text, onclick, { kind = "", drawing = null, label = null, ...more } = {}) {
   return el(
     "button",
-    { type: "button", class: `button ${kind}`.trim(), "aria-label": label, title: label, on: { click: onclick }, ...more },
+    {
+      type: "button",
+      class: `button ${kind}`.trim(),
+      "aria-label": label,
+      title: label,
+      on: { click: onclick },
+      ...more,
+    },
     drawing && icon(drawing),
     text && el("span", { text }),
   );

@@ -58,12 +58,14 @@ export function editorOf(row, pending, { stage, leave, isCompact = true }) {
       { class: "buttons" },
       el("button", { type: "submit", class: "button strong", text: "Stage" }),
       button("Cancel", leave, { kind: "quiet" }),
-      defaultOf(row.document) !== null && button("Default", () => input.write(defaultOf(row.document)), { kind: "quiet" }),
+      defaultOf(row.document) !== null &&
+        button("Default", () => input.write(defaultOf(row.document)), { kind: "quiet" }),
     ),
   );
   form.first = input.first;
   form.refresh = (now) => {
-    if (!sameText(now.text, before, type)) news.textContent = `Meanwhile it is ${now.text}${now.news ? `, by ${now.news.by}` : ""}.`;
+    if (!sameText(now.text, before, type))
+      news.textContent = `Meanwhile it is ${now.text}${now.news ? `, by ${now.news.by}` : ""}.`;
   };
   return form;
 }
@@ -144,7 +146,10 @@ function number(row, value, hintId, say) {
         event.preventDefault();
         const read = parse(first.value, type);
         if (read.error || !Number.isFinite(Number(read.text))) return;
-        const step = (event.key === "ArrowUp" ? 1 : -1) * (info?.increment ?? (isFloat(type) ? 0.1 : 1)) * (event.shiftKey ? 10 : 1);
+        const step =
+          (event.key === "ArrowUp" ? 1 : -1) *
+          (info?.increment ?? (isFloat(type) ? 0.1 : 1)) *
+          (event.shiftKey ? 10 : 1);
         first.value = stepped(read.text, step, type);
         say(parse(first.value, type));
       },
@@ -155,7 +160,12 @@ function number(row, value, hintId, say) {
     say(parse(text, type));
     first.focus();
   };
-  return { first, fields: [first, info?.units && el("span", { class: "units", text: info.units })], read: () => parse(first.value, type), write };
+  return {
+    first,
+    fields: [first, info?.units && el("span", { class: "units", text: info.units })],
+    read: () => parse(first.value, type),
+    write,
+  };
 }
 
 function list(row, value, hintId, say) {
@@ -189,7 +199,12 @@ function list(row, value, hintId, say) {
   };
   first.value = isNamed ? plain(value) : OTHER;
   field.first.hidden = isNamed;
-  return { first, fields: [first, ...field.fields.slice(0, 1)], read: () => (first.value === OTHER ? field.read() : parse(first.value, type)), write };
+  return {
+    first,
+    fields: [first, ...field.fields.slice(0, 1)],
+    read: () => (first.value === OTHER ? field.read() : parse(first.value, type)),
+    write,
+  };
 }
 
 function boxes(row, value, say) {
@@ -202,14 +217,21 @@ function boxes(row, value, say) {
     for (const [bit, box] of made) box.checked = Boolean((mask >> bit) & 1n);
   };
   const made = Object.keys(info.bits).map((bit) => {
-    const box = el("input", { type: "checkbox", on: { change: () => {
-      mask ^= 1n << BigInt(bit);
-      show();
-      say(parse(text(), type));
-    } } });
+    const box = el("input", {
+      type: "checkbox",
+      on: {
+        change: () => {
+          mask ^= 1n << BigInt(bit);
+          show();
+          say(parse(text(), type));
+        },
+      },
+    });
     return [BigInt(bit), box];
   });
-  const labels = made.map(([bit, box]) => el("label", { class: "bit" }, box, el("span", { text: info.bits[bit] }), el("small", { text: `bit ${bit}` })));
+  const labels = made.map(([bit, box]) =>
+    el("label", { class: "bit" }, box, el("span", { text: info.bits[bit] }), el("small", { text: `bit ${bit}` })),
+  );
   const group = el("fieldset", { class: "bits", "aria-label": `Bits of ${name}` }, labels);
   const step = (by, event) => {
     const place = made.findIndex(([, box]) => box === document.activeElement);
@@ -224,7 +246,7 @@ function boxes(row, value, say) {
   return {
     first: made[0]?.[1] ?? total,
     fields: [group, total],
-    read: () => (isFloat(type) ? parse(text(), type) : parse(text(), type)),
+    read: () => parse(text(), type),
     write: (standard) => {
       mask = maskOf(standard, type) ?? mask;
       show();
@@ -239,7 +261,8 @@ function stepped(text, step, type) {
   return String(Number((Number(text) + step).toFixed(Math.min(20, places))));
 }
 
-const decimals = (text) => (text.split("e")[0].split(".")[1] ?? "").length + Math.max(0, -Number(text.split("e")[1] ?? 0));
+const decimals = (text) =>
+  (text.split("e")[0].split(".")[1] ?? "").length + Math.max(0, -Number(text.split("e")[1] ?? 0));
 
 function hints(row) {
   const { info, type } = row;

@@ -103,7 +103,14 @@ export class Grid {
     made.mark = el("i", { class: "mark" });
     made.label = el("span", { class: "label" });
     made.name.append(made.mark, made.label);
-    made.row = el("div", { role: "row", class: "row", id: `row-${++this.count}` }, made.name, made.value, made.third, made.text);
+    made.row = el(
+      "div",
+      { role: "row", class: "row", id: `row-${++this.count}` },
+      made.name,
+      made.value,
+      made.third,
+      made.text,
+    );
     this.body.append(made.row);
     return made;
   }
@@ -127,7 +134,10 @@ export class Grid {
     if (pending) setText(made.number, `${row.text} → ${pending.text}`);
     else setText(made.number, row.text);
     setText(made.units, pending ? "" : row.meaning || row.info?.units || "");
-    setText(made.third, other ? (other.values.get(row.name)?.text ?? (other.isPartial ? "" : "–")) : (defaultOf(row.document) ?? ""));
+    setText(
+      made.third,
+      other ? (other.values.get(row.name)?.text ?? (other.isPartial ? "" : "–")) : (defaultOf(row.document) ?? ""),
+    );
     setText(made.text, row.description);
     setText(made.mark, "");
     const states = [
@@ -144,7 +154,11 @@ export class Grid {
     if (element.className !== kind) element.className = kind;
     setAttribute(element, "aria-selected", index === this.index);
     setAttribute(made.value, "aria-description", said(row, pending));
-    setAttribute(element, "title", row.news ? `${row.news.before} → ${textOf(row.document)}, changed by ${row.news.by}` : null);
+    setAttribute(
+      element,
+      "title",
+      row.news ? `${row.news.before} → ${textOf(row.document)}, changed by ${row.news.by}` : null,
+    );
   }
 
   /** Goes to a row and keeps it in sight. */
@@ -178,7 +192,16 @@ export class Grid {
   key(event) {
     if (event.target !== this.root || event.ctrlKey || event.metaKey || event.altKey) return;
     const page = Math.max(1, Math.floor(this.view / this.height) - 2);
-    const steps = { ArrowDown: 1, ArrowUp: -1, PageDown: page, PageUp: -page, Home: -Infinity, End: Infinity, j: 1, k: -1 };
+    const steps = {
+      ArrowDown: 1,
+      ArrowUp: -1,
+      PageDown: page,
+      PageUp: -page,
+      Home: -Infinity,
+      End: Infinity,
+      j: 1,
+      k: -1,
+    };
     if (event.key in steps) this.go(this.index + steps[event.key]);
     else if (!this.active) return;
     else if (event.key === "Enter" || event.key === "F2") this.open(this.active);

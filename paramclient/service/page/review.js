@@ -4,8 +4,8 @@ import { Problem, at, request } from "./api.js";
 import { announce, button, el } from "./dom.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
-import { store } from "./store.js";
-import { defaultOf, doubt, many, meaningOf, sameText, textOf } from "./values.js";
+import { keyOf, store } from "./store.js";
+import { defaultOf, doubt, many, meaningOf, sameText } from "./values.js";
 
 const AT_ONCE = 4;
 /** A write may be repeated for long on a bad link; the service says when it gives up. */
@@ -22,17 +22,35 @@ export const OUTCOMES = {
   failed: { text: "failed", kind: "bad" },
 };
 
-/** The state of a vehicle in which it should not be changed lightly: a sentence and a box to be ticked, or null. */
-export function caution(component, change) {
-  if (!component.is_armed) return null;
-  const box = el("input", { type: "checkbox", on: { change } });
-  const element = el(
-    "div",
-    { class: "armed", role: "alert" },
-    el("p", {}, el("b", { text: "The vehicle is armed. " }), "Its motors may turn, and what is sent counts at once."),
-    el("label", {}, box, el("span", { text: "Send all the same" })),
-  );
-  return { element, box };
+/**
+ * What stands in the way of sending to an armed vehicle: a sentence, and a box to be ticked. It shows itself while
+ * the vehicle is armed, also where that happens meanwhile; `change` is called when it may have made a difference.
+ */
+export class Caution {
+  constructor(component, change) {
+    this.key = keyOf(component);
+    this.box = el("input", { type: "checkbox", on: { change } });
+    this.element = el(
+      "div",
+      { class: "armed", role: "alert", hidden: !this.isArmed },
+      el("p", {}, el("b", { text: "The vehicle is armed. " }), "Its motors may turn, and what is sent counts at once."),
+      el("label", {}, this.box, el("span", { text: "Send all the same" })),
+    );
+    const forget = store.on("armed", () => {
+      if (!this.element.isConnected) return forget();
+      this.element.hidden = !this.isArmed;
+      this.box.checked = false;
+      return change();
+    });
+  }
+
+  get isArmed() {
+    return Boolean(store.components.get(this.key)?.is_armed);
+  }
+
+  get forbids() {
+    return this.isArmed && !this.box.checked;
+  }
 }
 
 /** Shows what is pending, sends it when that is wanted, shows what became of it. */
@@ -40,42 +58,60 @@ export async function review() {
   const { component, table } = store;
   const changes = [...table.pending.values()].sort((a, b) => (a.name < b.name ? -1 : 1));
   if (!component || !changes.length) return;
-  const lines = new Map(changes.map((change) => [change.name, lineOf(change, table.rows.get(change.name), () => drop(change.name))]));
-  const body = el("tbody", {}, [...lines.values()].map((line) => line.element));
+  const lines = new Map(
+    changes.map((change) => [change.name, lineOf(change, table.rows.get(change.name), () => drop(change.name))]),
+  );
+  const body = el(
+    "tbody",
+    {},
+    [...lines.values()].map((line) => line.element),
+  );
   const table_ = el(
     "table",
     { class: "changes" },
-    el("thead", {}, el("tr", {}, ...["Name", "Now", "New", "Remark"].map((text) => el("th", { scope: "col", text })), el("th", {}, el("span", { class: "unseen", text: "Drop" })))),
+    el(
+      "thead",
+      {},
+      el(
+        "tr",
+        {},
+        ...["Name", "Now", "New", "Remark"].map((text) => el("th", { scope: "col", text })),
+        el("th", {}, el("span", { class: "unseen", text: "Drop" })),
+      ),
+    ),
     body,
   );
-  const armed = caution(component, () => refresh());
+  const armed = new Caution(component, () => refresh());
   const summary = el("p", { class: "summary", role: "status" });
   const send = button("", () => go(), { kind: "strong" });
   const cancel = button("Not yet", closeDialog, { kind: "quiet" });
   const buttons = el("div", { class: "buttons" }, cancel, send);
   let isSending = false;
+  let sent = null;
 
   function refresh() {
     const count = lines.size;
-    send.disabled = !count || (armed !== null && !armed.box.checked);
+    if (isSending || sent) return;
+    send.disabled = !count || armed.forbids;
     send.replaceChildren(el("span", { text: `Send ${many(count, "change")}` }));
   }
 
   function drop(name) {
     lines.get(name).element.remove();
     lines.delete(name);
-    store.unstage(name);
+    table.pending.delete(name);
+    store.tell("pending");
     refresh();
     if (!lines.size) closeDialog();
     else send.focus();
   }
 
   async function go() {
-    if (isSending) return;
+    if (isSending || armed.forbids) return;
     isSending = true;
     send.disabled = cancel.disabled = true;
     send.replaceChildren(el("span", { text: "Sending …" }));
-    const sent = { names: new Set(lines.keys()), outcomes: [], at: Date.now() };
+    sent = { names: new Set(lines.keys()), outcomes: [], at: Date.now() };
     table.sent = sent;
     const queue = [...lines.values()];
     const worker = async () => {
@@ -91,18 +127,28 @@ export async function review() {
     announce(said);
     const late = sent.outcomes.filter((each) => each.isTaken && each.isLate).map((each) => each.name);
     if (late.length) summary.append(el("br"), `Counts from the next start of the vehicle on: ${late.join(", ")}.`);
-    const way = sent.outcomes.some((each) => each.isTaken) && button("Undo …", () => {
-      closeDialog();
-      undo();
-    }, { kind: "quiet", drawing: "undo" });
+    const way =
+      sent.outcomes.some((each) => each.isTaken) &&
+      button(
+        "Undo …",
+        () => {
+          closeDialog();
+          undo();
+        },
+        { kind: "quiet", drawing: "undo" },
+      );
     const done = button("Done", closeDialog, { kind: "strong" });
     buttons.replaceChildren(...[way, done].filter(Boolean));
     done.focus();
   }
 
   refresh();
-  const focus = armed ? armed.box : send;
-  await openDialog(`Review: ${nameOf(component)}`, el("div", {}, armed?.element, table_, summary), buttons, { isHeld: () => isSending, kind: "wide", focus });
+  const focus = armed.isArmed ? armed.box : send;
+  await openDialog(`Review: ${nameOf(component)}`, el("div", {}, armed.element, table_, summary), buttons, {
+    isHeld: () => isSending,
+    kind: "wide",
+    focus,
+  });
 }
 
 /** Puts the values from before the last sending on the list, and shows it. Nothing is sent without a look. */
@@ -131,7 +177,13 @@ export function nameOf(component) {
   return `${AUTOPILOTS[component.autopilot] ?? component.autopilot} ${component.system}/${component.component}`;
 }
 
-const AUTOPILOTS = { px4: "PX4", ardupilot: "ArduPilot", ardupilotmega: "ArduPilot", generic: "Generic", unknown: "Unknown" };
+const AUTOPILOTS = {
+  px4: "PX4",
+  ardupilot: "ArduPilot",
+  ardupilotmega: "ArduPilot",
+  generic: "Generic",
+  unknown: "Unknown",
+};
 
 function lineOf(change, row, drop) {
   const { name, text } = change;
@@ -147,9 +199,26 @@ function lineOf(change, row, drop) {
     return meaning ? `${value} ${meaning}` : `${value}${units}`;
   };
   const doubts = row ? doubt(text, row.info, row.type) : "";
-  const remark = el("td", { class: "remark" }, doubts && el("b", { class: "outcome warn", text: `${doubts} ` }), remarks.join(" "));
-  const away = el("td", { class: "drop-it" }, button("", drop, { kind: "quiet only", drawing: "close", label: `Drop ${name}` }));
-  const element = el("tr", {}, el("th", { scope: "row", text: name }), el("td", { class: "now", text: in_words(row?.text ?? "") }), el("td", { class: "new", text: in_words(text) }), remark, away);
+  const remark = el(
+    "td",
+    { class: "remark" },
+    doubts && el("b", { class: "outcome warn", text: `${doubts} ` }),
+    remarks.join(" "),
+  );
+  const away = el(
+    "td",
+    { class: "drop-it" },
+    button("", drop, { kind: "quiet only", drawing: "close", label: `Drop ${name}` }),
+  );
+  const element = el(
+    "tr",
+    {},
+    el("th", { scope: "row", text: name }),
+    el("td", { class: "now", text: in_words(row?.text ?? "") }),
+    el("td", { class: "new", text: in_words(text) }),
+    remark,
+    away,
+  );
   return { change, row, element, remark, away };
 }
 
@@ -157,17 +226,31 @@ function lineOf(change, row, drop) {
 async function sendOne(component, { change, row, element, remark, away }) {
   const { name, text, send } = change;
   const before = { text: row.text, restore: row.document.bits ? { bits: row.document.bits } : row.document.value };
-  const outcome = { name, before: before.text, restore: before.restore, isTaken: false, isLate: Boolean(row.info?.reboot_required) };
+  const outcome = {
+    name,
+    before: before.text,
+    restore: before.restore,
+    isTaken: false,
+    isLate: Boolean(row.info?.reboot_required),
+  };
   away.replaceChildren();
   element.classList.add("busy");
   remark.textContent = "sending …";
   try {
-    const { results } = await request("PATCH", at(component, "/params"), { values: { [name]: send } }, { patience: WRITE_PATIENCE });
+    const { results } = await request(
+      "PATCH",
+      at(component, "/params"),
+      { values: { [name]: send } },
+      { patience: WRITE_PATIENCE },
+    );
     const result = results[name];
     if (result?.problem) throw new Problem(result.problem.status, result.problem);
     outcome.status = result.status ?? "accepted";
     outcome.isTaken = true;
-    outcome.reason = outcome.status === "adjusted" ? `The vehicle made ${valueText(result.actual, row.type)} of ${text}.` : (result.reason ?? "");
+    outcome.reason =
+      outcome.status === "adjusted"
+        ? `The vehicle made ${valueText(result.actual, row.type)} of ${text}.`
+        : (result.reason ?? "");
   } catch (error) {
     outcome.status = error.document?.type?.endsWith(":no-reply") || !error.status ? "failed" : "refused";
     outcome.reason = error.message;
@@ -177,6 +260,3 @@ async function sendOne(component, { change, row, element, remark, away }) {
   remark.replaceChildren(el("b", { class: `outcome ${kind}`, text: word }), outcome.reason ? ` ${outcome.reason}` : "");
   return outcome;
 }
-
-/** What the vehicle has now under a name, in text. */
-export const nowOf = (name) => textOf(store.table.rows.get(name)?.document);

@@ -118,7 +118,7 @@ class Table {
   }
 }
 
-/** Everything. Those who draw subscribe by `on(kind, listener)`. */
+/** Everything. Those who draw subscribe by `on(kind, listener)`, which gives what ends that. */
 class Store {
   constructor() {
     this.me = { role: "read", name: "", read_only: true };
@@ -136,6 +136,11 @@ class Store {
   on(kind, listener) {
     if (!this.listeners.has(kind)) this.listeners.set(kind, []);
     this.listeners.get(kind).push(listener);
+    return () =>
+      this.listeners.set(
+        kind,
+        this.listeners.get(kind).filter((each) => each !== listener),
+      );
   }
 
   tell(kind, what) {
@@ -168,6 +173,7 @@ class Store {
     this.me = me;
     this.links = new Map(links.links.map((link) => [link.name, link]));
     const documents = new Map(found.components.map((each) => [keyOf(each), each]));
+    if (this.component && !documents.has(this.selected)) documents.set(this.selected, gone(this.component));
     this.components = documents;
     this.seq = found.seq;
     const early = this.early;
@@ -234,7 +240,8 @@ class Store {
   takeComponent(key, event) {
     if (event.seq <= this.seq) return;
     if (event.why === "forgotten") {
-      this.components.delete(key);
+      if (key === this.selected && this.component) this.components.set(key, gone(this.component));
+      else this.components.delete(key);
       const table = this.tables.get(key);
       if (table) table.isLoaded = false; // what was staged waits for the vehicle to come back
     } else {
@@ -291,6 +298,9 @@ class Store {
 }
 
 const NO_TABLE = new Table();
+
+/** One that the service does not know any more, and that somebody looks at: nobody is led to another unasked. */
+const gone = (component) => ({ ...component, is_lost: true, is_armed: null, state: "lost", silence_s: 0, fetch: null });
 
 /** Who changed a value, in words. */
 export function authorOf(by) {

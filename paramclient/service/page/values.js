@@ -10,7 +10,15 @@ const BOUNDS = {
   INT64: [-(2n ** 63n), 2n ** 63n - 1n],
   UINT64: [0n, 2n ** 64n - 1n],
 };
-const WORDS = { nan: "NaN", "+nan": "NaN", inf: "Infinity", "+inf": "Infinity", infinity: "Infinity", "-inf": "-Infinity", "-infinity": "-Infinity" };
+const WORDS = {
+  nan: "NaN",
+  "+nan": "NaN",
+  inf: "Infinity",
+  "+inf": "Infinity",
+  infinity: "Infinity",
+  "-inf": "-Infinity",
+  "-infinity": "-Infinity",
+};
 
 export const isFloat = (type) => type === "REAL32" || type === "REAL64";
 export const isWhole = (type) => type in BOUNDS;
@@ -52,7 +60,9 @@ export function meaningOf(text, info, type) {
   if (named !== undefined) return named;
   const mask = info.bits ? maskOf(text, type) : null;
   if (mask === null || mask === 0n) return "";
-  const names = Object.entries(info.bits).filter(([bit]) => (mask >> BigInt(bit)) & 1n).map(([, name]) => name);
+  const names = Object.entries(info.bits)
+    .filter(([bit]) => (mask >> BigInt(bit)) & 1n)
+    .map(([, name]) => name);
   const rest = Object.keys(info.bits).reduce((left, bit) => left & ~(1n << BigInt(bit)), mask);
   return [...names, ...(rest ? [`0x${rest.toString(16)}`] : [])].join(" | ");
 }
@@ -81,7 +91,8 @@ export function parse(written, type) {
   const text = written.trim();
   if (text === "") return { error: "A value is missing." };
   if (isWhole(type)) {
-    if (!/^[+-]?(\d{1,20}|0x[\da-f]{1,16})$/i.test(text)) return { error: `${type} takes a whole number, such as 12 or 0x1F.` };
+    if (!/^[+-]?(\d{1,20}|0x[\da-f]{1,16})$/i.test(text))
+      return { error: `${type} takes a whole number, such as 12 or 0x1F.` };
     const size = BigInt(text.replace(/^[+-]/, ""));
     const number = text.startsWith("-") ? -size : size;
     const [low, high] = BOUNDS[type];
@@ -93,7 +104,8 @@ export function parse(written, type) {
   const word = WORDS[text.toLowerCase()];
   if (word !== undefined) return { text: word, send: word };
   const plain = text.replace(",", ".");
-  if (!/^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d{1,3})?$/i.test(plain)) return { error: "That is no number; 12, -1.5, 1e-3, nan and inf are." };
+  if (!/^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d{1,3})?$/i.test(plain))
+    return { error: "That is no number; 12, -1.5, 1e-3, nan and inf are." };
   const number = type === "REAL64" ? Number(plain) : Math.fround(Number(plain));
   if (!Number.isFinite(number)) return { error: `${text} is more than a ${type} holds.` };
   return { text: numberText(Number(plain), type), send: Number(plain) };
@@ -105,9 +117,12 @@ export function doubt(text, info, type) {
   const units = info.units ? ` ${info.units}` : "";
   const number = Number(text);
   const as = (bound) => (type === "REAL32" ? Math.fround(bound) : bound);
-  if (Number.isNaN(number)) return typeof info.minimum === "number" || typeof info.maximum === "number" ? "NaN is in no range." : "";
-  if (typeof info.minimum === "number" && as(number) < as(info.minimum)) return `Below the minimum of ${info.minimum}${units}.`;
-  if (typeof info.maximum === "number" && as(number) > as(info.maximum)) return `Above the maximum of ${info.maximum}${units}.`;
+  if (Number.isNaN(number))
+    return typeof info.minimum === "number" || typeof info.maximum === "number" ? "NaN is in no range." : "";
+  if (typeof info.minimum === "number" && as(number) < as(info.minimum))
+    return `Below the minimum of ${info.minimum}${units}.`;
+  if (typeof info.maximum === "number" && as(number) > as(info.maximum))
+    return `Above the maximum of ${info.maximum}${units}.`;
   return "";
 }
 
@@ -145,7 +160,11 @@ export function rangeOf(info) {
 /** A duration as it is said: `4 s`, `3 min`, `2 h`. */
 export function span(seconds) {
   if (seconds < 90) return `${Math.max(0, Math.round(seconds))} s`;
-  return seconds < 5400 ? `${Math.round(seconds / 60)} min` : seconds < 172800 ? `${Math.round(seconds / 3600)} h` : `${Math.round(seconds / 86400)} days`;
+  return seconds < 5400
+    ? `${Math.round(seconds / 60)} min`
+    : seconds < 172800
+      ? `${Math.round(seconds / 3600)} h`
+      : `${Math.round(seconds / 86400)} days`;
 }
 
 /** A moment by the clock of who looks: the time today, else with the date. */

@@ -1,6 +1,6 @@
 /** The vehicles and how they are: the list at the side, the line on top, what can be done with one. */
 
-import { addressOf, at, get, request } from "./api.js";
+import { at, download, get, request } from "./api.js";
 import { announce, button, byId, el, setText } from "./dom.js";
 import { chooseOther } from "./compare.js";
 import { closeDialog, openDialog } from "./dialogs.js";
@@ -16,18 +16,38 @@ const STATES = {
   fetching: "fetching",
   lost: "lost",
 };
+/** A table that has to be fetched first. */
+const SAVE_PATIENCE = 180_000;
 /** A file of descriptions may have 100 kB, and the radio 2 kB a second. */
 const DESCRIPTION_PATIENCE = 300_000;
 const KINDS = { new: "idle", cached: "warn", partial: "warn", synced: "good", fetching: "busy", lost: "bad" };
 /** The kinds of vehicle of MAV_TYPE that have parameters worth a name. */
-const TYPES = { 1: "plane", 2: "quadrotor", 3: "coaxial", 4: "helicopter", 10: "rover", 11: "boat", 12: "submarine", 13: "hexarotor", 14: "octorotor", 15: "tricopter", 19: "tailsitter", 20: "tailsitter", 21: "tiltrotor", 22: "VTOL", 26: "gimbal", 30: "camera" };
+const TYPES = {
+  1: "plane",
+  2: "quadrotor",
+  3: "coaxial",
+  4: "helicopter",
+  10: "rover",
+  11: "boat",
+  12: "submarine",
+  13: "hexarotor",
+  14: "octorotor",
+  15: "tricopter",
+  19: "tailsitter",
+  20: "tailsitter",
+  21: "tiltrotor",
+  22: "VTOL",
+  26: "gimbal",
+  30: "camera",
+};
 const AWAY = { away: "link away", failed: "link failed", opening: "link opening" };
 
 /** How a component is, in words and as a kind of dot. */
 export function stateOf(component) {
   const link = store.links.get(component.link)?.state ?? component.link_state ?? "open";
   if (link !== "open") return { text: AWAY[link] ?? link, kind: "bad" };
-  if (component.is_lost) return { text: `lost${component.silence_s ? ` for ${span(component.silence_s)}` : ""}`, kind: "bad" };
+  if (component.is_lost)
+    return { text: `lost${component.silence_s ? ` for ${span(component.silence_s)}` : ""}`, kind: "bad" };
   if (component.fetch) return { text: progressText(component.fetch), kind: "busy" };
   return { text: STATES[component.state] ?? component.state, kind: KINDS[component.state] ?? "idle" };
 }
@@ -38,7 +58,9 @@ function progressText(fetch) {
 }
 
 export function drawVehicles() {
-  const components = [...store.components.values()].sort((a, b) => a.system - b.system || a.component - b.component || (a.link < b.link ? -1 : 1));
+  const components = [...store.components.values()].sort(
+    (a, b) => a.system - b.system || a.component - b.component || (a.link < b.link ? -1 : 1),
+  );
   drawList(components);
   drawChoice(components);
   drawVehicle(store.component);
@@ -49,7 +71,19 @@ function drawList(components) {
   const had = new Map([...list.children].map((item) => [item.dataset.key, item]));
   const items = components.map((component) => {
     const key = keyOf(component);
-    const item = had.get(key) ?? el("li", { data: { key } }, el("button", { type: "button", class: "vehicle", on: { click: () => store.select(key).catch(complain) } }, el("i", { class: "dot" }), el("b"), el("small")));
+    const item =
+      had.get(key) ??
+      el(
+        "li",
+        { data: { key } },
+        el(
+          "button",
+          { type: "button", class: "vehicle", on: { click: () => store.select(key).catch(complain) } },
+          el("i", { class: "dot" }),
+          el("b"),
+          el("small"),
+        ),
+      );
     const [choose] = item.children;
     const [dot, name, remark] = choose.children;
     const state = stateOf(component);
@@ -61,7 +95,8 @@ function drawList(components) {
     else choose.removeAttribute("aria-current");
     return item;
   });
-  if (items.length !== list.children.length || items.some((item, place) => list.children[place] !== item)) list.replaceChildren(...items);
+  if (items.length !== list.children.length || items.some((item, place) => list.children[place] !== item))
+    list.replaceChildren(...items);
   if (!items.length) list.append(el("li", { class: "nothing", text: "None heard yet." }));
 }
 
@@ -113,8 +148,14 @@ export function drawActions() {
   const actions = [
     button("Compare", () => chooseOther(), { drawing: "compare" }),
     button("Save", save, { drawing: "save" }),
-    button("Describe", describe, { drawing: "help", label: "Ask the vehicle what its parameters mean", id: "describe", hidden: true }),
-    store.mayWrite && button("Snapshot", keepState, { drawing: "keep", label: "Snapshot: keep the present state, to go back to" }),
+    button("Describe", describe, {
+      drawing: "help",
+      label: "Ask the vehicle what its parameters mean",
+      id: "describe",
+      hidden: true,
+    }),
+    store.mayWrite &&
+      button("Snapshot", keepState, { drawing: "keep", label: "Snapshot: keep the present state, to go back to" }),
     button("Fetch", fetchAll, { drawing: "refresh", label: "Fetch all parameters from the vehicle" }),
   ];
   byId("actions").replaceChildren(...actions.filter(Boolean));
@@ -149,18 +190,34 @@ async function describe() {
     }
     state.textContent = "";
   };
-  const input = el("input", { type: "file", id: "file", on: { change: () => input.files[0] && attempt("PUT", input.files[0]) } });
+  const input = el("input", {
+    type: "file",
+    id: "file",
+    on: { change: () => input.files[0] && attempt("PUT", input.files[0]) },
+  });
   const ask = button("Ask the vehicle", () => attempt("POST", {}), { kind: "strong" });
   const content = el(
     "div",
     {},
-    el("p", { text: "Units, ranges and the names of values are not known here yet. A vehicle with PX4 can tell them; for others there is a file of their firmware." }),
+    el("p", {
+      text: "Units, ranges and the names of values are not known here yet. A vehicle with PX4 can tell them; for others there is a file of their firmware.",
+    }),
     el("h3", { text: "From a file" }),
-    el("label", { class: "drop", for: "file" }, el("span", { text: "apm.pdef.xml, parameters.json or the like" }), input),
+    el(
+      "label",
+      { class: "drop", for: "file" },
+      el("span", { text: "apm.pdef.xml, parameters.json or the like" }),
+      input,
+    ),
     state,
     fault,
   );
-  await openDialog(`Describe the parameters of ${nameOf(component)}`, content, [button("Cancel", closeDialog, { kind: "quiet" }), ask], { focus: ask });
+  await openDialog(
+    `Describe the parameters of ${nameOf(component)}`,
+    content,
+    [button("Cancel", closeDialog, { kind: "quiet" }), ask],
+    { focus: ask },
+  );
 }
 
 /** Offers that where nothing is described. */
@@ -173,7 +230,9 @@ async function stopFetch() {
   const { component } = store;
   try {
     const { jobs } = await get("/jobs");
-    const running = jobs.filter((job) => job.kind === "fetch" && job.state === "running" && keyOf(job) === keyOf(component));
+    const running = jobs.filter(
+      (job) => job.kind === "fetch" && job.state === "running" && keyOf(job) === keyOf(component),
+    );
     for (const job of running) await request("DELETE", `/jobs/${encodeURIComponent(job.id)}`);
     if (!running.length) announce("The service fetches by itself; that cannot be stopped here.");
   } catch (error) {
@@ -191,7 +250,7 @@ async function keepState() {
   }
 }
 
-/** Lets the person choose a form of file, and saves it by the browser's own means. */
+/** Lets the person choose a form of file, and saves the table as one; what keeps it from that is told. */
 async function save() {
   const { component } = store;
   let forms;
@@ -201,12 +260,47 @@ async function save() {
     complain(error);
     return;
   }
-  const list = el("ul", { class: "choices" }, forms.filter((form) => form.writes !== false && form.is_written !== false).map((form) => {
-    const name = form.name ?? form.form ?? form;
-    const link = el("a", { class: "choice", href: addressOf(at(component, "/file", { form: name })), download: "" }, el("b", { text: form.title ?? form.description ?? name }), el("small", { text: form.endings?.join(", ") ?? name }));
-    return el("li", {}, link);
-  }));
-  await openDialog(`Save the parameters of ${nameOf(component)}`, list, [button("Close", closeDialog, { kind: "quiet" })], { focus: list.querySelector("a") });
+  const list = el(
+    "ul",
+    { class: "choices" },
+    forms
+      .filter((form) => form.writes !== false && form.is_written !== false)
+      .map((form) => {
+        const name = form.name ?? form.form ?? form;
+        const choose = el(
+          "button",
+          { type: "button", class: "choice", on: { click: () => take(name) } },
+          el("b", { text: form.title ?? name }),
+          el("small", { text: form.endings?.join(", ") ?? name }),
+        );
+        return el("li", {}, choose);
+      }),
+  );
+  const state = el("p", { role: "status" });
+  const fault = el("p", { class: "fault", role: "alert" });
+
+  async function take(form) {
+    fault.textContent = "";
+    state.textContent = "The vehicle is asked for all of it …";
+    try {
+      const { name, content } = await download(at(component, "/file", { form }), SAVE_PATIENCE);
+      const address = URL.createObjectURL(content);
+      el("a", { href: address, download: name }).click();
+      setTimeout(() => URL.revokeObjectURL(address), SAVE_PATIENCE);
+      state.textContent = `Saved as ${name}.`;
+    } catch (error) {
+      state.textContent = "";
+      fault.textContent = error.message;
+    }
+  }
+
+  const content = el("div", {}, list, state, fault);
+  await openDialog(
+    `Save the parameters of ${nameOf(component)}`,
+    content,
+    [button("Close", closeDialog, { kind: "quiet" })],
+    { focus: list.querySelector("button") },
+  );
 }
 
 /** Says what went wrong, where everybody sees it, until something else is said. */
