@@ -25,7 +25,7 @@ PLUGIN = "pytest_paramclient.py"
 SERVED = {
     path.relative_to(ROOT).as_posix()
     for folder in ("page", "reference")
-    for path in (ROOT / "paramclient/service" / folder).iterdir()
+    for path in (ROOT / "paramclient/service" / folder).glob("*.*")
 }
 TABLES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/sim/tables").glob("*.csv")}
 

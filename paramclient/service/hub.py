@@ -164,9 +164,7 @@ class Hub:
         found = [
             followed
             for line in self.lines.values()
-            if link in (None, line.name)
-            for followed in line.followed.values()
-            if followed.address == (system, component)
+            if link in (None, line.name) and (followed := line.followed.get((system, component))) is not None
         ]
         if not found:
             on = "any link" if link is None else link

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
 import time
 from collections.abc import Awaitable, Callable
@@ -12,6 +13,7 @@ import anyio.abc
 
 from paramclient.documents.base import Document
 from paramclient.documents.job import JobDoc
+from paramclient.errors import ParamClientError
 from paramclient.service.problems import ServiceError, problem_of
 
 if TYPE_CHECKING:
@@ -27,6 +29,8 @@ MOST_RUNNING: Final = 256
 """Jobs that are under way at once: one for each component that a link can carry. Each is a task."""
 MOST_ENDED: Final = 64
 """Jobs that are kept when they have ended, for those who ask late."""
+
+logger = logging.getLogger(__name__)
 
 
 class Job:
@@ -159,6 +163,8 @@ class Jobs:
         except Exception as error:
             job.error = error
             job.state = "failed"
+            if not isinstance(error, ParamClientError | ServiceError):
+                logger.error("job %s, a %s, failed", job.id, job.kind, exc_info=error)
         finally:
             if job.state == "running":
                 job.state = "cancelled"

@@ -92,7 +92,7 @@ async def serve(
     """Serve a hub, which is not open yet, until `stop` is set; then end in good order.
 
     Streams of events end, calls that wait are answered with a problem, the cache is written. Cancelled, it
-    ends in the same way. It runs on asyncio alone, as uvicorn does.
+    cuts connections off, and writes the cache all the same. It runs on asyncio alone, as uvicorn does.
 
     Args:
         hub: the links and the cache.
