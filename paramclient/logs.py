@@ -203,7 +203,7 @@ class _PastWriter(WriteThrough):
             return None
         self._has_asked.add(key)
         cached = await self._worker.run(partial(self._kept_tables.load, *key))
-        if cached is None or cached.updated_at > self._clock():
+        if cached is None or cached.updated_at >= self._clock():
             return None
         self._based_on[key] = cached.updated_at
         return cached

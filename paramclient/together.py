@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
 import anyio
 
-from paramclient.component import TIME_IS_OVER, Component
+from paramclient.component import PROGRESS_INTERVAL, TIME_IS_OVER, Component
 from paramclient.errors import CacheError, NoReply
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.fetch import Fetch
@@ -21,6 +21,9 @@ __all__ = ["FetchTogether", "FetchedAll"]
 
 SILENT_PATIENCE: Final = 1.0
 """Seconds for which a component that does not answer at all is asked, once another one is done."""
+PATIENCE_PER_ANSWER: Final = 4.0
+"""The same by the longest time in which another one has answered: where one process is all vehicles, or this
+one serves many links, an answer may come seconds later than it would from one alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +46,7 @@ class FetchedAll:
 
 
 class FetchTogether:
-    """The fetches of all components of one system, or of every system. `end` it, whatever happens.
+    """The fetches of all components of one system, or of every system.
 
     Args:
         station: the protocol.
@@ -61,9 +64,54 @@ class FetchTogether:
         self._refresh = refresh
         self._fetches: dict[Address, Fetch] = {}
         self._is_cache_awaited = False
+        self._unanswered: dict[Address, Fetch] = {}
+        self._longest_answer = 0.0
+        self._unheard_at: dict[Address, float] = {}  # when those who have not answered were not heard either
 
-    def join(self, now: float) -> None:
-        """Begin the fetches of components that have none yet, as soon as their cached table is there."""
+    async def run(
+        self,
+        check: Callable[[], None],
+        wake: Callable[[], None],
+        *,
+        until: float,
+        hear_until: float,
+        listen_until: float,
+        progress: Callable[[Mapping[Address, Progress]], None] | None,
+    ) -> FetchedAll:
+        """Fetch until nothing more may come.
+
+        Args:
+            check: raises what ends it; called at each turn.
+            wake: is told that there may be something to send.
+            until: ends it, with what has come.
+            hear_until, listen_until: as in `is_worth_waiting`.
+            progress: called about ten times a second.
+
+        Raises:
+            ParamClientError: as from `outcome`.
+        """
+        began = anyio.current_time()
+        try:
+            while True:
+                check()
+                now = anyio.current_time()
+                if self.join(now):
+                    wake()
+                is_worth_it = self.is_worth_waiting(now, listen_until=listen_until, hear_until=hear_until)
+                if now >= until or not is_worth_it:
+                    return self.outcome(now, waited=now - began)
+                await self.news(min(PROGRESS_INTERVAL, until - now))
+                if progress is not None:
+                    progress(self.progress(anyio.current_time()))
+        finally:
+            self._end(anyio.current_time())
+            wake()  # they may have been in the way of others
+
+    def join(self, now: float) -> bool:
+        """Begin the fetches of components that have none yet, as soon as their cached table is there.
+
+        Gives whether any has begun.
+        """
         self._is_cache_awaited = False
         ready: dict[int, list[ComponentMachine]] = {}
         for address, component in self._components.items():
@@ -79,7 +127,9 @@ class FetchTogether:
         for machines in ready.values():
             begun = self._station.begin_fetches(machines, now, refresh=self._refresh)
             for machine, fetch in zip(machines, begun, strict=True):
-                self._fetches[machine.system, machine.component] = fetch
+                address = machine.system, machine.component
+                self._fetches[address] = self._unanswered[address] = fetch
+        return bool(ready)
 
     def is_worth_waiting(self, now: float, *, listen_until: float, hear_until: float) -> bool:
         """Whether more may come.
@@ -93,11 +143,14 @@ class FetchTogether:
             return True
         if not self._fetches:
             return now < hear_until
-        is_anyone_done = any(fetch.result is not None for fetch in self._fetches.values())
-        patience = SILENT_PATIENCE if is_anyone_done else math.inf
+        for address, fetch in list(self._unanswered.items()):
+            self._look(address, fetch, now)
+        patience = math.inf
+        if any(fetch.result is not None for fetch in self._fetches.values()):
+            patience = max(SILENT_PATIENCE, PATIENCE_PER_ANSWER * self._longest_answer)
         return any(
-            not fetch.done and (not fetch.is_silent or now - fetch.begun_at - fetch.held_up(now) < patience)
-            for fetch in self._fetches.values()
+            not fetch.done and (not fetch.is_silent or not self._is_mute(address, fetch, now, patience))
+            for address, fetch in self._fetches.items()
         )
 
     async def news(self, seconds: float) -> None:
@@ -149,7 +202,28 @@ class FetchTogether:
             raise NoReply(f"the parameters of {whose}", attempts=attempts, waited=waited)
         return FetchedAll(results, silent)
 
-    def end(self, now: float) -> None:
+    def _end(self, now: float) -> None:
         """Nobody waits for them any longer."""
         for address, fetch in self._fetches.items():
             self._station.components[address].end_fetch(fetch, now)
+
+    def _look(self, address: Address, fetch: Fetch, now: float) -> None:
+        """See whether one has answered by now, and how long that took; or whether it was heard at all."""
+        presence = self._station.components[address].presence
+        answered_at = fetch.first_value_at
+        if fetch.result is not None and fetch.result.source == "cache":
+            answered_at = fetch.ended_at
+        if fetch.done or answered_at < math.inf:
+            del self._unanswered[address]
+            if answered_at < math.inf:
+                took = answered_at - fetch.begun_at - fetch.held_up(now)
+                self._longest_answer = max(self._longest_answer, took)
+        elif presence.is_overdue(now):
+            self._unheard_at[address] = now
+
+    def _is_mute(self, address: Address, fetch: Fetch, now: float, patience: float) -> bool:
+        """Whether one could have answered for so long, was heard meanwhile, and has not answered."""
+        presence = self._station.components[address].presence
+        since = max(fetch.begun_at + fetch.held_up(now), self._unheard_at.get(address, -math.inf))
+        is_heard = presence.heard_at >= since or presence.is_lost or not presence.has_beaten
+        return is_heard and now - since >= patience

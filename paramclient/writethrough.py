@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -26,6 +27,16 @@ __all__ = ["WriteThrough", "chosen_cache"]
 
 FLUSH_INTERVAL: Final = 0.25
 """Seconds that changes are gathered for before they are written. A download fills several batches."""
+DOWNLOAD_INTERVAL: Final = 10.0
+FEW_FETCHES: Final = 8
+"""Seconds for which what a fetch under way brings is gathered, and the number of fetches above which that is
+done: most are over by then, and each table is written once, where parts of it would take several times as
+long. So much of a download is lost where the process is killed in its course."""
+LEAST_NEW: Final = 0.5
+"""The share of a table that must be new for a part of it to be written: that costs as much as all of it."""
+PORTION: Final = 2_000
+"""Parameters after which a transaction ends, of those that are written together: to gather so many takes a
+few milliseconds, in which nothing else is done."""
 RETRY_INTERVAL: Final = 5.0
 """Seconds until a cache that could not be written is tried again."""
 MOST_VEHICLES: Final = 16
@@ -125,6 +136,7 @@ class WriteThrough:
         if kept is not None:
             del self._kept[machine]
             machine.table.take_dirty()
+            machine.table.take_overwritten()
         return False
 
     async def bring(self, machine: ComponentMachine, identity: Identity) -> bool:
@@ -149,6 +161,10 @@ class WriteThrough:
             return True
         finally:
             self._bringing.discard(machine)
+
+    def is_bringing(self, machine: ComponentMachine) -> bool:
+        """Whether `bring` is under way for it."""
+        return machine in self._bringing
 
     async def keep_late(self, machine: ComponentMachine) -> None:
         """Keep a table that there was no time to bring the cached one for.
@@ -190,15 +206,46 @@ class WriteThrough:
             await anyio.sleep(FLUSH_INTERVAL)
             if self.is_held_back:
                 self._something_to_write.set()
-            if not await self.flush():
+            if not await self.flush(is_last=False):
                 await anyio.sleep(RETRY_INTERVAL)
                 self._something_to_write.set()
             await self._take_news()
 
-    async def flush(self) -> bool:
-        """Write what is new; false when the cache could not take it. Cancelled, it loses nothing."""
+    async def flush(self, *, is_last: bool = True) -> bool:
+        """Write what is new; false when the cache could not take it. Cancelled, it loses nothing.
+
+        Args:
+            is_last: whether what a fetch under way has brought must not be left for later.
+        """
+        portion: list[_News] = []
+        size = 0
+        are_many = sum(machine.fetch is not None for machine in self._kept) > FEW_FETCHES
+        for kept in list(self._kept.values()) if self._cache is not None else ():
+            if are_many and not is_last and self._is_for_later(kept):
+                self._something_to_write.set()
+            elif self._kept.get(kept.machine) is kept:
+                for new in self._news_of(kept):
+                    portion.append(new)
+                    size += len(new.update.params)
+            if size >= PORTION:
+                if not await self._write(portion):
+                    return False
+                portion, size = [], 0
+        return await self._write(portion)
+
+    def _is_for_later(self, kept: _Kept) -> bool:
+        """Whether a fetch brings more of it that is better written together."""
+        fetch, table = kept.machine.fetch, kept.machine.table
+        if fetch is None:
+            return False
+        if len(table.dirty) < LEAST_NEW * len(table.params):
+            return True
+        began_at = fetch.first_value_at if fetch.first_value_at < math.inf else fetch.begun_at
+        return anyio.current_time() < max(kept.written_at, began_at) + DOWNLOAD_INTERVAL
+
+    async def _write(self, news: list[_News]) -> bool:
+        """Write what was gathered; false when the cache could not take it."""
         cache = self._cache
-        news = [] if cache is None else [new for kept in self._kept.values() for new in self._news_of(kept)]
         if cache is None or not news:
             return True
         is_written = False
@@ -269,7 +316,8 @@ class WriteThrough:
 
     def _keep(self, machine: ComponentMachine, identity: Identity, cached: CachedComponent | None) -> None:
         table = machine.table
-        kept = self._kept[machine] = _Kept(machine, identity, is_whole=table.complete)
+        kept = _Kept(machine, identity, is_whole=table.complete, written_at=anyio.current_time())
+        self._kept[machine] = kept
         for name in table.params:
             table.dirty.setdefault(name, "vehicle")
         if cached is not None:
@@ -306,8 +354,10 @@ class WriteThrough:
         if not (table.dirty or kept.is_whole or state != kept.state):
             return []
         dirty = table.take_dirty()
+        overwritten = table.take_overwritten()
         is_whole, kept.is_whole = kept.is_whole, False
         kept.state = state
+        kept.written_at = anyio.current_time()
         knows_volatile = bool(table.volatile) or table.volatile_known
         update = TableUpdate(
             identity=kept.identity,
@@ -316,19 +366,20 @@ class WriteThrough:
             at=now,
             table=state,
             params=[
-                StoredParam(
-                    table.params[name],
-                    now,
-                    name in table.volatile if knows_volatile else None,
-                    dirty.get(name, "vehicle"),
+                StoredParam(param, now, param.name in table.volatile if knows_volatile else None, by)
+                for param, by in (
+                    *overwritten,
+                    *(
+                        (table.params[name], dirty.get(name, "vehicle"))
+                        for name in (table.params if is_whole else dirty)
+                        if name in table.params
+                    ),
                 )
-                for name in (table.params if is_whole else dirty)
-                if name in table.params
             ],
             removed=[name for name in dirty if name not in table.params],
             replace=is_whole,
         )
-        return [_News(kept, dirty, update, is_synced)]
+        return [_News(kept, dirty, overwritten, update, is_synced)]
 
     def _state(self, machine: ComponentMachine, kept: _Kept) -> TableState:
         table = machine.table
@@ -362,6 +413,7 @@ class _Kept:
     synced_at: float | None = None
     is_synced: bool = False  # since it was written last, whose time then counts: the clock may be wrong now
     is_whole: bool = False
+    written_at: float = 0.0  # by the event loop's clock
 
 
 @dataclass(slots=True)
@@ -370,13 +422,16 @@ class _News:
 
     kept: _Kept
     dirty: dict[str, str]
+    overwritten: list[tuple[Param, str]]
     update: TableUpdate
     is_synced: bool
 
     def take_back(self) -> None:
         """It has not arrived: it is news again."""
         self.kept.is_synced |= self.is_synced
-        self.kept.machine.table.dirty = self.dirty | self.kept.machine.table.dirty
+        table = self.kept.machine.table
+        table.dirty = self.dirty | table.dirty
+        table.overwritten = self.overwritten + table.overwritten
         self.kept.is_whole |= self.update.replace
         self.kept.state = None
 

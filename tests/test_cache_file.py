@@ -747,6 +747,22 @@ def test_a_disk_that_is_full_from_the_beginning_holds_nothing_up(path: Path) -> 
         assert not cache.notes
 
 
+@pytest.mark.parametrize("size", [PAGE, 2 * PAGE, 8 * PAGE])
+def test_a_file_that_a_full_disk_left_without_tables_is_an_empty_cache(path: Path, size: int) -> None:
+    """Not one of an older version, as which it was told."""
+    with full_disk(at=size):
+        with ParamCache(path) as cache, pytest.raises(CacheError):
+            cache.save(whole_table(100))
+        assert path.stat().st_size > 0
+        with ParamCache(path) as cache:
+            assert cache.vehicles() == []
+            with pytest.raises(CacheError, match="cannot be used"):
+                cache.save(whole_table(100))
+    with ParamCache(path) as cache:
+        works(cache)
+        assert not cache.notes
+
+
 def test_where_no_open_file_can_be_renamed_it_is_closed_before(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

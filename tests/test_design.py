@@ -26,6 +26,7 @@ MAY_IMPORT = {
     "paramset": {"errors", "values", "identity"},
     "metadata.info": {"errors", "values"},
     "compare": {"errors", "values", "paramset"},
+    "notation": {"errors", "values", "paramset"},
     "protocol.wire": {"errors", "values", "protocol.wire"},
     "protocol.ftp.packets": {"errors", "values"},
     "protocol.pack": {"errors", "values"},
@@ -63,6 +64,8 @@ IMPURE_MODULES = {
 IMPURE_CALLS = {"open", "input", "print", "exec", "eval", "__import__"}
 
 COMMAND = ("cli", "__main__")
+SERVICE = "service"
+SERVICE_LIBRARIES = {"fastapi", "starlette", "uvicorn", "websockets"}
 COMMAND_LIBRARIES = {"rich", "cyclopts"}
 LONGEST_ROOM = 550
 
@@ -156,11 +159,18 @@ def test_imports_are_absolute_and_point_one_way(module: str) -> None:
             assert not is_command(target), where
 
 
+CHOICES = {("paramclient.client", "paramclient.remote")}
+"""Who makes one of its own kind that knows it, while it runs: a client whose link is a service."""
+
+
 def test_no_module_imports_itself_through_others() -> None:
     """Modules that only name each other's types do not count."""
     graph = {
         module: {
-            target for target, each in own_imports_of(module) if not each.for_types_only and target != module
+            target
+            for target, each in own_imports_of(module)
+            if not each.for_types_only and target != module
+            if each.runs_at_import or (module, target) not in CHOICES
         }
         for module in MODULES
     }
@@ -179,6 +189,22 @@ def test_only_the_command_and_the_ports_of_windows_know_asyncio() -> None:
     loops = {"asyncio", "trio"}
     uses = {module for module in MODULES for each in imports_of(module) if each.top in loops}
     assert {module for module in uses if not is_command(module)} == {"paramclient.links.transport"}
+
+
+def test_only_the_remote_client_knows_httpx() -> None:
+    for module in MODULES:
+        if not module.startswith("paramclient.remote"):
+            assert "httpx" not in {each.top for each in imports_of(module)}, module
+
+
+def test_only_the_client_chooses_the_remote_one() -> None:
+    uses = {
+        module
+        for module in MODULES
+        for target, _ in own_imports_of(module)
+        if room_of(target).startswith("remote") and not room_of(module).startswith("remote")
+    }
+    assert uses == {"paramclient.client"}
 
 
 def test_only_the_wire_knows_pymavlink() -> None:
@@ -214,6 +240,19 @@ def test_only_the_command_loads_its_libraries(module: str) -> None:
     for each in imports_of(module):
         if each.top in COMMAND_LIBRARIES:
             assert is_command(module), f"{module}:{each.line} imports {each.module}"
+
+
+@EVERY_MODULE
+def test_only_the_service_loads_its_libraries(module: str) -> None:
+    """And only the command knows the service, which it imports when it is to serve."""
+    is_service = room_of(module).split(".")[0] == SERVICE
+    for each in imports_of(module):
+        if each.top in SERVICE_LIBRARIES:
+            assert is_service, f"{module}:{each.line} imports {each.module}"
+    for target, each in own_imports_of(module):
+        if room_of(target).split(".")[0] == SERVICE and not is_service:
+            assert is_command(module), f"{module}:{each.line} imports {target}"
+            assert not each.runs_at_import, f"{module}:{each.line} imports {target}"
 
 
 @EVERY_MODULE
@@ -292,6 +331,8 @@ def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
         "psycopg_pool",
     ]
     unwanted += ["paramclient.sim", "paramclient.testing", "paramclient.cli", "paramclient.provision"]
+    unwanted += ["paramclient.documents", "paramclient.service", "fastapi", "starlette", "uvicorn", "httpx"]
+    unwanted += ["paramclient.remote"]
     program = f"import sys, paramclient; print([name for name in {unwanted!r} if name in sys.modules])"
     run = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60

@@ -49,6 +49,7 @@ from paramclient.protocol.wire import (
     encode,
     text_of,
 )
+from paramclient.protocol.wire.codec import MOST_TEXTS
 from paramclient.sim import Air
 from tests.liar import ESCAPE, LIES, LiarVehicle
 from tests.shell import bits, generic, small_px4, swiftly
@@ -244,6 +245,15 @@ def test_a_value_that_flips_is_asked_for_only_so_often(monkeypatch: pytest.Monke
     assert len(session.machine.reads) == 2
 
 
+def test_so_many_texts_are_remembered_and_no_more() -> None:
+    """Those that come again and again are one object each."""
+    known_well = text_of(b"MC_ROLL_P")
+    for number in range(2 * MOST_TEXTS):
+        text_of(b"NAME%d" % number)
+        assert text_of(b"MC_ROLL_P") is known_well
+    assert text_of.cache_info().currsize == MOST_TEXTS
+
+
 def test_a_file_has_so_many_gaps_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     """What would leave one more is passed over; all else still fits, and the file is whole in the end."""
     monkeypatch.setattr(blocks_room, "MOST_GAPS", 2)
@@ -360,7 +370,7 @@ def test_all_lies_at_once_cost_no_more_than_so_much_memory() -> None:
         mock.patch.object(download_room, "MOST_PARAMETERS", 1_000),
     ):
         tracemalloc.start()
-        for number in range(text_of.cache_parameters()["maxsize"] or 0):
+        for number in range(MOST_TEXTS):
             text_of(b"%d" % number)  # what remembers names is full
         liars = [LiarVehicle(*list(LIES)[start::3], system=66 + start, rate=150) for start in range(3)]
         station = Station(link="sim:test", is_stream=False, upkeep=Upkeep(30.0), counts_traffic=True)

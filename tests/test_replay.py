@@ -332,6 +332,34 @@ def test_to_import_again_changes_nothing(tmp_path: Path) -> None:
         assert repr(kept.component(KEY)) == table
 
 
+def test_to_import_again_changes_nothing_where_the_clock_was_set_back(tmp_path: Path) -> None:
+    """All that comes after that has one time, to the end of the log."""
+    cache = tmp_path / "cache"
+    log = Log().tell("A", A=1).wait(-60.0).change("A", 2).write(tmp_path / "flight.tlog")
+    [table] = imported(log, cache=cache)
+
+    def kept() -> str:
+        with ParamCache(cache) as kept:
+            return repr((kept.component(table.key).params["A"].value, kept.history(table.key)))
+
+    before = kept()
+    imported(log, cache=cache)
+    assert kept() == before
+
+
+def test_to_import_again_changes_nothing_where_a_name_went_and_came_back(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    log = whole(A=1, B=2).say(wire.AutopilotVersion(0, uid=0xDEADBEEF, flight_sw_version=8))  # an update
+    del log.values["B"]
+    log.list().wait(9.0).list(B=5).wait(9.0).change("A", 3).wait(1.0).beat()
+    imported(log.write(tmp_path / "flight.tlog"), cache=cache)
+    before = (kept_values(cache), lines(cache))
+    assert before[0] == {"A": 3, "B": 5}
+    assert [each[:3] for each in before[1]] == [("B", 2, None), ("A", 1, 3)]
+    imported(tmp_path / "flight.tlog", cache=cache)
+    assert (kept_values(cache), lines(cache)) == before
+
+
 @pytest.mark.parametrize("is_reversed", [False, True])
 def test_the_order_of_logs_does_not_matter(is_reversed: bool, tmp_path: Path) -> None:
     first = whole(A=1, B=2).wait(9.0).change("A", 3).wait(1.0).beat()
@@ -397,6 +425,24 @@ def test_a_name_that_a_later_table_lacks_stays_away(tmp_path: Path) -> None:
     imported(whole(A=1, OLD=2).write(tmp_path / "earlier.tlog"), cache=cache)
     assert kept_values(cache) == {"A": 1}
     assert lines(cache) == []
+
+
+def test_a_name_that_has_gone_since_stays_away(tmp_path: Path) -> None:
+    """Also from a table that is not whole: that it went is the later word."""
+    cache = tmp_path / "cache"
+    log = whole(A=1, OLD=2).write(tmp_path / "flight.tlog")
+    save(cache, NOW + 100.0, known("A", 1), known("OLD", 2))
+    who = Identity(1, "udp", UID)
+    gone = TableUpdate(identity=who, component=1, autopilot=12, at=NOW + 200.0, removed=("OLD",))
+    with ParamCache(cache) as kept:
+        kept.save(gone)
+    before = lines(cache)
+    assert before == [("OLD", 2, None, "vehicle", 200.0)]
+    imported(log, log, cache=cache)
+    assert kept_values(cache) == {"A": 1}
+    assert lines(cache) == before
+    imported(Log(NOW + 300.0).beat().identify().tell("OLD", OLD=5).write(tmp_path / "l.tlog"), cache=cache)
+    assert kept_values(cache) == {"A": 1, "OLD": 5}
 
 
 def test_vehicles_that_do_not_say_who_they_are_are_told_apart_by_the_log(tmp_path: Path) -> None:

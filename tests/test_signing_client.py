@@ -602,6 +602,17 @@ def test_setup_and_disable_with_their_proof(
     assert vehicle.signing_key is None
 
 
+def test_the_steps_are_told_without_the_key(
+    put: Callable[[Vehicle], str], key_file: Path, command: Command
+) -> None:
+    words = ("--signing-key", key_file, "--link-is-safe", "--verbose")
+    code, _, err = command("signing", "setup", put(small_px4()), *words)
+    assert code == 0
+    assert "protocol: to system 1: SetupSigning\n" in err
+    secret = KEY.secret
+    assert not any(each in err for each in (secret.hex(), repr(secret), str(list(secret)), secret.hex(" ")))
+
+
 def test_a_key_is_changed_with_the_one_before(
     put: Callable[[Vehicle], str], key_file: Path, tmp_path: Path, command: Command
 ) -> None:

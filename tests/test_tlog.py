@@ -20,7 +20,7 @@ import pytest
 from paramclient import ParamClient, UsageError, capture
 from paramclient.capture import Capture
 from paramclient.cli import run
-from paramclient.links.tlog import Record, packed_time, read_records
+from paramclient.links.tlog import LONGEST_LEAP, Record, packed_time, read_records
 from paramclient.protocol import wire
 from paramclient.protocol.sniff import MOST_PEERS, FrameCutter
 from paramclient.sim import ArduPilotVehicle
@@ -79,6 +79,29 @@ def test_what_is_no_record_is_stepped_over() -> None:
     found = records(log_of(first) + torn + b"\xfd" * 3 + log_of(second, third))
     assert found[0] == Record(NOW, first)
     assert found[-1] == Record(NOW + 1, third)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [(20.0, NOW), (315_964_800.0, NOW), (NOW, 315_964_800.0), (NOW, NOW - LONGEST_LEAP - 10), (20.0, 30.0)],
+    ids=["set from 1970", "set from 1980", "lost", "joined", "never set"],
+)
+@pytest.mark.parametrize("behind", [2, 9])
+def test_a_clock_that_is_set_costs_no_frame(first: float, second: float, behind: int) -> None:
+    frames = [frame(number) for number in range(3 + behind)]
+    found = records(log_of(*frames[:3], at=first) + log_of(*frames[3:], at=second))
+    assert [each.data for each in found] == frames
+    assert (found[0].at, found[3].at) == (first, second)
+
+
+@pytest.mark.parametrize("damaged", [0, 2, 4])
+def test_a_time_that_is_damaged_costs_one_frame(damaged: int) -> None:
+    frames = [frame(number) for number in range(5)]
+    data = bytearray(log_of(*frames))
+    data[(8 + len(frames[0])) * damaged + 1] ^= 0x01  # by nine years
+    found = records(bytes(data))
+    assert [each.data for each in found] == frames[:damaged] + frames[damaged + 1 :]
+    assert all(each.at < NOW + 5 for each in found)
 
 
 @pytest.mark.parametrize("missing", range(1, 12))

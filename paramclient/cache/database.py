@@ -177,6 +177,10 @@ class _Moved(Exception):
     """The file that was looked at, or written to, no longer stands under the path."""
 
 
+class _Empty(Exception):
+    """The file holds no tables: whoever began it found the disk full."""
+
+
 class Database:
     """One SQLite file, opened at the first operation. Safe to use from several threads.
 
@@ -243,6 +247,10 @@ class Database:
                         with _fresh(MIGRATIONS) as nothing:
                             return work(nothing)
                     return self._transact(work, writing=writing)
+                except _Empty:
+                    self._drop()
+                    with _fresh(MIGRATIONS) as nothing:
+                        return work(nothing)
                 except _Moved:
                     self.replacements += 1
                     self._drop()
@@ -300,7 +308,7 @@ class Database:
                 raise PermissionError("it is read-only")
             if may_write or self._companion("-shm").exists():
                 try:
-                    connection = self._open_with_locks()
+                    connection = self._open_with_locks(writing=writing)
                     self._for_once = not may_write
                     return connection
                 except sqlite3.OperationalError as error:
@@ -310,9 +318,11 @@ class Database:
             self._for_once = self._without_locks = True
             return self._open_without_locks()
 
-    def _open_with_locks(self) -> sqlite3.Connection:
+    def _open_with_locks(self, *, writing: bool) -> sqlite3.Connection:
         connection = self._connect("mode=rw")
         version = self._inspect(connection)
+        if not (version or writing):
+            raise _Empty
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
         connection.execute("PRAGMA foreign_keys = ON")
@@ -336,7 +346,10 @@ class Database:
             connection.execute("PRAGMA locking_mode = EXCLUSIVE")
         else:
             connection = self._connect("mode=ro&immutable=1")
-        if self._inspect(connection) < len(MIGRATIONS):
+        version = self._inspect(connection)
+        if not version:
+            raise _Empty
+        if version < len(MIGRATIONS):
             raise CacheError(
                 f"the cache {self.path} is of an older version and cannot be upgraded where it is"
             )

@@ -62,11 +62,12 @@ class _Past:
             self._save(update, vehicle)
             return
         self.owner, table = found
-        if update.at < table.updated_at:
+        goes_on = self.goes_on or self.based_on == table.updated_at
+        if update.at < table.updated_at or (update.at == table.updated_at and not goes_on):
             self._bring_in(update, table)
             self._widen(update, vehicle)
             return
-        self.goes_on |= update.replace or self.based_on == table.updated_at
+        self.goes_on = goes_on or update.replace
         if not self.goes_on:
             update = replace(update, table=None)
         self.catch_up(item.param.name for item in update.params)
@@ -116,12 +117,16 @@ class _Past:
         """Bring in what an update has of values that are not kept of a later time."""
         assert self.owner is not None
         before = stored_rows(self.session, self.owner)
-        gone_since = table.synced_at if table.complete and table.synced_at is not None else float("-inf")
+        whole_at = table.synced_at if table.complete and table.synced_at is not None else float("-inf")
         later: list[StoredParam] = []
+        heard = {item.param.name for item in update.params}
+        for name in set(self.overtaken) - heard if update.replace else update.removed:
+            self.overtaken.pop(name, None)  # what comes under it later is another parameter
         for item in update.params:
             name = item.param.name
             row = before.get(name)
-            if (gone_since if row is None else row.heard_at) < item.heard_at:
+            gone_at = self.session.gone_at(self.owner, name) if row is None else row.heard_at
+            if (max(whole_at, gone_at) if row is None else gone_at) < item.heard_at:
                 # its place is that of another count, perhaps
                 later.append(replace(item, param=replace(item.param, index=None)))
                 continue

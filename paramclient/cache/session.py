@@ -12,7 +12,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Final, TypeAlias
 
 from paramclient.cache.records import CachedSummary, CachedVehicle, HistoryEntry, SnapshotSummary, TableUpdate
-from paramclient.cache.rows import Row, cells, checksum, identity_cells, read_identity, read_param, time_cell
+from paramclient.cache.rows import (
+    Row,
+    cells,
+    checksum,
+    identity_cells,
+    read_identity,
+    read_param,
+    read_rows,
+    time_cell,
+)
 
 __all__ = ["Line", "NumberedLine", "Session"]
 
@@ -155,7 +164,7 @@ class Session(ABC):
             f"SELECT {_ROW} FROM param WHERE owner = ? ORDER BY param_index IS NULL, param_index, name",
             (owner,),
         )
-        rows = {name: Row(*row) for name, *row in (cells(row, "siiiIifI") for row in found)}
+        rows = read_rows(found)
         [(expected,)] = self._all("SELECT checksum FROM component WHERE id = ?", (owner,))
         return rows, expected
 
@@ -252,6 +261,13 @@ class Session(ABC):
             (owner, name, after, until),
         )
 
+    def gone_at(self, owner: int, name: str) -> float:
+        """When a name went last, by its lines; minus infinity where it never did."""
+        [(at,)] = self._all(
+            "SELECT max(at) FROM history WHERE owner = ? AND name = ? AND new_type IS NULL", (owner, name)
+        )
+        return float("-inf") if at is None else float(at)
+
     # what is known of the past beside the lines
 
     def begin(self, owner: int, at: float) -> None:
@@ -274,12 +290,13 @@ class Session(ABC):
 
     def add_births(self, owner: int, births: Iterable[tuple[str, float]]) -> None:
         """Note names that appeared behind the last line, where the states of the table are known."""
-        self._many(
-            "INSERT INTO birth (owner, name, line, at)"
-            " SELECT id, ?, coalesce((SELECT max(id) FROM history WHERE owner = ?), 0), ? FROM component"
-            " WHERE id = ? AND known_since IS NOT NULL",
-            [(name, owner, at, owner) for name, at in births],
-        )
+        _, _, known_since = self.described(owner)
+        if known_since is not None:
+            self._many(
+                "INSERT INTO birth (owner, name, line, at)"
+                " VALUES (?, ?, coalesce((SELECT max(id) FROM history WHERE owner = ?), 0), ?)",
+                [(owner, name, owner, at) for name, at in births],
+            )
 
     def births(self, owner: int) -> list[tuple[str, int, float]]:
         """Every name that has appeared, behind which line, and when."""

@@ -118,7 +118,8 @@ def _bring_in(session: Session, update: TableUpdate, owner: int, table: CachedSu
     agrees = True
     for item in update.params:
         row = before.get(item.param.name)
-        if (gone_since if row is None else row.heard_at) <= item.heard_at:
+        known_at = max(gone_since, session.gone_at(owner, item.param.name)) if row is None else row.heard_at
+        if known_at <= item.heard_at:
             newer.append(item)
             continue
         older.append(item)

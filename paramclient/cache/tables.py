@@ -52,12 +52,15 @@ def save(session: Session, updates: Iterable[TableUpdate]) -> None:
         forget_other_firmware(session, update.identity)
         earlier.watch_clock(session, update.identity.key, update.component, time_cell(update.at))
         owner = session.make(update)
-        before = stored_rows(session, owner)
-        after, lines, births = applied(update, before)
-        if after != before:
-            write_rows(session, owner, before, after)
-        session.add_births(owner, births)
-        write_lines(session, owner, lines)
+        before: Mapping[str, Row] = {}
+        after = before
+        if update.params or update.removed or update.replace:  # else it is about the table as a whole only
+            before = stored_rows(session, owner)
+            after, lines, births = applied(update, before)
+            if after != before:
+                write_rows(session, owner, before, after)
+            session.add_births(owner, births)
+            write_lines(session, owner, lines)
         if update.table is not None:
             write_state(session, owner, update.table)
             if update.table.complete:
@@ -148,7 +151,7 @@ def hashed(rows: Mapping[str, Row]) -> dict[str, tuple[int, int, int]]:
 def write_rows(session: Session, owner: int, before: Mapping[str, Row], after: Mapping[str, Row]) -> None:
     """Make the stored rows of a table the ones after an update."""
     session.drop_rows(owner, before.keys() - after.keys())
-    session.put_rows(owner, {name: row for name, row in after.items() if before.get(name) != row})
+    session.put_rows(owner, {name: row for name, row in sorted(after.items()) if before.get(name) != row})
     session.describe(owner, checksum=checksum(after))
 
 

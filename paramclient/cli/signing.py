@@ -7,13 +7,13 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Final
+from typing import Annotated, Final
 
 from cyclopts import Parameter
 
 from paramclient.cli.options import Id, KeyOptions, Seconds
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import print_json, print_line, printable
+from paramclient.cli.output import print_document, print_line, printable
 from paramclient.cli.session import HEARING_PATIENCE, Deadline
 from paramclient.client import ParamClient
 from paramclient.component import Component
@@ -47,6 +47,9 @@ class VehicleOptions(KeyOptions):
 
     json: bool = False
     """Print JSON, for programs."""
+
+    verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False
+    """Tell on stderr what is done, step by step; never the key."""
 
 
 _DEFAULTS: Final = VehicleOptions()
@@ -173,14 +176,16 @@ def _refused(address: tuple[int, int], what: str) -> VehicleError:
 
 def _tell(options: VehicleOptions, vehicle: Component, key: SigningKey | None) -> None:
     if options.json:
-        print_json(
-            {
-                "system": vehicle.system,
-                "component": vehicle.component,
-                "autopilot": vehicle.autopilot,
-                "signs": key is not None,
-                "fingerprint": None if key is None else key.fingerprint,
-            }
+        from paramclient.documents.command import SignsDoc  # only here: loads pydantic
+
+        print_document(
+            SignsDoc(
+                system=vehicle.system,
+                component=vehicle.component,
+                autopilot=vehicle.autopilot,
+                signs=key is not None,
+                fingerprint=None if key is None else key.fingerprint,
+            )
         )
         return
     who = f"{vehicle.system}/{vehicle.component} {vehicle.autopilot}"

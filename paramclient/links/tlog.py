@@ -5,6 +5,7 @@ The form of Mission Planner, MAVProxy, QGroundControl and pymavlink.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,14 +18,15 @@ __all__ = ["Record", "open_log", "packed_time", "read_records"]
 BLOCK: Final = 65536
 """Bytes that are read at once."""
 LONGEST_LEAP: Final = 366 * 86400.0
-"""Seconds between two frames that are believed behind a damaged place: logs of many days may be joined."""
-EARLIEST: Final = 315_532_800.0
+"""Seconds between two frames that are believed at once. A longer leap must be shared by the next frame: a
+clock that was not set begins with 1970 or 1980, and logs of many years may be joined; damage is alone."""
 LATEST: Final = 7_258_118_400.0
-"""Times that the first frame of a log may have, 1980 to 2200: an autopilot without a clock begins with the
-former, and bytes that are no log have any."""
+"""The latest time that a frame may have, in the year 2200: bytes that are no log have any."""
 
 _TIME: Final = struct.Struct(">Q")
 _LONGEST_RECORD: Final = 8 + 12 + 255 + 13
+_LOOKED_AT: Final = _LONGEST_RECORD + 8 + 3
+"""Bytes that say whether a record is one: it, and the beginning of the next one."""
 _MAGIC_V1: Final = 0xFE
 _MAGIC_V2: Final = 0xFD
 
@@ -80,10 +82,10 @@ def read_records(file: BinaryIO) -> Iterator[Record]:
     """
     buffer = b""
     start = 0
-    before: float | None = None
+    before = -math.inf
     is_over = False
     while True:
-        if not is_over and len(buffer) - start < _LONGEST_RECORD:
+        if not is_over and len(buffer) - start < _LOOKED_AT:
             block = file.read(BLOCK)
             is_over = not block
             buffer = buffer[start:] + block
@@ -92,9 +94,9 @@ def read_records(file: BinaryIO) -> Iterator[Record]:
         size = _size_at(buffer, start + 8)
         if size is None:
             return
-        at = _TIME.unpack_from(buffer, start)[0] / 1e6
-        if size and _may_be(at, before):
-            end = start + 8 + size
+        end = start + 8 + size
+        at = _time_at(buffer, start)
+        if size and (_are_near(at, before) or _is_shared(buffer, end, at, alone=before == -math.inf)):
             if end > len(buffer):
                 return
             yield Record(at, buffer[start + 8 : end])
@@ -115,7 +117,17 @@ def _size_at(buffer: bytes, at: int) -> int | None:
     return 0
 
 
-def _may_be(at: float, before: float | None) -> bool:
-    if before is None:
-        return EARLIEST <= at <= LATEST
+def _time_at(buffer: bytes, at: int) -> float:
+    return float(_TIME.unpack_from(buffer, at)[0] / 1e6)
+
+
+def _are_near(at: float, before: float) -> bool:
     return abs(at - before) <= LONGEST_LEAP
+
+
+def _is_shared(buffer: bytes, end: int, at: float, *, alone: bool) -> bool:
+    """Whether what stands behind a record is one of about the same time; the end will do for one alone."""
+    size = _size_at(buffer, end + 8)
+    if size is None:
+        return alone and at <= LATEST
+    return size > 0 and at <= LATEST and _are_near(_time_at(buffer, end), at)

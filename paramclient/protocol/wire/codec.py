@@ -35,6 +35,10 @@ from paramclient.protocol.wire.signing import SigningKey
 
 __all__ = ["UNDERSTOOD", "decode", "decode_param_value", "encode"]
 
+MOST_TEXTS: Final = 4096
+"""Texts that are remembered: the names of a few autopilots of different kinds, 100 bytes each. A vehicle that
+tells ever new ones costs no more than that, and decoding takes a microsecond longer."""
+
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
 
 
@@ -72,7 +76,7 @@ def encode(message: Message, *, system: int, component: int, sequence: int, vers
     )
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=MOST_TEXTS)
 def text_of(field: bytes) -> str:
     """A text field: cut at the first NUL. Latin-1 keeps every byte, so that odd names can be told apart.
 
