@@ -97,7 +97,7 @@ $(VENV)/made:
 
 $(VENV)/with-cli: pyproject.toml $(VENV)/made
 	@echo "Installing paramclient into $(VENV)"
-	@$(PIP) --editable '.[cli,serial,service]'
+	@$(PIP) --editable '.[cli,remote,serial,service]'
 	@touch $@
 
 # dependency groups need pip 25.1, and the pip of the environment is as old as its Python
