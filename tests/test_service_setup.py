@@ -22,14 +22,15 @@ from paramclient.files import FileForm, dumps, loads
 from paramclient.links import SimLink
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.protocol import wire
-from paramclient.service import Hub, create_app
+from paramclient.service import Hub, Settings, create_app
+from paramclient.service.access import AccessSettings
 from paramclient.service.hub import MOST_READINGS
 from paramclient.service.routes.files import attachment
 from paramclient.service.wanted import LARGEST_UPLOAD
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.sim.vehicle import Vehicle
 from paramclient.values import ParamType
-from tests.asgi import ASGITransport, a_browser
+from tests.asgi import a_browser
 from tests.caches import NOW, PX4, stored
 from tests.published import Published
 from tests.shell import Tap, swiftly, until
@@ -39,6 +40,7 @@ TUNE = {f"TUNE_{number:02}": number / 4 + 0.1 for number in range(20)}
 """What is set in most of these tests: values that no float32 holds exactly."""
 FILE = "".join(f"{name},{value + 1}\n" for name, value in TUNE.items())
 """The same, each one more, as Mission Planner writes it."""
+OCTETS = {"content-type": "application/octet-stream"}
 PUBLISHED: list[Published] = []
 WRITABLE = [form for form in FileForm if form is not FileForm.PX4_SCRIPT]
 
@@ -67,6 +69,8 @@ class Checked:
 
     async def ask(self, method: str, path: str, status: int = 200, **options: Any) -> Any:
         """What is answered, as JSON; the status must be this one."""
+        if "content" in options:
+            options["headers"] = OCTETS
         answer = await self.client.request(method, path, **options)
         assert answer.status_code == status, answer.text
         assert answer.headers["content-type"] in ("application/json", "application/problem+json")
@@ -240,7 +244,7 @@ async def test_two_set_ups_do_not_mix_and_one_can_be_ended(tmp_path: Path) -> No
         assert (busy["type"], busy["job"]) == ("urn:paramclient:busy", job)
         assert (await service.post(f"{HERE}/restore", {}, 409))["type"] == "urn:paramclient:busy"
         assert (await service.client.delete(f"/api/v1/jobs/{job}")).status_code == 204
-        told = await service.get(f"/api/v1/jobs/{job}")
+        told = await service.job(job, lambda told: told["state"] != "running")
         assert (told["state"], told["problem"]["type"]) == ("cancelled", "urn:paramclient:cancelled")
         tap.is_mute = False
         await service.post(f"{HERE}/apply", {**body, "wait": True})
@@ -267,6 +271,15 @@ async def test_what_was_written_before_it_was_ended_is_told(tmp_path: Path) -> N
         assert (told["state"], told["result"]["error"]) == ("cancelled", "interrupted")
         assert told["result"]["params"]
         assert {row["status"] for row in told["result"]["params"].values()} == {"unproven"}
+
+
+@swiftly
+async def test_the_service_ends_in_the_middle_of_a_set_up(tmp_path: Path) -> None:
+    tap = Tap(px4())
+    async with serving(tap, place=tmp_path) as service:
+        tap.is_mute = True
+        body = {"wanted": {"values": dict.fromkeys(TUNE, 7.5)}, "wait": False}
+        assert (await service.client.post(f"{HERE}/apply", json=body)).status_code == 202
 
 
 @swiftly
@@ -525,7 +538,7 @@ async def test_files_are_read_one_after_the_other_and_not_without_end() -> None:
         answers = []
 
         async def upload() -> None:
-            answer = await service.client.post("/api/v1/files?name=a.param", content=b"A,1\n")
+            answer = await service.client.post("/api/v1/files?name=a.param", content=b"A,1\n", headers=OCTETS)
             answers.append(answer.status_code)
 
         async with anyio.create_task_group() as tasks:
@@ -615,7 +628,7 @@ async def test_what_is_kept_of_a_vehicle_is_the_same_with_and_without_it(
         cached = await service.file(f"{there}/file", form="parm")
         assert loads(cached.content).choose(1).params == loads(live.content).choose(1).params
         for what in ("params", "history", "snapshots", "snapshots/1", "state?at=5", "file"):
-            for key in ("uid:00", "../../etc/passwd", "%27%20OR%201"):
+            for key in ("uid:00", "system:1@serial:/dev/ttyACM0:57600", "%27%20OR%201", "%"):
                 problem = await service.get(f"/api/v1/vehicles/{quote(key, safe='')}/1/{what}", 404)
                 assert problem["type"] == "urn:paramclient:unknown-vehicle"
 
@@ -682,11 +695,13 @@ async def test_who_may_only_read_changes_nothing(tmp_path: Path) -> None:
     on_board = px4()
     async with Hub([on_board], cache=False) as hub:
         await until(lambda: hub.followed, pause=0.1)
-        transport = ASGITransport(create_app(hub), state={"role": "read", "asker": "guest"})
-        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1:8765") as client:
+        async with a_browser(create_app(hub, Settings(access=AccessSettings(read_only=True)))) as client:
             body = {"wanted": {"values": {"MODE": 4}}}
             for path in ("apply", "restore", "snapshots"):
                 assert (await client.post(f"{HERE}/{path}", json=body)).status_code == 403
-            assert (await client.put(f"{HERE}/metadata", content=b"{}")).status_code == 403
-            assert (await client.post(f"{HERE}/plan", json=body)).status_code == 200
+            answer = await client.put(f"{HERE}/metadata", content=b"{}", headers=OCTETS)
+            assert answer.status_code == 403
+            for path in ("plan", "verify", "diff"):
+                assert (await client.post(f"{HERE}/{path}", json=body)).status_code == 200
+            assert (await client.post(f"{HERE}/metadata", json={})).status_code == 404
     assert on_board.values["MODE"] == 3

@@ -20,7 +20,7 @@ LONGEST_TARGET: Final = 8 * 1024
 
 SESSION_PATH: Final = "/api/v1/session"
 READ_BY_POST: Final = frozenset(
-    {"diff", "fetch", "files", "find", "plan", "read", "refreshed", "successor", "verify"}
+    {"diff", "fetch", "files", "find", "metadata", "plan", "read", "refreshed", "successor", "verify"}
 )
 """What asks by POST and changes nothing, by the last part of its path. All other methods than GET, and all
 other POSTs, need a token that may write: what is forgotten here is forbidden."""
