@@ -22,8 +22,7 @@ from paramclient.files import FileForm, dumps, loads
 from paramclient.links import SimLink
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.protocol import wire
-from paramclient.service import Hub, Settings, create_app
-from paramclient.service.access import AccessSettings
+from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
 from paramclient.service.hub import MOST_READINGS
 from paramclient.service.routes.files import attachment
 from paramclient.service.wanted import LARGEST_UPLOAD
@@ -40,7 +39,6 @@ TUNE = {f"TUNE_{number:02}": number / 4 + 0.1 for number in range(20)}
 """What is set in most of these tests: values that no float32 holds exactly."""
 FILE = "".join(f"{name},{value + 1}\n" for name, value in TUNE.items())
 """The same, each one more, as Mission Planner writes it."""
-OCTETS = {"content-type": "application/octet-stream"}
 PUBLISHED: list[Published] = []
 WRITABLE = [form for form in FileForm if form is not FileForm.PX4_SCRIPT]
 
@@ -57,6 +55,7 @@ def ardupilot(**options: Any) -> ArduPilotVehicle:
     return ArduPilotVehicle(**{"table": rows, "groups": {}, "live": ()} | options)
 
 
+A_FILE = {"content-type": "application/octet-stream"}
 BOTH = pytest.mark.parametrize("vehicle", [px4, ardupilot])
 
 
@@ -70,7 +69,7 @@ class Checked:
     async def ask(self, method: str, path: str, status: int = 200, **options: Any) -> Any:
         """What is answered, as JSON; the status must be this one."""
         if "content" in options:
-            options["headers"] = OCTETS
+            options["headers"] = A_FILE
         answer = await self.client.request(method, path, **options)
         assert answer.status_code == status, answer.text
         assert answer.headers["content-type"] in ("application/json", "application/problem+json")
@@ -538,7 +537,7 @@ async def test_files_are_read_one_after_the_other_and_not_without_end() -> None:
         answers = []
 
         async def upload() -> None:
-            answer = await service.client.post("/api/v1/files?name=a.param", content=b"A,1\n", headers=OCTETS)
+            answer = await service.client.post("/api/v1/files?name=a.param", content=b"A,1\n", headers=A_FILE)
             answers.append(answer.status_code)
 
         async with anyio.create_task_group() as tasks:
@@ -695,12 +694,14 @@ async def test_who_may_only_read_changes_nothing(tmp_path: Path) -> None:
     on_board = px4()
     async with Hub([on_board], cache=False) as hub:
         await until(lambda: hub.followed, pause=0.1)
-        async with a_browser(create_app(hub, Settings(access=AccessSettings(read_only=True)))) as client:
+        tokens = Tokens.of_text("guest read guest-may-read-only-0123")
+        app = create_app(hub, Settings(access=AccessSettings(tokens=tokens)))
+        async with a_browser(app) as client:
+            client.headers["authorization"] = "Bearer guest-may-read-only-0123"
             body = {"wanted": {"values": {"MODE": 4}}}
             for path in ("apply", "restore", "snapshots"):
                 assert (await client.post(f"{HERE}/{path}", json=body)).status_code == 403
-            answer = await client.put(f"{HERE}/metadata", content=b"{}", headers=OCTETS)
-            assert answer.status_code == 403
+            assert (await client.put(f"{HERE}/metadata", json={})).status_code == 403
             for path in ("plan", "verify", "diff"):
                 assert (await client.post(f"{HERE}/{path}", json=body)).status_code == 200
             assert (await client.post(f"{HERE}/metadata", json={})).status_code == 404
