@@ -187,6 +187,19 @@ def test_the_command_writes_logs_too(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert messages(tmp_path / "link.tlog")
 
 
+@pytest.mark.parametrize("now", [-86400.0, 30.0])
+@swiftly
+async def test_a_clock_that_was_never_set_ends_nothing(
+    now: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("paramclient.capture.time.time", lambda: now)
+    path = tmp_path / "flight.tlog"
+    async with a_client(small_px4(), tlog=path) as client:
+        assert (await (await client.component()).get("PARAM_07")).value == VALUES["PARAM_07"]
+    assert {each.at for each in records(path.read_bytes())} == {max(0.0, now)}
+    assert any(isinstance(each, wire.ParamValue) for each in messages(path))
+
+
 @swiftly
 async def test_no_key_and_no_signature_is_in_the_log(tmp_path: Path) -> None:
     """As the guide to message signing asks: a log is passed on, and a key is not."""

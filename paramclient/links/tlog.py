@@ -44,8 +44,8 @@ class Record(NamedTuple):
 
 
 def packed_time(at: float) -> bytes:
-    """A time, in unix seconds, as it stands in a log."""
-    return _TIME.pack(round(at * 1e6))
+    """A time, in unix seconds, as it stands in a log: 1970 for a clock that stands before it."""
+    return _TIME.pack(max(0, round(at * 1e6)))
 
 
 def open_log(path: str, name: str) -> BinaryIO:
