@@ -59,7 +59,7 @@ class ReplayLink:
         self._closed = anyio.Event()
         self._due = anyio.current_time()
         self._is_over = False
-        self._next = next(self._records)
+        self._next = next(self._records, None)
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`."""
