@@ -5,8 +5,8 @@
 #   make lint       style and types                make docs       the pages, into docs/_build/html
 #   make bench      speed of parser and start      make dist       wheel and sdist, into dist
 #   make cost       CPU and memory                 make peers      downloads beside other programs
-#   make soak       10,000 sessions at random      make fuzz       each target of fuzz/ for a while
-#   make clean      remove all that was made
+#   make scale      250 systems on one link        make fuzz       each target of fuzz/ for a while
+#   make soak       10,000 sessions at random      make clean      remove all that was made
 
 PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
 	"$$python" -c $(IS_NEW_ENOUGH) 2>/dev/null && echo "$$python" && break; done)
@@ -24,7 +24,7 @@ MEASURED = 'protocol/*' 'sim/*' 'cache/*' 'files/*' values.py errors.py identity
 # they start programs of their own, which are not measured, are about rooms that are not, or go where others have been
 UNMEASURED = $(addprefix --ignore=tests/test_,bench.py cli.py docs.py examples.py links.py machine.py packaging.py)
 
-.PHONY: demo test coverage soak fuzz lint docs bench cost peers dist clean
+.PHONY: demo test coverage soak fuzz lint docs bench cost scale peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -68,6 +68,9 @@ bench: $(VENV)/with-cli
 cost: $(VENV)/with-cli
 	$(BIN)/python bench/cost.py
 
+scale: $(VENV)/with-cli
+	$(BIN)/python bench/scale.py
+
 peers: $(VENV)/with-peers
 	$(BIN)/python bench/peers.py
 
@@ -90,7 +93,7 @@ $(VENV)/made:
 
 $(VENV)/with-cli: pyproject.toml $(VENV)/made
 	@echo "Installing paramclient into $(VENV)"
-	@$(PIP) --editable '.[cli,serial]'
+	@$(PIP) --editable '.[cli,serial,service]'
 	@touch $@
 
 # dependency groups need pip 25.1, and the pip of the environment is as old as its Python

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import logging
 import math
+import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from typing import Final, Protocol
 
 import anyio
+import anyio.lowlevel
 
 from paramclient.errors import LinkError
 from paramclient.links import Link, Peer
+from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.station import Station
 from paramclient.standstill import Standstill
 
@@ -29,6 +32,13 @@ HELD_UP: Final = 0.02
 has come in that time is read before anything counts as not answered."""
 READING_TIME: Final = 0.002
 """Seconds that the reader is given for that: it is ready to go on, so one turn of the event loop would do."""
+LONGEST_TURN: Final = 0.005
+"""Seconds of what came at once after which other tasks get their turn: with the last value of a list its hash
+is proven, which takes 2 ms, and many lists may end at once."""
+MANY: Final = 128
+"""Datagrams read at once that show that there are more: a link gives up to 256."""
+MOST_BEHIND: Final = 3.0
+"""Seconds for which time-outs wait for what has come to be read, on a link that brings more and more."""
 LINK_PATIENCE: Final = 10.0
 """Seconds that calls wait for a link to come back before they fail with its error."""
 FIRST_BACKOFF: Final = 0.25
@@ -100,6 +110,9 @@ class Carrier:
         self._of_others: deque[bytes] = deque()
         self._something_to_send = anyio.Event()
         self._sent = anyio.Event()  # set when anything is sent
+        self._behind_since = math.inf  # since when more comes than is read at once
+        self._read_at = -math.inf
+        self._asked = True  # whether anything may have been asked of anybody
         self._standstill = Standstill()
 
     async def read(self) -> None:
@@ -119,17 +132,29 @@ class Carrier:
             is_news = not chunks
             if not chunks:
                 self._station.over(now)
+                self._asked = True
+            if len(chunks) < MANY:
+                self._behind_since = math.inf
+            else:
+                self._behind_since = min(self._behind_since, now)
+            give_way_at = time.perf_counter() + LONGEST_TURN
             for peer, data in chunks:
                 is_news |= self._station.receive(data, peer, now)
                 for tap in self._taps:
                     tap.received(data, peer)
+                if time.perf_counter() >= give_way_at:
+                    self._dispatch()
+                    await anyio.lowlevel.checkpoint()
+                    now = self._read_at = anyio.current_time()
+                    give_way_at = time.perf_counter() + LONGEST_TURN
             if is_news:
                 self._dispatch()
                 self.tell()
-                self.wake()
+                self._something_to_send.set()
             elif self._may_rest and not self._station.is_waiting:
                 await self._rest(min(REST, MOST_PER_REST * (now - before) / max(1, len(chunks))))
             before = now
+            self._read_at = anyio.current_time()
 
     async def send(self) -> None:
         """Send what is to be sent, and do what is due, until the calls have failed for good."""
@@ -139,7 +164,10 @@ class Carrier:
             now = anyio.current_time()
             self._look_at_the_clock(now)
             self._standstill.expect(math.inf)  # a slow link may hold us up
-            station.tick(now)
+            everyone = self._asked
+            if not self._is_behind():
+                self._asked = False
+                station.tick(now, everyone=everyone)
             self._dispatch()
             to_send = station.data_to_send()
             if to_send:
@@ -149,8 +177,11 @@ class Carrier:
             for _ in range(min(len(self._of_others), OTHERS_PER_TURN)):
                 await self._transmit(self._of_others.popleft(), None)
             if self._of_others:
+                self._asked |= everyone  # whose deadlines have not been noted
                 continue
-            due = station.next_deadline()
+            due = station.next_deadline(everyone=everyone)
+            if self._is_behind():
+                due = anyio.current_time() + LONGEST_TURN
             self._standstill.expect(due)
             wait = due - anyio.current_time()
             with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):
@@ -163,10 +194,14 @@ class Carrier:
         if len(self._of_others) < MOST_OF_OTHERS and not self.is_away:
             self._of_others.append(frame)
             self._station.overhear(frame, anyio.current_time())
-            self.wake()
+            self._something_to_send.set()
 
-    def wake(self) -> None:
-        """There may be something to send, or another deadline."""
+    def wake(self, machine: ComponentMachine | None = None) -> None:
+        """There may be something to send, or another deadline: of this component, or of any."""
+        if machine is None:
+            self._asked = True
+        else:
+            self._station.touch(machine)
         self._something_to_send.set()
 
     def tell(self) -> None:
@@ -178,6 +213,11 @@ class Carrier:
         """No call can be answered any more."""
         self.ended = error
         self._fail_calls(error)
+
+    def _is_behind(self) -> bool:
+        """Whether more has come than was read, so that nothing can be said not to have been answered."""
+        now = anyio.current_time()
+        return self._behind_since <= now < self._behind_since + MOST_BEHIND and now - self._read_at < HELD_UP
 
     async def _transmit(self, data: bytes, peer: Peer | None) -> None:
         for tap in self._taps:

@@ -402,8 +402,8 @@ class ParamClient:
             while True:
                 self._check_open()
                 now = anyio.current_time()
-                together.join(now)
-                self._wake()
+                if together.join(now):
+                    self._wake()
                 listen_until = self._opened_at + LISTENING_TIME
                 if now >= deadline or not together.is_worth_waiting(
                     now, listen_until=listen_until, hear_until=hear_until
@@ -505,8 +505,8 @@ class ParamClient:
         assert self._tasks is not None, "nothing is heard before"
         self._tasks.start_soon(self._load, component, identity)
 
-    def _wake(self) -> None:
-        self._carrier.wake()
+    def _wake(self, machine: ComponentMachine | None = None) -> None:
+        self._carrier.wake(machine)
 
     # ends
 

@@ -63,6 +63,11 @@ class Difference:
         return self.standing is Standing.SAME
 
     @property
+    def is_news(self) -> bool:
+        """Whether there is anything to see: another value or type, or one that has moved."""
+        return not self.is_same or self.types_differ or self.moved not in (None, Moved.NEITHER)
+
+    @property
     def types_differ(self) -> bool:
         """Whether both sides say a type, and not the same one. `INT32 1` and `REAL32 1.0` are one value."""
         return (

@@ -15,6 +15,7 @@ from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.events import Changes
 from paramclient.identity import Identity, autopilot_name
 from paramclient.params import ParamMap
+from paramclient.protocol.authors import check_asker
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.operation import Operation
@@ -50,6 +51,8 @@ PROGRESS_INTERVAL = 0.1
 """Seconds between two calls of a progress callback."""
 IDENTITY_PATIENCE = 1.5
 """Seconds to wait for a component to say who it is before its cached table is done without."""
+CACHE_PATIENCE = 5.0
+"""The same while its cached table is being read: for milliseconds, but hundreds may be wanted at once."""
 SETUP_TRIES = 3
 SETUP_PAUSE = 0.1
 """How often SETUP_SIGNING is sent, and the seconds after each: nothing answers it, and frames get lost."""
@@ -195,6 +198,7 @@ class Component:
         value: SupportsIndex | SupportsFloat | bytes,
         *,
         timeout: float | None = None,
+        asker: str | None = None,
     ) -> SetResult:
         """Write one parameter and prove by its value that the vehicle has taken it.
 
@@ -205,13 +209,15 @@ class Component:
             name: param_id.
             value: a number; or the 4 bytes of the message for what cannot be said as a number.
             timeout: as in `get`.
+            asker: for whom it is done, in printable ASCII: the change, and its line of history, are then by
+                "us for ASKER".
 
         Returns:
             Accepted, or adjusted: the vehicle made another value of it.
 
         Raises:
-            UsageError: the name or the value cannot be right, or the client only listens. Nothing was
-                written.
+            UsageError: the name, the value or the asker cannot be right, or the client only listens. Nothing
+                was written.
             UnknownParameter: the vehicle does not have it.
             Refused: it gave a reason.
             TypeMismatch: it holds the parameter in another type.
@@ -223,7 +229,7 @@ class Component:
             raise UsageError(f"{HASH_CHECK} is no parameter: it can be read, and not written")
         machine = self._machine
         self._client._check_open()
-        write = machine.write(name, check_value(value), anyio.current_time())
+        write = machine.write(name, check_value(value), anyio.current_time(), check_asker(asker))
         try:
             what = f"PARAM_SET {name} to {self.system}/{self.component}"
             return await self._wait(write, timeout, lambda: (what, write.attempts))
@@ -295,7 +301,7 @@ class Component:
             result = await self._wait_for_fetch(fetch, None if timeout is None else began + timeout, progress)
         finally:
             machine.end_fetch(fetch, anyio.current_time())
-            self._client._wake()  # it may have been in the way of others
+            self._client._wake(machine)  # it may have been in the way of others
         return replace(result, elapsed=anyio.current_time() - began)
 
     async def refreshed(self, *, timeout: float | None = None) -> None:
@@ -401,24 +407,28 @@ class Component:
 
     def _cache_is_due(self, now: float) -> bool:
         """Whether the cached table is in `params`, or is not worth waiting for."""
+        writer = self._client._writer
+        patience = CACHE_PATIENCE if writer.is_bringing(self._machine) else IDENTITY_PATIENCE
         return (
             self._cache_is_read.is_set()
-            or not self._client._writer.may_have(self.system, self.component)
-            or now >= self._heard_at + IDENTITY_PATIENCE
+            or not writer.may_have(self.system, self.component)
+            or now >= self._heard_at + patience
         )
 
     async def _wait_for_cache(self) -> None:
         """Wait until the cached table, if the cache may have one, is in `params`; but not for long."""
-        now = anyio.current_time()
-        if not self._cache_is_due(now):
-            with anyio.move_on_after(self._heard_at + IDENTITY_PATIENCE - now):
-                await self._cache_is_read.wait()
-            self._client._check_open()
+        for patience in (IDENTITY_PATIENCE, CACHE_PATIENCE):
+            now = anyio.current_time()
+            if not self._cache_is_due(now):
+                with anyio.move_on_after(self._heard_at + patience - now):
+                    await self._cache_is_read.wait()
+                self._client._check_open()
 
     def _publish(self, change: Change) -> None:
         """Hand a change to everyone who listens."""
-        for changes in list(self._subscriptions):
-            changes.push(change)
+        if self._subscriptions:  # to go through the set takes a while, also when there is nobody in it
+            for changes in list(self._subscriptions):
+                changes.push(change)
 
     def _part(self) -> None:
         """It is lost, and not followed any more."""
@@ -446,7 +456,7 @@ class Component:
         began = anyio.current_time()
         ended = anyio.Event()
         operation.on_done.append(ended.set)
-        self._client._wake()
+        self._client._wake(self._machine)
         try:
             with anyio.move_on_after(patience):
                 while not operation.done:
@@ -467,7 +477,7 @@ class Component:
     ) -> FetchResult:
         ended = anyio.Event()
         fetch.on_done.append(ended.set)
-        self._client._wake()
+        self._client._wake(self._machine)
         try:
             while not fetch.done:
                 now = anyio.current_time()

@@ -120,4 +120,4 @@ class Ftp:
             return await component._wait(job, timeout, lambda: (awaited, 0), tell)
         finally:
             component._machine.files.release(job, anyio.current_time())
-            component._client._wake()
+            component._client._wake(component._machine)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from fnmatch import fnmatchcase
 
 from paramclient.errors import UsageError
 from paramclient.identity import Identity
@@ -103,6 +104,22 @@ class ParamSet(Mapping[str, WrittenParam]):
         """A copy of a table, such as `component.params.values()`, as it is at this moment."""
         written = {param.name: WrittenParam.of(param) for param in params}
         return cls(written, component, system, identity, at, source)
+
+    def only(self, patterns: Iterable[str]) -> ParamSet:
+        """Those that are named.
+
+        Args:
+            patterns: names, or patterns of the shell (`MC_*`, `SERVO?_TRIM`) in the spelling of the set.
+
+        Raises:
+            UsageError: one fits no name. Whoever misspells one must not hear that all is well.
+        """
+        fitting = {pattern: {name for name in self if fnmatchcase(name, pattern)} for pattern in patterns}
+        if useless := [pattern for pattern, found in fitting.items() if not found]:
+            of = f" of {self.source}" if self.source else ""
+            raise UsageError(f"no parameter{of} is called {' or '.join(useless)}")
+        chosen = set().union(*fitting.values())
+        return replace(self, params={name: param for name, param in self.items() if name in chosen})
 
     def __getitem__(self, name: str) -> WrittenParam:
         return self.params[name]

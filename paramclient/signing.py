@@ -12,7 +12,7 @@ from typing import Final
 from paramclient.errors import UsageError
 from paramclient.protocol.wire import SigningKey, SigningPolicy, SigningReport, timestamp_of
 
-__all__ = ["Signing", "key_from_environment", "read_key", "refused_in_words", "timestamp_now"]
+__all__ = ["Signing", "key_from_environment", "read_key", "read_private", "refused_in_words", "timestamp_now"]
 
 KEY_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY"
 FILE_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY_FILE"
@@ -59,17 +59,7 @@ def read_key(path: str | os.PathLike[str]) -> SigningKey:
         UsageError: the file cannot be read, is open to others than its owner (where there are such modes),
             or holds no key. The text never tells what it holds.
     """
-    try:
-        with Path(path).open("rb") as file:
-            mode = os.fstat(file.fileno()).st_mode & 0o777
-            data = file.read(LONGEST_FILE + 1)
-    except OSError as error:
-        raise UsageError(f"{os.fspath(path)}: the signing key cannot be read: {error.strerror}") from error
-    if os.name == "posix" and mode & OF_OTHERS:
-        raise UsageError(
-            f"{os.fspath(path)}: others than its owner can get at this signing key (mode {mode:o}); "
-            "`chmod 600` ends that, and a key that others may have read is better replaced"
-        )
+    data = read_private(path, "signing key", LONGEST_FILE + 1)
     try:
         if len(data) == 32:
             return SigningKey(data)
@@ -78,6 +68,31 @@ def read_key(path: str | os.PathLike[str]) -> SigningKey:
         return SigningKey.from_text(data.decode("ascii", "replace"))
     except UsageError as error:
         raise UsageError(f"{os.fspath(path)}: {error}") from None
+
+
+def read_private(path: str | os.PathLike[str], what: str, most: int) -> bytes:
+    """The first so many bytes of a file that is its owner's alone.
+
+    Args:
+        path: the file.
+        what: what it holds, for errors.
+        most: bytes that are read.
+
+    Raises:
+        UsageError: it cannot be read, or is open to others than its owner (where there are such modes).
+    """
+    try:
+        with Path(path).open("rb") as file:
+            mode = os.fstat(file.fileno()).st_mode & 0o777
+            data = file.read(most)
+    except OSError as error:
+        raise UsageError(f"{os.fspath(path)}: the {what} cannot be read: {error.strerror}") from error
+    if os.name == "posix" and mode & OF_OTHERS:
+        raise UsageError(
+            f"{os.fspath(path)}: others than its owner can get at this {what} (mode {mode:o}); "
+            f"`chmod 600` ends that, and a {what.split()[-1]} that others may have read is better replaced"
+        )
+    return data
 
 
 def key_from_environment(environment: Mapping[str, str] = os.environ) -> SigningKey | None:

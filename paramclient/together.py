@@ -21,6 +21,9 @@ __all__ = ["FetchTogether", "FetchedAll"]
 
 SILENT_PATIENCE: Final = 1.0
 """Seconds for which a component that does not answer at all is asked, once another one is done."""
+PATIENCE_PER_ANSWER: Final = 4.0
+"""The same by the longest time in which another one has answered: where one process is all vehicles, or this
+one serves many links, an answer may come seconds later than it would from one alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,9 +64,15 @@ class FetchTogether:
         self._refresh = refresh
         self._fetches: dict[Address, Fetch] = {}
         self._is_cache_awaited = False
+        self._unanswered: dict[Address, Fetch] = {}
+        self._longest_answer = 0.0
+        self._unheard_at: dict[Address, float] = {}  # when those who have not answered were not heard either
 
-    def join(self, now: float) -> None:
-        """Begin the fetches of components that have none yet, as soon as their cached table is there."""
+    def join(self, now: float) -> bool:
+        """Begin the fetches of components that have none yet, as soon as their cached table is there.
+
+        Gives whether any has begun.
+        """
         self._is_cache_awaited = False
         ready: dict[int, list[ComponentMachine]] = {}
         for address, component in self._components.items():
@@ -79,7 +88,9 @@ class FetchTogether:
         for machines in ready.values():
             begun = self._station.begin_fetches(machines, now, refresh=self._refresh)
             for machine, fetch in zip(machines, begun, strict=True):
-                self._fetches[machine.system, machine.component] = fetch
+                address = machine.system, machine.component
+                self._fetches[address] = self._unanswered[address] = fetch
+        return bool(ready)
 
     def is_worth_waiting(self, now: float, *, listen_until: float, hear_until: float) -> bool:
         """Whether more may come.
@@ -93,11 +104,14 @@ class FetchTogether:
             return True
         if not self._fetches:
             return now < hear_until
-        is_anyone_done = any(fetch.result is not None for fetch in self._fetches.values())
-        patience = SILENT_PATIENCE if is_anyone_done else math.inf
+        for address, fetch in list(self._unanswered.items()):
+            self._look(address, fetch, now)
+        patience = math.inf
+        if any(fetch.result is not None for fetch in self._fetches.values()):
+            patience = max(SILENT_PATIENCE, PATIENCE_PER_ANSWER * self._longest_answer)
         return any(
-            not fetch.done and (not fetch.is_silent or now - fetch.begun_at - fetch.held_up(now) < patience)
-            for fetch in self._fetches.values()
+            not fetch.done and (not fetch.is_silent or not self._is_mute(address, fetch, now, patience))
+            for address, fetch in self._fetches.items()
         )
 
     async def news(self, seconds: float) -> None:
@@ -153,3 +167,24 @@ class FetchTogether:
         """Nobody waits for them any longer."""
         for address, fetch in self._fetches.items():
             self._station.components[address].end_fetch(fetch, now)
+
+    def _look(self, address: Address, fetch: Fetch, now: float) -> None:
+        """See whether one has answered by now, and how long that took; or whether it was heard at all."""
+        presence = self._station.components[address].presence
+        answered_at = fetch.first_value_at
+        if fetch.result is not None and fetch.result.source == "cache":
+            answered_at = fetch.ended_at
+        if fetch.done or answered_at < math.inf:
+            del self._unanswered[address]
+            if answered_at < math.inf:
+                took = answered_at - fetch.begun_at - fetch.held_up(now)
+                self._longest_answer = max(self._longest_answer, took)
+        elif presence.is_overdue(now):
+            self._unheard_at[address] = now
+
+    def _is_mute(self, address: Address, fetch: Fetch, now: float, patience: float) -> bool:
+        """Whether one could have answered for so long, was heard meanwhile, and has not answered."""
+        presence = self._station.components[address].presence
+        since = max(fetch.begun_at + fetch.held_up(now), self._unheard_at.get(address, -math.inf))
+        is_heard = presence.heard_at >= since or presence.is_lost or not presence.has_beaten
+        return is_heard and now - since >= patience

@@ -23,6 +23,14 @@ __all__ = ["WriteThrough", "chosen_cache"]
 
 FLUSH_INTERVAL: Final = 0.25
 """Seconds that changes are gathered for before they are written. A download fills several batches."""
+DOWNLOAD_INTERVAL: Final = 2.0
+FEW_FETCHES: Final = 8
+"""Seconds for which what a fetch under way brings is gathered, and the number of fetches above which that is
+done: most are over by then, and each table is written once, where parts of it would take several times as
+long."""
+PORTION: Final = 2_000
+"""Parameters after which a transaction ends, of those that are written together: to gather so many takes a
+few milliseconds, in which nothing else is done."""
 RETRY_INTERVAL: Final = 5.0
 """Seconds until a cache that could not be written is tried again."""
 MOST_VEHICLES: Final = 16
@@ -142,6 +150,10 @@ class WriteThrough:
         finally:
             self._bringing.discard(machine)
 
+    def is_bringing(self, machine: ComponentMachine) -> bool:
+        """Whether `bring` is under way for it."""
+        return machine in self._bringing
+
     async def keep_late(self, machine: ComponentMachine) -> None:
         """Keep a table that there was no time to bring the cached one for.
 
@@ -182,14 +194,39 @@ class WriteThrough:
             await anyio.sleep(FLUSH_INTERVAL)
             if self.is_held_back:
                 self._something_to_write.set()
-            if not await self.flush():
+            if not await self.flush(is_last=False):
                 await anyio.sleep(RETRY_INTERVAL)
                 self._something_to_write.set()
 
-    async def flush(self) -> bool:
-        """Write what is new; false when the cache could not take it. Cancelled, it loses nothing."""
+    async def flush(self, *, is_last: bool = True) -> bool:
+        """Write what is new; false when the cache could not take it. Cancelled, it loses nothing.
+
+        Args:
+            is_last: whether what a fetch under way has brought must not be left for later.
+        """
+        portion: list[_News] = []
+        size = 0
+        are_many = sum(machine.fetch is not None for machine in self._kept) > FEW_FETCHES
+        for kept in list(self._kept.values()) if self._cache is not None else ():
+            if are_many and not is_last and self._is_for_later(kept):
+                self._something_to_write.set()
+            elif self._kept.get(kept.machine) is kept:
+                for new in self._news_of(kept):
+                    portion.append(new)
+                    size += len(new.update.params)
+            if size >= PORTION:
+                if not await self._write(portion):
+                    return False
+                portion, size = [], 0
+        return await self._write(portion)
+
+    def _is_for_later(self, kept: _Kept) -> bool:
+        """Whether a fetch brings more of it that is better written together."""
+        return kept.machine.fetch is not None and anyio.current_time() < kept.written_at + DOWNLOAD_INTERVAL
+
+    async def _write(self, news: list[_News]) -> bool:
+        """Write what was gathered; false when the cache could not take it."""
         cache = self._cache
-        news = [] if cache is None else [new for kept in self._kept.values() for new in self._news_of(kept)]
         if cache is None or not news:
             return True
         is_written = False
@@ -245,7 +282,8 @@ class WriteThrough:
 
     def _keep(self, machine: ComponentMachine, identity: Identity, cached: CachedComponent | None) -> None:
         table = machine.table
-        kept = self._kept[machine] = _Kept(machine, identity, is_whole=table.complete)
+        kept = _Kept(machine, identity, is_whole=table.complete, written_at=anyio.current_time())
+        self._kept[machine] = kept
         for name in table.params:
             table.dirty.setdefault(name, "vehicle")
         if cached is not None:
@@ -284,6 +322,7 @@ class WriteThrough:
         dirty = table.take_dirty()
         is_whole, kept.is_whole = kept.is_whole, False
         kept.state = state
+        kept.written_at = anyio.current_time()
         knows_volatile = bool(table.volatile) or table.volatile_known
         update = TableUpdate(
             identity=kept.identity,
@@ -338,6 +377,7 @@ class _Kept:
     synced_at: float | None = None
     is_synced: bool = False  # since it was written last, whose time then counts: the clock may be wrong now
     is_whole: bool = False
+    written_at: float = 0.0  # by the event loop's clock
 
 
 @dataclass(slots=True)

@@ -360,6 +360,32 @@ async def test_what_one_refuses_or_adjusts_does_not_stop_the_others() -> None:
     assert again.counts[ApplyStatus.UNCHANGED] == len(SETTINGS) - 3
 
 
+@pytest.mark.parametrize("bring", [apply, restore])
+@swiftly
+async def test_every_value_that_is_written_tells_who_asked(bring: Callable[..., Any]) -> None:
+    async with a_client(px4()) as client:
+        component = await client.component()
+        await component.fetch_all()
+        changes = component.changes()
+        wanted = written({"TUNE_01": 8.0, "TUNE_02": 9.0, "MAV_SYS_ID": 7})
+        result = await bring(component, wanted, include="identity", asker="anna@10.0.0.2")
+        assert set(statuses(result).values()) == {"set"}
+        told = {}
+        with anyio.move_on_after(1.0):
+            async for change in changes:
+                told[change.name] = change.by
+    assert told == dict.fromkeys(wanted, "us for anna@10.0.0.2")
+    async with a_client(Air([px4(), px4(system=2)])) as client:
+        components = [await client.component(1), await client.component(2)]
+        feeds = [each.changes() for each in components]
+        await apply_all(components, written({"TUNE_01": 8.0}), asker="anna@10.0.0.2")
+        for feed in feeds:
+            async for change in feed:
+                if change.name == "TUNE_01" and change.by != "vehicle":
+                    assert change.by == "us for anna@10.0.0.2"
+                    break
+
+
 @swiftly
 async def test_values_that_cannot_be_are_told_before_anything_is_sent() -> None:
     tap = Tap(ardupilot())

@@ -69,6 +69,15 @@ def test_the_oracle_by_file_waits_one_round_trip_for_what_was_lost(
     assert burst + 2.5 < seconds(0.05, 2.5) < burst + 4 * 2.5
 
 
+def test_service_prints_what_many_clients_at_once_cost() -> None:
+    text = bench("service", "--listeners", "4", "--reads", "20", "--seconds", "1")
+    assert re.search(
+        r"^4 listeners: 4 were told of every one of [\d,]+ events or more, in order: met$", text, re.MULTILINE
+    )
+    assert re.search(r"^20 reads at 20 a second, .*ms for the slowest of 100", text, re.MULTILINE), text
+    assert re.search(r"^\d\.\d\d of a core in 1\.0 s", text, re.MULTILINE), text
+
+
 def test_peers_prints_a_table_of_who_got_everything() -> None:
     text = bench("peers", "--repeat", "1", "--only", "paramclient", "pymavlink", "clean")
     head, _, *rows = text.splitlines()[:5]

@@ -28,9 +28,10 @@ from paramclient.cli import run
 from paramclient.cli import vehicle as vehicle_commands
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.outcome import ExitCode, code_of, status_of
-from paramclient.cli.output import hash_text, printable
+from paramclient.cli.output import printable
 from paramclient.errors import CacheError, ClientClosed, PackError, ParamClientError
 from paramclient.links import Peer, SimLink
+from paramclient.notation import hash_text
 from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.sim.table import Entry

@@ -10,9 +10,9 @@ from pathlib import Path
 import pytest
 
 from paramclient.cache import BY_US, ParamCache, TableState
-from paramclient.cli.output import time_text
 from paramclient.cli.when import parse_time, parse_when
 from paramclient.errors import UsageError
+from paramclient.notation import time_text
 from paramclient.values import ParamType, bits_of
 from tests.caches import NOW, PX4, stored, update, whole_table
 from tests.commands import Command, in_process

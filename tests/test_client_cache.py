@@ -10,6 +10,7 @@ import signal
 import threading
 from collections.abc import Callable, Collection
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +28,14 @@ from paramclient import (
     ParamCache,
     ParamClient,
     Trust,
+    UsageError,
     writethrough,
 )
 from paramclient import component as component_module
 from paramclient.cache import CachedComponent
+from paramclient.paramset import ParamSet
 from paramclient.protocol import wire
+from paramclient.provision import apply
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
 from tests.caches import full_disk, read_only, set_aside, start
 from tests.shell import (
@@ -474,6 +478,40 @@ async def test_after_our_own_set_the_next_session_hits_where_the_hash_is_compute
     with ParamCache(path) as cache:
         lines = cache.component().history("PARAM_01")
         assert [(line.new and line.new.value, line.by) for line in lines] == [(100, "us"), (101, "us")]
+
+
+@swiftly
+async def test_a_change_of_ours_tells_who_asked_for_it(path: Path) -> None:
+    """And counts as ours: the hash is computed, and the next session hits."""
+    vehicle = small_px4()
+    await session(vehicle, path)
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        assert (await component.fetch_all()).source == "cache"
+        changes = component.changes()
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(partial(component.set, "PARAM_01", 100, asker="anna@10.0.0.2"))
+            tasks.start_soon(partial(component.set, "PARAM_02", 200, asker="ben@10.0.0.3 (script)"))
+        told = {}
+        for _ in range(2):
+            change = await anext(changes)
+            told[change.name] = change.by
+    assert told == {"PARAM_01": "us for anna@10.0.0.2", "PARAM_02": "us for ben@10.0.0.3 (script)"}
+    with ParamCache(path) as cache:
+        assert {line.name: line.by for line in cache.component().history()} == told
+    assert (await session(vehicle, path)).source == "cache"
+
+
+@pytest.mark.parametrize("asker", ["", "x" * 129, "a\nb", "Änne", "\x7f"])
+@swiftly
+async def test_who_asks_is_told_in_printable_ascii(path: Path, asker: str) -> None:
+    vehicle = small_px4()
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        with pytest.raises(UsageError, match="who asks for a change is told in 1 to 128 printable ASCII"):
+            await component.set("PARAM_01", 100, asker=asker)
+        with pytest.raises(UsageError, match="who asks"):
+            await apply(component, ParamSet({}), asker=asker)
 
 
 @swiftly

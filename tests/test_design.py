@@ -26,6 +26,7 @@ MAY_IMPORT = {
     "paramset": {"errors", "values", "identity"},
     "metadata.info": {"errors", "values"},
     "compare": {"errors", "values", "paramset"},
+    "notation": {"errors", "values", "paramset"},
     "protocol.wire": {"errors", "values", "protocol.wire"},
     "protocol.ftp.packets": {"errors", "values"},
     "protocol.pack": {"errors", "values"},
@@ -63,6 +64,8 @@ IMPURE_MODULES = {
 IMPURE_CALLS = {"open", "input", "print", "exec", "eval", "__import__"}
 
 COMMAND = ("cli", "__main__")
+SERVICE = "service"
+SERVICE_LIBRARIES = {"fastapi", "starlette", "uvicorn", "websockets"}
 COMMAND_LIBRARIES = {"rich", "cyclopts"}
 LONGEST_ROOM = 550
 
@@ -217,6 +220,19 @@ def test_only_the_command_loads_its_libraries(module: str) -> None:
 
 
 @EVERY_MODULE
+def test_only_the_service_loads_its_libraries(module: str) -> None:
+    """And only the command knows the service, which it imports when it is to serve."""
+    is_service = room_of(module).split(".")[0] == SERVICE
+    for each in imports_of(module):
+        if each.top in SERVICE_LIBRARIES:
+            assert is_service, f"{module}:{each.line} imports {each.module}"
+    for target, each in own_imports_of(module):
+        if room_of(target).split(".")[0] == SERVICE and not is_service:
+            assert is_command(module), f"{module}:{each.line} imports {target}"
+            assert not each.runs_at_import, f"{module}:{each.line} imports {target}"
+
+
+@EVERY_MODULE
 def test_every_module_says_what_it_is(module: str) -> None:
     assert ast.get_docstring(source_of(module))
 
@@ -283,6 +299,7 @@ def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
     """Start-up is part of the command's promise; mavutil, besides, changes the process that imports it."""
     unwanted = ["rich", "cyclopts", "pydantic", "serialx", "yaml", "pymavlink.mavutil"]
     unwanted += ["paramclient.sim", "paramclient.testing", "paramclient.cli", "paramclient.provision"]
+    unwanted += ["paramclient.documents", "paramclient.service", "fastapi", "starlette", "uvicorn", "httpx"]
     program = f"import sys, paramclient; print([name for name in {unwanted!r} if name in sys.modules])"
     run = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60

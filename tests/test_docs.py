@@ -29,7 +29,7 @@ EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 DIRECTIVE = re.compile(r"^\.\. (\w+):: ([\w.]+)(?:\(\))?$", re.MULTILINE)
 COMMANDS = ["fetch", "get", "set", "watch", "link", "ports", "show", "diff", "save", "history", "sim"]
-COMMANDS += ["apply", "verify", "restore", "import"]
+COMMANDS += ["apply", "verify", "restore", "import", "serve"]
 
 LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]*)?\)")
 

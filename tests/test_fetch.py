@@ -10,9 +10,8 @@ import pytest
 from paramclient.errors import LinkError, NoReply
 from paramclient.protocol import wire
 from paramclient.protocol.events import Fetched, ParamChanged
-from paramclient.protocol.fetch import FRESH_HASH
 from paramclient.protocol.reads import Read
-from paramclient.protocol.result import FetchResult
+from paramclient.protocol.result import FRESH_HASH, FetchResult
 from paramclient.protocol.table import Change
 from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam

@@ -22,6 +22,11 @@ import paramclient
 ROOT = Path(__file__).parent.parent
 SOURCES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient").rglob("*.py")}
 PLUGIN = "pytest_paramclient.py"
+SERVED = {
+    path.relative_to(ROOT).as_posix()
+    for folder in ("page", "reference")
+    for path in (ROOT / "paramclient/service" / folder).glob("*.*")
+}
 TABLES = {path.relative_to(ROOT).as_posix() for path in (ROOT / "paramclient/sim/tables").glob("*.csv")}
 
 
@@ -51,7 +56,7 @@ def metadata(wheel: dict[str, bytes]) -> Message:
 def test_the_wheel_has_the_package_and_nothing_else(wheel: dict[str, bytes]) -> None:
     shipped = {name for name in wheel if ".dist-info/" not in name}
     data = {"paramclient/py.typed", "paramclient/provision/cautions.toml"}
-    assert shipped == SOURCES | TABLES | data | {PLUGIN}
+    assert shipped == SOURCES | TABLES | SERVED | data | {PLUGIN}
     assert len(TABLES) >= 3
 
 
@@ -95,7 +100,7 @@ def test_pytest_finds_the_plugin(wheel: dict[str, bytes], tmp_path: Path) -> Non
 
 
 def test_the_sdist_can_be_built_and_tested(sdist: set[str]) -> None:
-    assert sdist >= SOURCES | TABLES | {PLUGIN}
+    assert sdist >= SOURCES | TABLES | SERVED | {PLUGIN}
     assert sdist >= {
         "pyproject.toml",
         "README.md",

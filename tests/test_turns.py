@@ -15,6 +15,7 @@ from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.turns import (
     ENOUGH_SEEN,
     FAST_GROWTH,
+    FAST_RETRY,
     GROWTH,
     LONGEST_RETRY,
     MEMORY,
@@ -123,7 +124,83 @@ def test_where_values_come_in_bursts_it_goes_faster() -> None:
         road.run()
         if road.running != seen[-1]:
             seen.append(road.running)
-    assert seen == [1, FAST_GROWTH, FAST_GROWTH**2, 100]
+    assert seen == [
+        1,
+        FAST_GROWTH,
+        FAST_GROWTH * GROWTH,
+        FAST_GROWTH * GROWTH**2,
+        FAST_GROWTH * GROWTH**3,
+        100,
+    ]
+
+
+def bursty(lanes: int) -> Road:
+    """A link so fast that the values of a list come together."""
+    road = Road(lanes)
+    for lane in road.lanes:
+        lane.is_bursty = True
+    return road
+
+
+def test_where_bursts_are_lost_it_is_tried_again_soon_and_with_as_many_again() -> None:
+    road = bursty(100)
+    road.until(16)
+    failed_at = road.now
+    for lane in road.lanes[12:16]:
+        road.end(lane, is_cut=True)
+    assert road.running == 12
+    while road.now < failed_at + FAST_RETRY - STEP:
+        road.run()
+        assert road.running <= 16, "no more than before"
+    assert road.until(32) < 2 * FAST_RETRY < RETRY
+
+
+def test_many_that_are_cut_at_once_have_failed_once() -> None:
+    """They were cut for one want of room: neither are fewer allowed for each, nor is it waited for longer."""
+    road = bursty(100)
+    road.until(32)
+    failed_at = road.now
+    for lane in road.lanes[:20]:
+        road.end(lane, is_cut=True)
+    road.run()
+    assert road.running == 31, "that of the first, without it"
+    road.until(64)
+    assert road.now - failed_at < 2 * FAST_RETRY
+
+
+def test_where_all_of_many_bursts_lose_half_as_many_run() -> None:
+    """None of them came before the others, so nothing says how many of them have room."""
+    road = bursty(100)
+    road.until(32)
+    road.end(road.lanes[31], is_cut=True)
+    road.run(round(FAST_RETRY / STEP) - 2)
+    road.run(10, room=16)
+    running = [lane for lane in road.lanes if lane.is_running]
+    assert len(running) == 31
+    for ended, lane in enumerate(running):
+        road.end(lane)
+        road.turns.tick(road.now)
+        if road.running >= 31 - ended:
+            break  # another one has begun
+    assert road.running == 31 // 2
+
+
+def test_one_in_the_place_of_another_holds_up_nobody() -> None:
+    """Where so many have run before, it need not have shown anything for further ones to begin."""
+    road = bursty(100)
+    road.until(32)
+    failed_at = road.now
+    road.end(road.lanes[31], is_cut=True)
+    while road.now < failed_at + FAST_RETRY - 5 * STEP:
+        road.run()
+    road.end(road.lanes[0])
+    road.turns.tick(road.now)
+    late = next(lane for lane in reversed(road.lanes) if lane.is_running)
+    assert late.is_awaited
+    waiting = road.lanes
+    road.lanes = [lane for lane in waiting if lane is not late]  # nothing comes of it
+    road.until(60)
+    assert road.now < late.silent_at
 
 
 def test_nobody_follows_before_those_that_run_have_shown_how_they_come() -> None:

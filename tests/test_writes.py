@@ -52,8 +52,8 @@ class Desk:
             is_certain=lambda: self.is_certain,
         )
 
-    def set(self, name: str, value: Value) -> Write:
-        return self.writes.set(name, value, self.now)
+    def set(self, name: str, value: Value, asker: str | None = None) -> Write:
+        return self.writes.set(name, value, self.now, asker)
 
     def hear(self, name: str, value: Value, kind: int = ParamType.REAL32, *, at: float | None = None) -> None:
         self.now = self.now if at is None else at
@@ -119,13 +119,26 @@ def test_the_type_is_learnt_first() -> None:
     desk = Desk()
     write = desk.set("A", 5)
     assert desk.take() == ["read A"]
-    assert "A" not in desk.writes
+    assert desk.writes.author("A") is None
     desk.hear("A", 3, ParamType.INT16)
     assert desk.take() == ["set A 5 INT16"]
-    assert "A" in desk.writes
+    assert desk.writes.author("A") == "us"
     desk.hear("A", 5, ParamType.INT16)
     assert write.result is not None
     assert write.result.param.type is ParamType.INT16
+
+
+def test_writes_to_one_name_have_each_the_author_who_asked_for_it() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    writes = [desk.set("A", 2.0, "first"), desk.set("A", 3.0), desk.set("A", 4.0, "third")]
+    told = []
+    for value in (2.0, 3.0, 4.0):
+        told.append(desk.writes.author("A"))
+        desk.hear("A", value)
+    assert told == ["us for first", "us", "us for third"]
+    assert all(write.done and write.error is None for write in writes)
+    assert desk.writes.author("A") is None
 
 
 def test_a_cached_type_is_not_enough_but_a_verified_one_is() -> None:

@@ -28,7 +28,7 @@ __all__ = [
 ]
 
 BY_US: Final = "us"
-"""A change that one of our own writes caused."""
+"""A change that one of our own writes caused; `us for NAME` where it was told for whom."""
 BY_VEHICLE: Final = "vehicle"
 """A change that the vehicle made itself, or that came to light in a download."""
 
@@ -47,7 +47,7 @@ class StoredParam:
             in a whole table.
         heard_at: when the vehicle said so, not after the update's `at`.
         volatile: whether the vehicle leaves it out of its hash; None leaves what is known.
-        by: who caused the change, should it be one: `BY_US`, `BY_VEHICLE` or `by_station(…)`.
+        by: who caused the change, should it be one: `BY_US`, `us for NAME`, `BY_VEHICLE` or `by_station(…)`.
     """
 
     param: Param

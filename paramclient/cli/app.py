@@ -25,9 +25,11 @@ from paramclient.cli.outcome import ExitCode, code_of
 from paramclient.cli.output import printable, report, say
 from paramclient.cli.ports import ports
 from paramclient.cli.save import save
+from paramclient.cli.serve import serve
 from paramclient.cli.setup import apply, restore, verify
 from paramclient.cli.signing import disable, setup
 from paramclient.cli.simulate import sim
+from paramclient.cli.token import token
 from paramclient.cli.vehicle import fetch, get, set_, watch
 from paramclient.errors import ParamClientError
 from paramclient.version import __version__
@@ -262,6 +264,18 @@ _app.command(
     name="import",
     usage="Usage: paramclient import [OPTIONS] FILE [FILE...]",
     help_epilogue=_examples("import flight.tlog", "import logs/*.tlog --json"),
+)
+_app.command(
+    serve,
+    usage="Usage: paramclient serve [OPTIONS] LINK [LINK...]",
+    help_epilogue=_examples(
+        "serve udpin:0.0.0.0:14550",
+        "serve serial:/dev/ttyACM0:57600 udpin:0.0.0.0:14550 --listen 127.0.0.1:0",
+    ),
+)
+_app.command(
+    token,
+    help_epilogue=_examples("token anna --file tokens", "token wall-display --file tokens --read"),
 )
 _app.command(_cache)
 _app.command(ports, help_epilogue=_examples("ports", "ports --json"))

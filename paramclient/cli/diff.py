@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from cyclopts import Parameter
 
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import NO_DEFAULTS, Coloured, print_json, print_table, printable, say
+from paramclient.cli.output import Coloured, print_document, print_table, printable, say
 from paramclient.cli.sources import resolve_all
-from paramclient.cli.written import bits_written, described, origin_json, value_text, written_json
+from paramclient.cli.written import described, value_text
 from paramclient.compare import Comparison, Difference, Moved, Standing, compare, defaults_of
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
+from paramclient.notation import bits_written
 from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.taken import NO_DEFAULTS
 from paramclient.values import type_name
 
 __all__ = ["diff"]
@@ -61,9 +63,11 @@ async def diff(
         theirs = replace(theirs, params={name: theirs[name] for name in theirs if name in ours})
     outcome = compare(ours, theirs, base=before, names=only or None)
     sides = _Sides(ours, theirs, before, options, chosen)
-    shown = [entry for entry in outcome.entries if everything or _is_news(entry)]
+    shown = [entry for entry in outcome.entries if everything or entry.is_news]
     if options.json:
-        print_json(_as_json(outcome, shown, sides))
+        from paramclient.documents import DiffDoc  # only here: loads pydantic
+
+        print_document(DiffDoc.of(outcome, sides.left, sides.right, sides.base, everything=everything))
     else:
         if shown:
             _print(outcome, shown, sides)
@@ -77,10 +81,6 @@ def _defaults(left: ParamSet, right: ParamSet) -> ParamSet:
     if not base:
         raise UsageError(NO_DEFAULTS)
     return base
-
-
-def _is_news(entry: Difference) -> bool:
-    return not entry.is_same or entry.types_differ or entry.moved not in (None, Moved.NEITHER)
 
 
 class _Sides:
@@ -192,40 +192,3 @@ _STYLES: Final = {
     Standing.ONLY_LEFT: "red",
     Standing.ONLY_RIGHT: "green",
 }
-
-
-# for programs
-
-
-def _as_json(outcome: Comparison, shown: list[Difference], sides: _Sides) -> dict[str, Any]:
-    has_base = outcome.base is not None
-    return {
-        "same": outcome.is_same,
-        "left": origin_json(outcome.left),
-        "right": origin_json(outcome.right),
-        "base": None if outcome.base is None else origin_json(outcome.base),
-        "counts": {standing.value: outcome.counts[standing] for standing in Standing},
-        "moves": {moved.value: outcome.moves[moved] for moved in Moved} if has_base else None,
-        "params": {entry.name: _entry_json(entry, sides) for entry in shown},
-    }
-
-
-def _entry_json(entry: Difference, sides: _Sides) -> dict[str, Any]:
-    units = sides.units(entry.name)
-    return {
-        "is": entry.standing,
-        "types_differ": entry.types_differ,
-        "rounding": entry.is_rounding,
-        "left": _value_json(entry.left, sides.left),
-        "right": _value_json(entry.right, sides.right),
-        "base": _value_json(entry.base, sides.base),
-        "moved": entry.moved,
-        **({"units": units} if units else {}),
-    }
-
-
-def _value_json(param: WrittenParam | None, metadata: Metadata | None) -> dict[str, Any] | None:
-    if param is None:
-        return None
-    meaning = meaning_of(metadata, param.name, param.value)
-    return written_json(param) | ({"text": meaning} if meaning else {})

@@ -4,23 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 from paramclient.cache import FleetDiff, FleetVehicle, Holder, NameSpread, ParamCache
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import (
-    bits_text,
-    print_json,
-    print_table,
-    report,
-    say,
-    time_text,
-    value_json,
-)
+from paramclient.cli.output import print_document, print_table, report, say
 from paramclient.errors import UsageError
+from paramclient.notation import time_text
 from paramclient.paramset import ParamSet, WrittenParam
-from paramclient.values import Param, ParamType, check_name, format_value, type_name
+from paramclient.values import Param, ParamType, check_name, format_value
 
 __all__ = ["fleet_diff"]
 
@@ -46,7 +39,9 @@ def fleet_diff(
     with ParamCache(options.cache) as cache:
         found = cache.fleet_diff(chosen, component=component)
     if options.json:
-        print_json(_json(found))
+        from paramclient.documents import FleetDiffDoc  # only here: loads pydantic
+
+        print_document(FleetDiffDoc.of(found))
     else:
         _print(found)
     return ExitCode.DIFFERENT if found.differs else ExitCode.DONE
@@ -121,42 +116,3 @@ def _value(param: Param) -> str:
 
 def _number(count: int, what: str) -> str:
     return f"{count} {what}{'' if count == 1 else 's'}"
-
-
-def _json(found: FleetDiff) -> dict[str, Any]:
-    return {
-        "component": found.component,
-        "vehicles": len(found.vehicles),
-        "different": found.differs,
-        "names": [_name_json(each) for each in found.names],
-    }
-
-
-def _name_json(each: NameSpread) -> dict[str, Any]:
-    wanted = each.wanted
-    return {
-        "name": each.name,
-        "different": each.differs,
-        "wanted": None if wanted is None else value_json(wanted.value, wanted.type or ParamType.REAL32),
-        "values": [
-            {
-                "value": value_json(value.param.value, value.param.type),
-                "type": type_name(value.param.type),
-                "bits": bits_text(value.param),
-                "agrees": value.agrees,
-                "vehicles": [_holder_json(holder) for holder in value.holders],
-            }
-            for value in each.values
-        ],
-        "lacking": [_holder_json(holder) for holder in each.lacking],
-        "unknown": [_holder_json(holder) for holder in each.unknown],
-    }
-
-
-def _holder_json(holder: Holder) -> dict[str, Any]:
-    return {
-        "key": holder.vehicle.key,
-        "system": holder.vehicle.system,
-        "since": None if holder.since is None else time_text(holder.since),
-        "changed": holder.changed,
-    }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 from cyclopts import Parameter
 from cyclopts.validators import Number
@@ -12,10 +12,11 @@ from cyclopts.validators import Number
 from paramclient.cache import HistoryEntry, ParamCache, SnapshotSummary
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import hash_text, print_json, print_table, time_text, value_json
+from paramclient.cli.output import print_document, print_table
 from paramclient.cli.sources import vehicle_key
 from paramclient.cli.when import parse_time
 from paramclient.errors import UsageError
+from paramclient.notation import hash_text, time_text
 from paramclient.values import Param, check_name, format_value
 
 __all__ = ["history"]
@@ -63,14 +64,18 @@ def history(
 
 def _print_entries(entries: Sequence[HistoryEntry], options: CacheOptions) -> None:
     if options.json:
-        print_json({"history": [_entry_json(entry) for entry in entries]})
+        from paramclient.documents import HistoryDoc  # only here: loads pydantic
+
+        print_document(HistoryDoc.of(entries))
     else:
         print_table(["time", "component", "name", "old", "new", "by"], map(_entry_cells, entries))
 
 
 def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> None:
     if options.json:
-        print_json({"snapshots": [_snapshot_json(each) for each in kept]})
+        from paramclient.documents import SnapshotsDoc  # only here: loads pydantic
+
+        print_document(SnapshotsDoc.of(kept))
         return
     rows = (
         (each.id, time_text(each.at), each.component, each.size, hash_text(each.hash), _reason(each))
@@ -79,33 +84,9 @@ def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> 
     print_table(["id", "time", "component", "params", "hash", "reason"], rows, right="id params")
 
 
-def _entry_json(entry: HistoryEntry) -> dict[str, Any]:
-    new = entry.new
-    return {
-        "time": time_text(entry.at),
-        "component": entry.component,
-        "name": entry.name,
-        "old": value_json(entry.old.value, entry.old.type),
-        "new": None if new is None else value_json(new.value, new.type),
-        "by": entry.by,
-    }
-
-
 def _entry_cells(entry: HistoryEntry) -> tuple[object, ...]:
     new = None if entry.new is None else _value(entry.new)
     return time_text(entry.at), entry.component, entry.name, _value(entry.old), new, entry.by
-
-
-def _snapshot_json(each: SnapshotSummary) -> dict[str, Any]:
-    return {
-        "id": each.id,
-        "time": time_text(each.at),
-        "component": each.component,
-        "size": each.size,
-        "complete": each.complete,
-        "hash": hash_text(each.hash),
-        "reason": each.reason,
-    }
 
 
 def _reason(each: SnapshotSummary) -> str:

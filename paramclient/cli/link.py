@@ -14,12 +14,13 @@ from cyclopts import Parameter
 
 from paramclient.cli.options import Seconds, SigningOptions
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import live_view, milliseconds, print_json, print_line, print_table, rounded
+from paramclient.cli.output import live_view, milliseconds, print_json, print_line, print_table
 from paramclient.cli.session import Deadline, listen
 from paramclient.client import ParamClient
 from paramclient.component import Component
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.identity import autopilot_name
+from paramclient.notation import rounded
 from paramclient.protocol.traffic import ComponentTraffic, TrafficReport
 from paramclient.protocol.wire import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, SigningReport, enum_word
 

@@ -13,11 +13,12 @@ import anyio
 from paramclient.cache import ParamCache
 from paramclient.cli.options import CacheOptions
 from paramclient.cli.outcome import ExitCode, code_of
-from paramclient.cli.output import hash_text, print_json, print_table, report
+from paramclient.cli.output import print_json, print_table, report
 from paramclient.errors import ParamClientError
 from paramclient.identity import autopilot_name
 from paramclient.links import LinkKind, parse_link
 from paramclient.logs import ImportedTable, import_log
+from paramclient.notation import hash_text
 
 __all__ = ["cache_of_log", "import_"]
 

@@ -13,20 +13,20 @@ from cyclopts import Parameter
 
 from paramclient.cache import CachedComponent, ParamCache
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.output import param_json, print_line, printable, say, value_json
+from paramclient.cli.output import print_line, printable, say
 from paramclient.cli.session import Session
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of, read_metadata
 from paramclient.metadata.info import number_of
 from paramclient.paramset import ParamSet
-from paramclient.values import Param, ParamType, Value, check_name, format_value
+from paramclient.values import Param, Value, check_name, format_value
 
 __all__ = [
     "DESCRIBED_COLUMNS",
     "MetadataChoice",
     "described_cells",
-    "described_json",
     "from_file",
+    "info_of",
     "known_of_session",
     "known_of_sets",
     "known_of_table",
@@ -114,14 +114,7 @@ def known_of_sets(sets: Sequence[ParamSet], options: LinkOptions) -> list[Metada
     if options.place is False:
         return [None] * len(sets)
     store = MetadataStore.beside(ParamCache(options.cache).path)
-    own = [
-        None
-        if params.identity is None or params.component is None
-        else store.known(params.identity, params.component)
-        for params in sets
-    ]
-    first = next(filter(None, own), None)
-    return [first if each is None else each for each in own]
+    return store.known_of_sets(sets)
 
 
 # what is to be set
@@ -183,10 +176,8 @@ def problems(pairs: Iterable[tuple[str, int | float]], metadata: Metadata | None
 
 
 def info_of(metadata: Metadata | None, name: str) -> ParamInfo | None:
-    """The description of a parameter, however it is spelt: ArduPilot takes small letters as well."""
-    if metadata is None:
-        return None
-    return metadata.get(name) or metadata.get(name.upper())
+    """What is known of a parameter."""
+    return None if metadata is None else metadata.find(name)
 
 
 # what is printed
@@ -209,26 +200,6 @@ def units_of(metadata: Metadata | None, name: str) -> str:
     """The units of a parameter, or "" where there are none or they are not known."""
     info = info_of(metadata, name)
     return "" if info is None else info.units
-
-
-def described_json(params: Iterable[Param], metadata: Metadata | None, *, whole: bool) -> dict[str, Any]:
-    """Parameters by name; those that are described have more fields.
-
-    Args:
-        params: the parameters.
-        metadata: what is known of them, or None.
-        whole: whether to give everything that the descriptions say.
-    """
-    printed: dict[str, Any] = {}
-    for param in params:
-        printed[param.name] = param_json(param)
-        info = info_of(metadata, param.name)
-        if info is not None:
-            text = info.text(param.value)
-            printed[param.name] |= {"text": text} if text else {}
-            printed[param.name] |= {"units": info.units} if info.units else {}
-            printed[param.name] |= {"metadata": _info_json(info)} if whole else {}
-    return printed
 
 
 def written_json(name: str, actual: Value | None, metadata: Metadata | None) -> dict[str, Any]:
@@ -282,32 +253,6 @@ def _said(info: ParamInfo) -> Iterator[tuple[str, str]]:
         yield "read-only", "the vehicle sets it"
     if info.reboot_required:
         yield "reboot", "a new value counts when the vehicle has started again"
-
-
-def _info_json(info: ParamInfo) -> dict[str, Any]:
-    """A description, without what it does not say."""
-    said: dict[str, Any] = {
-        "short_description": info.short_description,
-        "long_description": info.long_description,
-        "units": info.units,
-        "minimum": _number_json(info.minimum),
-        "maximum": _number_json(info.maximum),
-        "increment": _number_json(info.increment),
-        "decimals": info.decimals,
-        "default": _number_json(info.default),
-        "values": {format_value(value): name for value, name in info.values.items()},
-        "bits": {str(bit): name for bit, name in info.bits.items()},
-        "reboot_required": info.reboot_required,
-        "is_read_only": info.is_read_only,
-        "is_volatile": info.is_volatile,
-        "category": info.category,
-        "group": info.group,
-    }
-    return {key: value for key, value in said.items() if value not in ("", None, {}) and value is not False}
-
-
-def _number_json(number: int | float | None) -> int | float | str | None:
-    return None if number is None else value_json(number, ParamType.REAL64)
 
 
 def _number(name: str, text: str) -> int | float:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import TYPE_CHECKING, Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
 from paramclient.cli.logs import cache_of_log
@@ -12,7 +12,6 @@ from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
     MetadataChoice,
     described_cells,
-    described_json,
     from_file,
     known_of_table,
     print_descriptions,
@@ -20,24 +19,26 @@ from paramclient.cli.metadata import (
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import (
-    NO_DEFAULTS,
     by_index,
     default_text,
-    hash_text,
-    print_json,
+    print_document,
     print_line,
     print_table,
     printable,
     report,
     say,
-    time_text,
 )
 from paramclient.cli.sources import is_file, open_file, vehicle_key
 from paramclient.cli.written import show_file
 from paramclient.errors import CacheError, UsageError
 from paramclient.identity import autopilot_name
 from paramclient.metadata import Metadata
+from paramclient.notation import hash_text, time_or_none, time_text
+from paramclient.taken import NO_DEFAULTS
 from paramclient.values import Param, check_name, format_value, type_name
+
+if TYPE_CHECKING:
+    from paramclient.documents import CachedTableDoc
 
 __all__ = ["cache_list", "cache_path", "cache_remove", "show", "tables_of"]
 
@@ -80,7 +81,9 @@ def show(
     if unknown := [name for name in wanted if not any(name in table.params for table in tables)]:
         raise CacheError(f"not among the cached parameters: {', '.join(unknown)}")
     if options.json:
-        print_json({"components": [_table_json(view) for view in views]})
+        from paramclient.documents import CachedTablesDoc  # only here: loads pydantic
+
+        print_document(CachedTablesDoc(components=[view.document() for view in views]))
     elif is_list:
         _print_summaries(summaries)
         say("paramclient show VEHICLE shows one of them: by its system id, or the beginning of its key")
@@ -99,7 +102,10 @@ def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     with _open(options) as cache:
         summaries = cache.components()
     if options.json:
-        print_json({"path": str(cache.path), "components": [_summary_json(each) for each in summaries]})
+        from paramclient.documents import CachedListDoc, CachedSummaryDoc  # only here: loads pydantic
+
+        told = [CachedSummaryDoc.of(each) for each in summaries]
+        print_document(CachedListDoc(path=str(cache.path), components=told))
     elif summaries:
         _print_summaries(summaries)
     else:
@@ -112,7 +118,9 @@ def cache_path(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     with _open(options) as cache:
         path = str(cache.path)
     if options.json:
-        print_json({"path": path})
+        from paramclient.documents import PlaceDoc  # only here: loads pydantic
+
+        print_document(PlaceDoc(path=path))
     else:
         print_line(path)
     return ExitCode.DONE
@@ -130,7 +138,9 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
         key = vehicle_key(cache, vehicle)
         removed = cache.remove(key, component)
     if options.json:
-        print_json({"key": key, "removed": removed})
+        from paramclient.documents import RemovedDoc  # only here: loads pydantic
+
+        print_document(RemovedDoc(key=key, removed=removed))
     else:
         print_line(f"removed {removed} {'table' if removed == 1 else 'tables'} of {key}")
     return ExitCode.DONE
@@ -207,34 +217,11 @@ class _View:
         params = self.table.params.changed() if self.changed else self.table.params
         return [params[name] for name in self.names if name in params] if self.names else params.values()
 
+    def document(self) -> CachedTableDoc:
+        """The same for programs."""
+        from paramclient.documents import CachedTableDoc  # only here: loads pydantic
 
-def _table_json(view: _View) -> dict[str, Any]:
-    table = view.table
-    return {
-        "system": table.system,
-        "component": table.component,
-        "autopilot": autopilot_name(table.autopilot),
-        "uid": table.identity.uid,
-        "hash": hash_text(table.hash),
-        "synced_at": _time(table.synced_at),
-        "params": described_json(view.params, view.metadata, whole=bool(view.names)),
-    }
-
-
-def _summary_json(summary: CachedSummary) -> dict[str, Any]:
-    return {
-        "key": summary.key,
-        "system": summary.system,
-        "component": summary.component,
-        "autopilot": autopilot_name(summary.autopilot),
-        "uid": summary.identity.uid,
-        "size": summary.size,
-        "count": summary.count,
-        "complete": summary.complete,
-        "hash": hash_text(summary.hash),
-        "synced_at": _time(summary.synced_at),
-        "updated_at": _time(summary.updated_at),
-    }
+        return CachedTableDoc.of(self.table, self.params, self.metadata, whole=bool(self.names))
 
 
 def _print_summaries(summaries: Sequence[CachedSummary]) -> None:
@@ -244,7 +231,7 @@ def _print_summaries(summaries: Sequence[CachedSummary]) -> None:
             autopilot_name(each.autopilot),
             each.size,
             hash_text(each.hash),
-            _time(each.synced_at),
+            time_or_none(each.synced_at),
             each.key,
         )
         for each in summaries
@@ -283,7 +270,3 @@ def _print_table(view: _View) -> None:
 
 def _value(param: Param) -> str:
     return format_value(param.value, param.type)
-
-
-def _time(at: float | None) -> str | None:
-    return None if at is None else time_text(at)

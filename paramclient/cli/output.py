@@ -7,47 +7,39 @@ as it came: in JSON everything outside ASCII is escaped, and people see `printab
 from __future__ import annotations
 
 import json
-import math
 import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Final
 
+from paramclient.notation import bits_text, value_json
 from paramclient.protocol.result import Progress
-from paramclient.values import Param, ParamType, Value, format_value, shortest_float, type_name
+from paramclient.values import Param, format_value, type_name
 
 if TYPE_CHECKING:
     from rich.table import Table
 
+    from paramclient.documents import Document
+
 __all__ = [
     "Coloured",
-    "NO_DEFAULTS",
     "as_json",
-    "bits_text",
     "by_index",
     "default_text",
-    "hash_text",
     "live_view",
     "milliseconds",
     "param_json",
+    "print_document",
     "print_json",
     "print_line",
     "print_table",
     "printable",
     "progress_bar",
     "report",
-    "rounded",
     "say",
-    "time_text",
-    "value_json",
 ]
 
-NO_DEFAULTS: Final = (
-    "the firmware's defaults are not known, so nor is what differs from them: they come with the parameter "
-    "file over MAVFTP, which ArduPilot and PX4 from 1.18 on serve"
-)
 UNLIMITED: Final = 10_000
 """Columns of an output that is no terminal: nothing is wrapped or cut there."""
 
@@ -73,26 +65,10 @@ def printable(text: str) -> str:
     )
 
 
-def time_text(at: float) -> str:
-    """A unix time in ISO 8601, UTC, with milliseconds."""
-    return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
-
-
-def hash_text(crc: int | None) -> str | None:
-    """A PX4 hash as 8 hexadecimal digits."""
-    return None if crc is None else f"{crc:08x}"
-
-
 def milliseconds(seconds: float) -> str:
     """A short time for people: `103 ms`, and `0.4 ms` where whole ones say nothing."""
     text = f"{seconds * 1000:.0f}" if seconds >= 0.01 else f"{seconds * 1000:.1f}"
     return f"{text} ms"
-
-
-def bits_text(param: Param) -> str:
-    """`Param.bits` as hexadecimal digits: 16 for the types of 8 bytes, else 8."""
-    is_wide = isinstance(param.type, ParamType) and param.type.size == 8
-    return f"{param.bits:0{16 if is_wide else 8}x}"
 
 
 def default_text(param: Param) -> str | None:
@@ -106,25 +82,6 @@ def by_index(params: Iterable[Param]) -> list[Param]:
 
 
 # for programs
-
-
-def value_json(value: Value, number: ParamType | int) -> int | float | str:
-    """A value as strict JSON knows it: NaN and infinities as text, raw bytes as hexadecimal text.
-
-    A REAL32 is given by the shortest number that rounds to the same float32.
-    """
-    if isinstance(value, bytes):
-        return format_value(value, number)
-    if isinstance(value, int):
-        return value
-    if math.isfinite(value):
-        return shortest_float(value) if number == ParamType.REAL32 else value
-    return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
-
-
-def rounded(seconds: float | None) -> float | None:
-    """Seconds to a tenth of a millisecond."""
-    return None if seconds is None else round(seconds, 4)
 
 
 def param_json(param: Param) -> dict[str, Any]:
@@ -146,6 +103,11 @@ def as_json(params: Iterable[Param]) -> dict[str, dict[str, Any]]:
 def print_json(result: object) -> None:
     """Print one object on one line, at once."""
     print(json.dumps(result, allow_nan=False), flush=True)
+
+
+def print_document(document: Document) -> None:
+    """Print a document of `paramclient.documents` on one line, at once."""
+    print_json(document.as_json())
 
 
 # for people

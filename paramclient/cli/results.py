@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, TypeAlias
+from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
 from paramclient.cli.outcome import ExitCode, code_of
-from paramclient.cli.output import Coloured, print_table, printable, report, say, value_json
+from paramclient.cli.output import Coloured, print_table, printable, report, say
+from paramclient.notation import typed
 from paramclient.provision import (
     MISSING,
     ApplyResult,
@@ -17,21 +18,24 @@ from paramclient.provision import (
     PlanRow,
     PlanStatus,
 )
-from paramclient.values import ParamType, Value, format_value, type_name
+from paramclient.values import Value, format_value
+
+if TYPE_CHECKING:
+    from paramclient.documents import ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc
 
 __all__ = [
     "Vehicle",
     "applied_code",
-    "applied_json",
-    "interrupted_json",
+    "applied_doc",
+    "interrupted_doc",
     "met_code",
     "planned_code",
-    "planned_json",
+    "planned_doc",
     "show_applied",
     "show_interrupted",
     "show_planned",
     "show_verified",
-    "verified_json",
+    "verified_doc",
 ]
 
 MOST_NAMED: Final = 10
@@ -62,7 +66,10 @@ def show_applied(results: Mapping[Vehicle, ApplyResult], *, full: bool) -> None:
     """Print one table of what became of each value, and a line for each vehicle on stderr."""
     _print(
         ["name", "before", "wanted", "now", "status", "reason"],
-        {vehicle: map(_applied_cells, _shown(result, full=full)) for vehicle, result in results.items()},
+        {
+            vehicle: map(_applied_cells, result.rows.values() if full else result.news)
+            for vehicle, result in results.items()
+        },
     )
     for vehicle, result in results.items():
         say(printable(f"{vehicle.who}: {_counted(result.counts, ApplyStatus)} in {result.elapsed:.1f} s"))
@@ -95,41 +102,18 @@ def applied_code(result: ApplyResult) -> ExitCode:
     return ExitCode.INCOMPLETE if result.error is None else max(ExitCode.INCOMPLETE, code_of(result.error))
 
 
-def applied_json(vehicle: Vehicle, result: ApplyResult, *, full: bool) -> dict[str, Any]:
-    """The result for one vehicle; values that it had already only on demand."""
-    return {
-        **_address(vehicle),
-        "now": {"system": result.system, "component": result.component},
-        "complete": result.complete,
-        "counts": {status.value: result.counts.get(status, 0) for status in ApplyStatus},
-        "params": {row.name: _applied_row_json(row) for row in _shown(result, full=full)},
-        "extra": len(result.extra),
-        "reboots": result.reboots,
-        "reboot_required": list(result.reboot_required),
-        "error": None if result.error is None else str(result.error),
-        "elapsed_s": round(result.elapsed, 3),
-    }
+def applied_doc(vehicle: Vehicle, result: ApplyResult, *, full: bool) -> ApplyResultDoc:
+    """The result for one vehicle, for programs; values that it had already only on demand."""
+    from paramclient.documents import ApplyResultDoc  # only here: loads pydantic
+
+    return ApplyResultDoc.of(result, system=vehicle.system, component=vehicle.component, full=full)
 
 
-def interrupted_json(vehicle: Vehicle, rows: Iterable[ApplyRow]) -> dict[str, Any]:
+def interrupted_doc(vehicle: Vehicle, rows: Iterable[ApplyRow]) -> InterruptedDoc:
     """The same for what was ended by somebody."""
-    return {
-        **_address(vehicle),
-        "complete": False,
-        "params": {row.name: _applied_row_json(row) for row in rows},
-        "error": "interrupted",
-    }
+    from paramclient.documents import InterruptedDoc  # only here: loads pydantic
 
-
-def _shown(result: ApplyResult, *, full: bool) -> list[ApplyRow]:
-    """All rows but those with nothing to see: what was so already, or is left out and no different."""
-    return [row for row in result.rows.values() if full or _is_news(result, row)]
-
-
-def _is_news(result: ApplyResult, row: ApplyRow) -> bool:
-    if row.status is ApplyStatus.SKIPPED:
-        return not row.is_as_wanted or result.plan.rows[row.name].differs
-    return row.status is not ApplyStatus.UNCHANGED
+    return InterruptedDoc.of(rows, system=vehicle.system, component=vehicle.component)
 
 
 def _applied_cells(row: ApplyRow) -> Cells:
@@ -141,10 +125,6 @@ def _applied_cells(row: ApplyRow) -> Cells:
         Coloured(row.status, _STYLES[row.status]),
         _why(row),
     ]
-
-
-def _applied_row_json(row: ApplyRow) -> dict[str, Any]:
-    return {"status": row.status, **_values_json(row), "actual": _json(row.actual, row), **_reasons_json(row)}
 
 
 # what is to be done
@@ -174,37 +154,11 @@ def planned_code(plan: Plan, *, skip_invalid: bool) -> ExitCode:
     return ExitCode.INCOMPLETE if is_missing else ExitCode.DONE
 
 
-def planned_json(vehicle: Vehicle, plan: Plan, *, full: bool) -> dict[str, Any]:
-    """The plan for one vehicle."""
-    return {
-        **_address(vehicle),
-        "dry_run": True,
-        "counts": {status.value: plan.counts.get(status, 0) for status in PlanStatus},
-        "stages": [
-            {
-                "purpose": stage.purpose,
-                "reboot_first": stage.reboot_first,
-                "steps": [
-                    {
-                        "name": step.name,
-                        "value": value_json(step.value, step.type),
-                        "type": type_name(step.type),
-                        "before": value_json(step.before, step.type),
-                        "needs_reboot": step.needs_reboot,
-                    }
-                    for step in stage.steps
-                ],
-            }
-            for stage in plan.stages
-        ],
-        "params": {
-            row.name: _planned_row_json(row)
-            for row in plan.rows.values()
-            if full or row.status is not PlanStatus.UNCHANGED
-        },
-        "extra": len(plan.extra),
-        "reboot_for": list(plan.reboot_for),
-    }
+def planned_doc(vehicle: Vehicle, plan: Plan, *, full: bool) -> PlanDoc:
+    """The plan for one vehicle, for programs."""
+    from paramclient.documents import PlanDoc  # only here: loads pydantic
+
+    return PlanDoc.of(plan, system=vehicle.system, component=vehicle.component, full=full)
 
 
 def _planned_rows(plan: Plan, *, reboot: bool, full: bool) -> Iterator[Cells]:
@@ -233,10 +187,6 @@ def _planned_cells(row: PlanRow) -> Cells:
     ]
 
 
-def _planned_row_json(row: PlanRow) -> dict[str, Any]:
-    return {"status": row.status, **_values_json(row), **_reasons_json(row)}
-
-
 def _is_worth_telling(row: PlanRow) -> bool:
     return row.status is not PlanStatus.UNCHANGED and row.differs
 
@@ -249,14 +199,14 @@ def show_verified(plans: Mapping[Vehicle, Plan], *, full: bool) -> None:
     _print(
         ["name", "wanted", "now", "is", "reason"],
         {
-            vehicle: (_verified_cells(row) for row in plan.rows.values() if full or not _is_met(row))
+            vehicle: (_verified_cells(row) for row in plan.rows.values() if full or not row.is_met)
             for vehicle, plan in plans.items()
         },
     )
     for vehicle, plan in plans.items():
         words: dict[str, int] = {}
         for row in plan.rows.values():
-            words[_standing(row)] = words.get(_standing(row), 0) + 1
+            words[row.standing] = words.get(row.standing, 0) + 1
         counted = ", ".join(f"{number} {word}" for word, number in sorted(words.items(), key=_by_word))
         say(printable(f"{vehicle.who}: {counted or 'nothing to compare'}"))
 
@@ -266,24 +216,15 @@ def met_code(plan: Plan) -> ExitCode:
     return ExitCode.DONE if plan.is_met else ExitCode.DIFFERENT
 
 
-def verified_json(vehicle: Vehicle, plan: Plan, *, full: bool) -> dict[str, Any]:
-    """How one vehicle compares."""
-    return {
-        **_address(vehicle),
-        "met": plan.is_met,
-        "counts": {
-            word: sum(_standing(row) == word for row in plan.rows.values()) for word in _STANDING_STYLES
-        },
-        "params": {
-            row.name: {"is": _standing(row), **_values_json(row), **_reasons_json(row)}
-            for row in plan.rows.values()
-            if full or not _is_met(row)
-        },
-    }
+def verified_doc(vehicle: Vehicle, plan: Plan, *, full: bool) -> VerifiedDoc:
+    """How one vehicle compares, for programs."""
+    from paramclient.documents import VerifiedDoc  # only here: loads pydantic
+
+    return VerifiedDoc.of(plan, system=vehicle.system, component=vehicle.component, full=full)
 
 
 def _verified_cells(row: PlanRow) -> Cells:
-    standing = _standing(row)
+    standing = row.standing
     return [
         row.name,
         _text(row.wanted.value, row),
@@ -291,19 +232,6 @@ def _verified_cells(row: PlanRow) -> Cells:
         Coloured(standing, _STANDING_STYLES[standing]),
         _like(row) if standing == "missing" else _why(row),
     ]
-
-
-def _standing(row: PlanRow) -> str:
-    """How one parameter compares, in a word."""
-    if row.category == MISSING:
-        return "missing"
-    if row.status is PlanStatus.SKIPPED:
-        return "left out"
-    return "same" if row.status is PlanStatus.UNCHANGED else "different"
-
-
-def _is_met(row: PlanRow) -> bool:
-    return _standing(row) in ("same", "left out")
 
 
 def _by_word(counted: tuple[str, int]) -> int:
@@ -344,38 +272,8 @@ def _print(columns: Sequence[str], tables: Mapping[Vehicle, Iterable[Cells]], *,
         print_table([*([] if is_one else ["vehicle"]), *columns], rows, right=f"before wanted now {right}")
 
 
-def _address(vehicle: Vehicle) -> dict[str, Any]:
-    return {"system": vehicle.system, "component": vehicle.component}
-
-
 def _text(value: Value | None, row: ApplyRow | PlanRow) -> str | None:
-    return None if value is None else format_value(_typed(value, row), _kind(row))
-
-
-def _json(value: Value | None, row: ApplyRow | PlanRow) -> int | float | str | None:
-    return None if value is None else value_json(_typed(value, row), _kind(row))
-
-
-def _values_json(row: ApplyRow | PlanRow) -> dict[str, Any]:
-    return {
-        "type": None if row.type is None else type_name(row.type),
-        "before": _json(row.before, row),
-        "wanted": _json(row.wanted.value, row),
-    }
-
-
-def _reasons_json(row: ApplyRow | PlanRow) -> dict[str, Any]:
-    return {"category": row.category, "reason": row.reason, "nearest": list(row.nearest)}
-
-
-def _typed(value: Value, row: ApplyRow | PlanRow) -> Value:
-    """A whole number that was written for a float as the float that it is."""
-    is_float = row.type in (ParamType.REAL32, ParamType.REAL64)
-    return float(value) if is_float and isinstance(value, int) else value
-
-
-def _kind(row: ApplyRow | PlanRow) -> ParamType | int:
-    return ParamType.REAL32 if row.type is None else row.type
+    return None if value is None else format_value(*typed(value, row.type))
 
 
 def _why(row: ApplyRow | PlanRow) -> str:

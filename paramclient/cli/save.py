@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -14,15 +13,16 @@ from cyclopts import Parameter
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import NO_DEFAULTS, print_json, printable, progress_bar, report, say
+from paramclient.cli.output import print_json, printable, progress_bar, report, say
 from paramclient.cli.session import Session, connect
-from paramclient.cli.sources import check_link, confirmed, names_vehicle, set_of
+from paramclient.cli.sources import check_link, confirmed, names_vehicle
 from paramclient.component import Component
 from paramclient.errors import UsageError
 from paramclient.files import FileForm, write_file
 from paramclient.files.model import AUTOPILOT, address, form_of_name
 from paramclient.paramset import ParamSet
 from paramclient.protocol.result import FetchResult
+from paramclient.taken import differing, set_of
 from paramclient.values import Param
 
 __all__ = ["save"]
@@ -87,16 +87,14 @@ async def _from_link(
         fetched, silent = await _fetch(session, all_=all_, refresh=refresh)
         faults += silent
         for component, result in fetched:
-            whole, known, missing = await confirmed(
-                component, result, session.client.link.name, session.deadline
-            )
-            if missing:
+            found = await confirmed(component, result, session.client.link.name, session.deadline)
+            if found.missing:
                 who = f"{component.system}/{component.component}"
                 faults.append(
-                    f"{who} is incomplete: {len(missing)} of {result.count} parameters did not come"
+                    f"{who} is incomplete: {len(found.missing)} of {result.count} parameters did not come"
                 )
             else:
-                faults += _add(sets, whole, known, changed=changed)
+                faults += _add(sets, found.set, found.params, changed=changed)
     return sets, faults
 
 
@@ -149,15 +147,10 @@ def _from_cache(
 
 def _add(sets: list[ParamSet], whole: ParamSet, params: Iterable[Param], *, changed: bool) -> Sequence[str]:
     """Take a set in, or what of it differs from the defaults; say what keeps that from being done."""
-    if not changed:
-        sets.append(whole)
-        return []
-    if not any(param.default is not None for param in whole.values()):
-        return [f"{address(whole)}: {NO_DEFAULTS}"]
-    differing = [param.name for param in params if param.is_changed]
-    if not differing:
-        return [f"{address(whole)}: no parameter differs from its default"]
-    sets.append(replace(whole, params={name: whole[name] for name in differing}))
+    try:
+        sets.append(differing(whole, params) if changed else whole)
+    except UsageError as error:
+        return [f"{address(whole)}: {error}"]
     return []
 
 

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, Annotated, Final, TypeAlias, TypeVar
 
 import anyio
 import anyio.to_thread
@@ -19,20 +18,20 @@ from paramclient.cache import ParamCache
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.outcome import ExitCode, code_of
-from paramclient.cli.output import print_json, printable, progress_bar, report, say
+from paramclient.cli.output import print_document, printable, progress_bar, report, say
 from paramclient.cli.results import (
     Vehicle,
     applied_code,
-    applied_json,
-    interrupted_json,
+    applied_doc,
+    interrupted_doc,
     met_code,
     planned_code,
-    planned_json,
+    planned_doc,
     show_applied,
     show_interrupted,
     show_planned,
     show_verified,
-    verified_json,
+    verified_doc,
 )
 from paramclient.cli.session import Session
 from paramclient.cli.sources import is_file, open_file
@@ -49,15 +48,19 @@ from paramclient.cli.targets import (
 from paramclient.cli.when import parse_when
 from paramclient.cli.written import described
 from paramclient.component import Component
-from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError
+from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.metadata import Metadata
 from paramclient.paramset import ParamSet
 from paramclient.protocol.result import Progress
-from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, ApplyStatus, Plan, verify_all
+from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, verify_all
 from paramclient.provision import apply_all as apply_to_all
 from paramclient.provision import restore as restore_to
-from paramclient.provision.applying import BEFORE_APPLY, restored
+from paramclient.provision.applying import restored
 from paramclient.provision.looking import identified
+from paramclient.taken import before_last_apply
+
+if TYPE_CHECKING:
+    from paramclient.documents import SetUpDoc
 
 __all__ = ["apply", "restore", "verify"]
 
@@ -279,12 +282,7 @@ async def _state(found: Targets, vehicle: Component, when: str | None, options: 
 
 def _kept(cache: ParamCache, key: str, component: int, moment: float | None) -> ParamSet:
     if moment is None:
-        kept = [each for each in cache.snapshots(key, component) if each.reason == BEFORE_APPLY]
-        if not kept:
-            raise CacheError(
-                f"the cache knows of no apply to {key}; name the moment whose state is to come back"
-            )
-        moment = kept[-1].id
+        return before_last_apply(cache, key, component)
     return cache.state_at(key, component, moment)
 
 
@@ -381,7 +379,7 @@ class _Show:
             plans,
             errors,
             lambda: show_planned(plans, reboot=reboot, full=self._full),
-            planned_json,
+            planned_doc,
             lambda plan: planned_code(plan, skip_invalid=skip_invalid),
         )
 
@@ -389,12 +387,12 @@ class _Show:
         self, results: Mapping[Vehicle, ApplyResult], errors: Mapping[Vehicle, ParamClientError]
     ) -> ExitCode:
         return self._tell(
-            results, errors, lambda: show_applied(results, full=self._full), applied_json, applied_code
+            results, errors, lambda: show_applied(results, full=self._full), applied_doc, applied_code
         )
 
     def verified(self, plans: Mapping[Vehicle, Plan], errors: Mapping[Vehicle, ParamClientError]) -> ExitCode:
         return self._tell(
-            plans, errors, lambda: show_verified(plans, full=self._full), verified_json, met_code
+            plans, errors, lambda: show_verified(plans, full=self._full), verified_doc, met_code
         )
 
     @contextmanager
@@ -411,7 +409,7 @@ class _Show:
                     vehicle = self._vehicles[component.system, component.component]
                     steps[vehicle] = (how_far.done, how_far.total)
                     if how_far.row is not None:
-                        rows.setdefault(vehicle, {})[how_far.row.name] = _so_far(how_far.row)
+                        rows.setdefault(vehicle, {})[how_far.row.name] = how_far.row.so_far
                         began = began or anyio.current_time()
                     if draw is not None and began:
                         done, total = (sum(numbers) for numbers in zip(*steps.values(), strict=True))
@@ -423,8 +421,8 @@ class _Show:
         except anyio.get_cancelled_exc_class():
             told = {vehicle: list(each.values()) for vehicle, each in rows.items()}
             if self._as_json:
-                self._print_json(
-                    [interrupted_json(each, told.get(each, [])) for each in self._vehicles.values()]
+                self._print_documents(
+                    [interrupted_doc(each, told.get(each, [])) for each in self._vehicles.values()]
                 )
             else:
                 show_interrupted(told)
@@ -435,15 +433,15 @@ class _Show:
         results: Mapping[Vehicle, Result],
         errors: Mapping[Vehicle, ParamClientError],
         show: Callable[[], None],
-        as_json: Callable[..., dict[str, Any]],
+        as_document: Callable[..., SetUpDoc],
         code: Callable[[Result], ExitCode],
     ) -> ExitCode:
         """Print it in one form or the other; an error of a vehicle that is alone is the command's."""
         if errors and not self._is_fleet:
             raise next(iter(errors.values()))
         if self._as_json:
-            told = [as_json(vehicle, result, full=self._full) for vehicle, result in results.items()]
-            self._print_json(told, errors)
+            told = [as_document(vehicle, result, full=self._full) for vehicle, result in results.items()]
+            self._print_documents(told, errors)
         else:
             show()
         for vehicle, error in errors.items():
@@ -451,21 +449,13 @@ class _Show:
         codes = [*map(code, results.values()), *map(code_of, errors.values())]
         return max(codes, default=ExitCode.DONE)
 
-    def _print_json(
-        self, told: list[dict[str, Any]], errors: Mapping[Vehicle, ParamClientError] | None = None
+    def _print_documents(
+        self, told: Sequence[SetUpDoc], errors: Mapping[Vehicle, ParamClientError] | None = None
     ) -> None:
         if not self._is_fleet:
-            print_json(told[0])
+            print_document(told[0])
             return
-        failed = [
-            {"system": vehicle.system, "component": vehicle.component, "error": str(error)}
-            for vehicle, error in (errors or {}).items()
-        ]
-        print_json({"vehicles": told, "errors": failed})
+        from paramclient.documents import FleetSetupDoc  # only here: loads pydantic
 
-
-def _so_far(row: ApplyRow) -> ApplyRow:
-    """What has become of a parameter, where nobody will read it back any more."""
-    if row.status is not ApplyStatus.SET:
-        return row
-    return replace(row, status=ApplyStatus.UNPROVEN, reason="acknowledged, and not read back")
+        failed = {(vehicle.system, vehicle.component): error for vehicle, error in (errors or {}).items()}
+        print_document(FleetSetupDoc.of(told, failed))

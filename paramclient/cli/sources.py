@@ -13,27 +13,25 @@ So `./1` is the file and `cache:1` the vehicle, if ever there are both.
 from __future__ import annotations
 
 import re
-import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from contextlib import nullcontext, suppress
-from itertools import islice
 from pathlib import Path
 from typing import Final
 
 import anyio
 
-from paramclient.cache import CachedComponent, CachedSummary, ParamCache
+from paramclient.cache import CachedSummary, ParamCache
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import progress_bar, report
 from paramclient.cli.session import Deadline, connect
 from paramclient.component import Component
-from paramclient.errors import CacheError, NoReply, UsageError, VehicleError
+from paramclient.errors import CacheError, UsageError
 from paramclient.files import ParamFile, read_file
 from paramclient.files.model import AUTOPILOT
 from paramclient.links import FORMS, parse_link
 from paramclient.paramset import ParamSet
 from paramclient.protocol.result import FetchResult
-from paramclient.values import Param, Trust
+from paramclient.taken import Taken, cached_set, incomplete, taken
 
 __all__ = [
     "check_link",
@@ -44,14 +42,9 @@ __all__ = [
     "open_file",
     "resolve",
     "resolve_all",
-    "set_of",
     "vehicle_key",
 ]
 
-REFRESH_PATIENCE: Final = 10.0
-"""Seconds for the values that no hash covers, where the user sets no limit."""
-MOST_NAMED: Final = 20
-"""Missing parameters that are named to people."""
 SOURCES: Final = f"""\
   FILE                a parameter file that exists
   cache:VEHICLE       last known of a vehicle: its system id, the beginning of its hardware id, or its key;
@@ -144,53 +137,15 @@ def check_link(text: str) -> None:
         ) from None
 
 
-async def confirmed(
-    component: Component, result: FetchResult, link: str, deadline: Deadline
-) -> tuple[ParamSet, list[Param], list[str]]:
-    """What of a fetched table was given or confirmed in this session.
-
-    The values that no hash covers are waited for. Parameters that the vehicle does not list, and that are
-    only last known, cannot be confirmed, and are left out.
-
-    Returns:
-        the set, the same parameters as the table has them, and the names (or `index 12`) of those that did
-        not come.
+async def confirmed(component: Component, result: FetchResult, link: str, deadline: Deadline) -> Taken:
+    """What of a fetched table was given or confirmed in this session; see `taken`.
 
     Raises:
         LinkError: the link failed.
     """
-    with suppress(NoReply):  # what was not read afresh is missing below
-        await component.refreshed(timeout=deadline.left(REFRESH_PATIENCE))
     for note in result.notes:
         report(f"{component.system}/{component.component} {component.autopilot} on {link}: {note}")
-    known = [param for param in component.params.values() if param.trust is not Trust.CACHED]
-    stale = {
-        param.index: param.name
-        for param in component.params.values()
-        if param.trust is Trust.CACHED and param.index is not None
-    }
-    missing = [stale.get(index, f"index {index}") for index in sorted({*result.missing, *stale})]
-    taken = ParamSet.of(
-        known,
-        component=component.component,
-        system=component.system,
-        identity=component.identity,
-        at=time.time(),
-        source=f"link {link}",
-    )
-    return taken, known, missing
-
-
-def set_of(table: CachedComponent) -> ParamSet:
-    """What the cache has of a component."""
-    return ParamSet.of(
-        table.params.values(),
-        component=table.component,
-        system=table.system,
-        identity=table.identity,
-        at=table.updated_at if table.synced_at is None else table.synced_at,
-        source=f"cache {table.key}",
-    )
+    return await taken(component, result, source=f"link {link}", timeout=deadline.left())
 
 
 def open_file(path: str) -> ParamFile:
@@ -246,21 +201,11 @@ def _from_cache(vehicle: str, options: LinkOptions) -> ParamSet:
         raise UsageError(f"{vehicle!r} is a vehicle in the cache, and --no-cache excludes that")
     with ParamCache(options.cache) as cache:
         key = vehicle_key(cache, vehicle)
-        summary = _component(cache.components(key), options.component)
-        who = f"{summary.system}/{summary.component} ({key})"
-        if not summary.complete:
-            of = "" if summary.count is None else f" of {summary.count}"
-            raise CacheError(
-                f"the cache has {summary.size}{of} parameters of {who}, not all; fetch them first"
-            )
-        table = cache.load(key, summary.component)
-    if table is None:
-        raise CacheError(f"{who} has just been removed from the cache by another process")
-    return set_of(table)
+        return cached_set(cache, key, _component(cache.components(key), options.component))
 
 
-def _component(summaries: Sequence[CachedSummary], component: int | None) -> CachedSummary:
-    """The table that the user means, of those of one vehicle."""
+def _component(summaries: Sequence[CachedSummary], component: int | None) -> int:
+    """The component that the user means, of those of one vehicle."""
     by_id = {each.component: each for each in summaries}
     if component is None:
         component = AUTOPILOT if AUTOPILOT in by_id or len(by_id) > 1 else next(iter(by_id))
@@ -269,7 +214,7 @@ def _component(summaries: Sequence[CachedSummary], component: int | None) -> Cac
             f"component {component} of {summaries[0].key} is not in the cache, which holds "
             f"{', '.join(map(str, sorted(by_id)))}"
         )
-    return by_id[component]
+    return component
 
 
 async def _from_link(url: str, options: LinkOptions, *, is_alone: bool) -> ParamSet:
@@ -279,17 +224,7 @@ async def _from_link(url: str, options: LinkOptions, *, is_alone: bool) -> Param
         link = session.client.link.name
         with progress_bar(f"fetching {session.who}") if is_alone else nullcontext() as progress:
             result = await component.fetch_all(timeout=deadline.left(), progress=progress)
-        params, _, missing = await confirmed(component, result, link, deadline)
-        if missing:
-            raise VehicleError(
-                f"{session.who} on {link} is incomplete: {_listed(missing)} did not come",
-                system=component.system,
-                component=component.component,
-            )
-        return params
-
-
-def _listed(names: Sequence[str]) -> str:
-    shown: Iterable[str] = islice(names, MOST_NAMED)
-    more = len(names) - MOST_NAMED
-    return f"{', '.join(shown)}{f' and {more} more' if more > 0 else ''}"
+        found = await confirmed(component, result, link, deadline)
+        if found.missing:
+            raise incomplete(component, found.missing)
+        return found.set

@@ -17,7 +17,6 @@ from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
     MetadataChoice,
     described_cells,
-    described_json,
     from_file,
     known_of_session,
     needs_reboot,
@@ -29,30 +28,28 @@ from paramclient.cli.metadata import (
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.outcome import ExitCode, code_of, status_of
 from paramclient.cli.output import (
-    NO_DEFAULTS,
     as_json,
     by_index,
     default_text,
-    hash_text,
     milliseconds,
+    print_document,
     print_json,
     print_line,
     print_table,
     printable,
     progress_bar,
     report,
-    rounded,
     say,
-    time_text,
-    value_json,
 )
 from paramclient.cli.session import Session, connect
 from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError, ValueNotApplied
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
 from paramclient.metadata import Metadata
+from paramclient.notation import hash_text, rounded, time_text, value_json
 from paramclient.protocol.result import FetchResult, Policy
 from paramclient.protocol.sampling import SAMPLE_SIZE, Sample
 from paramclient.protocol.table import Change
+from paramclient.taken import NO_DEFAULTS
 from paramclient.values import Param, ParamType, Trust, Value, check_name, format_value, type_name
 
 __all__ = ["fetch", "get", "set_", "watch"]
@@ -145,9 +142,9 @@ async def get(
         if described is None:
             described = await known_of_session(session, metadata)
     if options.json:
-        texts = {each: str(error) for each, error in errors.items()}
-        found = described_json(params, described, whole=True)
-        print_json({"params": found, **({"errors": texts} if texts else {})})
+        from paramclient.documents import GotDoc  # only here: loads pydantic
+
+        print_document(GotDoc.of(params, described, errors))
     elif params and described is None:
         print_table(_COLUMNS, map(_cells, params), right="value index")
     elif params and described is not None:

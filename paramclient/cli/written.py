@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Final
+from typing import Final
 
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import (
-    NO_DEFAULTS,
-    print_json,
-    print_table,
-    printable,
-    report,
-    say,
-    time_text,
-    value_json,
-)
+from paramclient.cli.output import print_document, print_table, printable, report, say
 from paramclient.compare import same_value
-from paramclient.errors import UsageError
 from paramclient.files import ParamFile
 from paramclient.files.model import address
 from paramclient.identity import autopilot_name
+from paramclient.notation import time_text
 from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.taken import NO_DEFAULTS
 from paramclient.values import ParamType, Value, format_value, type_name
 
-__all__ = ["bits_written", "described", "origin_json", "show_file", "value_text", "written_json"]
+__all__ = ["described", "show_file", "value_text"]
 
 
 def show_file(file: ParamFile, component: int | None, *, changed: bool, json: bool) -> ExitCode:
@@ -35,9 +27,9 @@ def show_file(file: ParamFile, component: int | None, *, changed: bool, json: bo
     else:
         shown = [*sets]
     if json:
-        print_json(
-            {"file": file.source, "form": file.form, "components": [_set_json(each) for each in shown]}
-        )
+        from paramclient.documents import FileDoc  # only here: loads pydantic
+
+        print_document(FileDoc.of(file, shown))
     else:
         for each in shown:
             _print_set(each, changed=changed)
@@ -58,51 +50,9 @@ def described(params: ParamSet) -> str:
     return " ".join(filter(None, [_counted(len(params)), *who])) + at
 
 
-def origin_json(params: ParamSet) -> dict[str, Any]:
-    """Whose parameters a set has, for programs."""
-    identity = params.identity
-    return {
-        "source": params.source,
-        "system": params.system,
-        "component": params.component,
-        "autopilot": None if identity is None else autopilot_name(identity.autopilot),
-        "uid": None if identity is None else identity.uid,
-        "at": None if params.at is None else time_text(params.at),
-        "count": len(params),
-    }
-
-
-def written_json(param: WrittenParam) -> dict[str, Any]:
-    """A parameter's value for programs; its name is the key under which it stands.
-
-    Without a type, `value` is the number as it is written, and there are no `bits`.
-    """
-    return {
-        "value": _json(param.value, param),
-        "type": None if param.type is None else type_name(param.type),
-        "bits": bits_written(param),
-    }
-
-
 def value_text(param: WrittenParam) -> str:
     """A parameter's value for people."""
     return _text(param.value, param)
-
-
-def bits_written(param: WrittenParam) -> str | None:
-    """The value's bits as hexadecimal digits; None where no type stands beside it, or one that it exceeds."""
-    if param.type is None:
-        return None
-    try:
-        bits = (
-            int.from_bytes(param.value, "little")
-            if isinstance(param.value, bytes)
-            else param.bits_as(param.type)
-        )
-    except UsageError:
-        return None
-    is_wide = isinstance(param.type, ParamType) and param.type.size == 8
-    return f"{bits:0{16 if is_wide else 8}x}"
 
 
 _COLUMNS: Final = ("name", "value", "default", "type", "comment")
@@ -133,18 +83,6 @@ def _print_set(params: ParamSet, *, changed: bool) -> None:
     say(printable(f"{described(params)}{', those that differ from their default' if changed else ''}"))
 
 
-def _set_json(params: ParamSet) -> dict[str, Any]:
-    return {**origin_json(params), "params": {name: _param_json(param) for name, param in params.items()}}
-
-
-def _param_json(param: WrittenParam) -> dict[str, Any]:
-    return {
-        **written_json(param),
-        **({} if param.default is None else {"default": _json(param.default, param)}),
-        **({"comment": param.comment} if param.comment else {}),
-    }
-
-
 def _changed(params: ParamSet) -> ParamSet:
     """Those whose value differs from the firmware's default."""
     differing = {
@@ -153,10 +91,6 @@ def _changed(params: ParamSet) -> ParamSet:
         if param.default is not None and not same_value(param, replace(param, value=param.default))
     }
     return replace(params, params=differing)
-
-
-def _json(value: Value, param: WrittenParam) -> int | float | str:
-    return value_json(value, ParamType.REAL64 if param.type is None else param.type)
 
 
 def _text(value: Value, param: WrittenParam) -> str:

@@ -232,6 +232,10 @@ class Metadata(Mapping[str, ParamInfo]):
                 return group.instance(name, digits.group())
         raise KeyError(name)
 
+    def find(self, name: str) -> ParamInfo | None:
+        """The description of a parameter, however it is spelt: ArduPilot takes small letters as well."""
+        return self.get(name) or self.get(name.upper())
+
     def __iter__(self) -> Iterator[str]:
         return iter(self.params)
 

@@ -7,6 +7,7 @@ import logging
 import os
 import re
 import tempfile
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Final
@@ -15,6 +16,7 @@ from paramclient.errors import MetadataError
 from paramclient.identity import Identity
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.reading import LARGEST_PACKED, read_content, unpacked
+from paramclient.paramset import ParamSet
 from paramclient.values import crc32_px4
 
 __all__ = ["MetadataStore", "has_checksum"]
@@ -96,6 +98,17 @@ class MetadataStore:
             logger.warning("%s", error)
             self._remove(path)
             return None
+
+    def known_of_sets(self, sets: Sequence[ParamSet]) -> list[Metadata | None]:
+        """For each set what is kept for its vehicle's firmware; where it names none, what another one has."""
+        own = [
+            None
+            if params.identity is None or params.component is None
+            else self.known(params.identity, params.component)
+            for params in sets
+        ]
+        first = next(filter(None, own), None)
+        return [first if each is None else each for each in own]
 
     def _file(self, crc: int) -> Path:
         return self.folder / f"{crc:08x}.metadata"

@@ -5,7 +5,14 @@ from __future__ import annotations
 import math
 from typing import Final
 
-__all__ = ["Authors"]
+from paramclient.errors import UsageError
+
+__all__ = ["Authors", "by_us", "check_asker", "is_ours"]
+
+BY_US: Final = "us"
+FOR: Final = "us for "
+LONGEST_ASKER: Final = 128
+"""Characters of a name with an address, and of what a program says of itself besides."""
 
 FOREIGN_SET_MEMORY: Final = 2.0
 """Seconds for which a PARAM_SET of another station explains a change."""
@@ -16,6 +23,32 @@ MOST_CHANGES: Final = 4_096
 DOUBT: Final = 2.0
 """Seconds within which a second change of one value may be an old answer that came late: ArduPilot takes the
 values for a batch of answers up to 100 ms before it sends them, and what was set meanwhile overtakes them."""
+
+
+def check_asker(asker: str | None) -> str | None:
+    """Who wants a change, as it will stand in the history.
+
+    Raises:
+        UsageError: it is empty, too long, or holds more than printable ASCII.
+    """
+    if asker is None:
+        return None
+    if not 1 <= len(asker) <= LONGEST_ASKER or not (asker.isascii() and asker.isprintable()):
+        raise UsageError(
+            f"who asks for a change is told in 1 to {LONGEST_ASKER} printable ASCII characters, "
+            f"not {asker!r:.200}"
+        )
+    return asker
+
+
+def by_us(asker: str | None) -> str:
+    """The author of a change that a write of ours makes: "us", or "us for NAME"."""
+    return BY_US if asker is None else FOR + asker
+
+
+def is_ours(by: str) -> bool:
+    """Whether a write of ours has made the change, for whomever."""
+    return by == BY_US or by.startswith(FOR)
 
 
 class Authors:

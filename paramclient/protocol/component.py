@@ -68,6 +68,7 @@ class ComponentMachine(Parts):
         table: its parameters.
         round_trip: what its answers tell of the link.
         presence: whether it is there.
+        following: the list that another station has asked for, while none of ours comes.
         sync: whether the table is still the vehicle's.
         files: its files.
         descriptions: where it says that what it has to say of itself lies.
@@ -144,8 +145,10 @@ class ComponentMachine(Parts):
             self._count_moved(count, now)
         authors = self._authors
         writes = self.writes
-        is_ours = bool(writes.queues) and name in writes
-        by = "us" if is_ours else authors.of(name, now) if authors.foreign_sets else "vehicle"
+        by = writes.author(name) if writes.queues else None
+        is_ours = by is not None
+        if by is None:
+            by = authors.of(name, now) if authors.foreign_sets else "vehicle"
         change = table.hear(message, by, is_exact=is_ours and writes.wants(message))
         if change is not None:
             authors.changed(name, now, is_ours)
@@ -156,6 +159,8 @@ class ComponentMachine(Parts):
         fetch = self.fetches.current
         if fetch is not None:
             fetch.heard(message, now)
+        elif not self.reads.awaits(message):
+            self.following.heard(message, now)
         if writes.queues:
             writes.heard(message, now)
         self._value_heard(message, now)
@@ -216,8 +221,8 @@ class ComponentMachine(Parts):
         read.is_of_caller = True
         return read
 
-    def write(self, name: str, value: Value, now: float) -> Write:
-        """Write one parameter.
+    def write(self, name: str, value: Value, now: float, asker: str | None = None) -> Write:
+        """Write one parameter, for somebody.
 
         Raises:
             UsageError: the type is known and the value does not fit it. Nothing was sent.
@@ -228,7 +233,7 @@ class ComponentMachine(Parts):
         known = self.table.params.get(name)
         if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
             encode(value, known.type, self.table.encoding)
-        write = self.writes.set(name, value, now)
+        write = self.writes.set(name, value, now, asker)
         write.on_done.append(lambda: self._write_ended(write.ended_at))
         return write
 
@@ -383,6 +388,7 @@ class ComponentMachine(Parts):
         self._report(self.table.forget())
         self.sync.forget()
         self.fetches.forget()
+        self.following.forget()
         self._known_as = None
         if self.restart is not None:
             self.restart.another(now)
@@ -453,6 +459,7 @@ class ComponentMachine(Parts):
         """The vehicle has started again: what it had not saved is gone, and its list begins anew."""
         self._emit(events.ComponentRebooted(self))
         self._doubt()
+        self.following.forget()
         self._authors.clear()
         self.sync.check(now)
         self.who.doubt(now)

@@ -309,7 +309,12 @@ class Download(Operation[None]):
         timeout = self._round_trip.timeout
         if self._stream.is_awaited and self._passes > 1:
             timeout = min(timeout, self._list_patience)
-        return self._stream.quiet_at(timeout)
+        stream = self._stream
+        quiet_at = stream.quiet_at(timeout)
+        if stream.is_bursty and self._turns.is_beside_others(self):
+            # on a link so fast it is the program that has no time for more, or the vehicle, and pauses
+            return max(quiet_at, stream.heard_at + max(SHORTEST_QUIET, timeout))
+        return quiet_at
 
     def _note_answer(self, now: float) -> None:
         if not self._is_answered and self.lists:

@@ -34,9 +34,6 @@ from paramclient.values import Trust
 
 __all__ = ["Fetch"]
 
-FRESH_HASH: Final = 1.0
-"""Seconds for which an announced hash answers the question what the hash is. It is asked for when a component
-is found, so that a fetch right after that need not wait for another round trip."""
 IDENTITY_PATIENCE: Final = 1.0
 """Seconds for which a component may say whether it serves the file before its list is asked for."""
 MOST_RESTARTS: Final = 8
@@ -62,6 +59,7 @@ class Fetch(Operation[FetchResult]):
         file: the download as a file, while that is tried and when it has come.
         file_failed: whether the component has no such file, once that is known: None before, and where it may
             be bad luck.
+        first_value_at: when the first value came of a download by list; infinity before.
     """
 
     def __init__(
@@ -93,7 +91,7 @@ class Fetch(Operation[FetchResult]):
         self._repeated: Repeated | None = None
         self._was_asked_meanwhile = False
         self._is_hash_unknown = False  # the vehicle answers, but not to that
-        self._first_value_at = math.inf
+        self.first_value_at = math.inf
         self._held_before = 0.0  # by a download that was begun anew
         self._listed = listed
         self._policy = policy
@@ -109,7 +107,7 @@ class Fetch(Operation[FetchResult]):
             self._sample(sampled, table.count, now)
         elif table.hash is None or not table.complete:
             self._begin_or_resume(announced, now)
-        elif announced is not None and now - announced.at <= FRESH_HASH:
+        elif announced is not None and announced.is_fresh(now):
             self._compare(announced, now)
         else:
             self._ask_hash(self._hash_came_first, now)
@@ -128,9 +126,12 @@ class Fetch(Operation[FetchResult]):
         if self.file is not None:
             self.file.heard(message)
         download = self.download
-        if download is not None and not download.done:
-            if self._first_value_at > now:
-                self._first_value_at = now
+        if download is None:
+            if not self._reads.awaits(message):  # else it comes because we have asked
+                self._means.following.heard(message, now)
+        elif not download.done:
+            if self.first_value_at > now:
+                self.first_value_at = now
             download.heard(message, now)
             is_unheard = self._proof.before is None and not self._was_asked_meanwhile
             if is_unheard and self._expects_hash() and not self.done:
@@ -191,8 +192,8 @@ class Fetch(Operation[FetchResult]):
         self._had_no_file = self._file_was_silent = False
         self._restarts += 1
         if self._restarts > MOST_RESTARTS:
-            system, component = self._target
-            what = f"the parameters of {system}/{component}, which has started again {self._restarts} times"
+            whose = "/".join(map(str, self._target))
+            what = f"the parameters of {whose}, which has started again {self._restarts} times"
             self.fail(NoReply(what, attempts=self._restarts, waited=now - self.begun_at), now)
             return
         self._held_before = held_up
@@ -217,10 +218,9 @@ class Fetch(Operation[FetchResult]):
             missing = () if file.done else tuple(range(file.count))
             return self._result("ftp", file.count, missing, None, now, (note,))
         if download is None or download.count is None:
-            system, component = self._target
+            what = "the parameters of " + "/".join(map(str, self._target))
             attempts = 1 if download is None else download.lists
-            waited = now - self.begun_at
-            raise NoReply(f"the parameters of {system}/{component}", attempts=attempts, waited=waited)
+            raise NoReply(what, attempts=attempts, waited=now - self.begun_at)
         return self._result("stream", download.count, download.missing, None, now, (note,))
 
     @property
@@ -243,11 +243,8 @@ class Fetch(Operation[FetchResult]):
         if self.file is not None:
             return self.file.progress(now)
         received, total = (0, self._table.count) if self.download is None else self.download.progress
-        running = now - self._first_value_at
         came = received - (0 if self.download is None else self.download.resumed)
-        rate = came / running if came > 0 and running > 0 else 0.0
-        left = (total - received) / rate if rate and total is not None else None
-        return Progress(received, total, rate, left)
+        return Progress.after(received, total, came, now - self.first_value_at)
 
     def _sample(self, sampled: Sampled, count: int, now: float) -> None:
         """Judge the cached table by some of its parameters."""
@@ -313,7 +310,7 @@ class Fetch(Operation[FetchResult]):
             self._begin_download(now)
         elif not self._expects_hash():
             self._resume(now)
-        elif announced is not None and now - announced.at <= FRESH_HASH:
+        elif announced is not None and announced.is_fresh(now):
             self._resume_under(announced, now)
         else:
             self._ask_hash(self._hash_came_to_resume, now)
@@ -359,6 +356,10 @@ class Fetch(Operation[FetchResult]):
             file = self.file = PackFetch(means.files, means.turns, means.table, means.changed, now)
             file.on_done.append(partial(self._file_ended, file))
             return
+        count, following = self._table.count, means.following
+        if not (present or self._listed) and following.is_running(now):
+            # another station has asked for it: to ask again would begin it anew for both
+            present, count = following.hand_over(means.reads)
         download = self.download = Download(
             means.target,
             means.round_trip,
@@ -367,7 +368,7 @@ class Fetch(Operation[FetchResult]):
             means.turns,
             now,
             listed=self._listed,
-            count=self._table.count,
+            count=count,
             present=present,
         )
         if download.done:

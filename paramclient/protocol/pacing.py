@@ -49,12 +49,13 @@ class Share:
         each: requests a second that every one of them may send.
     """
 
-    __slots__ = ("_askers", "_best", "_streams", "each")
+    __slots__ = ("_askers", "_best", "_best_rate", "_came", "_sent", "_streams", "each")
 
     def __init__(self) -> None:
         self._askers: set[Pace] = set()
         self._streams: dict[Pace, tuple[float, float]] = {}
-        self._best: dict[Pace, float] = {}
+        self._best: set[Pace] = set()  # whose lists made the best rate there was
+        self._best_rate = self._sent = self._came = 0.0  # the sums, as all of it is wanted for each request
         self.each = LARGEST_RATE
 
     def join(self, pace: Pace) -> None:
@@ -70,27 +71,32 @@ class Share:
     def stream_seen(self, pace: Pace, rate: float, loss: float) -> None:
         """A component sends its list with so many values a second, of which a share is lost."""
         if pace in self._best:
-            self._best = {}  # of an earlier list of it
+            self._best.clear()  # of an earlier list of it
+            self._best_rate = 0.0
+        sent, came = self._streams.get(pace, (0.0, 0.0))
         self._streams[pace] = rate, rate * (1.0 - loss)
+        self._sent += rate - sent
+        self._came += rate * (1.0 - loss) - came
         self._divide()
 
     def stream_ended(self, pace: Pace) -> None:
         """Its list is over. What it has shown of the link counts on until it sends another."""
         if pace in self._streams:
-            rates = self._rates()
-            if sum(rates.values()) > sum(self._best.values()):
-                self._best = rates
-            del self._streams[pace]
+            if self._rate() > self._best_rate:
+                self._best_rate = self._rate()
+                self._best = set(self._streams)
+            sent, came = self._streams.pop(pace)
+            self._sent = self._sent - sent if self._streams else 0.0
+            self._came = self._came - came if self._streams else 0.0
             self._divide()
 
-    def _rates(self) -> dict[Pace, float]:
+    def _rate(self) -> float:
         """Values a second of the lists that run: beside another one, lost values show no room on the link."""
-        is_alone = len(self._streams) == 1
-        return {pace: sent if is_alone else came for pace, (sent, came) in self._streams.items()}
+        return self._sent if len(self._streams) == 1 else self._came
 
     def _divide(self) -> None:
-        values = max(sum(self._best.values()), sum(self._rates().values()))
-        if values:
+        values = max(self._best_rate, self._rate())
+        if values > 0.0:
             requests = values * VALUE_SIZE * UPSTREAM_SHARE / REQUEST_SIZE
             self.each = max(requests, SMALLEST_RATE) / max(len(self._askers), 1)
 

@@ -13,6 +13,7 @@ from paramclient.protocol.descriptions import Descriptions
 from paramclient.protocol.events import Event
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.fetches import Fetches
+from paramclient.protocol.following import Following
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.identify import Identification
 from paramclient.protocol.presence import Presence
@@ -99,6 +100,7 @@ class Parts(ABC):
         self.commands = Commands(target, own, self.round_trip, send)
         self.restart: Restart | None = None
         self.files = FileTransfers(target, own, self.round_trip, send)
+        self.following = Following()
         self.fetches = Fetches(
             Means(
                 target,
@@ -111,6 +113,7 @@ class Parts(ABC):
                 expects_hash=lambda: self.sync.expects_hash,
                 changed=self._moved,
                 doubt=self._doubt_identity,
+                following=self.following,
                 trace=trace,
             ),
             self.sync,

@@ -19,6 +19,8 @@ USUAL_INTERVAL: Final = 1.0
 """Seconds from one heartbeat to the next, by the standard."""
 BEATS_IN_A_GAP: Final = 2.5
 """Intervals of silence in which an update may have been lost as well: two heartbeats were."""
+BEATS_OVERDUE: Final = 1.5
+"""The same after which one is late: the link, or whoever is behind with all that there is to do, owes it."""
 COPY: Final = 0.5
 """Seconds within which a second heartbeat is one that came twice, or late."""
 LOST_AFTER_HIGH_LATENCY: Final = 20.0
@@ -89,6 +91,11 @@ class Presence:
     def has_beaten(self) -> bool:
         """Whether it ever sent a heartbeat."""
         return self.beat_at > -math.inf
+
+    def is_overdue(self, now: float) -> bool:
+        """Whether it should have been heard since, and is not lost yet: what it owes besides says nothing."""
+        late = BEATS_OVERDUE / BEATS_IN_A_GAP * self.gap
+        return self.has_beaten and not self.is_lost and now - self.heard_at > late
 
     @property
     def is_booting(self) -> bool:

@@ -122,6 +122,10 @@ class Reads:
     def __contains__(self, key: Key) -> bool:
         return key in self._open
 
+    def awaits(self, message: ParamValue) -> bool:
+        """Whether this is the answer to a read under way."""
+        return message.param_id in self._open or message.param_index in self._open
+
     def ask(self, key: Key, now: float, *, urgent: bool = True) -> Read:
         """Want an answer; joins an open read of the same. Give it back with `release`."""
         read = self._open.get(key)

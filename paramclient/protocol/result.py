@@ -5,7 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from typing import Final
 
+from paramclient.protocol.following import Following
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.notes import MOVED
 from paramclient.protocol.reads import Read, Reads
@@ -18,6 +20,10 @@ from paramclient.protocol.wire import Message, ParamValue
 from paramclient.values import Param, Trust
 
 __all__ = ["Announcement", "FetchResult", "Means", "Policy", "Progress", "Sampled"]
+
+FRESH_HASH: Final = 1.0
+"""Seconds for which an announced hash answers the question what the hash is. It is asked for when a component
+is found, so that a fetch right after that need not wait for another round trip."""
 
 
 class Policy(StrEnum):
@@ -45,6 +51,7 @@ class Means:
         expects_hash: whether it has a hash, as far as is known.
         changed: is told of changes that no PARAM_VALUE brought.
         doubt: is told that a table has turned out not to be what it was.
+        following: the list that another station may be having sent.
         trace: is told of each step.
     """
 
@@ -58,6 +65,7 @@ class Means:
     expects_hash: Callable[[], bool]
     changed: Callable[[list[Change]], None]
     doubt: Callable[[float], None]
+    following: Following
     trace: Trace = silent
 
 
@@ -92,6 +100,10 @@ class Announcement:
         """What the answer to a read of `_HASH_CHECK` says, or None without one."""
         return None if read.result is None else cls.of(read.result, read.ended_at)
 
+    def is_fresh(self, now: float) -> bool:
+        """Whether it need not be asked for again."""
+        return now - self.at <= FRESH_HASH
+
 
 @dataclass(frozen=True, slots=True)
 class Progress:
@@ -108,6 +120,13 @@ class Progress:
     total: int | None
     rate: float
     seconds_left: float | None
+
+    @classmethod
+    def after(cls, received: int, total: int | None, came: int, running: float) -> Progress:
+        """What it is when so many of those received came in so many seconds."""
+        rate = came / running if came > 0 and running > 0 else 0.0
+        left = (total - received) / rate if rate and total is not None else None
+        return cls(received, total, rate, left)
 
 
 @dataclass(frozen=True, slots=True)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
+from heapq import heapify, heappop, heappush
 from typing import Final, TypeAlias
 
 from paramclient.errors import LinkError, UsageError
@@ -57,6 +58,8 @@ NOBODY: Final = (0, 0)
 MOST_COMPONENTS: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each have. Further ones are heard
 when one that is lost and has told of no parameter can be forgotten for them."""
+MOST_PAST: Final = 8
+"""Deadlines of the past that are kept for each component before they are sorted out."""
 SEARCH_INTERVAL: Final = 0.5
 """Seconds between two searches for one that can be forgotten, where there was none: each looks at all."""
 MOST_PEERS: Final = 256
@@ -71,6 +74,8 @@ class Station:
     """Turns what a link delivers into tables and answers, and what is wanted into bytes to send.
 
     Feed it with `receive`, call `tick` at `next_deadline`, send what `data_to_send` gives, look at `events`.
+    Both look at every component, as anything may have been asked of any. Where there are many that takes
+    longer than all the rest; whoever calls `touch` for what was asked may have the others left out.
 
     Args:
         link: the link's canonical name.
@@ -131,6 +136,11 @@ class Station:
         self._heartbeat_at = math.inf if self.listens_only else -math.inf
         self._is_paused = False
         self._turns = Turns()
+        self._of_system: dict[int, list[ComponentMachine]] = {}
+        self._last_waiting: ComponentMachine | None = None
+        self._touched: dict[ComponentMachine, None] = {}  # whose deadline may be another than was noted
+        self._deadlines: dict[ComponentMachine, float] = {}  # as noted
+        self._order: list[tuple[float, int, int]] = []  # a heap of these, with some that are of the past
         self._room = Room()
         self._full_until = -math.inf
 
@@ -159,12 +169,18 @@ class Station:
             machine = self.components.get((system, component))
             if number == PARAM_VALUE_ID and machine is not None:  # the short way for what comes in thousands
                 self._peers[system] = peer
+                self._touched[machine] = None
                 machine.receive_value(decode_param_value(payload), now, version)
             else:
                 self._receive_other(frame, peer, now)
         if self._is_stream and not data:
             self._peers = {system: each for system, each in self._peers.items() if each != peer}
         return bool(frames)
+
+    def touch(self, machine: ComponentMachine) -> None:
+        """Something was asked of a component, or is no longer."""
+        if self.components.get((machine.system, machine.component)) is machine:
+            self._touched[machine] = None
 
     def overhear(self, data: bytes, now: float) -> None:
         """Take note of a frame that another program sends to the vehicles over this link: who sets what."""
@@ -173,8 +189,12 @@ class Station:
             if isinstance(message, ParamSet):
                 self._receive_foreign_set(message, (frame.system, frame.component), now)
 
-    def tick(self, now: float) -> None:
-        """Do what is due: our heartbeat, and every component's time-outs."""
+    def tick(self, now: float, *, everyone: bool = True) -> None:
+        """Do what is due: our heartbeat, and every component's time-outs.
+
+        Without `everyone`, only components that were heard or touched, or whose deadline has come, are
+        looked at: a share of the link that has become larger meanwhile is then used a little later.
+        """
         if self._is_paused or self.is_log:
             return
         if self._signer is not None:
@@ -183,21 +203,41 @@ class Station:
             self._heartbeat_at = now + HEARTBEAT_INTERVAL
             beat = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=MAV_STATE_ACTIVE)
             self._send(beat, None, 2)
-        for machine in list(self.components.values()):
+        if not everyone:
+            while self._order and self._order[0][0] <= now:
+                _, system, component = heappop(self._order)
+                self._touched[self.components[system, component]] = None
+        for machine in list(self.components.values() if everyone else self._touched):
             if machine.next_deadline() <= now or machine.writes.is_held:  # for another component's word
                 machine.tick(now)
-        self._turns.tick(now)
+                self._touched[machine] = None
+        if self._turns.tick(now):
+            self._touch_all(self.components.values())
         if self.traffic is not None:
             self.traffic.sent(self.bytes_sent, now)
 
-    def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity while the link is away, and in a log."""
+    def next_deadline(self, *, everyone: bool = True) -> float:
+        """When `tick` has something to do, or infinity while the link is away, and in a log.
+
+        `everyone` is as there.
+        """
         if self._is_paused or self.is_log:
             return math.inf
-        turns_at = self._turns.next_deadline()
-        return min(
-            [self._heartbeat_at, turns_at, *(machine.next_deadline() for machine in self.components.values())]
-        )
+        if everyone:
+            self._touch_all(self.components.values())
+        deadlines, order = self._deadlines, self._order
+        for machine in self._touched:
+            deadline = machine.next_deadline()
+            if deadline != deadlines.get(machine):
+                deadlines[machine] = deadline
+                heappush(order, (deadline, machine.system, machine.component))
+        self._touched = {each: None for each in self._touched if each.writes.is_held}  # till another speaks
+        if len(order) > MOST_PAST * (len(deadlines) + 1):
+            self._order = order = sorted((at, each.system, each.component) for each, at in deadlines.items())
+        while order and deadlines[self.components[order[0][1:]]] != order[0][0]:
+            heappop(order)
+        first = order[0][0] if order else math.inf
+        return min(self._heartbeat_at, self._turns.next_deadline(), first)
 
     def data_to_send(self) -> list[tuple[bytes, Peer | None]]:
         """Frames to send, in order, each with the peer it is for; None is for all."""
@@ -226,6 +266,7 @@ class Station:
         if not self.listens_only:
             self._heartbeat_at = now
         self._turns.resume(now)
+        self._touch_all(self.components.values())
         for machine in self.components.values():
             machine.resume(now)
 
@@ -264,7 +305,10 @@ class Station:
     @property
     def is_waiting(self) -> bool:
         """Whether anything is awaited of any component."""
-        return any(machine.is_waiting for machine in self.components.values())
+        last = self._last_waiting
+        if last is None or not last.is_waiting:  # one is asked after the other: mostly it still is the same
+            self._last_waiting = next((each for each in self.components.values() if each.is_waiting), None)
+        return self._last_waiting is not None
 
     def fail_all(self, error: LinkError, now: float) -> None:
         """The link is gone for good: everyone who waits gets its error."""
@@ -290,8 +334,8 @@ class Station:
         first = self.components.get((system, AUTOPILOT_COMPONENT))
         if first is not None and first.who.is_autopilot:
             return first
-        for machine in self.components.values():
-            if machine.system == system and machine.who.is_autopilot:
+        for machine in self._of_system.get(system, ()):
+            if machine.who.is_autopilot:
                 return machine
         return None
 
@@ -326,7 +370,9 @@ class Station:
         When they are all that is known of it, none of them has a table worth going on with, none is being
         fetched, none may give it as a file, and no other list runs, the list is asked for once, of all.
         """
-        is_new = self._turns.is_free and all(machine.fetch is None for machine in machines)
+        is_new = self._turns.is_free and not any(
+            machine.fetch is not None or machine.following.is_running(now) for machine in machines
+        )
         may_list = self.policy is Policy.AUTO
         is_fresh = refresh or not any(m.can_hit or present_of(m.table, m.reads) for m in machines)
         has_file = any(machine.fetches.may_use_file() is not False for machine in machines)
@@ -338,6 +384,9 @@ class Station:
                 self._send(ParamRequestList(system, COMP_ID_ALL), system, version)
                 return [machine.begin_fetch(now, refresh=refresh, listed=True) for machine in machines]
         return [machine.begin_fetch(now, refresh=refresh) for machine in machines]
+
+    def _touch_all(self, machines: Iterable[ComponentMachine]) -> None:
+        self._touched.update(dict.fromkeys(machines))
 
     def _watch(self, data: bytes, peer: Peer, now: float) -> None:
         """What somebody wants done with everything that comes, before it is looked into."""
@@ -378,6 +427,7 @@ class Station:
             return
         machine = self.components.get(sender) or self._meet(sender, message, now)
         if machine is not None:
+            self._touch_all(self._of_system[machine.system])  # what one says of the vehicle counts for all
             machine.receive(message, now, version=frame.version)
 
     def _meet(self, sender: Address, message: Message, now: float) -> ComponentMachine | None:
@@ -389,6 +439,8 @@ class Station:
         machine: ComponentMachine | None = None
 
         def send(message: Message) -> None:
+            if machine is not None:
+                self.touch(machine)
             self._send(message, system, 2 if machine is None else machine.version)
 
         machine = ComponentMachine(
@@ -408,6 +460,7 @@ class Station:
             trace=self._trace,
         )
         self.components[sender] = machine
+        self._of_system.setdefault(system, []).append(machine)
         self._events.append(ComponentHeard(machine))
         return machine
 
@@ -421,20 +474,30 @@ class Station:
             return True
         if now < self._full_until:
             return False
-        for address, machine in self.components.items():
+        for machine in self.components.values():
             if machine.presence.is_lost and not machine.table.params and not machine.is_waiting:
-                del self.components[address]
-                machine.reads.pace.idle()
-                self._events.append(ComponentForgotten(machine))
+                self._forget(machine)
                 return True
         self._full_until = now + SEARCH_INTERVAL
         return False
 
+    def _forget(self, machine: ComponentMachine) -> None:
+        """Part with a component, and with what was noted of it: another one may take its address."""
+        address = (machine.system, machine.component)
+        del self.components[address]
+        self._of_system[machine.system].remove(machine)
+        self._touched.pop(machine, None)
+        self._deadlines.pop(machine, None)
+        self._last_waiting = None
+        self._order = [each for each in self._order if each[1:] != address]
+        heapify(self._order)
+        machine.reads.pace.idle()
+        self._events.append(ComponentForgotten(machine))
+
     def _become_another(self, system: int, now: float) -> None:
         """Another vehicle has taken a system id, with all of its components."""
-        for machine in self.components.values():
-            if machine.system == system:
-                machine.become_another(now)
+        for machine in self._of_system[system]:
+            machine.become_another(now)
 
     def _autopilot_is_doubted(self, system: int) -> bool:
         autopilot = self.autopilot_of(system)
@@ -445,6 +508,7 @@ class Station:
         for machine in self.components.values():
             is_target = message.target_component in (machine.component, COMP_ID_ALL)
             if is_target and message.target_system in (machine.system, 0):
+                self._touched[machine] = None
                 machine.foreign_set(message.param_id, station, now)
 
     def _send(self, message: Message, system: int | None, version: int) -> None:

@@ -62,6 +62,11 @@ class ListStream:
         """Whether enough has come for its own pace to be known."""
         return self._advances >= ENOUGH_ADVANCES
 
+    @property
+    def is_bursty(self) -> bool:
+        """Whether most of its values come together."""
+        return self._together >= MOSTLY * (self._advances - self._came_before)
+
     def rewind(self) -> None:
         """What comes next is of another pass, or of another count."""
         self.front = self._jump = -1
@@ -113,7 +118,7 @@ class ListStream:
         if self.is_awaited:
             return Seen(0, 0, 0.0, False)
         came = self._advances - self._came_before
-        return Seen(came, self.front - self._began[0] + 1, self._longest, self._together >= MOSTLY * came)
+        return Seen(came, self.front - self._began[0] + 1, self._longest, self.is_bursty)
 
     def measure(self) -> None:
         """Work out its pace; not done for each value."""

@@ -10,7 +10,8 @@ from functools import partial
 from typing import Final
 
 from paramclient.errors import UnknownParameter, UsageError
-from paramclient.protocol.fetch import FRESH_HASH, Fetch
+from paramclient.protocol.authors import is_ours
+from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.result import Announcement, FetchResult, Policy
@@ -214,7 +215,7 @@ class Sync:
         """A parameter has changed: the hash that was announced is of the past, unless that leaves it out."""
         name, _, _, by = change
         if name not in self._table.volatile:
-            if by != "us":
+            if not is_ours(by):
                 self._moved_by_us_alone = False
             announced = self.announced
             if announced is not None and announced.at != _PAST:
@@ -298,7 +299,7 @@ class Sync:
     def compare(self, now: float) -> bool:
         """Whether the vehicle has just announced the hash that belongs to the table; then it is confirmed."""
         table, announced = self._table, self.announced
-        if announced is None or now - announced.at > FRESH_HASH or announced.hash != table.hash:
+        if announced is None or not announced.is_fresh(now) or announced.hash != table.hash:
             return False
         if not table.complete or announced.count != len(table.listed()):
             return False

@@ -37,7 +37,8 @@ class Change(NamedTuple):
         name: param_id.
         old: what was known before, or None when the parameter is new.
         new: what is known now, or None when the vehicle no longer has it.
-        by: "us" (our own `set`), "vehicle", or "station S/C" when another station was heard setting it.
+        by: "us" (our own `set`), "us for NAME" (one for which it was told who asked), "vehicle", or "station
+            S/C" when another station was heard setting it.
     """
 
     name: str

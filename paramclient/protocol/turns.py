@@ -23,10 +23,13 @@ SHOWING_TIME: Final = 0.5
 GROWTH: Final = 2
 """How many times as many may run when those that run have shown room."""
 FAST_GROWTH: Final = 8
-"""The same where values come in bursts that take no time: then the link is idle nearly all of it."""
+"""The same for the first one, where values come in bursts that take no time: then the link is idle nearly all
+of it. Further ones could be more than the program has time for, which shows when its buffer is full."""
+FAST_RETRY: Final = 0.25
 RETRY: Final = 5.0
 LONGEST_RETRY: Final = 60.0
-"""Seconds after which more are tried again when there was no room; doubled from the first to the longest."""
+"""Seconds after which more are tried again when there was no room; doubled from the first to the longest.
+The fast one is for lists that come in bursts which take no time: they last no longer than a second."""
 MEMORY: Final = 30.0
 """Seconds without any list after which what was found out about the link counts no more."""
 LOSSIER: Final = 0.1
@@ -78,8 +81,9 @@ class Turns:
 
     A list that is alone begins at once. Others begin when those that run have shown their pace and the last
     ones to begin made none of them slower or lossier: as many again each time. When they did, no more run
-    beside each other than before, and one more is tried a while later. One that stays silent takes nothing
-    of the link: it is no longer counted once its time-out is over.
+    beside each other than before, and one more is tried a while later; where lists come in bursts that take
+    no time, soon, and as many again. One that stays silent takes nothing of the link: it is no longer counted
+    once its time-out is over.
 
     Attributes:
         share: what all reads of the link may take of it together.
@@ -87,8 +91,10 @@ class Turns:
 
     def __init__(self) -> None:
         self.share = Share()
+        self._are_bursty = False  # whether the lists that were looked at last come in bursts: on a fast link
         self._now = -math.inf
         self._limit = 1
+        self._shown = 0  # how many have run beside each other and had room
         self._failures = 0
         self._again_at = -math.inf  # when more may be tried
         self._idle_since = -math.inf
@@ -112,7 +118,7 @@ class Turns:
         self._now = now
         if not self._running and now - self._idle_since > MEMORY:
             self._limit = 1
-            self._failures = self._came = self._passed = 0
+            self._failures = self._came = self._passed = self._shown = 0
             self._again_at = -math.inf
         if self.is_free:
             self._begin(stream, now)
@@ -122,8 +128,10 @@ class Turns:
     def has_begun(self, stream: Stream) -> None:
         """A list runs that was asked for without a turn."""
         self._running[stream] = _NOTHING
-        self._newest.add(stream)
-        self._marked_at = None
+        is_one_more = len(self._running) > self._shown  # else it has taken the place of one that is over
+        if is_one_more or not self._are_bursty:
+            self._newest.add(stream)
+            self._marked_at = None
 
     def give_back(self, stream: Stream, *, is_cut: bool = False) -> None:
         """The list is over, or is wanted no more. The next one begins with the next `tick`.
@@ -151,8 +159,8 @@ class Turns:
         """When a list of another one came last."""
         return max(self._crowded_at, -math.inf if self._lone is stream else self._lone_at)
 
-    def tick(self, now: float) -> None:
-        """Let the next ones begin, if there is room."""
+    def tick(self, now: float) -> bool:
+        """Let the next ones begin, if there is room; whether any has."""
         self._now = now
         coming = [stream for stream in self._running if not stream.is_awaited]
         if len(coming) > 1:
@@ -163,13 +171,14 @@ class Turns:
                 self._lone = coming[0]
             self._lone_at = now
         if self._waiting and not self._newest and self._again_at <= now:
-            self._newest.update(self._running)
+            self._newest.update(coming if self._are_bursty else self._running)
         if self._newest:
             self._look(now)
         room = self._limit - self._active() if self._waiting else 0
-        while room > 0 and self._waiting:
+        begins = min(room, len(self._waiting))
+        for _ in range(begins):
             self._begin(self._waiting.popleft(), now)
-            room -= 1
+        return begins > 0
 
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity."""
@@ -200,7 +209,8 @@ class Turns:
     def _look(self, now: float) -> None:
         """Judge by what has come whether the newest lists had room."""
         active = [stream for stream in self._running if stream.silent_at > now]
-        if any(stream.is_awaited for stream in active):
+        judged = self._newest.intersection(active) if self._are_bursty else active
+        if any(stream.is_awaited for stream in judged):
             return
         if not active:  # all keep silent, so nothing is known of the link, and nobody is in the way
             self._limit *= GROWTH
@@ -233,25 +243,32 @@ class Turns:
                 expected += self._paces[stream] * since
         if not is_shown and now < self._marked_at + SHOWING_TIME:
             return
+        self._are_bursty = is_bursty
         is_slower = expected >= FEWEST_EXPECTED and not is_bursty and earlier < SLOWER * expected
         if is_slower or self._is_lossier(came, passed):
-            self._fail(len(active) - len(self._newest))
+            self._fail(len(active) - len(self._newest) or len(active) // 2 * self._are_bursty)
         else:
+            self._shown = max(self._shown, len(active))
             self._came += came
             self._passed += passed
             self._paces = paces
             # several that began together have shown nothing of how each one comes alone
             if now >= self._again_at and (expected or len(active) == 1):
-                growth = FAST_GROWTH if is_bursty else GROWTH
-                more = len(active) + 1 if self._failures else len(active) * growth
+                is_first = len(active) == 1 and not self._failures
+                growth = FAST_GROWTH if is_bursty and is_first else GROWTH
+                is_careful = self._failures and not is_bursty
+                more = len(active) + 1 if is_careful else len(active) * growth
                 self._limit = max(self._limit, more)
         self._newest.clear()
         self._marked_at = None
 
     def _fail(self, limit: int) -> None:
         """There was no room: no more than so many for a while."""
-        self._limit = max(min(limit, self._limit), 1)
-        self._again_at = self._now + min(RETRY * 2**self._failures, LONGEST_RETRY)
+        if self._are_bursty and self._now < self._again_at:
+            return  # of as many lists as run there, others are cut for the same want of room
+        self._limit = self._shown = max(min(limit, self._limit), 1)
+        retry = FAST_RETRY if self._are_bursty else RETRY
+        self._again_at = self._now + min(retry * 2**self._failures, LONGEST_RETRY)
         self._failures += 1
 
     def _is_lossier(self, came: int, passed: int) -> bool:

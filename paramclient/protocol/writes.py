@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from paramclient.errors import NoReply, ParamErrorCode, TypeMismatch, UsageError, ValueNotApplied
+from paramclient.protocol.authors import by_us
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.timing import RoundTrip
@@ -63,10 +64,11 @@ class SetResult:
 class Write(Operation[SetResult]):
     """One PARAM_SET until its value is proven; see `Writes`."""
 
-    def __init__(self, name: str, value: Value, begun_at: float) -> None:
+    def __init__(self, name: str, value: Value, begun_at: float, asker: str | None = None) -> None:
         super().__init__(begun_at)
         self.name = name
         self.value = value
+        self.by = by_us(asker)
         self.attempts = 0
         self.sent_at = math.inf
         self.number = 0  # the type that was sent
@@ -124,13 +126,14 @@ class Writes:
     def __len__(self) -> int:
         return len(self.queues)
 
-    def __contains__(self, name: str) -> bool:
-        """Whether a PARAM_SET to this name is under way."""
-        return self._active(name) is not None
+    def author(self, name: str) -> str | None:
+        """Who a change of this name is by, as far as a PARAM_SET to it is under way."""
+        write = self._active(name)
+        return None if write is None else write.by
 
-    def set(self, name: str, value: Value, now: float) -> Write:
+    def set(self, name: str, value: Value, now: float, asker: str | None = None) -> Write:
         """Begin a write, behind those to the same name that are open."""
-        write = Write(name, value, now)
+        write = Write(name, value, now, asker)
         self.asked += 1
         queue = self.queues.setdefault(name, deque())
         queue.append(write)

@@ -38,6 +38,7 @@ async def apply(
     skip_invalid: bool = False,
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
+    asker: str | None = None,
     progress: Callable[[ApplyProgress], None] | None = None,
 ) -> ApplyResult:
     """Bring a vehicle to the wanted values, and prove each of them by reading it back at the end.
@@ -65,6 +66,7 @@ async def apply(
         skip_invalid: set the others although some values cannot be right.
         backup: a file for the state before; its form follows from its name, see `paramclient.files`.
         timeout: seconds, after which the result says how far it came.
+        asker: for whom it is done, as in `Component.set`.
         progress: called after each value and when a phase begins; it must not raise.
 
     Raises:
@@ -85,6 +87,7 @@ async def apply(
         allow_armed=allow_armed,
         skip_invalid=skip_invalid,
         backup=backup,
+        asker=asker,
         progress=progress,
         reason=BEFORE_APPLY,
     )
@@ -101,6 +104,7 @@ async def restore(
     allow_armed: bool = False,
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
+    asker: str | None = None,
     progress: Callable[[ApplyProgress], None] | None = None,
 ) -> ApplyResult:
     """Bring an earlier state of a vehicle back: `apply`, with its own identity and calibration included.
@@ -111,7 +115,7 @@ async def restore(
         component: the vehicle.
         state: what it had, such as a snapshot, or the file of a backup. If it does not say that it is this
             vehicle's own, identity and calibration are left out.
-        include, info, reboot, allow_armed, backup, timeout, progress: as in `apply`.
+        include, info, reboot, allow_armed, backup, timeout, asker, progress: as in `apply`.
 
     Raises:
         UsageError: it is the state of another vehicle.
@@ -127,6 +131,7 @@ async def restore(
         allow_armed=allow_armed,
         skip_invalid=True,
         backup=backup,
+        asker=asker,
         progress=progress,
         reason=BEFORE_RESTORE,
     )

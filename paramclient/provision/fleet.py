@@ -35,6 +35,7 @@ async def apply_all(
     skip_invalid: bool = False,
     backup: Callable[[Component], str | os.PathLike[str]] | None = None,
     timeout: float | None = None,
+    asker: str | None = None,
     progress: Callable[[Component, ApplyProgress], None] | None = None,
 ) -> FleetApplied:
     """`apply` to several vehicles side by side. What becomes of one does not stop the others.
@@ -43,7 +44,7 @@ async def apply_all(
         components: the vehicles.
         wanted: what they shall have: all the same; or each its own, by (system, component) or by a call.
             `overlay` puts what is one vehicle's own over what all share.
-        include, reboot, allow_armed, skip_invalid, timeout: as in `apply`.
+        include, reboot, allow_armed, skip_invalid, timeout, asker: as in `apply`.
         info: gives the metadata for a vehicle.
         backup: gives the name of the file for the state before of a vehicle.
         progress: as in `apply`, with the vehicle.
@@ -68,6 +69,7 @@ async def apply_all(
             skip_invalid=skip_invalid,
             backup=None if backup is None else backup(component),
             timeout=timeout,
+            asker=asker,
             progress=tell,
         )
 

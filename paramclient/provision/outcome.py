@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from paramclient.errors import ParamClientError
@@ -67,6 +67,13 @@ class ApplyRow:
         if self.status is ApplyStatus.SKIPPED:
             return self.category in _ON_PURPOSE
         return self.status in (ApplyStatus.SET, ApplyStatus.UNCHANGED)
+
+    @property
+    def so_far(self) -> ApplyRow:
+        """The same where nobody will read it back any more."""
+        if self.status is not ApplyStatus.SET:
+            return self
+        return replace(self, status=ApplyStatus.UNPROVEN, reason="acknowledged, and not read back")
 
     def __str__(self) -> str:
         kind = ParamType.REAL32 if self.type is None else self.type
@@ -133,6 +140,16 @@ class ApplyResult:
     def of(self, status: ApplyStatus) -> list[ApplyRow]:
         """The rows with this status, in order."""
         return [row for row in self.rows.values() if row.status is status]
+
+    @property
+    def news(self) -> list[ApplyRow]:
+        """The rows with something to see: not what was so already, or is left out and no different."""
+        return [row for row in self.rows.values() if self._is_news(row)]
+
+    def _is_news(self, row: ApplyRow) -> bool:
+        if row.status is ApplyStatus.SKIPPED:
+            return not row.is_as_wanted or self.plan.rows[row.name].differs
+        return row.status is not ApplyStatus.UNCHANGED
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{count} {status}" for status, count in self.counts.items())

@@ -34,6 +34,7 @@ __all__ = [
     "Plan",
     "PlanRow",
     "PlanStatus",
+    "RowStanding",
     "Stage",
     "Step",
     "overlay",
@@ -74,6 +75,17 @@ class PlanStatus(StrEnum):
     """The value cannot be right; `PlanRow.reason` says why."""
 
 
+class RowStanding(StrEnum):
+    """How what a vehicle has compares with a wanted parameter."""
+
+    SAME = "same"
+    DIFFERENT = "different"
+    MISSING = "missing"
+    """The vehicle does not have the parameter."""
+    LEFT_OUT = "left out"
+    """It need not be the same."""
+
+
 @dataclass(frozen=True, slots=True)
 class PlanRow:
     """What a plan means to do with one wanted parameter.
@@ -105,6 +117,20 @@ class PlanRow:
     def differs(self) -> bool:
         """Whether the vehicle holds another value than the wanted one, or none."""
         return self.before is None or not _is_same(self.wanted.value, self.before, self.type)
+
+    @property
+    def standing(self) -> RowStanding:
+        """How it compares."""
+        if self.category == MISSING:
+            return RowStanding.MISSING
+        if self.status is PlanStatus.SKIPPED:
+            return RowStanding.LEFT_OUT
+        return RowStanding.SAME if self.status is PlanStatus.UNCHANGED else RowStanding.DIFFERENT
+
+    @property
+    def is_met(self) -> bool:
+        """Whether the vehicle has the value already, or need not have it."""
+        return self.standing in (RowStanding.SAME, RowStanding.LEFT_OUT)
 
     def __str__(self) -> str:
         kind = ParamType.REAL32 if self.type is None else self.type
@@ -206,11 +232,7 @@ class Plan:
     @property
     def is_met(self) -> bool:
         """Whether the vehicle has all that is wanted already, but for what is left out on purpose."""
-        return all(
-            row.status is PlanStatus.UNCHANGED
-            or (row.status is PlanStatus.SKIPPED and row.category != MISSING)
-            for row in self.rows.values()
-        )
+        return all(row.is_met for row in self.rows.values())
 
     def __repr__(self) -> str:
         counts = ", ".join(f"{count} {status}" for status, count in self.counts.items())

@@ -23,6 +23,7 @@ from paramclient.errors import (
 )
 from paramclient.identity import SHARED_UIDS, Identity
 from paramclient.paramset import ParamSet
+from paramclient.protocol.authors import check_asker
 from paramclient.provision.cautions import cautions_for
 from paramclient.provision.looking import LOOKING_PACE, Seen, identified, look, plan_for
 from paramclient.provision.outcome import ApplyProgress, ApplyResult, ApplyRow, ApplyStatus
@@ -83,6 +84,7 @@ class Run:
         allow_armed: bool,
         skip_invalid: bool,
         backup: str | os.PathLike[str] | None,
+        asker: str | None,
         progress: Callable[[ApplyProgress], None] | None,
         reason: str,
     ) -> None:
@@ -99,6 +101,7 @@ class Run:
         self._allow_armed = allow_armed
         self._skip_invalid = skip_invalid
         self._backup = backup
+        self._asker = check_asker(asker)
         self._progress = progress
         self._reason = reason
         self._cautions = cautions_for("")
@@ -259,7 +262,7 @@ class Run:
         self._is_proven = False
         self.sent.add(step.name)
         try:
-            done = await self._component.set(step.name, step.value)
+            done = await self._component.set(step.name, step.value, asker=self._asker)
         except (VehicleError, UsageError) as error:
             self._silent = 0
             self._settle(step, ApplyStatus.REFUSED, step.before, str(error))
@@ -322,7 +325,7 @@ class Run:
     async def _send_and_leave(self, step: Step) -> None:
         """Write what may not be acknowledged: whether it was taken shows where the vehicle is heard then."""
         with suppress(ParamClientError):
-            await self._component.set(step.name, step.value)
+            await self._component.set(step.name, step.value, asker=self._asker)
 
     async def _restart(self) -> None:
         """Start the vehicle again, and go on with it; under its new system id if it has been given one."""

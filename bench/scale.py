@@ -1,0 +1,408 @@
+"""Many vehicles in one process: how time and memory grow from one system on a link to 250.
+
+    python bench/scale.py [--systems N ...] [--links N] [--parameters N] [--check]
+
+The vehicles are simulated PX4 autopilots in another process, each with a UDP socket of its own. A client
+fetches all of them at once, with an empty cache; then another client does so again with what the first one
+has kept: a warm start, one question for the hash each. Last, so many links are open in one process.
+
+Every size is measured in a process of its own. For each it prints, beside the targets at 250:
+
+- seconds by the clock on the wall, and of the CPU: of the whole process with the kernel's share for it, from
+  the call of `fetch_all` until it has returned;
+- the ratio of that CPU time to the bare framing of the same bytes: every datagram that came in that time goes
+  once more, one at a time, through a `Framer` that makes the same frames of them and nothing else;
+- the share of it that the cache's thread took, and what it took afterwards until all is written;
+- the longest time for which the event loop did not come round, by a task that is due every 5 ms: the first
+  figure is the clock's, which other programs of the machine push up as well; the second is how much of that
+  the process spent computing;
+- by how much the process has grown, in resident memory.
+"""
+
+from __future__ import annotations
+
+import argparse
+import gc
+import heapq
+import multiprocessing
+import os
+import random
+import selectors
+import socket
+import sys
+import tempfile
+import time
+from array import array
+from collections.abc import Sequence
+from contextlib import AsyncExitStack, suppress
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from multiprocessing.synchronize import Event
+from pathlib import Path
+
+import anyio
+
+from paramclient import FetchedAll, FetchResult, ParamCache, ParamClient
+from paramclient.cache import CachedComponent, TableUpdate
+from paramclient.links import Peer, parse_link
+from paramclient.links.udp import UdpIn
+from paramclient.protocol.station import HEARD
+from paramclient.protocol.wire import Framer
+from paramclient.sim import PX4Vehicle, SimParam, px4_table
+from paramclient.values import ParamType
+
+SYSTEMS = (1, 10, 50, 250)
+LINKS = 20
+PARAMETERS = 1_000
+MOST_FRAMINGS = 4.0
+MOST_MEMORY = 200
+MOST_IN_CACHE = 0.1
+LONGEST_BLOCK = 0.020
+"""The targets, at the largest size: times the bare framing, MiB, the share of the time that goes into the
+cache, and seconds for which the event loop does not come round."""
+
+WATCH_INTERVAL = 0.005
+"""Seconds from one look at the event loop to the next."""
+SETTLING_TIME = 1.0
+"""Seconds in which what is left of the time before or after a fetch comes to its end."""
+ROOM = 96 * 1024 * 1024
+"""Bytes of what comes that are kept, to be framed once more. They are there before memory is measured."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What is measured: links, systems in all, parameters of each."""
+
+    links: int
+    systems: int
+    parameters: int
+
+
+@dataclass(frozen=True)
+class Phase:
+    """What one fetch of everything took; times in seconds.
+
+    Attributes:
+        elapsed: by the clock on the wall.
+        cpu: of the CPU, in the whole process.
+        cache: of that, in the cache's thread.
+        later: what that took after the fetch, until all was written.
+        framing: for the bare framing of what came.
+        block: the longest time in which the event loop did not come round.
+        computed: the longest that the process computed in one of those times.
+        grown: resident memory at the end, beyond that before the clients were opened, in MiB.
+        right: systems whose table is whole and as the vehicle has it.
+        source: where the tables are from.
+        requests: messages that the vehicles have received, other than heartbeats.
+    """
+
+    elapsed: float
+    cpu: float
+    cache: float
+    later: float
+    framing: float
+    block: float
+    computed: float
+    grown: float
+    right: int
+    source: str
+    requests: int
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--systems", type=int, nargs="+", default=SYSTEMS, help="on one link, from 1 to 250")
+    parser.add_argument("--links", type=int, default=LINKS, help="at once, with 12 systems each; 0 for none")
+    parser.add_argument("--parameters", type=int, default=PARAMETERS, help="of each system, from 1,000 up")
+    parser.add_argument("--check", action="store_true", help="fail when a target is missed")
+    arguments = parser.parse_args()
+    print(f"Python {sys.version.split()[0]}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}\n")
+    print(
+        f"{'links':>5}{'systems':>8} {'':5}{'seconds':>8}{'CPU':>7}{'framing':>8}{'ratio':>6}"
+        f"{'cache':>7}{'later':>7}{'blocked':>14}{'MiB':>6}{'requests':>9}  right"
+    )
+    are_met = True
+    sizes = [Sizes(1, systems, arguments.parameters) for systems in arguments.systems]
+    if arguments.links:
+        sizes.append(Sizes(arguments.links, 12 * arguments.links, arguments.parameters))
+    for each in sizes:
+        cold, warm = measured(each)
+        for name, phase in (("cold", cold), ("warm", warm)):
+            blocked = f"{phase.block * 1e3:.0f}, {phase.computed * 1e3:.0f} ms"
+            print(
+                f"{each.links:5}{each.systems:8} {name:5}{phase.elapsed:8.2f}{phase.cpu:7.2f}"
+                f"{phase.framing:8.2f}{phase.cpu / phase.framing:6.1f}{phase.cache / phase.cpu:7.0%}"
+                f"{phase.later:7.2f}{blocked:>14}{phase.grown:6.0f}{phase.requests:9}  "
+                f"{phase.right}/{each.systems} from {phase.source}",
+                flush=True,
+            )
+        are_met &= cold.right == warm.right == each.systems
+        if each.links == 1 and each.systems == max(arguments.systems):
+            are_met &= print_verdicts(cold, warm)
+    return 1 if arguments.check and not are_met else 0
+
+
+def print_verdicts(cold: Phase, warm: Phase) -> bool:
+    """Each target, and whether it is met."""
+    verdicts = {
+        f"at most {MOST_FRAMINGS:g} times the bare framing": cold.cpu <= MOST_FRAMINGS * cold.framing,
+        f"at most {MOST_IN_CACHE:.0%} of the time in the cache": cold.cache <= MOST_IN_CACHE * cold.cpu,
+        f"never blocked for more than {LONGEST_BLOCK * 1e3:.0f} ms": (
+            max(cold.computed, warm.computed) <= LONGEST_BLOCK
+        ),
+        f"at most {MOST_MEMORY} MiB": max(cold.grown, warm.grown) <= MOST_MEMORY,
+    }
+    for target, is_met in verdicts.items():
+        print(f"      target: {target}: {'met' if is_met else 'missed'}")
+    return all(verdicts.values())
+
+
+def measured(sizes: Sizes) -> tuple[Phase, Phase]:
+    """A cold fetch and a warm one, in a process of their own."""
+    spawn = multiprocessing.get_context("spawn")
+    here, there = spawn.Pipe()
+    process = spawn.Process(target=measure, args=(sizes, there))
+    process.start()
+    there.close()
+    try:
+        cold, warm = here.recv()
+    except EOFError:
+        raise SystemExit("the measurement has failed") from None
+    finally:
+        process.join()
+    return cold, warm
+
+
+def measure(sizes: Sizes, out: Connection) -> None:
+    """Start the vehicles, fetch all of them twice, and say what that took; in a process of its own."""
+    spawn = multiprocessing.get_context("spawn")
+    stop = spawn.Event()
+    here, there = spawn.Pipe()
+    vehicles = spawn.Process(target=fly, args=(sizes, stop, there))
+    vehicles.start()
+    try:
+        here.recv()  # they are there
+        record = Record()
+        gc.collect()
+        before = resident()
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "cache.sqlite3"
+            phases = [anyio.run(fetch, sizes, path, record, before, here) for _ in range(2)]
+        out.send(phases)
+    finally:
+        stop.set()
+        vehicles.join()
+
+
+class Record:
+    """The datagrams that came, in order, in memory that is there from the beginning."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray(os.urandom(1024 * 1024) * (ROOM // (1024 * 1024)))
+        self._ends = array("L", bytes(8 * ROOM // 32))
+        self.count = 0
+
+    def add(self, data: bytes) -> None:
+        begin = self._ends[self.count - 1] if self.count else 0
+        end = begin + len(data)
+        self._bytes[begin:end] = data
+        self._ends[self.count] = end
+        self.count += 1
+
+    def framing(self) -> float:
+        """Seconds of the CPU to frame all of it once more."""
+        begin = 0
+        datagrams = []
+        for end in self._ends[: self.count]:
+            datagrams.append(bytes(self._bytes[begin:end]))
+            begin = end
+        framer = Framer(HEARD, stream=False)
+        start = time.process_time()
+        for data in datagrams:
+            framer.receive(data)
+        return time.process_time() - start
+
+
+class Watch:
+    """Notes for how long the event loop does not come round."""
+
+    def __init__(self) -> None:
+        self.block = 0.0
+        self.computed = 0.0
+
+    async def run(self) -> None:
+        while True:
+            due = time.perf_counter() + WATCH_INTERVAL
+            before = time.process_time()
+            await anyio.sleep(WATCH_INTERVAL)
+            late = time.perf_counter() - due
+            self.block = max(self.block, late)
+            self.computed = max(self.computed, min(late, time.process_time() - before))
+
+
+class RecordedLink(UdpIn):
+    """A link that sets down what comes."""
+
+    def __init__(self, record: Record) -> None:
+        super().__init__(parse_link("udpin:127.0.0.1:0"))
+        self._record = record
+
+    async def receive(self) -> list[tuple[Peer, bytes]]:
+        batch = await super().receive()
+        for _, data in batch:
+            self._record.add(data)
+        return batch
+
+
+class TimedCache(ParamCache):
+    """A cache that adds up what it takes of the CPU, in whatever thread."""
+
+    seconds = 0.0
+
+    def save(self, update: TableUpdate | Sequence[TableUpdate]) -> None:
+        start = time.thread_time()
+        super().save(update)
+        self.seconds += time.thread_time() - start
+
+    def load(self, key: str, component: int) -> CachedComponent | None:
+        start = time.thread_time()
+        try:
+            return super().load(key, component)
+        finally:
+            self.seconds += time.thread_time() - start
+
+
+async def fetch(sizes: Sizes, path: Path, record: Record, before: float, vehicles: Connection) -> Phase:
+    """Fetch everything, with what the cache has."""
+    per_link = sizes.systems // sizes.links
+    results: list[FetchedAll] = []
+    watch = Watch()
+
+    async def fetch_one(client: ParamClient) -> None:
+        results.append(await client.fetch_all())
+
+    async with AsyncExitStack() as stack:
+        cache = TimedCache(path)
+        stack.callback(cache.close)
+        links = [RecordedLink(record) for _ in range(sizes.links)]
+        clients = [await stack.enter_async_context(ParamClient(link, cache=cache)) for link in links]
+        vehicles.send([link.address for link in links])
+        for client in clients:
+            with anyio.fail_after(60):
+                for system in range(1, per_link + 1):
+                    await client.component(system)
+        await anyio.sleep(SETTLING_TIME)
+        asked = requests_of(vehicles)
+        record.count = 0
+        cache.seconds = 0.0
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(watch.run)
+            began, used = time.perf_counter(), time.process_time()
+            async with anyio.create_task_group() as fetches:
+                for client in clients:
+                    fetches.start_soon(fetch_one, client)
+            elapsed, cpu = time.perf_counter() - began, time.process_time() - used
+            in_cache, datagrams = cache.seconds, record.count
+            await anyio.sleep(SETTLING_TIME)
+            tasks.cancel_scope.cancel()
+        grown = resident() - before
+        asked = requests_of(vehicles) - asked
+        later = cache.seconds - in_cache
+    whole = [result for fetched in results for result in fetched.results.values()]
+    record.count = datagrams
+    return Phase(
+        elapsed=elapsed,
+        cpu=cpu,
+        cache=in_cache,
+        later=later,
+        framing=record.framing(),
+        block=watch.block,
+        computed=watch.computed,
+        grown=grown,
+        right=sum(is_right(result, sizes.parameters) for result in whole),
+        source="+".join(sorted({result.source for result in whole})),
+        requests=asked,
+    )
+
+
+def is_right(result: FetchResult, parameters: int) -> bool:
+    """Whether a result is whole, and every value is the vehicle's."""
+    rows = table_of(result.system, parameters)
+    return result.complete and all(
+        result.params[row.name].bits == (result.system if row.name == "MAV_SYS_ID" else row.bits)
+        for row in rows
+    )
+
+
+def resident() -> float:
+    """MiB of memory that this process holds now."""
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1024 / 1024
+
+
+def requests_of(vehicles: Connection) -> int:
+    """What the vehicles have received so far, but for heartbeats."""
+    vehicles.send(None)
+    number: int = vehicles.recv()
+    return number
+
+
+def table_of(system: int, parameters: int) -> list[SimParam]:
+    """The parameters of one vehicle: those of a real quad, and more, with values of its own."""
+    table = px4_table()
+    dice = random.Random(system)
+    more = range(parameters - len(table))
+    return [*table, *(SimParam(f"XTRA_{i}", ParamType.REAL32, dice.uniform(-9, 9)) for i in more)]
+
+
+def fly(sizes: Sizes, stop: Event, out: Connection) -> None:
+    """The vehicles, until told to stop; runs in a process of its own. They speak when they are told where."""
+    selector = selectors.DefaultSelector()
+    due: list[tuple[float, int]] = []
+    wake_at: list[float] = []
+    fleet = []
+    per_link = sizes.systems // sizes.links
+    for number in range(sizes.systems):
+        system = number % per_link + 1
+        vehicle = PX4Vehicle(system=system, uid=number + 1, table=table_of(system, sizes.parameters))
+        vehicle.announced_hash()
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.setblocking(False)
+        fleet.append((vehicle, sock))
+        selector.register(sock, selectors.EVENT_READ, number)
+        wake_at.append(time.monotonic() + number / sizes.systems)  # they were not switched on together
+        due.append((wake_at[number], number))
+    selector.register(out, selectors.EVENT_READ, None)
+    out.send(None)
+    heapq.heapify(due)
+    while not stop.is_set():
+        ready = [key.data for key, _ in selector.select(min(max(0.0, due[0][0] - time.monotonic()), 0.1))]
+        now = time.monotonic()
+        if None in ready:
+            addresses = out.recv()
+            for number, (_, sock) in enumerate(fleet if addresses else ()):
+                sock.connect(addresses[number // per_link])
+            if addresses:
+                continue
+            every = [vehicle.requests for vehicle, _ in fleet]
+            out.send(sum(each.total() - each["HEARTBEAT"] for each in every))
+        turn = {number for number in ready if number is not None}
+        while due and due[0][0] <= now:
+            at, number = heapq.heappop(due)
+            if at == wake_at[number]:
+                turn.add(number)
+        for number in turn:
+            vehicle, sock = fleet[number]
+            with suppress(OSError):  # nobody is there, or takes it
+                while True:
+                    vehicle.receive(sock.recv(65535), now)
+            vehicle.tick(now)
+            for data in vehicle.data_to_send():
+                with suppress(OSError):  # nobody is there, or takes it
+                    sock.send(data)
+            wake_at[number] = vehicle.next_deadline() or now
+            heapq.heappush(due, (wake_at[number], number))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,264 @@
+"""What the service costs: a core's share with many listeners, many reads and a download at once.
+
+    python bench/service.py [--listeners N] [--reads N] [--seconds S] [--check]
+
+Three processes on loopback: a simulated vehicle (`paramclient sim`), the service (`paramclient serve`, its
+uvicorn and nothing else, held to one core where the system allows it), and this one, which is its clients.
+First all listeners open their streams of events, then the table is downloaded, over and over, while single
+cached values are read evenly at the rate that is asked for, whether or not the answers come.
+
+Prints the share of a core that the service took (its CPU time by the seconds in which the reads were due),
+how long a read took from the moment at which it was due, and whether every listener was told of every event,
+in order. With `--check` it fails when a target is missed. What else the machine does shows in how long a read
+takes, and hardly in the share.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import re
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+LISTENERS = 200
+READS = 500
+MOST_LOAD = 1.0
+MOST_LATENCY = 0.25
+"""The targets: listeners, reads a second, the share of a core, seconds for 99 of 100 reads."""
+
+NAMES = ("MC_ROLL_P", "BAT1_N_CELLS", "COM_ARM_WO_GPS")
+CONNECTIONS = 20
+"""What is read, and the connections over which: each one request at a time, as by so many programs."""
+PATIENCE = 30.0
+"""Seconds for a process to start, and for the last event to come."""
+
+_EVENT = re.compile(rb"^id: [0-9a-f]+-(\d+)\ndata: ", re.MULTILINE)
+
+
+@dataclass
+class Figures:
+    """What was measured."""
+
+    reads: int = 0
+    downloads: int = 0
+    cpu: float = 0.0
+    elapsed: float = 0.0
+    latencies: list[float] = field(default_factory=list)
+
+
+@dataclass
+class Listener:
+    """One stream of events: the numbers that came, and the last bytes, which may be half an event."""
+
+    first: int | None = None
+    last: int = 0
+    events: int = 0
+    is_whole: bool = True
+    rest: bytes = b""
+
+    def take(self, chunk: bytes) -> None:
+        """Look at what has come. Each chunk of the transfer holds whole events, so its frame is left in."""
+        text = self.rest + chunk
+        end = text.rfind(b"\n\n") + 2
+        self.rest = text[end:] if end > 1 else text
+        for found in _EVENT.finditer(text, 0, max(end, 0)):
+            number = int(found[1])
+            if self.first is None:
+                self.first = number
+            else:
+                self.is_whole &= number == self.last + 1
+                self.events += 1
+            self.last = number
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--listeners", type=int, default=LISTENERS, help="streams of events")
+    parser.add_argument("--reads", type=int, default=READS, help="reads a second")
+    parser.add_argument("--seconds", type=float, default=10.0, help="for which it is read")
+    parser.add_argument("--check", action="store_true", help="fail when a target is missed")
+    arguments = parser.parse_args()
+    print(f"Python {sys.version.split()[0]}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}")
+    with started("sim", "px4", "--link", "udpin:127.0.0.1:0") as (_, vehicle):
+        link = vehicle.replace("udpin", "udpout")
+        with started("serve", link, "--listen", "127.0.0.1:0", "--no-cache", "--no-fetch") as (server, url):
+            hold_to_one_core(server)
+            figures, listeners = asyncio.run(
+                measure(url, server.pid, arguments.listeners, arguments.reads, arguments.seconds)
+            )
+    return 1 if not show(figures, listeners, arguments.reads) and arguments.check else 0
+
+
+def show(figures: Figures, listeners: list[Listener], rate: int) -> bool:
+    """Print the figures; whether every target is met."""
+    told = min((each.events for each in listeners), default=0)
+    whole = sum(each.is_whole for each in listeners)  # each has come to the last one, from where it began
+    share = figures.cpu / figures.elapsed
+    cuts = statistics.quantiles(figures.latencies, n=100)
+    are_met = [
+        whole == len(listeners),
+        share <= MOST_LOAD,
+        cuts[98] <= MOST_LATENCY,
+    ]
+    print(
+        f"{len(listeners)} listeners: {whole} were told of every one of {told:,} events or more, in order"
+        f"{verdict(are_met[0])}\n"
+        f"{figures.reads:,} reads at {rate} a second, beside {figures.downloads} downloads: "
+        f"{1000 * cuts[49]:.1f} ms each, {1000 * cuts[98]:.1f} ms for the slowest of 100 "
+        f"(target {1000 * MOST_LATENCY:.0f} ms){verdict(are_met[2])}\n"
+        f"{share:.2f} of a core in {figures.elapsed:.1f} s (target {MOST_LOAD:.2f}){verdict(are_met[1])}"
+    )
+    return all(are_met)
+
+
+def verdict(is_met: bool) -> str:
+    return ": met" if is_met else ": missed"
+
+
+async def measure(
+    url: str, process: int, count: int, rate: int, seconds: float
+) -> tuple[Figures, list[Listener]]:
+    """Listen, download and read, and see what that takes."""
+    host, port = url.removeprefix("http://").rsplit(":", 1)
+    where = (host, int(port))
+    listeners = [Listener() for _ in range(count)]
+    figures = Figures()
+    async with connection(where) as calls:
+        await call(calls, "POST", "/api/v1/find", {"timeout_s": PATIENCE})
+        following = [asyncio.create_task(listen(where, each)) for each in listeners]
+        await until(lambda: all(each.first is not None for each in listeners))
+        for name in NAMES:
+            await call(calls, "POST", f"/api/v1/components/1/1/params/{name}/read", {})
+        cpu = cpu_time(process)
+        downloading = asyncio.create_task(download(where, figures))
+        await read_evenly(where, rate, seconds, figures)
+        figures.elapsed, figures.cpu = seconds, cpu_time(process) - cpu
+        downloading.cancel()
+        await asyncio.sleep(1.0)  # what ends a download is told too
+        last = await call(calls, "GET", "/api/v1/components")
+        await until(lambda: all(each.last >= last["seq"] for each in listeners))
+        for each in following:
+            each.cancel()
+    return figures, listeners
+
+
+async def until(condition: Callable[[], bool]) -> None:
+    """Wait for what nobody tells of."""
+    async with asyncio.timeout(PATIENCE):
+        while not condition():  # noqa: ASYNC110 - nobody tells
+            await asyncio.sleep(0.02)
+
+
+async def listen(where: tuple[str, int], listener: Listener) -> None:
+    """Follow the events until cancelled."""
+    async with connection(where) as (reader, writer):
+        writer.write(head("GET", "/api/v1/events", b""))
+        while chunk := await reader.read(1 << 16):
+            listener.take(chunk)
+
+
+async def download(where: tuple[str, int], figures: Figures) -> None:
+    """Download the table again and again, until cancelled."""
+    async with connection(where) as calls:
+        while True:
+            await call(calls, "POST", "/api/v1/components/1/1/fetch", {"refresh": True})
+            figures.downloads += 1
+
+
+async def read_evenly(where: tuple[str, int], rate: int, seconds: float, figures: Figures) -> None:
+    """Read cached values at a rate; a read that is due while all connections are busy counts from then."""
+    due: asyncio.Queue[float | None] = asyncio.Queue()
+
+    async def read() -> None:
+        async with connection(where) as calls:
+            while (at := await due.get()) is not None:
+                name = NAMES[figures.reads % len(NAMES)]
+                figures.reads += 1
+                await call(calls, "GET", f"/api/v1/components/1/1/params/{name}")
+                figures.latencies.append(time.monotonic() - at)
+
+    async with asyncio.TaskGroup() as tasks:
+        for _ in range(CONNECTIONS):
+            tasks.create_task(read())
+        began = time.monotonic()
+        for number in range(int(rate * seconds)):
+            at = began + number / rate
+            if (wait := at - time.monotonic()) > 0:
+                await asyncio.sleep(wait)
+            due.put_nowait(at)
+        for _ in range(CONNECTIONS):
+            due.put_nowait(None)
+
+
+Calls = tuple[asyncio.StreamReader, asyncio.StreamWriter]
+
+
+@asynccontextmanager
+async def connection(where: tuple[str, int]) -> AsyncIterator[Calls]:
+    reader, writer = await asyncio.open_connection(*where, limit=1 << 24)
+    try:
+        yield reader, writer
+    finally:
+        writer.close()
+
+
+async def call(calls: Calls, method: str, path: str, body: object = None) -> dict[str, int]:
+    """One request and its answer, in as little HTTP as it takes: the clients are not what is measured."""
+    reader, writer = calls
+    content = b"" if body is None else json.dumps(body).encode()
+    writer.write(head(method, path, content) + content)
+    answer = await reader.readuntil(b"\r\n\r\n")
+    length = re.search(rb"content-length: (\d+)", answer)
+    assert length is not None, answer
+    text = await reader.readexactly(int(length[1]))
+    assert answer.split(b" ", 2)[1] == b"200", text
+    found: dict[str, int] = json.loads(text)
+    return found
+
+
+def head(method: str, path: str, content: bytes) -> bytes:
+    lines = [f"{method} {path} HTTP/1.1", "host: 127.0.0.1", f"content-length: {len(content)}"]
+    lines += ["content-type: application/json"] if content else []
+    return "\r\n".join([*lines, "", ""]).encode()
+
+
+@contextmanager
+def started(*words: str) -> Iterator[tuple[subprocess.Popen[str], str]]:
+    """The command in a process of its own, and the address that it prints first."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "paramclient", *words], stdout=subprocess.PIPE, text=True
+    )
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        found = re.search(r"(?:udpin:|http://)[\d.:]+\d", line)
+        assert found, f"{words[0]} says {line!r}"
+        yield process, found[0]
+    finally:
+        process.terminate()
+        process.wait(PATIENCE)
+
+
+def hold_to_one_core(process: subprocess.Popen[str]) -> None:
+    """Give the service one core, where the system lets us."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(process.pid, {max(os.sched_getaffinity(0))})
+
+
+def cpu_time(process: int) -> float:
+    """Seconds of CPU that a process has taken (Linux, proc(5): utime and stime)."""
+    fields = Path(f"/proc/{process}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,168 @@
+"""What the cache holds: tables, and the vehicles whose they are."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from paramclient.documents.base import Document
+from paramclient.documents.param import ParamDoc
+from paramclient.identity import autopilot_name
+from paramclient.notation import hash_text, time_or_none
+
+if TYPE_CHECKING:
+    from paramclient.cache import CachedComponent, CachedSummary, CachedVehicle
+    from paramclient.metadata import Metadata
+    from paramclient.values import Param
+
+__all__ = [
+    "CachedListDoc",
+    "CachedSummaryDoc",
+    "CachedTableDoc",
+    "CachedTablesDoc",
+    "PlaceDoc",
+    "RemovedDoc",
+    "VehicleDoc",
+    "VehiclesDoc",
+]
+
+
+class CachedSummaryDoc(Document):
+    """One component's table, without its parameters; see `CachedSummary`."""
+
+    key: str
+    system: int
+    component: int
+    autopilot: str
+    uid: str | None
+    size: int
+    count: int | None
+    complete: bool
+    hash: str | None
+    synced_at: str | None
+    updated_at: str | None
+
+    @classmethod
+    def of(cls, summary: CachedSummary) -> CachedSummaryDoc:
+        """What a user has of it."""
+        return cls(
+            key=summary.key,
+            system=summary.system,
+            component=summary.component,
+            autopilot=autopilot_name(summary.autopilot),
+            uid=summary.identity.uid,
+            size=summary.size,
+            count=summary.count,
+            complete=summary.complete,
+            hash=hash_text(summary.hash),
+            synced_at=time_or_none(summary.synced_at),
+            updated_at=time_or_none(summary.updated_at),
+        )
+
+
+class CachedListDoc(Document):
+    """The tables in the cache at a place."""
+
+    path: str
+    components: list[CachedSummaryDoc]
+
+
+class CachedTableDoc(Document):
+    """One component's table as it was last known."""
+
+    system: int
+    component: int
+    autopilot: str
+    uid: str | None
+    hash: str | None
+    synced_at: str | None
+    params: dict[str, ParamDoc]
+
+    @classmethod
+    def of(
+        cls,
+        table: CachedComponent,
+        params: Iterable[Param] | None = None,
+        metadata: Metadata | None = None,
+        *,
+        whole: bool = False,
+        kept: bool = False,
+    ) -> CachedTableDoc:
+        """A table.
+
+        Args:
+            table: which one.
+            params: these of it; None for all.
+            metadata: what is known of them.
+            whole: whether to give everything that is known of them.
+            kept: whether to say how far each can be trusted, and when it was heard.
+        """
+        shown = table.params.values() if params is None else params
+        told = {}
+        for param in shown:
+            info = None if metadata is None else metadata.find(param.name)
+            heard_at = table.heard_at.get(param.name)
+            told[param.name] = (
+                ParamDoc.kept(param, info, heard_at=heard_at, whole=whole)
+                if kept
+                else ParamDoc.of(param, info, whole=whole)
+            )
+        return cls(
+            system=table.system,
+            component=table.component,
+            autopilot=autopilot_name(table.autopilot),
+            uid=table.identity.uid,
+            hash=hash_text(table.hash),
+            synced_at=time_or_none(table.synced_at),
+            params=told,
+        )
+
+
+class CachedTablesDoc(Document):
+    """The tables of a vehicle, or of all."""
+
+    components: list[CachedTableDoc]
+
+
+class VehicleDoc(Document):
+    """A vehicle of which tables are kept; see `CachedVehicle`. Times are in unix seconds."""
+
+    key: str
+    system: int
+    autopilot: str
+    uid: str | None
+    first_seen: float
+    last_seen: float
+    components: list[CachedSummaryDoc]
+
+    @classmethod
+    def of(cls, vehicle: CachedVehicle, tables: Iterable[CachedSummary]) -> VehicleDoc:
+        """A vehicle with those of these tables that are its own."""
+        return cls(
+            key=vehicle.key,
+            system=vehicle.identity.system,
+            autopilot=autopilot_name(vehicle.identity.autopilot),
+            uid=vehicle.identity.uid,
+            first_seen=vehicle.first_seen,
+            last_seen=vehicle.last_seen,
+            components=[CachedSummaryDoc.of(each) for each in tables if each.key == vehicle.key],
+        )
+
+
+class VehiclesDoc(Document):
+    """Every vehicle that was ever heard."""
+
+    vehicles: list[VehicleDoc]
+
+
+class PlaceDoc(Document):
+    """Where the cache is kept."""
+
+    path: str
+
+
+class RemovedDoc(Document):
+    """How many tables of a vehicle were removed."""
+
+    key: str
+    removed: int

@@ -1,0 +1,111 @@
+"""How two sets of parameters stand to each other."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pydantic import Field
+
+from paramclient.compare import Moved, Standing
+from paramclient.documents.base import Document, Maybe, Scalar
+from paramclient.documents.written import OriginDoc
+from paramclient.notation import bits_written, value_written
+from paramclient.values import type_name
+
+if TYPE_CHECKING:
+    from paramclient.compare import Comparison, Difference
+    from paramclient.metadata import Metadata
+    from paramclient.paramset import WrittenParam
+
+__all__ = ["ComparedDoc", "DiffDoc", "DifferenceDoc"]
+
+
+class ComparedDoc(Document):
+    """A value of one side; `text` is what it means in a word, where that is known."""
+
+    value: Scalar
+    type: str | None
+    bits: str | None
+    text: Maybe[str] = None
+
+    @classmethod
+    def of(cls, param: WrittenParam, metadata: Metadata | None = None) -> ComparedDoc:
+        """A parameter of this side, and what is known there of what values mean."""
+        info = None if metadata is None else metadata.find(param.name)
+        return cls(
+            value=value_written(param.value, param),
+            type=None if param.type is None else type_name(param.type),
+            bits=bits_written(param),
+            text=None if info is None else info.text(param.value) or None,
+        )
+
+
+class DifferenceDoc(Document):
+    """How one name stands; see `Difference`."""
+
+    standing: Standing = Field(validation_alias="is", serialization_alias="is")
+    types_differ: bool
+    rounding: bool
+    left: ComparedDoc | None
+    right: ComparedDoc | None
+    base: ComparedDoc | None
+    moved: Moved | None
+    units: Maybe[str] = None
+
+    @classmethod
+    def of(
+        cls,
+        entry: Difference,
+        left: Metadata | None = None,
+        right: Metadata | None = None,
+        base: Metadata | None = None,
+    ) -> DifferenceDoc:
+        """An entry, and what is known of the parameters of each side."""
+        infos = [side.find(entry.name) for side in (left, right) if side is not None]
+        return cls(
+            standing=entry.standing,
+            types_differ=entry.types_differ,
+            rounding=entry.is_rounding,
+            left=None if entry.left is None else ComparedDoc.of(entry.left, left),
+            right=None if entry.right is None else ComparedDoc.of(entry.right, right),
+            base=None if entry.base is None else ComparedDoc.of(entry.base, base),
+            moved=entry.moved,
+            units=next((info.units for info in infos if info is not None and info.units), None),
+        )
+
+
+class DiffDoc(Document):
+    """What came of a comparison; see `Comparison`. `params` has what is not the same, or all on demand."""
+
+    same: bool
+    left: OriginDoc
+    right: OriginDoc
+    base: OriginDoc | None
+    counts: dict[Standing, int]
+    moves: dict[Moved, int] | None
+    params: dict[str, DifferenceDoc]
+
+    @classmethod
+    def of(
+        cls,
+        outcome: Comparison,
+        left: Metadata | None = None,
+        right: Metadata | None = None,
+        base: Metadata | None = None,
+        *,
+        everything: bool = False,
+    ) -> DiffDoc:
+        """A comparison, and what is known of the parameters of each side."""
+        return cls(
+            same=outcome.is_same,
+            left=OriginDoc.of(outcome.left),
+            right=OriginDoc.of(outcome.right),
+            base=None if outcome.base is None else OriginDoc.of(outcome.base),
+            counts={standing: outcome.counts[standing] for standing in Standing},
+            moves=None if outcome.base is None else {moved: outcome.moves[moved] for moved in Moved},
+            params={
+                entry.name: DifferenceDoc.of(entry, left, right, base)
+                for entry in outcome.entries
+                if everything or entry.is_news
+            },
+        )

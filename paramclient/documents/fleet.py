@@ -1,0 +1,97 @@
+"""Many vehicles beside each other."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from paramclient.documents.base import Document, Scalar
+from paramclient.notation import bits_text, time_or_none, value_json
+from paramclient.values import ParamType, type_name
+
+if TYPE_CHECKING:
+    from paramclient.cache import FleetDiff, FleetValue, Holder, NameSpread
+
+__all__ = ["FleetDiffDoc", "FleetValueDoc", "HolderDoc", "NameSpreadDoc"]
+
+
+class HolderDoc(Document):
+    """A vehicle with what it has; see `Holder`."""
+
+    key: str
+    system: int
+    since: str | None
+    changed: bool
+
+    @classmethod
+    def of(cls, holder: Holder) -> HolderDoc:
+        """All of it."""
+        return cls(
+            key=holder.vehicle.key,
+            system=holder.vehicle.system,
+            since=time_or_none(holder.since),
+            changed=holder.changed,
+        )
+
+
+class FleetValueDoc(Document):
+    """A value, and who has it; see `FleetValue`."""
+
+    value: Scalar
+    type: str
+    bits: str
+    agrees: bool
+    vehicles: list[HolderDoc]
+
+    @classmethod
+    def of(cls, value: FleetValue) -> FleetValueDoc:
+        """All of it."""
+        return cls(
+            value=value_json(value.param.value, value.param.type),
+            type=type_name(value.param.type),
+            bits=bits_text(value.param),
+            agrees=value.agrees,
+            vehicles=[HolderDoc.of(holder) for holder in value.holders],
+        )
+
+
+class NameSpreadDoc(Document):
+    """One parameter across the vehicles; see `NameSpread`."""
+
+    name: str
+    different: bool
+    wanted: Scalar | None
+    values: list[FleetValueDoc]
+    lacking: list[HolderDoc]
+    unknown: list[HolderDoc]
+
+    @classmethod
+    def of(cls, each: NameSpread) -> NameSpreadDoc:
+        """All of it."""
+        wanted = each.wanted
+        return cls(
+            name=each.name,
+            different=each.differs,
+            wanted=None if wanted is None else value_json(wanted.value, wanted.type or ParamType.REAL32),
+            values=[FleetValueDoc.of(value) for value in each.values],
+            lacking=[HolderDoc.of(holder) for holder in each.lacking],
+            unknown=[HolderDoc.of(holder) for holder in each.unknown],
+        )
+
+
+class FleetDiffDoc(Document):
+    """How vehicles stand to each other, or to what is wanted of them; see `FleetDiff`."""
+
+    component: int
+    vehicles: int
+    different: bool
+    names: list[NameSpreadDoc]
+
+    @classmethod
+    def of(cls, found: FleetDiff) -> FleetDiffDoc:
+        """All of it, with the number of vehicles."""
+        return cls(
+            component=found.component,
+            vehicles=len(found.vehicles),
+            different=found.differs,
+            names=[NameSpreadDoc.of(each) for each in found.names],
+        )

@@ -1,0 +1,445 @@
+"""Who may do what: every request passes here before anything else sees it.
+
+Pure ASGI, and independent of the framework behind it. What is let through has in `scope["state"]` who asks
+(`asker`, `name`), what that one may do (`role`, `read_only`), and neither token nor cookie in its headers.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import time
+from collections.abc import Awaitable, Callable, Collection, Iterable, Mapping, MutableMapping
+from contextlib import suppress
+from dataclasses import dataclass
+from ipaddress import ip_address
+from typing import Any, Final, TypeAlias
+
+import anyio
+
+from paramclient.errors import UsageError
+from paramclient.protocol.authors import LONGEST_ASKER
+from paramclient.service.request import ASK, HOST, SESSION_PATH, Denied, Request, Scope
+from paramclient.service.tokens import SESSION_AGE, Guesses, Holder, Sessions, Tokens
+
+__all__ = ["AccessMiddleware", "AccessSettings", "may_write"]
+
+logger = logging.getLogger(__name__)
+
+Message: TypeAlias = MutableMapping[str, Any]
+Receive: TypeAlias = Callable[[], Awaitable[Message]]
+Send: TypeAlias = Callable[[Message], Awaitable[None]]
+App: TypeAlias = Callable[[Scope, Receive, Send], Awaitable[None]]
+
+MAX_BODY: Final = 8 * 1024 * 1024
+"""Bytes of one body: parameter files have a hundredth of it."""
+MAX_BODIES: Final = 8 * MAX_BODY
+"""Bytes of all bodies that are being read at once."""
+LONGEST_SESSION: Final = 1_024
+"""Bytes of the body that begins a session: all that those without a token may send."""
+BODY_PATIENCE: Final = 60.0
+"""Seconds for a body to come."""
+LONGEST_CLIENT: Final = 64
+"""Characters in which a client says what it is, in X-Asker."""
+
+API_POLICY: Final = "default-src 'none'; base-uri 'none'; form-action 'none'; frame-ancestors 'none'; sandbox"
+PAGE_POLICY: Final = (
+    "default-src 'none'; script-src 'self'; style-src 'self'; img-src 'self' data:; connect-src 'self'; "
+    "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+)
+ALLOWED_METHODS: Final = "GET, HEAD, POST, PUT, PATCH, DELETE"
+ALLOWED_HEADERS: Final = "Authorization, Content-Type, Last-Event-ID, X-Asker"
+SHOWN_HEADERS: Final = "Content-Disposition, Location, Retry-After, X-Seq"
+PREFLIGHT_AGE: Final = 600
+"""Seconds for which a browser need not ask again."""
+
+
+@dataclass(frozen=True, slots=True)
+class AccessSettings:
+    """Who is let in.
+
+    Attributes:
+        listen: the address or name that is listened at.
+        tokens: who has one; None only where nobody but this machine can connect.
+        hosts: names by which the service may be called, beside this machine's loopback names, and addresses.
+        origins: pages elsewhere that may use it from a browser, such as `https://station.example`.
+        read_only: nobody may change anything.
+        max_body: bytes of one body.
+
+    Raises:
+        UsageError: it would be open to others without a token, or something in it cannot be.
+    """
+
+    listen: str = "127.0.0.1"
+    tokens: Tokens | None = None
+    hosts: Collection[str] = ()
+    origins: Collection[str] = ()
+    read_only: bool = False
+    max_body: int = MAX_BODY
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hosts", frozenset(map(_host_name, self.hosts)))
+        object.__setattr__(self, "origins", frozenset(map(_origin, self.origins)))
+        beyond = [name for name in (self.listen, *sorted(self.hosts)) if not _is_loopback(name)]
+        if self.tokens is None and beyond:
+            raise UsageError(
+                f"as {beyond[0]} the service would let everyone on the network change parameters: it needs a "
+                "token. Make one with `paramclient token NAME --file FILE` and start with --token-file FILE, "
+                "or listen at 127.0.0.1 alone"
+            )
+
+
+class AccessMiddleware:
+    """An ASGI application in front of another one.
+
+    Args:
+        app: the other one.
+        settings: who is let in.
+        clock: seconds, that only go forward.
+    """
+
+    def __init__(
+        self, app: App, settings: AccessSettings, *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
+        self._app = app
+        self._settings = settings
+        self._sessions = Sessions(clock)
+        self._guesses = Guesses(clock)
+        self._in_bodies = 0
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] not in ("http", "websocket"):
+            await self._app(scope, receive, send)
+            return
+        request = Request(scope)
+        answer = _Answer(request, send, varies=bool(self._settings.origins))
+        try:
+            await self._let_in(request, receive, answer)
+        except Denied as denied:
+            await answer.refuse(denied, receive)
+
+    async def _let_in(self, request: Request, receive: Receive, answer: _Answer) -> None:
+        request.check_shape()
+        self._check_host(request)
+        self._check_origin(request)
+        answer.origin = request.origin if request.origin in self._settings.origins else None
+        if request.is_preflight:
+            await answer.preflight()
+            return
+        holder = self._holder(request)
+        if request.path == SESSION_PATH and request.method in ("POST", "DELETE"):
+            await self._session(request, receive, answer, holder)
+            return
+        self._check_role(request, holder)
+        state = request.scope.setdefault("state", {})
+        state["asker"] = _asker(request, holder if self._settings.tokens is not None else None)
+        state["name"] = None if holder is None else holder.name
+        state["role"] = None if holder is None else holder.role
+        state["read_only"] = self._settings.read_only
+        if request.has_body:
+            request.check_content()
+            body = await self._body(request, receive, self._settings.max_body)
+            receive = _after(body, receive)
+        scope = {**request.scope, "headers": [each for each in request.headers if each[0] not in _SECRET]}
+        await self._app(scope, receive, answer.send)
+
+    # Where it comes from
+
+    def _check_host(self, request: Request) -> None:
+        """The service is called by a name of its own: another one may be led here by its owner's DNS."""
+        name = request.host_name
+        if name in _LOOPBACK_NAMES or name in self._settings.hosts or name == self._settings.listen.lower():
+            return
+        try:
+            address = ip_address(name)
+        except ValueError:
+            pass
+        else:  # an address is no name that could be led elsewhere
+            if address.is_loopback or not _is_loopback(self._settings.listen):
+                return
+        raise Denied(
+            421,
+            "foreign-host",
+            "This service does not go by the name in Host; `paramclient serve --host NAME` allows another.",
+        )
+
+    def _check_origin(self, request: Request) -> None:
+        """No page of somebody else uses the browser of one who may do more than that page."""
+        origin = request.origin
+        if origin is not None:
+            if origin in self._settings.origins or origin == request.own_origin:
+                return
+            raise Denied(
+                403,
+                "foreign-origin",
+                "Pages from elsewhere may not use this service; those that may are named with "
+                "`paramclient serve --allow-origin ORIGIN`.",
+            )
+        site = request.header(b"sec-fetch-site")
+        if site in (None, b"none", b"same-origin"):
+            return
+        is_followed_link = request.method in ("GET", "HEAD") and (
+            request.header(b"sec-fetch-mode"),
+            request.header(b"sec-fetch-dest"),
+        ) == (b"navigate", b"document")
+        if not is_followed_link:
+            raise Denied(403, "foreign-origin", "Pages from elsewhere may not use this service.")
+
+    # Who it is
+
+    def _holder(self, request: Request) -> Holder | None:
+        """Whose token or session came with it; None for nobody's, where that is enough."""
+        tokens = self._settings.tokens
+        if tokens is None:
+            return _LOCAL
+        token = request.token
+        if token is not None:
+            return self._holder_of(token, request.address, tokens)
+        cookie = request.cookie
+        holder = None if cookie is None else self._sessions.holder(cookie)
+        if holder is None and not request.is_public:
+            raise Denied(401, "unauthenticated", "This service is open to those who have a token.", ASK)
+        return holder
+
+    def _holder_of(self, token: bytes, address: str, tokens: Tokens) -> Holder:
+        wait = math.ceil(self._guesses.wait(address))
+        if wait > 0:
+            raise Denied(
+                429,
+                "too-many-guesses",
+                f"Too many wrong tokens have come from this address; it may try again in {wait} s.",
+                [(b"retry-after", str(wait).encode())],
+            )
+        holder = tokens.holder(token)
+        if holder is None:
+            if self._guesses.add(address, token):
+                logger.warning("many wrong tokens have come from %s", address)
+            raise Denied(401, "unauthenticated", "The service does not know this token.", ASK)
+        return holder
+
+    def _check_role(self, request: Request, holder: Holder | None) -> None:
+        if not request.changes:
+            return
+        if self._settings.read_only:
+            raise Denied(403, "read-only", "This service was started with --read-only; nothing is changed.")
+        if holder is None or holder.role != "write":
+            raise Denied(403, "forbidden", "This token allows to read only.")
+
+    async def _session(
+        self, request: Request, receive: Receive, answer: _Answer, holder: Holder | None
+    ) -> None:
+        """Begin or end the session of a browser."""
+        if request.has_body or request.method == "POST":
+            request.check_content()
+        if request.method == "DELETE":
+            if request.cookie is not None:
+                self._sessions.end(request.cookie)
+            await answer.respond(204, b"", [(b"set-cookie", _set_cookie(request, "", 0))])
+            return
+        token = _token_in(await self._body(request, receive, LONGEST_SESSION))
+        headers = []
+        if self._settings.tokens is not None:
+            holder = self._holder_of(token, request.address, self._settings.tokens)
+            value = _set_cookie(request, self._sessions.begin(holder), int(SESSION_AGE))
+            headers.append((b"set-cookie", value))
+        assert holder is not None
+        me = {"role": holder.role, "name": holder.name, "read_only": self._settings.read_only}
+        await answer.respond(200, json.dumps(me).encode(), [*headers, _JSON])
+
+    # What it brings
+
+    async def _body(self, request: Request, receive: Receive, most: int) -> bytes:
+        """All of it, before anything is done with it.
+
+        Raises:
+            Denied: it is too long, takes too long, or there are too many at once.
+        """
+        too_large = Denied(413, "too-large", f"A body has at most {most} bytes.")
+        if request.length is not None and request.length > most:
+            raise too_large
+        body = bytearray()
+        try:
+            with anyio.fail_after(BODY_PATIENCE):
+                is_whole = False
+                while not is_whole:
+                    message = await receive()
+                    if message["type"] == "http.disconnect":
+                        raise Denied(400, "bad-request", "The body ends before its end.")
+                    piece = message.get("body", b"")
+                    body += piece
+                    self._in_bodies += len(piece)
+                    if len(body) > most:
+                        raise too_large
+                    if self._in_bodies > MAX_BODIES:
+                        raise Denied(
+                            503,
+                            "busy",
+                            "Too much is being sent to this service at once.",
+                            [(b"retry-after", b"1")],
+                        )
+                    is_whole = not message.get("more_body", False)
+        except TimeoutError:
+            raise Denied(408, "too-slow", f"The body has not come within {BODY_PATIENCE:.0f} s.") from None
+        finally:
+            self._in_bodies -= len(body)
+        return bytes(body)
+
+
+def may_write(request: Any) -> bool:
+    """Whether a request may change something, where its address alone does not tell whether it does.
+
+    Takes anything with the `scope` of a request.
+    """
+    state = request.scope["state"]
+    return state["role"] == "write" and not state["read_only"]
+
+
+@dataclass(slots=True)
+class _Answer:
+    """What goes back, with the headers that every answer has."""
+
+    request: Request
+    original: Send
+    origin: str | None = None
+    varies: bool = False
+
+    async def send(self, message: Message) -> None:
+        """Send a message of the application."""
+        if message["type"] in ("http.response.start", "websocket.http.response.start"):
+            message = {**message, "headers": self._headers(message.get("headers", ()))}
+        await self.original(message)
+
+    async def respond(self, status: int, body: bytes, headers: Iterable[tuple[bytes, bytes]]) -> None:
+        """Send an answer of our own."""
+        kind = "websocket.http" if self.request.scope["type"] == "websocket" else "http"
+        given = [*headers, (b"content-length", str(len(body)).encode())] if status != 204 else list(headers)
+        await self.send({"type": f"{kind}.response.start", "status": status, "headers": given})
+        await self.original({"type": f"{kind}.response.body", "body": body})
+
+    async def preflight(self) -> None:
+        """Tell a browser what a page that is named may ask."""
+        headers = [
+            (b"access-control-allow-methods", ALLOWED_METHODS.encode()),
+            (b"access-control-allow-headers", ALLOWED_HEADERS.encode()),
+            (b"access-control-max-age", str(PREFLIGHT_AGE).encode()),
+            (b"vary", b"Access-Control-Request-Method, Access-Control-Request-Headers"),
+        ]
+        await self.respond(204, b"", headers)
+
+    async def refuse(self, denied: Denied, receive: Receive) -> None:
+        """Say why not. Where it is not certain where the next request begins, the connection ends."""
+        if self.request.scope["type"] == "websocket":
+            await receive()
+            if "websocket.http.response" not in self.request.scope.get("extensions", {}):
+                await self.original({"type": "websocket.close", "code": 1008, "reason": denied.detail[:100]})
+                return
+        problem = {
+            "type": f"urn:paramclient:{denied.kind}",
+            "title": denied.kind.replace("-", " ").capitalize(),
+            "status": denied.status,
+            "detail": denied.detail,
+        }
+        headers = [*denied.headers, (b"content-type", b"application/problem+json")]
+        if self.request.says_body or denied.status in _MISSHAPEN:
+            headers.append((b"connection", b"close"))
+        await self.respond(denied.status, json.dumps(problem).encode(), headers)
+
+    def _headers(self, given: Iterable[tuple[bytes, bytes]]) -> list[tuple[bytes, bytes]]:
+        is_page = self.request.is_page
+        ours = [*_ALWAYS, (b"content-security-policy", (PAGE_POLICY if is_page else API_POLICY).encode())]
+        if not is_page:
+            ours.append((b"cache-control", b"no-store"))
+        if self.origin is not None:
+            ours.append((b"access-control-allow-origin", self.origin.encode("latin-1")))
+            ours.append((b"access-control-expose-headers", SHOWN_HEADERS.encode()))
+        if self.varies:
+            ours.append((b"vary", b"Origin"))
+        names = {name for name, _ in ours} - {b"vary"}
+        kept = [(name, value) for name, value in given if name.lower() not in names]
+        if is_page and not any(name.lower() == b"cache-control" for name, _ in kept):
+            ours.append((b"cache-control", b"no-cache"))
+        return [*kept, *ours]
+
+
+def _asker(request: Request, holder: Holder | None) -> str:
+    """Who asks, for the history: `anna@10.0.0.2 (what the client says it is)`."""
+    who = "local" if holder is None else f"{holder.name}@{request.address}"
+    given = request.header(b"x-asker")
+    if given is None:
+        return who
+    client = given.decode("latin-1")
+    if not 1 <= len(client) <= LONGEST_CLIENT or not (client.isascii() and client.isprintable()):
+        raise Denied(400, "bad-request", f"X-Asker has 1 to {LONGEST_CLIENT} printable ASCII characters.")
+    return f"{who} ({client})"[:LONGEST_ASKER]
+
+
+def _after(body: bytes, receive: Receive) -> Receive:
+    """What gives a whole body first, and then whatever comes."""
+    given = False
+
+    async def next_message() -> Message:
+        nonlocal given
+        if given:
+            return await receive()
+        given = True
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    return next_message
+
+
+def _set_cookie(request: Request, value: str, age: int) -> bytes:
+    secure = "; Secure" if request.is_secure else ""
+    cookie = f"{request.cookie_name}={value}; Path=/; Max-Age={age}; HttpOnly; SameSite=Strict{secure}"
+    return cookie.encode()
+
+
+def _token_in(body: bytes) -> bytes:
+    """The token in the body that begins a session."""
+    try:
+        document = json.loads(body)
+    except (ValueError, RecursionError):
+        document = None
+    if isinstance(document, Mapping) and list(document) == ["token"] and isinstance(document["token"], str):
+        return document["token"].encode("utf-8", "surrogatepass")
+    raise Denied(422, "invalid-request", 'A session begins with {"token": TOKEN}.')
+
+
+def _host_name(text: str) -> str:
+    name = text.strip("[]").lower().removesuffix(".")
+    with suppress(ValueError):
+        return str(ip_address(name))
+    found = HOST.fullmatch(name)
+    if found is None or found["port"] is not None:
+        raise UsageError(f"{text!r:.100} is no name of a host, such as companion.local")
+    return name
+
+
+def _origin(text: str) -> str:
+    scheme, separator, host = text.lower().partition("://")
+    if scheme not in ("http", "https") or not separator or not HOST.fullmatch(host):
+        raise UsageError(f"{text!r:.100} is no origin of pages, such as https://station.example:8443")
+    return f"{scheme}://{host}"
+
+
+def _is_loopback(listen: str) -> bool:
+    """Whether only this machine can connect there. Of another name than localhost nothing is known."""
+    if listen.lower() == "localhost":
+        return True
+    try:
+        return ip_address(listen.strip("[]")).is_loopback
+    except ValueError:
+        return False
+
+
+_LOOPBACK_NAMES: Final = frozenset({"localhost"})
+_LOCAL: Final = Holder("local", "write")
+_SECRET: Final = frozenset({b"authorization", b"cookie"})
+_MISSHAPEN: Final = (400, 414, 431)
+_JSON: Final = (b"content-type", b"application/json")
+_ALWAYS: Final = [
+    (b"x-content-type-options", b"nosniff"),
+    (b"referrer-policy", b"no-referrer"),
+    (b"cross-origin-opener-policy", b"same-origin"),
+    (b"cross-origin-resource-policy", b"same-origin"),
+]

@@ -1,0 +1,114 @@
+"""The application: routers, problems, the pages, and what every answer carries."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import MutableMapping
+from dataclasses import dataclass, field
+from importlib import resources
+from typing import Any, Final
+
+from fastapi import FastAPI, Request, Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from paramclient.service import problems
+from paramclient.service.access import AccessMiddleware, AccessSettings
+from paramclient.service.hub import Hub
+from paramclient.service.problems import RESPONSES, ServiceError
+from paramclient.service.routes import ROUTERS
+from paramclient.version import __version__
+
+__all__ = ["Settings", "create_app"]
+
+MEDIA_TYPES: Final = {
+    "html": "text/html; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "js": "text/javascript; charset=utf-8",
+    "svg": "image/svg+xml",
+}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Settings:
+    """How the application is to be.
+
+    Attributes:
+        access: who is let in; without it, those on this machine.
+    """
+
+    access: AccessSettings = field(default_factory=AccessSettings)
+
+
+def create_app(hub: Hub, settings: Settings | None = None) -> ASGIApp:
+    """The application over a hub, which is opened and closed by whoever has made it."""
+    app = FastAPI(
+        title="paramclient",
+        version=__version__,
+        summary="MAVLink parameters of everyone who is heard on the links of this service",
+        docs_url=None,
+        redoc_url=None,
+        redirect_slashes=False,
+        responses=RESPONSES,
+    )
+    app.state.hub = hub
+    problems.install(app)
+    for router in ROUTERS:
+        app.include_router(router)
+    _add_files(app, "page", index="/", prefix="/page/")
+    _add_files(app, "reference", index="/docs", prefix="/docs/")
+    access = Settings().access if settings is None else settings.access
+    return AccessMiddleware(_Stamped(app, hub), access)
+
+
+class _Stamped:
+    """Gives every answer the number of the newest event."""
+
+    def __init__(self, app: ASGIApp, hub: Hub) -> None:
+        self._app = app
+        self._feed = hub.feed
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+
+        is_answered = False
+
+        async def stamped(message: Message) -> None:
+            nonlocal is_answered
+            if message["type"] == "http.response.start":
+                given = list(message.get("headers", ()))
+                given.append((b"x-seq", str(self._feed.place).encode()))
+                message["headers"] = given
+            await send(message)
+            is_answered = message["type"] == "http.response.body" and not message.get("more_body", False)
+
+        try:
+            await self._app(scope, receive, stamped)
+        except Exception:
+            if not is_answered:  # else it is a problem that was answered and logged
+                raise
+
+
+def _add_files(app: FastAPI, folder: str, *, index: str, prefix: str) -> None:
+    """Serve the files of a folder of this package as they are; they are few and small, and stay in memory."""
+    files: MutableMapping[str, tuple[bytes, str, str]] = {}
+    place = resources.files("paramclient.service").joinpath(folder)
+    for file in place.iterdir() if place.is_dir() else ():
+        media_type = MEDIA_TYPES.get(file.name.rpartition(".")[2])
+        if media_type is not None:
+            content = file.read_bytes()
+            files[file.name] = (content, media_type, f'"{hashlib.sha256(content).hexdigest()[:16]}"')
+
+    async def answer(request: Request) -> Response:
+        name: Any = request.path_params.get("name", "index.html")
+        if name not in files:
+            raise ServiceError(404, "not-found", "There is nothing at this address.")
+        content, media_type, tag = files[name]
+        headers = {"etag": tag, "cache-control": "no-cache"}
+        if request.headers.get("if-none-match") == tag:
+            return Response(status_code=304, headers=headers)
+        return Response(content, media_type=media_type, headers=headers)
+
+    app.add_route(index, answer, methods=["GET"], include_in_schema=False)
+    app.add_route(f"{prefix}{{name}}", answer, methods=["GET"], include_in_schema=False)

@@ -1,0 +1,120 @@
+"""What one connection may cost: uvicorn's protocol, with an end to what it would wait for without one."""
+
+from __future__ import annotations
+
+import json
+from ipaddress import ip_address
+from typing import Any, Final
+
+import h11
+from uvicorn.protocols.http.h11_impl import H11Protocol
+
+__all__ = ["Connection"]
+
+MOST_CONNECTIONS: Final = 512
+"""Connections at once: some hundred listeners, and half of the 1,024 files that a process may open."""
+MOST_FROM_ONE: Final = 128
+"""Of them from one address; those of this machine count for themselves, as behind a proxy all are of it."""
+HEAD_PATIENCE: Final = 10.0
+"""Seconds for the head of a request to come, once the connection is there or its first byte has come."""
+STALL_PATIENCE: Final = 60.0
+"""Seconds in which a client that is being answered has to take something. It comes again, and is told what it
+has missed."""
+
+
+class Connection(H11Protocol):
+    """One connection, until it becomes a WebSocket, which has time limits of its own."""
+
+    # the timers are asyncio's, which only uvicorn needs to know here
+    _head: Any = None
+    _stall: Any = None
+    _unsent = 0
+
+    def connection_made(self, transport: Any) -> None:
+        super().connection_made(transport)
+        if len(self.connections) > MOST_CONNECTIONS or self._has_too_many():
+            transport.abort()
+        else:
+            self._await_head()
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._stop()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        super().data_received(data)
+        if self.transport.get_protocol() is not self:  # it is a WebSocket now
+            self._stop()
+        elif self.conn.their_state is not h11.IDLE:
+            self._head_has_come()
+        elif self._head is None and not self.transport.is_closing():
+            self._await_head()
+
+    def on_response_complete(self) -> None:
+        super().on_response_complete()
+        self._watch()
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._watch()
+
+    def send_400_response(self, msg: str) -> None:
+        """Answer what is no HTTP, as a problem like all others."""
+        if self.conn.our_state not in (h11.IDLE, h11.SEND_RESPONSE):
+            self.transport.abort()  # it has been answered already
+            return
+        problem = {
+            "type": "urn:paramclient:bad-request",
+            "title": "Bad request",
+            "status": 400,
+            "detail": "This is no HTTP request.",
+        }
+        headers = [
+            ("content-type", "application/problem+json"),
+            ("x-content-type-options", "nosniff"),
+            ("connection", "close"),
+        ]
+        response = h11.Response(status_code=400, headers=headers, reason=b"Bad Request")
+        for event in (response, h11.Data(data=json.dumps(problem).encode()), h11.EndOfMessage()):
+            self.transport.write(self.conn.send(event) or b"")
+        self.transport.close()
+
+    def _has_too_many(self) -> bool:
+        if self.client is None or _is_here(self.client[0]):
+            return False
+        hosts = [client[0] for each in self.connections if (client := getattr(each, "client", None))]
+        return hosts.count(self.client[0]) > MOST_FROM_ONE
+
+    def _await_head(self) -> None:
+        self._head = self.loop.call_later(HEAD_PATIENCE, self.transport.abort)
+
+    def _head_has_come(self) -> None:
+        if self._head is not None:
+            self._head.cancel()
+            self._head = None
+
+    def _watch(self) -> None:
+        """What has been written is to be taken, however slowly."""
+        self._unsent = self.transport.get_write_buffer_size()
+        if self._unsent and self._stall is None:
+            self._stall = self.loop.call_later(STALL_PATIENCE, self._check)
+
+    def _check(self) -> None:
+        self._stall = None
+        if 0 < self._unsent <= self.transport.get_write_buffer_size():
+            self.transport.abort()
+        else:
+            self._watch()
+
+    def _stop(self) -> None:
+        self._head_has_come()
+        if self._stall is not None:
+            self._stall.cancel()
+            self._stall = None
+
+
+def _is_here(address: str) -> bool:
+    try:
+        return ip_address(address.partition("%")[0]).is_loopback
+    except ValueError:
+        return False

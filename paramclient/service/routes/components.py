@@ -1,0 +1,107 @@
+"""Who is heard: all components, one of them, and what is asked of it as a whole."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import APIRouter, Depends, Request, Response
+from pydantic import Field
+
+from paramclient.client import HEARING_PATIENCE
+from paramclient.component import Component
+from paramclient.documents.base import Body
+from paramclient.documents.component import ComponentDoc, ComponentsDoc
+from paramclient.service.asking import LinkName, Seconds, Target, TheHub, answered, may_write
+from paramclient.service.following import Followed
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/api/v1", tags=["components"])
+
+Id = Annotated[int | None, Field(ge=1, le=255)]
+
+
+class Patience(Body):
+    """For how long to wait."""
+
+    timeout_s: Seconds = None
+
+
+class Sought(Body):
+    """Whom to wait for; null is any. Without `timeout_s` as long as the library waits, null for ever."""
+
+    system: Id = None
+    component: Id = None
+    timeout_s: Seconds = HEARING_PATIENCE
+
+
+class Moved(Body):
+    """Under which system id a vehicle is looked for."""
+
+    system: Annotated[int, Field(ge=1, le=255)]
+    timeout_s: Seconds = HEARING_PATIENCE
+
+
+class Restarted(Body):
+    """The system id that a vehicle takes with the start, where another one was set."""
+
+    system: Id = None
+    timeout_s: Seconds = None
+
+
+@router.get("/components")
+async def all_components(hub: TheHub) -> ComponentsDoc:
+    """Everyone who is heard, and the number of the event up to which that holds."""
+    for followed in hub.followed:
+        followed.look()
+    place = hub.feed.place
+    return ComponentsDoc(run=place.run, seq=place.seq, components=[each.document for each in hub.followed])
+
+
+@router.get("/components/{system}/{component}")
+async def one_component(target: Target) -> ComponentDoc:
+    """One component."""
+    return target.document
+
+
+@router.post("/components/{system}/{component}/refreshed", status_code=204)
+async def refreshed(request: Request, target: Target, body: Patience) -> Response:
+    """Wait until the values that a hash does not cover have been read afresh."""
+    await answered(request, lambda: target.component.refreshed(timeout=body.timeout_s), target)
+    return Response(status_code=204)
+
+
+@router.post("/components/{system}/{component}/reboot", dependencies=[Depends(may_write)])
+async def reboot(request: Request, target: Target, body: Restarted) -> ComponentDoc:
+    """Let the vehicle start again, and wait until the same one is back."""
+
+    async def work() -> Component:
+        return await target.component.reboot(system=body.system, timeout=body.timeout_s)
+
+    return _document(target, await answered(request, work, target))
+
+
+@router.post("/components/{system}/{component}/successor")
+async def successor(request: Request, target: Target, body: Moved) -> ComponentDoc:
+    """Wait for the same component of the same vehicle under another system id."""
+
+    async def work() -> Component:
+        client = target.component._client
+        return await client.successor(target.component, body.system, timeout=body.timeout_s)
+
+    return _document(target, await answered(request, work, target))
+
+
+@router.post("/find")
+async def find(request: Request, hub: TheHub, body: Sought, link: LinkName = None) -> ComponentDoc:
+    """Wait for a component on any link: the first autopilot, or what is named; also on links to come."""
+    found = await answered(request, lambda: hub.wait_for(body.system, body.component, link, body.timeout_s))
+    found.look()
+    return found.document
+
+
+def _document(target: Followed, component: Component) -> ComponentDoc:
+    """How a component stands that is on the same link."""
+    followed = target.line.followed[component.system, component.component]
+    followed.look()
+    return followed.document

@@ -1,0 +1,76 @@
+"""What firmwares say of their parameters: what is known here, what the vehicle says, what a file says."""
+
+from __future__ import annotations
+
+from fnmatch import fnmatchcase
+from typing import Annotated, Final
+
+from fastapi import APIRouter, Depends, Query, Request
+
+from paramclient.documents.base import Body
+from paramclient.documents.param import DescribedDoc, InfosDoc
+from paramclient.metadata import Metadata, metadata_of, read_content
+from paramclient.service.asking import Seconds, Target, TheHub, answered, may_write
+from paramclient.service.following import Followed
+from paramclient.service.problems import ServiceError
+from paramclient.service.routes.files import body_of
+from paramclient.service.wanted import LONGEST_NAME
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/api/v1/components/{system}/{component}", tags=["descriptions"])
+
+MOST_PATTERNS: Final = 64
+"""Patterns of one request."""
+
+
+class Asked(Body):
+    """How long to wait for an answer."""
+
+    timeout_s: Seconds = None
+
+
+@router.get("/metadata")
+async def known_infos(
+    target: Target,
+    names: Annotated[
+        list[str], Query(max_length=MOST_PATTERNS, description="Such as MC_*; any of them.")
+    ] = [],  # noqa: B006 - FastAPI copies it
+) -> InfosDoc:
+    """What is known here of the parameters that the component has."""
+    metadata = target.metadata
+    if metadata is None:
+        raise ServiceError(404, "not-described", "Nothing is known here of what its parameters mean.")
+    chosen = [
+        name
+        for name in target.component.params
+        if not names or any(fnmatchcase(name, pattern) for pattern in names)
+    ]
+    return InfosDoc.of(metadata, chosen)
+
+
+@router.post("/metadata")
+async def described(request: Request, target: Target, body: Asked) -> DescribedDoc:
+    """Let the component describe its parameters. It is kept for its firmware."""
+    metadata = await answered(request, lambda: metadata_of(target.component, timeout=body.timeout_s), target)
+    if metadata is None:
+        raise ServiceError(404, "not-described", "The component does not describe its parameters.")
+    return _take(target, metadata)
+
+
+@router.put("/metadata", dependencies=[Depends(may_write)])
+async def described_by_file(
+    request: Request,
+    hub: TheHub,
+    target: Target,
+    name: Annotated[str, Query(max_length=LONGEST_NAME)] = "the file",
+) -> DescribedDoc:
+    """Take the descriptions of a file, for as long as the service runs."""
+    content = await body_of(request)
+    return _take(target, await hub.read_aside(lambda: read_content(content, source=name)))
+
+
+def _take(target: Followed, metadata: Metadata) -> DescribedDoc:
+    target.metadata = metadata
+    target.tell("params", {"count": len(target.component.params)})
+    return DescribedDoc(count=len(metadata), source=metadata.source)

@@ -1,0 +1,140 @@
+"""Parameter files: what a component has in any form, and what a file says."""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, Query, Request, Response
+
+from paramclient.documents.written import FormDoc, FormsDoc, UploadedDoc
+from paramclient.errors import UsageError
+from paramclient.files import LARGEST_FILE, FileForm, ParamFile, dumps, loads
+from paramclient.files.model import ENDINGS
+from paramclient.identity import autopilot_name
+from paramclient.paramset import ParamSet
+from paramclient.service.asking import Target, TheHub, answered
+from paramclient.service.hub import Hub
+from paramclient.service.problems import ServiceError
+from paramclient.service.wanted import LONGEST_NAME, known_set, parsed, state, when_of
+from paramclient.taken import differing, whole_set
+
+__all__ = ["attachment", "body_of", "moment", "router"]
+
+router = APIRouter(prefix="/api/v1", tags=["files"])
+
+LONGEST_STEM: Final = 100
+"""Characters of the name of a file that is given, before its ending."""
+
+Form = Annotated[FileForm, Query(description="One of those that /forms says can be written.")]
+From = Annotated[str, Query(alias="from", max_length=64, description="live, known, snapshot:ID, or a time.")]
+Id = Annotated[int | None, Query(ge=1, le=255)]
+
+_FILE: Final[dict[int | str, dict[str, Any]]] = {
+    200: {"content": {"application/octet-stream": {}}, "description": "The file"}
+}
+
+
+@router.get("/forms")
+async def forms() -> FormsDoc:
+    """The forms of parameter files. All of them are read."""
+    return FormsDoc(forms=[FormDoc.of(form) for form in FileForm])
+
+
+@router.get("/components/{system}/{component}/file", responses=_FILE, response_class=Response)
+async def file(
+    request: Request,
+    hub: TheHub,
+    target: Target,
+    form: Form = FileForm.QGC,
+    source: From = "live",
+    changed: Annotated[bool, Query(description="Only what differs from the firmware's defaults.")] = False,
+) -> Response:
+    """The parameters of a component as a file; `live` asks the vehicle. An incomplete table is not given."""
+
+    async def work() -> Response:
+        if source not in ("live", "known"):
+            if changed:
+                raise UsageError("what differs from the defaults is known of the present table alone")
+            return await attachment(hub, await state(hub, target, moment(source)), form)
+        if source == "known":
+            whole, params = known_set(target), list(target.component.params.values())
+        else:
+            found = await whole_set(target.component, source=f"link {target.line.name}")
+            whole, params = found.set, list(found.params)
+        return await attachment(hub, differing(whole, params) if changed else whole, form)
+
+    return await answered(request, work, target)
+
+
+@router.post("/files")
+async def files(
+    request: Request,
+    hub: TheHub,
+    name: Annotated[str, Query(max_length=LONGEST_NAME, description="The ending may tell the form.")] = "",
+    form: Annotated[FileForm | None, Query()] = None,
+    component: Id = None,
+    system: Id = None,
+) -> UploadedDoc:
+    """Read a parameter file of any form; it is kept nowhere.
+
+    Of a file with several components, `params` are those of the autopilot, or of the one that is named.
+    """
+    data = await body_of(request)
+    read: Callable[[], ParamFile] = partial(loads, data, source=name, form=form)
+    found = await parsed(hub, read)
+    return UploadedDoc.of(found, found.choose(component, system=system))
+
+
+def moment(text: str) -> float | int:
+    """What `from` says: the number of a snapshot as an int, a time as a float.
+
+    Raises:
+        UsageError: it is neither.
+    """
+    number = re.fullmatch("snapshot:([0-9]{1,18})", text)
+    if number:
+        return int(number[1])
+    try:
+        at = when_of(text)
+    except ValueError as error:
+        raise UsageError(f"from={text}: {error}") from None
+    assert isinstance(at, float)
+    return at
+
+
+async def attachment(hub: Hub, params: ParamSet, form: FileForm) -> Response:
+    """A set as a file of this form, with a name of its own.
+
+    Raises:
+        FileError: the form cannot say it.
+    """
+    name = f"{_stem(params)}{_ending(form)}"
+    data = await hub.aside(lambda: dumps(params, form=form, target=name))
+    headers = {"content-disposition": f'attachment; filename="{name}"'}
+    return Response(data, media_type="application/octet-stream", headers=headers)
+
+
+async def body_of(request: Request) -> bytes:
+    """All of the body, as far as a parameter file can be that long."""
+    data = bytearray()
+    async for piece in request.stream():
+        data += piece
+        if len(data) > LARGEST_FILE:
+            raise ServiceError(413, "too-large", f"No parameter file has more than {LARGEST_FILE} bytes.")
+    return bytes(data)
+
+
+def _stem(params: ParamSet) -> str:
+    """Whose parameters and of when, in characters that are safe in a header and on every disk."""
+    autopilot = "params" if params.identity is None else autopilot_name(params.identity.autopilot)
+    ids = [str(each) for each in (params.system, params.component) if each is not None]
+    at = time.strftime("%Y%m%d-%H%M%S", time.gmtime(time.time() if params.at is None else params.at))
+    return re.sub(r"[^A-Za-z0-9._-]", "_", "-".join([autopilot, *ids, at]))[:LONGEST_STEM]
+
+
+def _ending(form: FileForm) -> str:
+    return next((ending for ending, each in ENDINGS.items() if each is form), ".txt")

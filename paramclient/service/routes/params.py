@@ -1,0 +1,199 @@
+"""The parameters of a component: as they are known, asked for, and written.
+
+What is known goes out as it stands written in `following`; nothing is validated on the way.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from fnmatch import fnmatchcase
+from typing import Annotated
+
+import anyio
+from fastapi import APIRouter, Depends, Query, Request, Response
+from pydantic import Field
+
+from paramclient.documents.base import Body, Document
+from paramclient.documents.call import NotSetDoc, SetManyDoc, SetResultDoc
+from paramclient.documents.param import ParamDoc
+from paramclient.errors import ParamClientError, UnknownParameter, UsageError
+from paramclient.service.asking import (
+    Seconds,
+    Target,
+    TheHub,
+    ValueGiven,
+    answered,
+    asker_of,
+    may_write,
+    value_of,
+)
+from paramclient.service.following import Followed
+from paramclient.service.problems import problem_of
+from paramclient.values import Param
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/api/v1/components/{system}/{component}", tags=["parameters"])
+
+MOST_PATTERNS = 64
+"""Patterns of one request."""
+MOST_VALUES = 10_000
+"""Values of one request: more than a table has."""
+JSON = "application/json"
+
+Name = Annotated[str, Field(min_length=1, max_length=16)]
+
+
+Patterns = Annotated[
+    list[str] | None, Query(max_length=MOST_PATTERNS, description="Such as MC_*; one of them must fit.")
+]
+
+
+class ParamsDoc(Document):
+    """Parameters by name, and the number of the event up to which they hold."""
+
+    run: str
+    seq: int
+    params: dict[str, ParamDoc]
+
+
+class Asked(Body):
+    """How long to wait for an answer."""
+
+    timeout_s: Seconds = None
+
+
+class Read(Body):
+    """One parameter, by its name or by its index."""
+
+    name: Name | None = None
+    index: Annotated[int, Field(ge=0, le=65_535)] | None = None
+    timeout_s: Seconds = None
+
+
+class Write(Body):
+    """One value."""
+
+    value: ValueGiven
+    timeout_s: Seconds = None
+
+
+class WriteMany(Body):
+    """Several values, by name."""
+
+    values: Annotated[dict[Name, ValueGiven], Field(min_length=1, max_length=MOST_VALUES)]
+    timeout_s: Seconds = None
+
+
+@router.get("/params", responses={200: {"model": ParamsDoc}}, response_class=Response)
+async def known_params(
+    hub: TheHub,
+    target: Target,
+    names: Annotated[
+        list[str], Query(max_length=MOST_PATTERNS, description="Such as MC_*; any of them.")
+    ] = [],  # noqa: B006 - FastAPI copies it
+    changed: Annotated[
+        bool, Query(description="Only those that differ from the firmware's default.")
+    ] = False,
+    metadata: Annotated[bool, Query(description="With what is known beside the values.")] = False,
+) -> Response:
+    """All that is known of the parameters, with no traffic."""
+    params: Mapping[str, Param] = target.component.params
+    chosen = [
+        param
+        for name, param in params.items()
+        if (not names or any(fnmatchcase(name, pattern) for pattern in names))
+        and (not changed or param.is_changed)
+    ]
+    target.look()
+    text = ",".join(_texts_with_metadata(target, chosen)) if metadata else target.texts(chosen)[1:-1]
+    place = hub.feed.place
+    head = f'{{"run":"{place.run}","seq":{place.seq},"params":{{'
+    return Response(f"{head}{text}}}}}", media_type=JSON)
+
+
+@router.get("/params/{name}", responses={200: {"model": ParamDoc}}, response_class=Response)
+async def known_param(target: Target, name: str) -> Response:
+    """What is known of one parameter, with no traffic."""
+    param = target.component.params.get(name)
+    if param is None:
+        raise _unknown(target, name)
+    return Response(_text_with_metadata(target, param), media_type=JSON)
+
+
+@router.post("/read", responses={200: {"model": ParamDoc}}, response_class=Response)
+async def read(request: Request, target: Target, body: Read) -> Response:
+    """Ask the vehicle for one parameter. The answer has the name that the vehicle gives it."""
+    key = body.index if body.name is None else body.name
+    if key is None or None not in (body.name, body.index):
+        raise UsageError("give either a name or an index")
+    return await _read(request, target, key, body.timeout_s)
+
+
+@router.post("/params/{name}/read", responses={200: {"model": ParamDoc}}, response_class=Response)
+async def read_by_path(request: Request, target: Target, name: str, body: Asked) -> Response:
+    """The same for one whose name can stand in an address; `#17` is the one with this index."""
+    key = int(name[1:]) if name.startswith("#") and name[1:].isdecimal() and len(name) <= 6 else name
+    return await _read(request, target, key, body.timeout_s)
+
+
+@router.put("/params/{name}", dependencies=[Depends(may_write)])
+async def write(request: Request, target: Target, name: str, body: Write) -> SetResultDoc:
+    """Write one parameter, and prove by its value that the vehicle has taken it."""
+    asker = asker_of(request)
+    return await answered(request, lambda: _write(target, name, body.value, body.timeout_s, asker), target)
+
+
+@router.patch("/params", dependencies=[Depends(may_write)])
+async def write_many(request: Request, target: Target, body: WriteMany) -> SetManyDoc:
+    """Write several side by side. All are tried; the answer says of each what became of it."""
+    asker = asker_of(request)
+    results: dict[str, SetResultDoc | NotSetDoc] = {}
+
+    async def write_one(name: str) -> None:
+        try:
+            results[name] = await _write(target, name, body.values[name], body.timeout_s, asker)
+        except ParamClientError as error:
+            results[name] = NotSetDoc(problem=problem_of(error))
+
+    async def work() -> None:
+        async with anyio.create_task_group() as tasks:
+            for name in body.values:
+                tasks.start_soon(write_one, name)
+
+    await answered(request, work, target)
+    return SetManyDoc(results={name: results[name] for name in body.values})
+
+
+async def _read(request: Request, target: Followed, key: str | int, timeout: float | None) -> Response:
+    param = await answered(request, lambda: target.component.get(key, timeout=timeout), target)
+    target.was_heard(param.name)
+    return Response(_text_with_metadata(target, param), media_type=JSON)
+
+
+async def _write(
+    target: Followed, name: str, given: ValueGiven, timeout: float | None, asker: str
+) -> SetResultDoc:
+    value = await value_of(target, name, given)
+    result = await target.component.set(name, value, timeout=timeout, asker=asker)
+    target.was_heard(result.param.name)
+    return SetResultDoc.of(result)
+
+
+def _text_with_metadata(target: Followed, param: Param) -> str:
+    info = None if target.metadata is None else target.metadata.get(param.name)
+    if info is None:
+        return target.text_of(param)
+    document = ParamDoc.kept(param, info, heard_at=target.heard_at(param.name), whole=True)
+    return document.model_dump_json()
+
+
+def _texts_with_metadata(target: Followed, params: list[Param]) -> list[str]:
+    return [f"{json.dumps(each.name)}:{_text_with_metadata(target, each)}" for each in params]
+
+
+def _unknown(target: Followed, name: str) -> UnknownParameter:
+    system, component = target.address
+    what = f"no parameter {name!r} of {system}/{component} is known here; it can be asked for"
+    return UnknownParameter(what, system=system, component=component, name=name)

@@ -1,0 +1,293 @@
+"""What was: history, snapshots and earlier states, of who is heard and of everyone in the cache."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Annotated, Any, Final
+
+from fastapi import APIRouter, Depends, Path, Query, Request, Response
+from pydantic import Field, model_validator
+
+from paramclient.cache import HISTORY_LINES, HistoryEntry
+from paramclient.documents.base import Body
+from paramclient.documents.cached import CachedTableDoc, VehicleDoc, VehiclesDoc
+from paramclient.documents.fleet import FleetDiffDoc
+from paramclient.documents.past import HistoryDoc, SnapshotDoc, SnapshotsDoc, WholeSnapshotDoc
+from paramclient.documents.written import SetDoc
+from paramclient.errors import UsageError
+from paramclient.files import FileForm
+from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.service.asking import Target, TheHub, answered, may_write
+from paramclient.service.following import Followed
+from paramclient.service.hub import Hub
+from paramclient.service.problems import ServiceError
+from paramclient.service.routes.files import Form, From, attachment, moment
+from paramclient.service.wanted import (
+    GivenFile,
+    Moment,
+    cached,
+    key_of,
+    parsed,
+    past,
+    state,
+    the_cache,
+    written,
+)
+from paramclient.values import check_name
+
+__all__ = ["router"]
+
+router = APIRouter(prefix="/api/v1", tags=["history"])
+
+LONGEST_PAGE: Final = 1_000
+"""Lines of history in one answer."""
+A_PAGE: Final = 100
+MOST_NAMES: Final = 1_000
+"""Names and patterns that a fleet is compared in."""
+
+Key = Annotated[str, Path(max_length=400, description="As /vehicles names it, percent-encoded.")]
+Id = Annotated[int, Path(ge=1, le=255)]
+Snapshot = Annotated[int, Path(ge=1, lt=1 << 62)]
+Name = Annotated[str | None, Query(max_length=16)]
+Limit = Annotated[int, Query(ge=1, le=LONGEST_PAGE)]
+Since = Annotated[Moment | None, Query(description="From this time on only.")]
+Before = Annotated[Moment | None, Query(description="Before this time only: `before` of the last answer.")]
+At = Annotated[Moment, Query(description="Unix seconds, or ISO 8601 with a zone.")]
+
+_FILE: Final[dict[int | str, dict[str, Any]]] = {
+    200: {"content": {"application/octet-stream": {}}, "description": "The file"}
+}
+
+
+class SetDown(Body):
+    """What a snapshot is for, in words."""
+
+    reason: Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class FleetCompared(Body):
+    """What all vehicles are compared in: names and patterns, or what a file or values want of them."""
+
+    names: (
+        Annotated[
+            tuple[Annotated[str, Field(min_length=1, max_length=64)], ...], Field(max_length=MOST_NAMES)
+        ]
+        | None
+    ) = None
+    file: GivenFile | None = None
+    values: Annotated[dict[str, int | float], Field(min_length=1, max_length=MOST_NAMES)] | None = None
+    component: Annotated[int, Field(ge=1, le=255)] | None = None
+
+    @model_validator(mode="after")
+    def _is_one(self) -> FleetCompared:
+        if sum(each is not None for each in (self.names, self.file, self.values)) != 1:
+            raise ValueError("vehicles are compared either in names, with a file, or with values")
+        return self
+
+
+# of who is heard
+
+
+@router.get("/components/{system}/{component}/history")
+async def history(
+    request: Request,
+    hub: TheHub,
+    target: Target,
+    name: Name = None,
+    limit: Limit = A_PAGE,
+    since: Since = None,
+    before: Before = None,
+) -> HistoryDoc:
+    """How the values of a component have changed, the newest last."""
+    return await answered(request, lambda: _history(hub, target, name, limit, since, before))
+
+
+@router.get("/components/{system}/{component}/snapshots")
+async def snapshots(request: Request, hub: TheHub, target: Target) -> SnapshotsDoc:
+    """What was set down of a component's table, the newest last."""
+
+    async def work() -> SnapshotsDoc:
+        key = await _key(hub, target)
+        return await _snapshots(hub, key, target.component.component)
+
+    return await answered(request, work)
+
+
+@router.post("/components/{system}/{component}/snapshots", status_code=201, dependencies=[Depends(may_write)])
+async def set_down(request: Request, hub: TheHub, target: Target, body: SetDown) -> SnapshotDoc:
+    """Set the table of a component down as it is known now, to have it again however it changes."""
+
+    async def work() -> SnapshotDoc:
+        cache, key, component = the_cache(hub), await _key(hub, target), target.component.component
+        kept = await hub.aside(lambda: cache.snapshot(key, component, reason=body.reason))
+        return SnapshotDoc.of(kept, exact=True)
+
+    return await answered(request, work)
+
+
+@router.get("/components/{system}/{component}/snapshots/{snapshot}")
+async def one_snapshot(request: Request, hub: TheHub, target: Target, snapshot: Snapshot) -> WholeSnapshotDoc:
+    """A snapshot with its parameters."""
+
+    async def work() -> WholeSnapshotDoc:
+        return await _snapshot(hub, await _key(hub, target), target.component.component, snapshot)
+
+    return await answered(request, work)
+
+
+@router.get("/components/{system}/{component}/state")
+async def state_at(request: Request, hub: TheHub, target: Target, at: At) -> SetDoc:
+    """The table of a component as it was at a time."""
+
+    async def work() -> SetDoc:
+        return SetDoc.of(await state(hub, target, at))
+
+    return await answered(request, work)
+
+
+# of everyone in the cache
+
+
+@router.get("/vehicles")
+async def vehicles(hub: TheHub) -> VehiclesDoc:
+    """Every vehicle that was ever heard, the one heard last first, with what is kept of it."""
+    cache = the_cache(hub)
+    await written(hub)
+    known, tables = await hub.aside(lambda: (cache.vehicles(), cache.components()))
+    return VehiclesDoc(vehicles=[VehicleDoc.of(each, tables) for each in known])
+
+
+@router.get("/vehicles/{key:path}/{component}/params")
+async def kept_params(hub: TheHub, key: Key, component: Id) -> CachedTableDoc:
+    """The parameters of a vehicle as they were last known."""
+    return CachedTableDoc.of(await cached(hub, key, component), kept=True)
+
+
+@router.get("/vehicles/{key:path}/{component}/history")
+async def kept_history(
+    hub: TheHub,
+    key: Key,
+    component: Id,
+    name: Name = None,
+    limit: Limit = A_PAGE,
+    since: Since = None,
+    before: Before = None,
+) -> HistoryDoc:
+    """How its values have changed, the newest last."""
+    await cached(hub, key, component)
+    return await _page(hub, key, component, name, limit, since, before)
+
+
+@router.get("/vehicles/{key:path}/{component}/snapshots")
+async def kept_snapshots(hub: TheHub, key: Key, component: Id) -> SnapshotsDoc:
+    """What was set down of its table, the newest last."""
+    await cached(hub, key, component)
+    return await _snapshots(hub, key, component)
+
+
+@router.get("/vehicles/{key:path}/{component}/snapshots/{snapshot}")
+async def kept_snapshot(hub: TheHub, key: Key, component: Id, snapshot: Snapshot) -> WholeSnapshotDoc:
+    """A snapshot with its parameters."""
+    await cached(hub, key, component)
+    return await _snapshot(hub, key, component, snapshot)
+
+
+@router.get("/vehicles/{key:path}/{component}/state")
+async def kept_state(hub: TheHub, key: Key, component: Id, at: At) -> SetDoc:
+    """Its table as it was at a time."""
+    return SetDoc.of(await past(hub, key, component, at))
+
+
+@router.get("/vehicles/{key:path}/{component}/file", responses=_FILE, response_class=Response)
+async def kept_file(
+    hub: TheHub, key: Key, component: Id, form: Form = FileForm.QGC, source: From = "known"
+) -> Response:
+    """Its parameters as a file: as last known, if that is all of them, of a snapshot, or of a time."""
+    when = None if source == "known" else moment(source)
+    return await attachment(hub, await past(hub, key, component, when), form)
+
+
+@router.post("/fleet/diff")
+async def fleet_diff(hub: TheHub, body: FleetCompared) -> FleetDiffDoc:
+    """Compare all vehicles in the cache: in some parameters with each other, or with what is wanted."""
+    cache = the_cache(hub)
+    wanted: ParamSet | tuple[str, ...]
+    if body.file is not None:
+        wanted = (await parsed(hub, body.file.read)).choose(body.component)
+    elif body.values is not None:
+        wanted = ParamSet(
+            {name: WrittenParam(check_name(name), value) for name, value in body.values.items()}
+        )
+    else:
+        wanted = tuple(map(check_name, body.names or ()))
+        if not wanted:
+            raise UsageError("name the parameters to compare")
+    await written(hub)
+    found = await hub.aside(lambda: cache.fleet_diff(wanted, component=body.component))
+    return FleetDiffDoc.of(found)
+
+
+async def _key(hub: Hub, target: Followed) -> str:
+    """The key under which a component is kept, when all that was heard of it is on the disk.
+
+    Raises:
+        ServiceError: there is no cache, or nothing of it in there yet.
+    """
+    the_cache(hub)
+    key = await key_of(hub, target)
+    await cached(hub, key, target.component.component)
+    return key
+
+
+async def _history(
+    hub: Hub, target: Followed, name: str | None, limit: int, since: float | None, before: float | None
+) -> HistoryDoc:
+    key = await _key(hub, target)
+    return await _page(hub, key, target.component.component, name, limit, since, before)
+
+
+async def _page(
+    hub: Hub,
+    key: str,
+    component: int,
+    name: str | None,
+    limit: int,
+    since: float | None,
+    before: float | None,
+) -> HistoryDoc:
+    """The newest lines before a time; those of one moment stay together, as that tells the next page."""
+    cache = the_cache(hub)
+    most = limit + 1 if before is None else HISTORY_LINES
+    lines = await hub.aside(lambda: cache.history(key, component, name, most, since))
+    if before is not None:
+        lines = [line for line in lines if line.at < before]
+    page = lines[-limit:]
+    if len(page) == len(lines):
+        return HistoryDoc.of(page, exact=True)
+    if before is None and lines[0].at == page[0].at:  # there may be more of them
+        lines = await hub.aside(lambda: cache.history(key, component, name, HISTORY_LINES, since))
+    oldest = page[0].at
+    page = [*_same_moment(lines[: len(lines) - len(page)], oldest), *page]
+    return HistoryDoc.of(page, exact=True, before=oldest if len(page) < len(lines) else None)
+
+
+def _same_moment(lines: Sequence[HistoryEntry], at: float) -> Sequence[HistoryEntry]:
+    """The last lines that are all of one moment."""
+    count = 0
+    while count < len(lines) and lines[-1 - count].at == at:
+        count += 1
+    return lines[len(lines) - count :]
+
+
+async def _snapshots(hub: Hub, key: str, component: int) -> SnapshotsDoc:
+    cache = the_cache(hub)
+    return SnapshotsDoc.of(await hub.aside(lambda: cache.snapshots(key, component)), exact=True)
+
+
+async def _snapshot(hub: Hub, key: str, component: int, number: int) -> WholeSnapshotDoc:
+    cache = the_cache(hub)
+    kept = await hub.aside(lambda: cache.snapshots(key, component))
+    for each in kept:
+        if each.id == number:
+            return WholeSnapshotDoc.whole(each, await past(hub, key, component, number))
+    raise ServiceError(404, "unknown-snapshot", f"There is no snapshot {number} of it.")

@@ -1,0 +1,308 @@
+"""What requests mean by parameters: a file, an earlier state, another vehicle, values as they stand."""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import time
+from collections.abc import Callable
+from datetime import datetime
+from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeVar
+
+from pydantic import BeforeValidator, Field, model_validator
+
+from paramclient.documents.base import Body
+from paramclient.errors import CacheError, UsageError
+from paramclient.files import FileForm, ParamFile, loads
+from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.provision.looking import identified
+from paramclient.service.asking import ValueGiven, value_of
+from paramclient.service.problems import ServiceError
+from paramclient.taken import before_last_apply, cached_set, whole_set
+from paramclient.values import Trust, check_name
+
+if TYPE_CHECKING:
+    from paramclient.cache import CachedComponent, ParamCache
+    from paramclient.service.following import Followed
+    from paramclient.service.hub import Hub
+
+__all__ = [
+    "Elsewhere",
+    "GivenFile",
+    "Moment",
+    "Source",
+    "cached",
+    "key_of",
+    "known_set",
+    "parsed",
+    "past",
+    "resolved",
+    "state",
+    "the_cache",
+    "written",
+    "when_of",
+]
+
+MOST_VALUES: Final = 65_535
+"""Values of one request: as many as an index can count."""
+LONGEST_NAME: Final = 255
+"""Characters of a file's name."""
+LATEST: Final = 253_402_300_799.0
+"""The last second of the year 9999: what stands beyond cannot be written as a date."""
+
+Result = TypeVar("Result")
+
+
+def when_of(text: object) -> object:
+    """A moment as a program writes it: unix seconds, or ISO 8601 with a zone."""
+    if not isinstance(text, str):
+        return text
+    try:
+        return float(text)
+    except ValueError:
+        pass
+    try:
+        moment = datetime.fromisoformat(text)
+    except ValueError:
+        raise ValueError("a time is unix seconds, or as 2026-11-20T14:00:00Z") from None
+    if moment.tzinfo is None:
+        raise ValueError("a time needs its zone, as in 2026-11-20T14:00:00Z")
+    return moment.timestamp()
+
+
+Moment = Annotated[float, BeforeValidator(when_of), Field(ge=0, le=LATEST, allow_inf_nan=False)]
+"""A time, in unix seconds when it is read."""
+Id = Annotated[int, Field(ge=1, le=255)]
+Number = Annotated[int, Field(ge=1, lt=1 << 62)]
+
+
+class GivenFile(Body):
+    """A parameter file, as text or in base64. Its name may tell its form; `component` whose set is meant."""
+
+    name: Annotated[str, Field(max_length=LONGEST_NAME)] = ""
+    text: str | None = None
+    base64: str | None = None
+    form: FileForm | None = None
+    component: Id | None = None
+
+    @model_validator(mode="after")
+    def _is_one(self) -> GivenFile:
+        if (self.text is None) == (self.base64 is None):
+            raise ValueError("a file is given either as text or in base64")
+        return self
+
+    def read(self) -> ParamFile:
+        """The file. It takes its time.
+
+        Raises:
+            FileError: it cannot be read.
+            UsageError: it is not base64.
+        """
+        if self.text is not None:
+            data = self.text.encode("utf-8", "surrogatepass")
+        else:
+            try:
+                data = base64.b64decode(self.base64 or "", validate=True)
+            except (binascii.Error, ValueError) as error:
+                raise UsageError(f"{self.name or 'the file'} is no base64: {error}") from None
+        return loads(data, source=self.name, form=self.form)
+
+
+class Elsewhere(Body):
+    """Another component that is heard."""
+
+    system: Id
+    component: Id
+    link: Annotated[str, Field(max_length=200)] | None = None
+
+
+class Cached(Body):
+    """A component in the cache: as it was last known, in a snapshot, or at a time."""
+
+    key: Annotated[str, Field(min_length=1, max_length=400)]
+    component: Id
+    snapshot: Number | None = None
+    at: Moment | None = None
+
+
+class Source(Body):
+    """Where parameters are taken from. One of the members stands, and no other.
+
+    `snapshot` (its number) and `at` are earlier states of the component that the request is about,
+    `component` is another one that is heard, `vehicle` one in the cache, `values` stand here, `defaults` are
+    the firmware's.
+    """
+
+    file: GivenFile | None = None
+    snapshot: Number | None = None
+    at: Moment | None = None
+    component: Elsewhere | None = None
+    vehicle: Cached | None = None
+    values: Annotated[dict[str, ValueGiven], Field(min_length=1, max_length=MOST_VALUES)] | None = None
+    defaults: Literal[True] | None = None
+
+    @model_validator(mode="after")
+    def _is_one(self) -> Source:
+        if len(self.model_fields_set) != 1 or None in (getattr(self, name) for name in self.model_fields_set):
+            raise ValueError(f"a source has one of these members: {', '.join(type(self).model_fields)}")
+        return self
+
+
+async def resolved(hub: Hub, target: Followed, source: Source) -> ParamSet:
+    """The parameters that a source stands for, of a request about this component.
+
+    Another component that is heard is asked for its whole table.
+
+    Raises:
+        ServiceError: there is no such component, vehicle, snapshot or state.
+        UsageError: it is `defaults`, which are no set of their own.
+        ParamClientError: it cannot be read, or not all of it came.
+    """
+    if source.file is not None:
+        return _choose(await parsed(hub, source.file.read), target, source.file.component)
+    if source.component is not None:
+        where = source.component
+        other = hub.find(where.system, where.component, where.link)
+        return (await whole_set(other.component, source=f"link {other.line.name}")).set
+    if source.vehicle is not None:
+        kept = source.vehicle
+        if kept.snapshot is not None and kept.at is not None:
+            raise UsageError("a state in the cache is a snapshot or that of a time, not both")
+        when = kept.at if kept.snapshot is None else kept.snapshot
+        return await past(hub, kept.key, kept.component, when)
+    if source.values is not None:
+        return ParamSet({name: await _value(target, name, given) for name, given in source.values.items()})
+    if source.defaults:
+        raise UsageError("the firmware's defaults are a base to compare with, and nothing besides")
+    return await state(hub, target, source.at if source.snapshot is None else source.snapshot)
+
+
+async def state(hub: Hub, target: Followed, when: float | int | None) -> ParamSet:
+    """An earlier state of a component that is heard.
+
+    Args:
+        when: a float is a time, an int the number of a snapshot, None is before the last apply.
+
+    Raises:
+        ServiceError: it is not known, or there is no cache.
+    """
+    cache = the_cache(hub)
+    key, component = await key_of(hub, target), target.component.component
+    if when is None:
+        return await _known(hub, lambda: before_last_apply(cache, key, component))
+    return await past(hub, key, component, when)
+
+
+async def key_of(hub: Hub, target: Followed) -> str:
+    """The key under which a component is kept, when all that was heard of it is on the disk."""
+    await identified(target.component)
+    await written(hub)
+    return target.component.identity.key
+
+
+async def written(hub: Hub) -> None:
+    """Have everything on the disk that was heard so far."""
+    for _, client in hub.clients():
+        await client._writer.flush()
+        await client._writer.aside(_nothing)  # what was being written already, is then
+
+
+async def past(hub: Hub, key: str, component: int, when: float | int | None) -> ParamSet:
+    """What the cache has of a component.
+
+    Args:
+        when: a float is a time, an int the number of a snapshot, None is what was last known, if that is all.
+
+    Raises:
+        ServiceError: the cache has no such vehicle, or not all of it, or no such state; or there is no cache.
+    """
+    cache = the_cache(hub)
+    await cached(hub, key, component)
+    if when is None:
+        return await _known(hub, lambda: cached_set(cache, key, component))
+    return await _known(hub, lambda: cache.state_at(key, component, when))
+
+
+async def cached(hub: Hub, key: str, component: int) -> CachedComponent:
+    """A table in the cache.
+
+    Raises:
+        ServiceError: there is none of this key.
+    """
+    cache = the_cache(hub)
+    await written(hub)
+    table = await hub.aside(lambda: cache.load(key, component))
+    if table is None:
+        what = f"The cache has no table of component {component} of a vehicle {key!r}."
+        raise ServiceError(404, "unknown-vehicle", what)
+    return table
+
+
+def the_cache(hub: Hub) -> ParamCache:
+    """Where tables are kept.
+
+    Raises:
+        ServiceError: nowhere.
+    """
+    if hub.cache is None:
+        raise ServiceError(
+            409, "no-cache", "This service keeps no cache, and so knows nothing of earlier times."
+        )
+    return hub.cache
+
+
+def known_set(target: Followed) -> ParamSet:
+    """The table of a component as it stands here, if all of it was heard or confirmed in this session.
+
+    Raises:
+        ServiceError: it was not; the vehicle has to be asked.
+    """
+    component = target.component
+    params = list(component.params.values())
+    unsure = sum(param.trust is Trust.CACHED for param in params)
+    count = component.count
+    listed = sum(param.index is not None for param in params)
+    if not params or unsure or count is None or listed < count:
+        told = f"{listed - unsure} of {'?' if count is None else count}"
+        what = f"{told} parameters were heard or confirmed in this session; fetch them first."
+        raise ServiceError(409, "incomplete", what)
+    return ParamSet.of(
+        params,
+        component=component.component,
+        system=component.system,
+        identity=component.identity,
+        at=time.time(),
+        source=f"link {target.line.name}",
+    )
+
+
+async def parsed(hub: Hub, read: Callable[[], ParamFile]) -> ParamFile:
+    """Read a file in a thread: a long one takes seconds, and others have files too.
+
+    Raises:
+        FileError: it cannot be read.
+    """
+    return await hub.read_aside(read)
+
+
+def _choose(file: ParamFile, target: Followed, component: int | None) -> ParamSet:
+    """What a file has for a component; the system counts only in a file that has several."""
+    is_of_several = len({each.system for each in file.sets}) > 1
+    wanted = target.component.component if component is None else component
+    return file.choose(wanted, system=target.component.system if is_of_several else None)
+
+
+async def _value(target: Followed, name: str, given: ValueGiven) -> WrittenParam:
+    return WrittenParam(check_name(name), await value_of(target, name, given))
+
+
+async def _known(hub: Hub, look: Callable[[], Result]) -> Result:
+    """What the cache knows. That it does not is no failure of the disk: that was read just now."""
+    try:
+        return await hub.aside(look)
+    except CacheError as error:
+        raise ServiceError(404, "unknown-state", str(error), error=type(error).__name__) from error
+
+
+def _nothing() -> None:
+    return

@@ -1,0 +1,435 @@
+"""Many vehicles on one link: nothing is done for all of them that one of them is the reason of."""
+
+from __future__ import annotations
+
+import inspect
+import math
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import anyio
+import anyio.lowlevel
+import pytest
+
+from paramclient import ParamCache, ParamClient, carrier, writethrough
+from paramclient.cache import CachedComponent, TableUpdate
+from paramclient.carrier import HELD_UP, LONGEST_TURN, MOST_BEHIND, Carrier
+from paramclient.links import Peer
+from paramclient.protocol import station as station_room
+from paramclient.protocol import wire
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.station import Station
+from paramclient.protocol.wire import MAV_AUTOPILOT_PX4, Heartbeat
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, SimParam, Vehicle
+from paramclient.values import ParamType
+from tests.shell import Tap, swiftly
+
+MANY = 250
+PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
+
+
+def hear(station: Station, system: int, now: float) -> None:
+    frame = wire.encode(PX4, system=system, component=1, sequence=0)
+    station.receive(frame, "peer", now)
+
+
+@pytest.fixture
+def looks(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
+    """How often the deadlines of each system were worked out."""
+    looks: Counter[int] = Counter()
+    whole = ComponentMachine.next_deadline
+
+    def counted(machine: ComponentMachine) -> float:
+        looks[machine.system] += 1
+        return whole(machine)
+
+    monkeypatch.setattr(ComponentMachine, "next_deadline", counted)
+    return looks
+
+
+def test_what_one_says_makes_nobody_look_at_the_others(looks: Counter[int]) -> None:
+    station = Station(link="x", is_stream=False)
+    for system in range(1, MANY + 1):
+        hear(station, system, 0.0)
+    station.tick(0.0)
+    station.next_deadline()
+    looks.clear()
+    hear(station, 7, 0.1)
+    station.tick(0.1, everyone=False)
+    station.next_deadline(everyone=False)
+    assert set(looks) == {7}
+    assert looks[7] <= 3
+
+
+def test_a_deadline_is_kept_whoever_was_looked_at_meanwhile() -> None:
+    """Those who were asked who they are and say nothing are asked again in time."""
+    station = Station(link="x", is_stream=False)
+    for system in range(1, 11):
+        hear(station, system, system / 100)
+    station.tick(0.1, everyone=False)
+    station.data_to_send()
+    assert station.next_deadline(everyone=False) == 1.01  # our heartbeat came at 0.1
+    asked: list[tuple[float, int]] = []
+    now = 0.1
+    while len(asked) < 10:
+        now = station.next_deadline(everyone=False)
+        station.tick(now, everyone=False)
+        for data, _ in station.data_to_send():
+            for frame in wire.Framer(wire.UNDERSTOOD, stream=False).receive(data):
+                message = wire.decode(frame)
+                if isinstance(message, wire.CommandLong):
+                    asked.append((round(now, 3), message.target_system))
+    assert asked == [(1 + system / 100, system) for system in range(1, 11)]
+
+
+def test_what_was_asked_of_one_goes_out_when_it_was_touched() -> None:
+    station = Station(link="x", is_stream=False)
+    hear(station, 1, 0.0)
+    hear(station, 2, 0.0)
+    station.tick(0.0)
+    station.next_deadline()
+    machine = station.components[2, 1]
+    for index in range(40):  # more than may go out at once
+        machine.reads.ask(index, 0.0)
+    station.touch(machine)
+    assert station.next_deadline(everyone=False) == pytest.approx(machine.reads.pace.next_at())
+    assert station.next_deadline(everyone=False) == station.next_deadline()
+
+
+def test_who_was_forgotten_leaves_no_deadline_to_whoever_comes_in_its_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One that is lost makes room for another, and is asked for a parameter although it is gone."""
+    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 2)
+    station = Station(link="x", is_stream=False)
+    hear(station, 1, 0.0)
+    hear(station, 2, 0.0)
+    gone = station.components[1, 1]
+    for second in range(1, 20):
+        hear(station, 2, float(second))
+        station.tick(float(second), everyone=False)
+        station.next_deadline(everyone=False)
+    assert gone.presence.is_lost
+    station.touch(gone)
+    hear(station, 3, 20.0)
+    gone.reads.ask("A", 20.0)
+    station.touch(gone)
+    hear(station, 2, 20.0)
+    for second in range(20, 60):
+        station.tick(float(second), everyone=False)
+        assert station.next_deadline(everyone=False) > second
+    assert [*station.components] == [(2, 1), (3, 1)]
+    assert all(machine.presence.is_lost for machine in station.components.values()), "by their own deadlines"
+    assert station.autopilot_of(1) is None
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_it_makes_no_difference_who_is_looked_at(loss: float) -> None:
+    """A whole session of twelve, with and without looking at everyone."""
+    ends = []
+    for everyone in (True, False):
+        vehicles = [small(system) for system in range(1, 13)]
+        air = Air.symmetric(vehicles, loss=loss, delay=0.01, seed=5)
+        fetches, now = session(air, vehicles, everyone=everyone)
+        assert all(fetch.result is not None and fetch.result.complete for fetch in fetches)
+        ends.append(now)
+    assert ends[1] <= 1.1 * ends[0]
+
+
+def small(system: int) -> Vehicle:
+    table = [SimParam(f"P_{index:03}", ParamType.INT32, index * system) for index in range(150)]
+    if system % 2:
+        return PX4Vehicle(system=system, table=table)
+    return ArduPilotVehicle(system=system, table=table, ftp=False)
+
+
+def session(air: Air, vehicles: list[Vehicle], *, everyone: bool) -> tuple[list[Fetch], float]:
+    """All of them are fetched at once, as soon as they have said who they are."""
+    station = Station(link="x", is_stream=False)
+    fetches: list[Fetch] = []
+    now = 0.0
+    air.tick(now)
+    while not (fetches and all(fetch.done for fetch in fetches)):
+        assert now < 120.0
+        station.tick(now, everyone=everyone)
+        machines = list(station.components.values())
+        if not fetches and len(machines) == len(vehicles) and all(each.who.settled for each in machines):
+            fetches = [machine.begin_fetch(now) for machine in machines]
+            for machine in machines:
+                station.touch(machine)
+        for data, _ in station.data_to_send():
+            air.receive(data, now)
+        deadline = air.next_deadline()
+        ours = station.next_deadline(everyone=everyone)
+        now = max(min(ours, math.inf if deadline is None else deadline), now + 1e-7)
+        air.tick(now)
+        for data in air.data_to_send():
+            station.receive(data, None, now)
+    return fetches, now
+
+
+def test_whether_anything_is_awaited_is_asked_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    whole = inspect.getattr_static(ComponentMachine, "is_waiting")
+
+    def counted(machine: ComponentMachine) -> bool:
+        asked.append(machine.system)
+        return bool(whole.fget(machine))
+
+    monkeypatch.setattr(ComponentMachine, "is_waiting", property(counted))
+    station = Station(link="x", is_stream=False)
+    for system in range(1, MANY + 1):
+        hear(station, system, 0.0)
+    for system in range(1, MANY):
+        station.components[system, 1].who.settled = True
+        station.components[system, 1].who._is_asking = False
+    assert station.is_waiting
+    asked.clear()
+    assert station.is_waiting
+    assert asked == [MANY]
+
+
+class SlowCache(ParamCache):
+    """One that has hundreds of others to read first."""
+
+    def load(self, key: str, component: int) -> CachedComponent | None:
+        time.sleep(0.3)
+        return super().load(key, component)
+
+
+@pytest.mark.asyncio
+async def test_a_cached_table_that_is_being_read_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "cache.sqlite3"
+    async with ParamClient(small(1), cache=path) as client:
+        await (await client.component()).fetch_all()
+    monkeypatch.setattr("paramclient.component.IDENTITY_PATIENCE", 0.05)
+    with SlowCache(path) as cache:
+        async with ParamClient(small(1), cache=cache) as client:
+            assert (await client.fetch_all()).results[1, 1].source == "cache"
+
+
+class Flood:
+    """A link that brings so many datagrams every few milliseconds, as it is told."""
+
+    name = "flood"
+    is_stream = False
+    reconnects = False
+    interval = 0.005
+
+    def __init__(self) -> None:
+        self.size = 0
+        self.is_stuck = anyio.Event()
+
+    async def open(self) -> None: ...
+
+    async def close(self) -> None: ...
+
+    async def send(self, data: bytes, peer: Peer | None) -> None: ...
+
+    async def receive(self) -> list[tuple[Peer, bytes]]:
+        await anyio.sleep(self.interval)
+        while not self.size:
+            await self.is_stuck.wait()
+        return [("peer", b"x")] * self.size
+
+
+class Watched(Station):
+    """A station with a deadline every ten milliseconds, that notes when it looks at what is due."""
+
+    def __init__(self) -> None:
+        super().__init__(link="flood", is_stream=False)
+        self.ticks: list[float] = []
+        self.on_receive: Callable[[], None] = lambda: None
+
+    def receive(self, data: bytes, peer: Peer, now: float) -> bool:
+        self.on_receive()
+        return True
+
+    def tick(self, now: float, *, everyone: bool = True) -> None:
+        self.ticks.append(now)
+
+    def next_deadline(self, *, everyone: bool = True) -> float:
+        return anyio.current_time() + 0.01
+
+
+async def carry(link: Flood, station: Watched, seconds: float, dispatch: Callable[[], None]) -> None:
+    whole = Carrier(link, station, dispatch=dispatch, end=lambda error: None)
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(whole.read)
+        tasks.start_soon(whole.send)
+        await anyio.sleep(seconds)
+        tasks.cancel_scope.cancel()
+
+
+@swiftly
+async def test_time_outs_wait_until_what_has_come_is_read() -> None:
+    link, station = Flood(), Watched()
+    link.size = carrier.MANY
+    began = anyio.current_time()
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(carry, link, station, 2.0, lambda: None)
+        await anyio.sleep(1.0)
+        meanwhile = [at for at in station.ticks if at > began + link.interval]
+        assert not meanwhile, "more was there after each reading"
+        link.size = carrier.MANY - 1
+        await anyio.sleep(0.1)
+        assert station.ticks[-1] > began + 1.0
+        assert len(station.ticks) > 5
+
+
+@swiftly
+async def test_time_outs_do_not_wait_for_ever() -> None:
+    link, station = Flood(), Watched()
+    link.size = carrier.MANY
+    began = anyio.current_time()
+    await carry(link, station, MOST_BEHIND + 1.0, lambda: None)
+    meanwhile = [at - began for at in station.ticks if at > began + link.interval]
+    assert MOST_BEHIND <= meanwhile[0] < MOST_BEHIND + 0.1
+    assert len(meanwhile) > 50
+
+
+@swiftly
+async def test_time_outs_wait_for_nothing_that_does_not_come() -> None:
+    """The last reading brought many, and then the link falls silent."""
+    link, station = Flood(), Watched()
+    link.size = carrier.MANY
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(carry, link, station, 1.0, lambda: None)
+        await anyio.sleep(0.5)
+        link.size = 0
+        silent_at = anyio.current_time()
+        await anyio.sleep(0.2)
+    assert next(at for at in station.ticks if at > silent_at) < silent_at + HELD_UP + 2 * LONGEST_TURN
+
+
+@swiftly
+async def test_what_comes_at_once_gives_way_to_other_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each datagram takes a millisecond; so do others that are told of what has happened by then."""
+
+    class Clock:
+        now = 0.0
+
+        def perf_counter(self) -> float:
+            return self.now
+
+    def take() -> None:
+        clock.now += 0.001
+        happened.append("read")
+
+    async def beside() -> None:
+        while True:
+            await anyio.lowlevel.checkpoint()
+            happened.append("another")
+
+    clock = Clock()
+    monkeypatch.setattr(carrier, "time", clock)
+    happened: list[str] = []
+    link, station = Flood(), Watched()
+    station.on_receive = take
+    link.size = 100
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(beside)
+        await carry(link, station, 0.008, lambda: happened.append("told"))
+        tasks.cancel_scope.cancel()
+    assert happened.count("read") == 100
+    most = round(LONGEST_TURN / 0.001)
+    rounds = "".join(each[0] for each in happened).split("a")
+    longest = max(part.count("r") for part in rounds)
+    assert longest == most
+    assert all(part.endswith("t") for part in rounds if "r" in part)
+
+
+class Portions(ParamCache):
+    """One that notes what it is given at once."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.given: list[dict[int, int]] = []
+
+    def save(self, update: object) -> None:
+        assert isinstance(update, list)
+        updates: list[TableUpdate] = update
+        self.given.append({each.identity.system: len(each.params) for each in updates})
+        super().save(updates)
+
+
+@swiftly
+async def test_what_is_new_is_written_in_portions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No transaction begins another table when it has enough: to gather one takes the loop's time."""
+    monkeypatch.setattr(writethrough, "PORTION", 200)
+    monkeypatch.setattr(writethrough, "FLUSH_INTERVAL", 1000.0)  # everything on closing
+    vehicles = [small(system) for system in range(1, 8)]
+    cache = Portions(tmp_path / "cache.sqlite3")
+    with cache:
+        async with ParamClient(Air.symmetric(vehicles), cache=cache) as client:
+            await client.fetch_all()
+            assert not cache.given
+        assert [sum(each.values()) for each in cache.given] == [300, 300, 300, 150]
+        assert sorted(system for each in cache.given for system in each) == [*range(1, 8)]
+        assert len(cache.components()) == 7
+
+
+class Busy(Tap):
+    """A vehicle that does nothing for a while when its parameters are asked for: it has others to see to.
+
+    Args:
+        vehicle: who is asked.
+        seconds: for so long it does not speak, from the first time on; half a second later it hears, too.
+        beats: whether its heartbeats come all the same.
+    """
+
+    def __init__(self, vehicle: Vehicle, seconds: float, *, beats: bool) -> None:
+        super().__init__(vehicle)
+        self._vehicle = vehicle
+        self._seconds = seconds
+        self._beats = beats
+        self._until: float | None = None
+        self._waiting: list[bytes] = []
+
+    def receive(self, data: bytes, now: float) -> None:
+        self.is_deaf = True
+        super().receive(data, now)
+        if self.messages(wire.ParamRequestList) and self._until is None:
+            self._until = now + self._seconds
+        self._waiting.append(data)
+        self.tick(now)
+
+    def tick(self, now: float) -> None:
+        until = -1.0 if self._until is None else self._until
+        self.is_mute = now < until and not self._beats
+        if now >= until + 0.5:
+            waiting, self._waiting = self._waiting, []
+            for data in waiting:
+                self._vehicle.receive(data, now)
+        super().tick(now)
+
+    def next_deadline(self) -> float | None:
+        deadline = super().next_deadline()
+        if not self._waiting or self._until is None:
+            return deadline
+        return min(self._until + 0.5, math.inf if deadline is None else deadline)
+
+
+@swiftly
+async def test_who_answers_no_sooner_than_others_is_waited_for() -> None:
+    """Where another one took a while as well, an answer that is late says nothing."""
+    vehicles = [Busy(small(1), 0.3, beats=True), Busy(small(2), 2.3, beats=True)]
+    async with ParamClient(Air.symmetric(vehicles), cache=False) as client:
+        everything = await client.fetch_all()
+        assert everything.complete
+        assert everything.results.keys() == {(1, 1), (2, 1)}
+
+
+@swiftly
+async def test_who_is_not_heard_at_all_for_a_while_is_waited_for() -> None:
+    """It owes its heartbeats as well, and is not lost."""
+    vehicles: list[Endpoint] = [small(1), *(Busy(small(system), 3.5, beats=False) for system in (2, 3))]
+    async with ParamClient(Air.symmetric(vehicles), cache=False) as client:
+        everything = await client.fetch_all()
+        assert everything.complete
+        assert everything.results.keys() == {(1, 1), (2, 1), (3, 1)}
