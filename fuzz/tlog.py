@@ -136,9 +136,8 @@ def _records_of(content: bytes) -> list[Record]:
         behind = _record_at(content, end)
         is_proven = behind is not None and behind[1] > end and abs(behind[0] - time) <= YEAR
         is_alone = behind is None and last is None
-        if end > at and (
-            (last is not None and abs(time - last) <= YEAR) or (time <= END and (is_proven or is_alone))
-        ):
+        is_near = last is not None and abs(time - last) <= YEAR
+        if end > at and time <= END and (is_near or is_proven or is_alone):
             if end > len(content):
                 break
             found.append(Record(time / 1e6, content[at + 8 : end]))

@@ -108,7 +108,11 @@ def read_records(file: BinaryIO) -> Iterator[Record]:
             return
         end = start + 8 + size
         at = _time_at(buffer, start)
-        if size and (_are_near(at, before) or _is_shared(buffer, end, at, alone=before == -math.inf)):
+        if (
+            size
+            and at <= LATEST
+            and (_are_near(at, before) or _is_shared(buffer, end, at, alone=before == -math.inf))
+        ):
             if end > len(buffer):
                 return
             yield Record(at, buffer[start + 8 : end])
@@ -142,5 +146,5 @@ def _is_shared(buffer: bytes, end: int, at: float, *, alone: bool) -> bool:
     """Whether what stands behind a record is one of about the same time; the end will do for one alone."""
     size = _size_at(buffer, end + 8)
     if size is None:
-        return alone and at <= LATEST
-    return size > 0 and at <= LATEST and _are_near(_time_at(buffer, end), at)
+        return alone
+    return size > 0 and _are_near(_time_at(buffer, end), at)
