@@ -518,7 +518,7 @@ def test_the_command_reads_logs(tmp_path: Path, capsys: pytest.CaptureFixture[st
     for names in ([], ["B"]):
         assert run(["watch", f"replay:{path}?speed=100", *names]) == 0  # it ends with the log
         told = capsys.readouterr().out.splitlines()
-        assert [line.partition("  ")[2] for line in told] == ["B  2 -> 4  (vehicle)"]
+        assert told == ["2023-11-14T22:18:21.000Z  B  2 -> 4  (vehicle)"], "with the time of the log"
     assert run(["watch", f"replay:{path}?speed=100", "A"]) == 0
     assert capsys.readouterr().out == ""
     assert run(["show", f"replay:{path}.gone"]) == 4

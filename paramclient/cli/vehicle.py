@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import AsyncGenerator, Iterable, Sequence
 from contextlib import aclosing, suppress
 from dataclasses import dataclass, replace
@@ -474,7 +473,7 @@ async def _print_news(
                 continue
             else:
                 text, json = _event_text(each), _event_json(each)
-            at = time_text(time.time())
+            at = time_text(session.now)
             if as_lines_of_json:
                 print_json({"time": at, **json})
             else:
