@@ -7,6 +7,7 @@
 #   make cost       CPU and memory                 make peers      downloads beside other programs
 #   make scale      250 systems on one link        make fuzz       each target of fuzz/ for a while
 #   make soak       10,000 sessions at random      make clean      remove all that was made
+#   make screenshots  what the page looks like, into docs/images
 
 PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
 	"$$python" -c $(IS_NEW_ENOUGH) 2>/dev/null && echo "$$python" && break; done)
@@ -24,7 +25,7 @@ MEASURED = 'protocol/*' 'sim/*' 'cache/*' 'files/*' values.py errors.py identity
 # they start programs of their own, which are not measured, are about rooms that are not, or go where others have been
 UNMEASURED = $(addprefix --ignore=tests/test_,bench.py cli.py docs.py examples.py links.py machine.py packaging.py)
 
-.PHONY: demo test coverage soak fuzz lint docs bench cost scale peers dist clean
+.PHONY: demo test coverage soak fuzz lint docs screenshots bench cost scale peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -61,6 +62,9 @@ lint: $(VENV)/with-test $(VENV)/with-lint
 docs: $(VENV)/with-docs
 	$(BIN)/sphinx-build --fail-on-warning --keep-going --fresh-env -d docs/_build/doctrees docs docs/_build/html
 
+screenshots: $(VENV)/with-test
+	$(BIN)/python -m tests.screenshots
+
 bench: $(VENV)/with-cli
 	$(BIN)/python bench/parse.py
 	$(BIN)/python bench/startup.py
@@ -93,7 +97,7 @@ $(VENV)/made:
 
 $(VENV)/with-cli: pyproject.toml $(VENV)/made
 	@echo "Installing paramclient into $(VENV)"
-	@$(PIP) --editable '.[cli,serial,service]'
+	@$(PIP) --editable '.[cli,remote,serial,service]'
 	@touch $@
 
 # dependency groups need pip 25.1, and the pip of the environment is as old as its Python

@@ -16,12 +16,13 @@ import anyio.abc
 from paramclient.beside import Beside
 from paramclient.cache import ParamCache
 from paramclient.carrier import Carrier
-from paramclient.component import PROGRESS_INTERVAL, Component, address_in_words, patience_of
+from paramclient.component import Component, address_in_words, patience_of
 from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
 from paramclient.events import Events, told
 from paramclient.ftp import Ftp
 from paramclient.identity import Identity
 from paramclient.links import Link, ReplayLink, create_link
+from paramclient.links.names import names_service
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import (
     ComponentForgotten,
@@ -57,7 +58,6 @@ LISTENING_TIME: Final = 1.2
 CLOSING_PATIENCE: Final = 0.5
 """Seconds that closing waits for the hash after a write, where the next session could not do without it."""
 
-
 logger = logging.getLogger(__name__)
 protocol_logger = logging.getLogger("paramclient.protocol")
 
@@ -78,7 +78,8 @@ class ParamClient:
 
     Args:
         link: a link's name, such as `udpin:0.0.0.0:14550` (`paramclient.links.FORMS` says which there are), a
-            link object, or a simulated vehicle.
+            link object, or a simulated vehicle. With `http://HOST:8765` a service of `paramclient serve` has
+            the links (see `paramclient.remote`); of the other arguments only `token` goes with that.
         cache: where tables are kept: None for the user's cache, a path, a `ParamCache` (which stays open), or
             False for none. A log that is replayed neither reads nor writes one.
         system, component: who we are on the link.
@@ -102,6 +103,7 @@ class ParamClient:
             written over; a full disk ends it with a warning, and nothing else.
         signing: the key with which what is sent is signed and what comes is checked, or a `Signing`, which
             says more. None: nothing is signed, and signatures count for nothing.
+        token: what a service wants to see; None for PARAMCLIENT_TOKEN of the environment.
 
     Attributes:
         cache: where tables are kept, or None.
@@ -111,6 +113,14 @@ class ParamClient:
             for the second time, or the telemetry log exists or cannot be made.
         LinkError: on entering: the link, or the one to the other program, cannot be opened.
     """
+
+    def __new__(cls, link: str | Link | Endpoint, **_: object) -> ParamClient:
+        """One of the kind that the link's name asks for."""
+        if cls is ParamClient and names_service(link):
+            from paramclient.remote import RemoteClient  # brings httpx along
+
+            return object.__new__(RemoteClient)
+        return object.__new__(cls)
 
     def __init__(
         self,
@@ -127,7 +137,10 @@ class ParamClient:
         forward: str | Link | None = None,
         tlog: str | os.PathLike[str] | None = None,
         signing: Signing | SigningKey | None = None,
+        token: str | None = None,
     ) -> None:
+        if token is not None:
+            raise UsageError("a token is for a service, whose name is http://HOST:PORT; a link takes none")
         for number in (system, component):
             if not 1 <= number <= 255:
                 raise UsageError(f"our own system and component ids are 1 to 255, not {number}")
@@ -395,27 +408,15 @@ class ParamClient:
         self._station.check_refresh(refresh)
         timeout = patience_of(self._station, timeout)
         began = anyio.current_time()
-        deadline = math.inf if timeout is None else began + timeout
-        hear_until = began + HEARING_PATIENCE if timeout is None else deadline
         together = FetchTogether(self._station, self._components, system, refresh=refresh)
-        try:
-            while True:
-                self._check_open()
-                now = anyio.current_time()
-                if together.join(now):
-                    self._wake()
-                listen_until = self._opened_at + LISTENING_TIME
-                if now >= deadline or not together.is_worth_waiting(
-                    now, listen_until=listen_until, hear_until=hear_until
-                ):
-                    break
-                await together.news(min(PROGRESS_INTERVAL, deadline - now))
-                if progress is not None:
-                    progress(together.progress(anyio.current_time()))
-            return together.outcome(now, waited=now - began)
-        finally:
-            together.end(anyio.current_time())
-            self._wake()  # they may have been in the way of others
+        return await together.run(
+            self._check_open,
+            self._wake,
+            until=math.inf if timeout is None else began + timeout,
+            hear_until=began + (HEARING_PATIENCE if timeout is None else timeout),
+            listen_until=self._opened_at + LISTENING_TIME,
+            progress=progress,
+        )
 
     def traffic_report(self) -> TrafficReport:
         """What has gone over the link so far: who was heard, how fast, and what was lost on the way.

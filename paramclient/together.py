@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
 
 import anyio
 
-from paramclient.component import TIME_IS_OVER, Component
+from paramclient.component import PROGRESS_INTERVAL, TIME_IS_OVER, Component
 from paramclient.errors import CacheError, NoReply
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.fetch import Fetch
@@ -46,7 +46,7 @@ class FetchedAll:
 
 
 class FetchTogether:
-    """The fetches of all components of one system, or of every system. `end` it, whatever happens.
+    """The fetches of all components of one system, or of every system.
 
     Args:
         station: the protocol.
@@ -67,6 +67,45 @@ class FetchTogether:
         self._unanswered: dict[Address, Fetch] = {}
         self._longest_answer = 0.0
         self._unheard_at: dict[Address, float] = {}  # when those who have not answered were not heard either
+
+    async def run(
+        self,
+        check: Callable[[], None],
+        wake: Callable[[], None],
+        *,
+        until: float,
+        hear_until: float,
+        listen_until: float,
+        progress: Callable[[Mapping[Address, Progress]], None] | None,
+    ) -> FetchedAll:
+        """Fetch until nothing more may come.
+
+        Args:
+            check: raises what ends it; called at each turn.
+            wake: is told that there may be something to send.
+            until: ends it, with what has come.
+            hear_until, listen_until: as in `is_worth_waiting`.
+            progress: called about ten times a second.
+
+        Raises:
+            ParamClientError: as from `outcome`.
+        """
+        began = anyio.current_time()
+        try:
+            while True:
+                check()
+                now = anyio.current_time()
+                if self.join(now):
+                    wake()
+                is_worth_it = self.is_worth_waiting(now, listen_until=listen_until, hear_until=hear_until)
+                if now >= until or not is_worth_it:
+                    return self.outcome(now, waited=now - began)
+                await self.news(min(PROGRESS_INTERVAL, until - now))
+                if progress is not None:
+                    progress(self.progress(anyio.current_time()))
+        finally:
+            self._end(anyio.current_time())
+            wake()  # they may have been in the way of others
 
     def join(self, now: float) -> bool:
         """Begin the fetches of components that have none yet, as soon as their cached table is there.
@@ -163,7 +202,7 @@ class FetchTogether:
             raise NoReply(f"the parameters of {whose}", attempts=attempts, waited=waited)
         return FetchedAll(results, silent)
 
-    def end(self, now: float) -> None:
+    def _end(self, now: float) -> None:
         """Nobody waits for them any longer."""
         for address, fetch in self._fetches.items():
             self._station.components[address].end_fetch(fetch, now)

@@ -183,7 +183,8 @@ _set_name, _set_value, _set_type, _set_index, _set_bits, _set_trust, _set_defaul
 _REAL32 = int(ParamType.REAL32)
 _REAL64 = int(ParamType.REAL64)
 _BYTEWISE = Encoding.BYTEWISE
-_FITTING = {int(kind): layout for kind, layout in _LAYOUT.items() if layout.size <= 4}
+_LAYOUTS = {int(kind): layout for kind, layout in _LAYOUT.items()}
+_FITTING = {number: layout for number, layout in _LAYOUTS.items() if layout.size <= 4}
 _BOUNDS = {int(kind): kind.bounds for kind in ParamType if kind.is_integer}
 
 
@@ -324,10 +325,10 @@ def from_bits(bits: int, number: int, *, is_raw: bool = False) -> Value:
         number: param_type.
         is_raw: whether `Param.is_raw` was true.
     """
-    if is_raw or not 1 <= number <= ParamType.REAL64:
+    layout = None if is_raw else _LAYOUTS.get(number)
+    if layout is None:
         return bits.to_bytes(4, "little")
-    kind = ParamType(number)
-    value: int | float = _LAYOUT[kind].unpack(bits.to_bytes(kind.size, "little"))[0]
+    value: int | float = layout.unpack(bits.to_bytes(layout.size, "little"))[0]
     return value
 
 

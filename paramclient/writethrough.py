@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import math
 import os
 import time
 from collections.abc import Callable, Mapping
@@ -23,11 +24,13 @@ __all__ = ["WriteThrough", "chosen_cache"]
 
 FLUSH_INTERVAL: Final = 0.25
 """Seconds that changes are gathered for before they are written. A download fills several batches."""
-DOWNLOAD_INTERVAL: Final = 2.0
+DOWNLOAD_INTERVAL: Final = 10.0
 FEW_FETCHES: Final = 8
 """Seconds for which what a fetch under way brings is gathered, and the number of fetches above which that is
 done: most are over by then, and each table is written once, where parts of it would take several times as
-long."""
+long. So much of a download is lost where the process is killed in its course."""
+LEAST_NEW: Final = 0.5
+"""The share of a table that must be new for a part of it to be written: that costs as much as all of it."""
 PORTION: Final = 2_000
 """Parameters after which a transaction ends, of those that are written together: to gather so many takes a
 few milliseconds, in which nothing else is done."""
@@ -125,6 +128,7 @@ class WriteThrough:
         if kept is not None:
             del self._kept[machine]
             machine.table.take_dirty()
+            machine.table.take_overwritten()
         return False
 
     async def bring(self, machine: ComponentMachine, identity: Identity) -> bool:
@@ -222,7 +226,13 @@ class WriteThrough:
 
     def _is_for_later(self, kept: _Kept) -> bool:
         """Whether a fetch brings more of it that is better written together."""
-        return kept.machine.fetch is not None and anyio.current_time() < kept.written_at + DOWNLOAD_INTERVAL
+        fetch, table = kept.machine.fetch, kept.machine.table
+        if fetch is None:
+            return False
+        if len(table.dirty) < LEAST_NEW * len(table.params):
+            return True
+        began_at = fetch.first_value_at if fetch.first_value_at < math.inf else fetch.begun_at
+        return anyio.current_time() < max(kept.written_at, began_at) + DOWNLOAD_INTERVAL
 
     async def _write(self, news: list[_News]) -> bool:
         """Write what was gathered; false when the cache could not take it."""
@@ -320,6 +330,7 @@ class WriteThrough:
         if not (table.dirty or kept.is_whole or state != kept.state):
             return []
         dirty = table.take_dirty()
+        overwritten = table.take_overwritten()
         is_whole, kept.is_whole = kept.is_whole, False
         kept.state = state
         kept.written_at = anyio.current_time()
@@ -331,19 +342,20 @@ class WriteThrough:
             at=now,
             table=state,
             params=[
-                StoredParam(
-                    table.params[name],
-                    now,
-                    name in table.volatile if knows_volatile else None,
-                    dirty.get(name, "vehicle"),
+                StoredParam(param, now, param.name in table.volatile if knows_volatile else None, by)
+                for param, by in (
+                    *overwritten,
+                    *(
+                        (table.params[name], dirty.get(name, "vehicle"))
+                        for name in (table.params if is_whole else dirty)
+                        if name in table.params
+                    ),
                 )
-                for name in (table.params if is_whole else dirty)
-                if name in table.params
             ],
             removed=[name for name in dirty if name not in table.params],
             replace=is_whole,
         )
-        return [_News(kept, dirty, update, is_synced)]
+        return [_News(kept, dirty, overwritten, update, is_synced)]
 
     def _state(self, machine: ComponentMachine, kept: _Kept) -> TableState:
         table = machine.table
@@ -386,13 +398,16 @@ class _News:
 
     kept: _Kept
     dirty: dict[str, str]
+    overwritten: list[tuple[Param, str]]
     update: TableUpdate
     is_synced: bool
 
     def take_back(self) -> None:
         """It has not arrived: it is news again."""
         self.kept.is_synced |= self.is_synced
-        self.kept.machine.table.dirty = self.dirty | self.kept.machine.table.dirty
+        table = self.kept.machine.table
+        table.dirty = self.dirty | table.dirty
+        table.overwritten = self.overwritten + table.overwritten
         self.kept.is_whole |= self.update.replace
         self.kept.state = None
 

@@ -15,6 +15,7 @@ from paramclient import Component, Param, ParamClient, ParamType
 from paramclient.errors import LinkError
 from paramclient.links import Peer, SimLink
 from paramclient.protocol import wire
+from paramclient.protocol.component import ComponentMachine
 from paramclient.sim import Endpoint, GenericVehicle, PX4Vehicle, SimParam
 from paramclient.worker import Worker
 
@@ -251,9 +252,14 @@ def bits(params: Mapping[str, Param]) -> dict[str, int]:
     return {name: param.bits for name, param in params.items()}
 
 
+def machine_of(component: Component) -> ComponentMachine:
+    """What stands behind a component, wherever its link is."""
+    return component._machine
+
+
 def residue(component: Component) -> list[object]:
     """What is still registered with a component: reads, writes, a fetch, waiters."""
-    machine = component._machine
+    machine = machine_of(component)
     left: list[object] = [f"{len(machine.reads)} reads"] if len(machine.reads) else []
     left += [f"{len(machine.writes)} writes"] if len(machine.writes) else []
     left += [machine.fetch] if machine.fetch is not None else []
@@ -288,7 +294,11 @@ async def settled() -> None:
 
 def a_client(link: Any, **options: Any) -> ParamClient:
     """A client without a cache, unless one is given."""
-    return ParamClient(link, **{"cache": False} | options)
+    return client_of(link, **{"cache": False} | options)
+
+
+client_of: Callable[..., ParamClient] = ParamClient
+"""What makes clients; see `tests/ways.py`."""
 
 
 def _nothing() -> None:

@@ -10,6 +10,7 @@ from collections.abc import Iterable, MutableMapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 import anyio
 import pytest
@@ -121,7 +122,7 @@ class Door:
             "type": "http",
             "method": method,
             "path": path,
-            "raw_path": path.encode(),
+            "raw_path": quote(path).encode(),
             "query_string": b"",
             "scheme": "http",
             "headers": headers,
@@ -784,6 +785,21 @@ async def test_a_path_is_plain(path: str) -> None:
     door = Door()
     assert (await door.request(path=path)).problem == "bad-path"
     assert not door.seen
+
+
+@swiftly
+async def test_a_slash_in_a_name_is_a_part_of_it() -> None:
+    door = Door()
+    for path, raw in (
+        (
+            "/api/v1/vehicles/system:1@serial:/dev//tty/../ttyS1/1/params",
+            b"/api/v1/vehicles/system%3A1%40x%2F%2Fy/1",
+        ),
+        ("/x/..", b"/x%2F.."),
+    ):
+        assert (await door.request(path=path, raw_path=raw)).status == 200
+    for raw in (b"/x/%2e%2E/y", b"/x/.%2e", b"/%2e/x", b"/x//y", b"x"):
+        assert (await door.request(path="/x/y", raw_path=raw)).problem == "bad-path"
 
 
 @pytest.mark.parametrize(

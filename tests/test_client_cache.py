@@ -502,6 +502,27 @@ async def test_a_change_of_ours_tells_who_asked_for_it(path: Path) -> None:
     assert (await session(vehicle, path)).source == "cache"
 
 
+@swiftly
+async def test_what_was_written_is_in_the_history_however_short_it_stood(path: Path) -> None:
+    vehicle = small_px4()
+    await session(vehicle, path)
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        before = (await component.get("PARAM_01")).value
+        async with anyio.create_task_group() as tasks:
+            for value, asker in ((100, "anna"), (101, "ben"), (before, "anna"), (100, None)):
+                tasks.start_soon(partial(component.set, "PARAM_01", value, asker=asker))
+        vehicle.set_param("PARAM_01", 7)
+        await component.get("PARAM_01")
+    with ParamCache(path) as cache:
+        lines = cache.component().history("PARAM_01")
+    authors = ["us for anna", "us for ben", "us for anna", "us", "vehicle"]
+    assert [(line.new and line.new.value, line.by) for line in lines] == [
+        *zip([100, 101, before, 100, 7], authors, strict=True)
+    ]
+    assert [line.old.value for line in lines] == [before, 100, 101, before, 100]
+
+
 @pytest.mark.parametrize("asker", ["", "x" * 129, "a\nb", "Änne", "\x7f"])
 @swiftly
 async def test_who_asks_is_told_in_printable_ascii(path: Path, asker: str) -> None:

@@ -48,6 +48,9 @@ from tests.shell import (
     swiftly,
     until,
 )
+from tests.ways import pytest_generate_tests, way
+
+__all__ = ["pytest_generate_tests", "way"]
 
 VOLATILE = {"CAL_ACC0_XOFF", "PARAM_03"}
 MISSES = (ParamRequestRead, ParamRequestList, ParamSet)
@@ -343,7 +346,7 @@ def kept(path: Path) -> dict[tuple[str, int], dict[str, object]]:
 @swiftly
 async def test_a_strangers_values_never_reach_the_other_ones_cache(path: Path, answers: bool) -> None:
     berth, camera = Berth(small_px4(uid=1)), Berth(generic(component=100))
-    async with ParamClient(Air([berth, camera]), cache=path) as client:
+    async with a_client(Air([berth, camera]), cache=path) as client:
         component = await client.component()
         await client.fetch_all()
         await asyncio.sleep(1.0)
@@ -397,7 +400,7 @@ async def test_cache_only_sends_nothing(path: Path) -> None:
     vehicle = small_px4()
     await learn(vehicle, path)
     tap = Tap(vehicle)
-    async with ParamClient(tap, cache=path, policy="cache-only") as client:
+    async with a_client(tap, cache=path, policy="cache-only") as client:
         component = await client.component()
         result = await component.fetch_all()
         assert (result.source, result.hash, result.complete) == ("cache", None, True)
@@ -417,7 +420,7 @@ async def test_cache_only_sends_nothing(path: Path) -> None:
 @swiftly
 async def test_cache_only_where_nothing_is_cached(path: Path) -> None:
     tap = Tap(Air([small_px4(), generic(component=100)]))
-    async with ParamClient(tap, cache=path, policy=Policy.CACHE_ONLY) as client:
+    async with a_client(tap, cache=path, policy=Policy.CACHE_ONLY) as client:
         component = await client.component()
         with pytest.raises(CacheError, match="1/1"):
             await component.fetch_all()
@@ -431,7 +434,7 @@ async def test_cache_only_where_nothing_is_cached(path: Path) -> None:
 async def test_one_that_is_not_cached_keeps_the_others_not_back(path: Path) -> None:
     vehicle = small_px4()
     await learn(vehicle, path)
-    async with ParamClient(Air([vehicle, generic(component=100)]), cache=path, policy="cache-only") as client:
+    async with a_client(Air([vehicle, generic(component=100)]), cache=path, policy="cache-only") as client:
         await client.component()
         everything = await client.fetch_all()
         assert everything.results.keys() == {(1, 1)}
@@ -443,7 +446,7 @@ async def test_hash_only_asks_for_the_hash_alone(path: Path) -> None:
     vehicle = small_px4()
     await learn(vehicle, path)
     tap = Tap(vehicle)
-    async with ParamClient(tap, cache=path, policy="hash-only") as client:
+    async with a_client(tap, cache=path, policy="hash-only") as client:
         component = await client.component()
         result = await component.fetch_all()
         assert (result.source, result.hash) == ("cache", vehicle.announced_hash())

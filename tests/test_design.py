@@ -159,11 +159,18 @@ def test_imports_are_absolute_and_point_one_way(module: str) -> None:
             assert not is_command(target), where
 
 
+CHOICES = {("paramclient.client", "paramclient.remote")}
+"""Who makes one of its own kind that knows it, while it runs: a client whose link is a service."""
+
+
 def test_no_module_imports_itself_through_others() -> None:
     """Modules that only name each other's types do not count."""
     graph = {
         module: {
-            target for target, each in own_imports_of(module) if not each.for_types_only and target != module
+            target
+            for target, each in own_imports_of(module)
+            if not each.for_types_only and target != module
+            if each.runs_at_import or (module, target) not in CHOICES
         }
         for module in MODULES
     }
@@ -182,6 +189,22 @@ def test_only_the_command_and_the_ports_of_windows_know_asyncio() -> None:
     loops = {"asyncio", "trio"}
     uses = {module for module in MODULES for each in imports_of(module) if each.top in loops}
     assert {module for module in uses if not is_command(module)} == {"paramclient.links.transport"}
+
+
+def test_only_the_remote_client_knows_httpx() -> None:
+    for module in MODULES:
+        if not module.startswith("paramclient.remote"):
+            assert "httpx" not in {each.top for each in imports_of(module)}, module
+
+
+def test_only_the_client_chooses_the_remote_one() -> None:
+    uses = {
+        module
+        for module in MODULES
+        for target, _ in own_imports_of(module)
+        if room_of(target).startswith("remote") and not room_of(module).startswith("remote")
+    }
+    assert uses == {"paramclient.client"}
 
 
 def test_only_the_wire_knows_pymavlink() -> None:
@@ -300,6 +323,7 @@ def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
     unwanted = ["rich", "cyclopts", "pydantic", "serialx", "yaml", "pymavlink.mavutil"]
     unwanted += ["paramclient.sim", "paramclient.testing", "paramclient.cli", "paramclient.provision"]
     unwanted += ["paramclient.documents", "paramclient.service", "fastapi", "starlette", "uvicorn", "httpx"]
+    unwanted += ["paramclient.remote"]
     program = f"import sys, paramclient; print([name for name in {unwanted!r} if name in sys.modules])"
     run = subprocess.run(
         [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60

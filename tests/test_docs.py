@@ -18,6 +18,7 @@ import paramclient
 import paramclient.links
 import paramclient.metadata
 import paramclient.provision
+import paramclient.remote
 import paramclient.sim
 import paramclient.testing
 
@@ -29,7 +30,7 @@ EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 DIRECTIVE = re.compile(r"^\.\. (\w+):: ([\w.]+)(?:\(\))?$", re.MULTILINE)
 COMMANDS = ["fetch", "get", "set", "watch", "link", "ports", "show", "diff", "save", "history", "sim"]
-COMMANDS += ["apply", "verify", "restore", "import", "serve"]
+COMMANDS += ["apply", "verify", "restore", "import", "serve", "token"]
 
 LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]*)?\)")
 
@@ -114,7 +115,7 @@ def test_every_page_is_in_the_table_of_contents() -> None:
     "module",
     [
         *(paramclient, paramclient.links, paramclient.metadata, paramclient.provision),
-        *(paramclient.sim, paramclient.testing),
+        *(paramclient.remote, paramclient.sim, paramclient.testing),
     ],
     ids=lambda m: m.__name__,
 )

@@ -282,7 +282,7 @@ def test_a_spec_tells_what_the_name_says() -> None:
         ("vehicle.params", "no kind of link"),
         ("/home/me/vehicle.params", "no kind of link"),
         ("./px4:1", "no kind of link"),
-        ("http://127.0.0.1:80", "'http' is no kind of link"),
+        ("http://127.0.0.1:80", "a service has links and is none"),
         ("mavlink:px4", "'mavlink' is no|is no port"),
         ("udpin:", "port is missing"),
         ("udpin:0.0.0.0", "port is missing"),

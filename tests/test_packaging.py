@@ -58,6 +58,7 @@ def test_the_wheel_has_the_package_and_nothing_else(wheel: dict[str, bytes]) -> 
     data = {"paramclient/py.typed", "paramclient/provision/cautions.toml"}
     assert shipped == SOURCES | TABLES | SERVED | data | {PLUGIN}
     assert len(TABLES) >= 3
+    assert "paramclient/service/page/index.html" in SERVED
 
 
 def test_the_wheel_has_the_licence(wheel: dict[str, bytes], metadata: Message) -> None:

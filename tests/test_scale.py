@@ -25,6 +25,7 @@ from paramclient.protocol.station import Station
 from paramclient.protocol.wire import MAV_AUTOPILOT_PX4, Heartbeat
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, SimParam, Vehicle
 from paramclient.values import ParamType
+from paramclient.writethrough import DOWNLOAD_INTERVAL, LEAST_NEW
 from tests.shell import Tap, swiftly
 
 MANY = 250
@@ -433,3 +434,27 @@ async def test_who_is_not_heard_at_all_for_a_while_is_waited_for() -> None:
         everything = await client.fetch_all()
         assert everything.complete
         assert everything.results.keys() == {(1, 1), (2, 1), (3, 1)}
+
+
+@pytest.mark.parametrize("seconds", [5, 40])
+@swiftly
+async def test_tables_that_are_fetched_in_numbers_are_written_once_or_in_growing_parts(
+    tmp_path: Path, seconds: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each part costs as much as all of the table: so half of it must be new."""
+    monkeypatch.setattr(writethrough, "FEW_FETCHES", 0)
+    vehicles: list[Vehicle] = []
+    for system in range(1, 13):
+        table = [SimParam(f"P_{index:03}", ParamType.INT32, index) for index in range(200)]
+        vehicles.append(PX4Vehicle(system=system, table=table, burst=1, period=seconds / 200))
+    cache = Portions(tmp_path / "cache.sqlite3")
+    with cache:
+        async with ParamClient(Air.symmetric(vehicles), cache=cache) as client:
+            assert (await client.fetch_all()).complete
+    for system in range(1, 13):
+        sizes = [each[system] for each in cache.given if each.get(system)]
+        assert sizes[-1] == 200, "all of it, when it was fetched"
+        parts = sizes[:-1]
+        assert bool(parts) == (seconds > DOWNLOAD_INTERVAL)
+        for number, part in enumerate(parts):
+            assert part >= LEAST_NEW * sum(parts[: number + 1])

@@ -7,6 +7,7 @@ import json
 import re
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -21,12 +22,14 @@ from paramclient.files import FileForm, dumps, loads
 from paramclient.links import SimLink
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.protocol import wire
-from paramclient.service import Hub, create_app
+from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
 from paramclient.service.hub import MOST_READINGS
+from paramclient.service.routes.files import attachment
+from paramclient.service.wanted import LARGEST_UPLOAD
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.sim.vehicle import Vehicle
 from paramclient.values import ParamType
-from tests.asgi import ASGITransport, a_browser
+from tests.asgi import a_browser
 from tests.caches import NOW, PX4, stored
 from tests.published import Published
 from tests.shell import Tap, swiftly, until
@@ -52,6 +55,7 @@ def ardupilot(**options: Any) -> ArduPilotVehicle:
     return ArduPilotVehicle(**{"table": rows, "groups": {}, "live": ()} | options)
 
 
+A_FILE = {"content-type": "application/octet-stream"}
 BOTH = pytest.mark.parametrize("vehicle", [px4, ardupilot])
 
 
@@ -64,6 +68,8 @@ class Checked:
 
     async def ask(self, method: str, path: str, status: int = 200, **options: Any) -> Any:
         """What is answered, as JSON; the status must be this one."""
+        if "content" in options:
+            options["headers"] = A_FILE
         answer = await self.client.request(method, path, **options)
         assert answer.status_code == status, answer.text
         assert answer.headers["content-type"] in ("application/json", "application/problem+json")
@@ -435,6 +441,18 @@ async def test_a_table_comes_as_a_file_of_every_form_and_goes_back(vehicle: Call
 
 
 @swiftly
+async def test_the_name_of_a_file_is_safe_whoever_the_vehicle_is() -> None:
+    whose = replace(PX4, autopilot=200, system=9)
+    params = ParamSet(
+        {"A": WrittenParam("A", 1, ParamType.INT32)}, system=9, component=1, identity=whose, at=NOW
+    )
+    async with Hub([], cache=False) as hub:
+        answer = await attachment(hub, params, FileForm.QGC)
+    name = "autopilot_200-9-1-20261118-110640.params"
+    assert answer.headers["content-disposition"] == f'attachment; filename="{name}"'
+
+
+@swiftly
 async def test_an_earlier_state_comes_as_a_file_too(tmp_path: Path) -> None:
     async with serving(px4(), place=tmp_path) as service:
         kept = await service.ask("POST", f"{HERE}/snapshots", 201, json={"reason": "as it came"})
@@ -488,7 +506,11 @@ async def test_a_file_is_read_and_its_faults_are_told_by_line() -> None:
         assert (await upload(b"", 422))["error"] == "FileError"
         assert (await upload(b"{" * 100_000, 422, form="json"))["error"] == "FileError"
         assert (await upload(b"- " * 50_000, 422, form="yaml"))["error"] == "FileError"
-        assert (await upload(b"\0" * 17_000_000, 413))["type"] == "urn:paramclient:too-large"
+        assert (await upload(b"A,1\n" * (LARGEST_UPLOAD // 4 + 1), 413))[
+            "type"
+        ] == "urn:paramclient:too-large"
+        large = {"file": {"name": "a.param", "text": "A,1\n" * (LARGEST_UPLOAD // 4 + 1)}}
+        assert (await service.post(f"{HERE}/plan", {"wanted": large}, 413))["most"] == LARGEST_UPLOAD
         several = dumps(
             [
                 ParamSet({"A": WrittenParam("A", 1, ParamType.INT32)}, component=each, system=1)
@@ -506,7 +528,7 @@ async def test_files_are_read_one_after_the_other_and_not_without_end() -> None:
         answers = []
 
         async def upload() -> None:
-            answer = await service.client.post("/api/v1/files?name=a.param", content=b"A,1\n")
+            answer = await service.client.post("/api/v1/files?name=a.param", content=b"A,1\n", headers=A_FILE)
             answers.append(answer.status_code)
 
         async with anyio.create_task_group() as tasks:
@@ -663,11 +685,13 @@ async def test_who_may_only_read_changes_nothing(tmp_path: Path) -> None:
     on_board = px4()
     async with Hub([on_board], cache=False) as hub:
         await until(lambda: hub.followed, pause=0.1)
-        transport = ASGITransport(create_app(hub), state={"role": "read", "asker": "guest"})
-        async with httpx.AsyncClient(transport=transport, base_url="http://127.0.0.1:8765") as client:
+        tokens = Tokens.of_text("guest read guest-may-read-only-0123")
+        app = create_app(hub, Settings(access=AccessSettings(tokens=tokens)))
+        async with a_browser(app) as client:
+            client.headers["authorization"] = "Bearer guest-may-read-only-0123"
             body = {"wanted": {"values": {"MODE": 4}}}
             for path in ("apply", "restore", "snapshots"):
                 assert (await client.post(f"{HERE}/{path}", json=body)).status_code == 403
-            assert (await client.put(f"{HERE}/metadata", content=b"{}")).status_code == 403
+            assert (await client.put(f"{HERE}/metadata", json={})).status_code == 403
             assert (await client.post(f"{HERE}/plan", json=body)).status_code == 200
     assert on_board.values["MODE"] == 3

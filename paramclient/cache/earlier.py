@@ -64,10 +64,14 @@ def write_births(connection: sqlite3.Connection, owner: int, births: Iterable[tu
 
     Before the table was first complete this is not needed, and not done.
     """
+    [(is_needed,)] = connection.execute(
+        "SELECT known_since IS NOT NULL FROM component WHERE id = ?", (owner,)
+    )
+    if not is_needed:
+        return
     connection.executemany(
         "INSERT INTO birth (owner, name, line, at)"
-        " SELECT id, ?2, ifnull((SELECT max(id) FROM history WHERE owner = ?1), 0), ?3 FROM component"
-        " WHERE id = ?1 AND known_since IS NOT NULL",
+        " VALUES (?1, ?2, ifnull((SELECT max(id) FROM history WHERE owner = ?1), 0), ?3)",
         [(owner, name, at) for name, at in births],
     )
 

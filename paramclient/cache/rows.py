@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, replace
+from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
 from paramclient.cache.database import Damaged
@@ -19,6 +20,7 @@ __all__ = [
     "identity_cells",
     "read_identity",
     "read_param",
+    "read_rows",
     "time_cell",
 ]
 
@@ -32,6 +34,10 @@ _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "S": (str, type(None)),
 }
 _MASK_64: Final = (1 << 64) - 1
+_TIMES: Final[dict[tuple[object, ...], tuple[int, ...]]] = {}
+"""Where rows of a shape hold times: by the kinds and the types of cells that were found to be right."""
+_name: Final = itemgetter(0)
+_new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
 
 
 def cells(row: Sequence[object], kinds: str) -> Any:
@@ -40,9 +46,13 @@ def cells(row: Sequence[object], kinds: str) -> Any:
     Args:
         kinds: a letter for each cell: i integer, f time, s text; in capitals where NULL is possible.
     """
-    for cell, kind in zip(row, kinds, strict=True):
-        if not isinstance(cell, _KINDS[kind]) or (isinstance(cell, float) and not 0 <= cell < _YEAR_10000):
-            raise Damaged(f"a cell holds {cell!r:.40}")
+    shape = (kinds, *map(type, row))
+    times = _TIMES.get(shape)
+    if times is None:  # a row like none before; those of a table are all like a few
+        times = _TIMES[shape] = _times(row, kinds)
+    for place in times:
+        if not 0 <= row[place] < _YEAR_10000:  # type: ignore[operator]  # the shape says that it is a float
+            raise Damaged(f"a cell holds {row[place]!r:.40}")
     return row
 
 
@@ -79,10 +89,21 @@ class Row(NamedTuple):
     @classmethod
     def of(cls, param: Param, index: int | None, volatile: bool, heard_at: float) -> Row:
         """The cells of a parameter."""
-        bits = _signed(param.bits)
         number = int(param.type)
+        bits = param.bits
         default = None if param.default is None else _signed(bits_of(param.default, number))
-        return cls(number, bits, int(param.is_raw), index, int(volatile), time_cell(heard_at), default)
+        return _new(
+            cls,
+            (
+                number,
+                bits - (1 << 64) if bits >> 63 else bits,
+                int(isinstance(param.value, bytes)),
+                index,
+                int(volatile),
+                time_cell(heard_at),
+                default,
+            ),
+        )
 
     @property
     def value(self) -> tuple[int, int, int]:
@@ -101,13 +122,21 @@ class Row(NamedTuple):
         )
 
 
+def read_rows(found: Iterable[Sequence[object]]) -> dict[str, Row]:
+    """The rows of a table by name, of cells in this order: name, then as in `Row`."""
+    return {row[0]: _new(Row, row[1:]) for row in (cells(each, "siiiIifI") for each in found)}
+
+
 def checksum(rows: Mapping[str, Row]) -> int:
     """A CRC-32 of all that is kept of a table's parameters, whatever their order.
 
     A row without a default counts as it did before there were any.
     """
-    kept = ((name, *(row[:-1] if row.default_bits is None else row)) for name, row in rows.items())
-    return zlib.crc32(repr(sorted(kept)).encode())
+    kept = [
+        (name, *(row[:-1] if row.default_bits is None else row))
+        for name, row in sorted(rows.items(), key=_name)
+    ]
+    return zlib.crc32(repr(kept).encode())
 
 
 def read_param(
@@ -124,6 +153,14 @@ def read_param(
     if not 0 <= number <= 255:
         raise Damaged(f"{number} is not a type")
     return Param(name, value, known_type(number), index, bits & _MASK_64, Trust.CACHED, default)
+
+
+def _times(row: Sequence[object], kinds: str) -> tuple[int, ...]:
+    """Where a row holds times; `Damaged` where a cell is not of its kind."""
+    for cell, kind in zip(row, kinds, strict=True):
+        if not isinstance(cell, _KINDS[kind]):
+            raise Damaged(f"a cell holds {cell!r:.40}")
+    return tuple(place for place, cell in enumerate(row) if isinstance(cell, float))
 
 
 def _value(number: int, bits: int, is_raw: bool) -> Value:

@@ -65,7 +65,7 @@ async def diff(
     sides = _Sides(ours, theirs, before, options, chosen)
     shown = [entry for entry in outcome.entries if everything or entry.is_news]
     if options.json:
-        from paramclient.documents import DiffDoc  # only here: loads pydantic
+        from paramclient.documents.diff import DiffDoc  # only here: loads pydantic
 
         print_document(DiffDoc.of(outcome, sides.left, sides.right, sides.base, everything=everything))
     else:

@@ -39,7 +39,7 @@ def fleet_diff(
     with ParamCache(options.cache) as cache:
         found = cache.fleet_diff(chosen, component=component)
     if options.json:
-        from paramclient.documents import FleetDiffDoc  # only here: loads pydantic
+        from paramclient.documents.fleet import FleetDiffDoc  # only here: loads pydantic
 
         print_document(FleetDiffDoc.of(found))
     else:

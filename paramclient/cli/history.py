@@ -64,7 +64,7 @@ def history(
 
 def _print_entries(entries: Sequence[HistoryEntry], options: CacheOptions) -> None:
     if options.json:
-        from paramclient.documents import HistoryDoc  # only here: loads pydantic
+        from paramclient.documents.past import HistoryDoc  # only here: loads pydantic
 
         print_document(HistoryDoc.of(entries))
     else:
@@ -73,7 +73,7 @@ def _print_entries(entries: Sequence[HistoryEntry], options: CacheOptions) -> No
 
 def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> None:
     if options.json:
-        from paramclient.documents import SnapshotsDoc  # only here: loads pydantic
+        from paramclient.documents.past import SnapshotsDoc  # only here: loads pydantic
 
         print_document(SnapshotsDoc.of(kept))
         return

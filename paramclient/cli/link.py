@@ -5,24 +5,22 @@ from __future__ import annotations
 import sys
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import suppress
-from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import anyio
 from cyclopts import Parameter
 
 from paramclient.cli.options import Seconds, SigningOptions
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import live_view, milliseconds, print_json, print_line, print_table
+from paramclient.cli.output import live_view, milliseconds, print_document, print_line, print_table
 from paramclient.cli.session import Deadline, listen
 from paramclient.client import ParamClient
 from paramclient.component import Component
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.identity import autopilot_name
-from paramclient.notation import rounded
 from paramclient.protocol.traffic import ComponentTraffic, TrafficReport
-from paramclient.protocol.wire import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, SigningReport, enum_word
+from paramclient.protocol.wire import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, enum_word
 
 __all__ = ["link"]
 
@@ -72,7 +70,10 @@ async def link(
         noise = f" (but {report.bytes_received:,} other bytes)" if report.bytes_received else ""
         raise NoReply(f"anything on {client.link.name}{noise}", attempts=0, waited=report.seconds)
     if json:
-        print_json(_as_json(client, report))
+        from paramclient.documents.traffic import TrafficDoc  # only here: loads pydantic
+
+        trips = {(each.system, each.component): _round_trip(client, each) for each in report.components}
+        print_document(TrafficDoc.of(client.link.name, report, client.signing_report(), trips))
     elif not is_live:
         print_table(_COLUMNS, _rows(client, report), right=" ".join(_COLUMNS[2:]))
         for line in _lines(client, report):
@@ -208,73 +209,6 @@ def _type(number: int) -> str:
 
 def _state(number: int) -> str:
     return enum_word("MAV_STATE", number)
-
-
-# for programs
-
-
-def _as_json(client: ParamClient, report: TrafficReport) -> dict[str, Any]:
-    return {
-        "link": client.link.name,
-        "seconds": round(report.seconds, 3),
-        "bytes_received": report.bytes_received,
-        "bytes_sent": report.bytes_sent,
-        "received_per_s": round(report.received_rate, 1),
-        "sent_per_s": round(report.sent_rate, 1),
-        "frames": report.frames,
-        "unknown": report.unknown,
-        "damaged": report.damaged,
-        "other_bytes": report.other_bytes,
-        "signing": _signing_json(client.signing_report()),
-        "components": [_component_json(client, each) for each in report.components],
-    }
-
-
-def _signing_json(report: SigningReport | None) -> dict[str, Any] | None:
-    if report is None:
-        return None
-    return {
-        "fingerprint": report.fingerprint,
-        "policy": report.policy,
-        "link_id": report.link_id,
-        "signed": report.signed,
-        "unsigned": report.unsigned,
-        "unproven": dict(report.unproven),
-        "refused": dict(report.refused),
-    }
-
-
-def _component_json(client: ParamClient, each: ComponentTraffic) -> dict[str, Any]:
-    beat = each.heartbeat
-    return {
-        "system": each.system,
-        "component": each.component,
-        "mavlink": each.version,
-        "autopilot": None if beat is None else autopilot_name(beat.autopilot),
-        "type": None if beat is None else _type(beat.type),
-        "state": None if beat is None else _state(beat.system_status),
-        "heartbeat_age_s": rounded(each.heartbeat_age),
-        "age_s": rounded(each.age),
-        "frames": each.frames,
-        "bytes": each.bytes,
-        "frames_per_s": round(each.frame_rate, 2),
-        "bytes_per_s": round(each.byte_rate, 1),
-        "lost": each.lost,
-        "loss": None if each.loss is None else round(each.loss, 4),
-        "repeated": each.repeated,
-        "late": each.late,
-        "signed": each.signed,
-        "round_trip_s": rounded(_round_trip(client, each)),
-        "messages": {
-            message.name: {
-                "id": message.message_id,
-                "count": message.count,
-                "per_s": round(message.rate, 2),
-            }
-            for message in each.messages
-        },
-        "radio": None if each.radio is None else asdict(each.radio),
-    }
 
 
 def _round_trip(client: ParamClient, each: ComponentTraffic) -> float | None:

@@ -6,14 +6,14 @@ import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import anyio
 
 from paramclient.cache import ParamCache
 from paramclient.cli.options import CacheOptions
 from paramclient.cli.outcome import ExitCode, code_of
-from paramclient.cli.output import print_json, print_table, report
+from paramclient.cli.output import print_document, print_table, report
 from paramclient.errors import ParamClientError
 from paramclient.identity import autopilot_name
 from paramclient.links import LinkKind, parse_link
@@ -49,7 +49,9 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
             if not tables:
                 report(f"{each} holds no parameters")
     if options.json:
-        print_json({"tables": [_as_json(*each) for each in found]})
+        from paramclient.documents.command import ImportDoc, ImportedDoc  # only here: loads pydantic
+
+        print_document(ImportDoc(tables=[ImportedDoc.of(str(log), table) for log, table in found]))
     elif found:
         columns = ["file", "component", "autopilot", "params", "complete", "hash", "key"]
         print_table(columns, (_cells(*each) for each in found), right="params")
@@ -72,19 +74,6 @@ def cache_of_log(url: str) -> Iterator[ParamCache]:
     ):
         anyio.run(import_log, spec.host, cache)
         yield cache
-
-
-def _as_json(file: Path, table: ImportedTable) -> dict[str, Any]:
-    return {
-        "file": str(file),
-        "key": table.key,
-        "system": table.system,
-        "component": table.component,
-        "autopilot": _autopilot(table),
-        "params": table.params,
-        "complete": table.complete,
-        "hash": hash_text(table.hash),
-    }
 
 
 def _cells(file: Path, table: ImportedTable) -> tuple[object, ...]:

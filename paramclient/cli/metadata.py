@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Final, TypeAlias
+from typing import Annotated, Final, TypeAlias
 
 import anyio
 import anyio.to_thread
@@ -37,7 +37,6 @@ __all__ = [
     "problems",
     "resolved",
     "units_of",
-    "written_json",
 ]
 
 MetadataChoice: TypeAlias = Annotated[str | None, Parameter(name="--metadata")]
@@ -200,14 +199,6 @@ def units_of(metadata: Metadata | None, name: str) -> str:
     """The units of a parameter, or "" where there are none or they are not known."""
     info = info_of(metadata, name)
     return "" if info is None else info.units
-
-
-def written_json(name: str, actual: Value | None, metadata: Metadata | None) -> dict[str, Any]:
-    """What a described parameter that was written has more in JSON."""
-    info = info_of(metadata, name)
-    text = None if info is None or actual is None else info.text(actual)
-    late = {"reboot_required": True} if needs_reboot(name, metadata) else {}
-    return ({"text": text} if text else {}) | late
 
 
 def needs_reboot(name: str, metadata: Metadata | None) -> bool:

@@ -38,7 +38,7 @@ from paramclient.taken import NO_DEFAULTS
 from paramclient.values import Param, check_name, format_value, type_name
 
 if TYPE_CHECKING:
-    from paramclient.documents import CachedTableDoc
+    from paramclient.documents.cached import CachedTableDoc
 
 __all__ = ["cache_list", "cache_path", "cache_remove", "show", "tables_of"]
 
@@ -81,7 +81,7 @@ def show(
     if unknown := [name for name in wanted if not any(name in table.params for table in tables)]:
         raise CacheError(f"not among the cached parameters: {', '.join(unknown)}")
     if options.json:
-        from paramclient.documents import CachedTablesDoc  # only here: loads pydantic
+        from paramclient.documents.cached import CachedTablesDoc  # only here: loads pydantic
 
         print_document(CachedTablesDoc(components=[view.document() for view in views]))
     elif is_list:
@@ -102,7 +102,7 @@ def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     with _open(options) as cache:
         summaries = cache.components()
     if options.json:
-        from paramclient.documents import CachedListDoc, CachedSummaryDoc  # only here: loads pydantic
+        from paramclient.documents.cached import CachedListDoc, CachedSummaryDoc  # only here: loads pydantic
 
         told = [CachedSummaryDoc.of(each) for each in summaries]
         print_document(CachedListDoc(path=str(cache.path), components=told))
@@ -118,7 +118,7 @@ def cache_path(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     with _open(options) as cache:
         path = str(cache.path)
     if options.json:
-        from paramclient.documents import PlaceDoc  # only here: loads pydantic
+        from paramclient.documents.cached import PlaceDoc  # only here: loads pydantic
 
         print_document(PlaceDoc(path=path))
     else:
@@ -138,7 +138,7 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
         key = vehicle_key(cache, vehicle)
         removed = cache.remove(key, component)
     if options.json:
-        from paramclient.documents import RemovedDoc  # only here: loads pydantic
+        from paramclient.documents.cached import RemovedDoc  # only here: loads pydantic
 
         print_document(RemovedDoc(key=key, removed=removed))
     else:
@@ -219,7 +219,7 @@ class _View:
 
     def document(self) -> CachedTableDoc:
         """The same for programs."""
-        from paramclient.documents import CachedTableDoc  # only here: loads pydantic
+        from paramclient.documents.cached import CachedTableDoc  # only here: loads pydantic
 
         return CachedTableDoc.of(self.table, self.params, self.metadata, whole=bool(self.names))
 

@@ -11,27 +11,23 @@ import sys
 from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
-from paramclient.notation import bits_text, value_json
 from paramclient.protocol.result import Progress
-from paramclient.values import Param, format_value, type_name
+from paramclient.values import Param, format_value
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from paramclient.documents import Document
+    from paramclient.documents.base import Document
 
 __all__ = [
     "Coloured",
-    "as_json",
     "by_index",
     "default_text",
     "live_view",
     "milliseconds",
-    "param_json",
     "print_document",
-    "print_json",
     "print_line",
     "print_table",
     "printable",
@@ -84,30 +80,9 @@ def by_index(params: Iterable[Param]) -> list[Param]:
 # for programs
 
 
-def param_json(param: Param) -> dict[str, Any]:
-    """One parameter; its name is the key under which it stands."""
-    return {
-        "value": value_json(param.value, param.type),
-        "type": type_name(param.type),
-        "index": param.index,
-        "bits": bits_text(param),
-        **({} if param.default is None else {"default": value_json(param.default, param.type)}),
-    }
-
-
-def as_json(params: Iterable[Param]) -> dict[str, dict[str, Any]]:
-    """Parameters by name."""
-    return {param.name: param_json(param) for param in params}
-
-
-def print_json(result: object) -> None:
-    """Print one object on one line, at once."""
-    print(json.dumps(result, allow_nan=False), flush=True)
-
-
 def print_document(document: Document) -> None:
     """Print a document of `paramclient.documents` on one line, at once."""
-    print_json(document.as_json())
+    print(json.dumps(document.as_json(), allow_nan=False), flush=True)
 
 
 # for people

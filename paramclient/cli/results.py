@@ -21,7 +21,7 @@ from paramclient.provision import (
 from paramclient.values import Value, format_value
 
 if TYPE_CHECKING:
-    from paramclient.documents import ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc
+    from paramclient.documents.setup import ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc
 
 __all__ = [
     "Vehicle",
@@ -104,14 +104,14 @@ def applied_code(result: ApplyResult) -> ExitCode:
 
 def applied_doc(vehicle: Vehicle, result: ApplyResult, *, full: bool) -> ApplyResultDoc:
     """The result for one vehicle, for programs; values that it had already only on demand."""
-    from paramclient.documents import ApplyResultDoc  # only here: loads pydantic
+    from paramclient.documents.setup import ApplyResultDoc  # only here: loads pydantic
 
     return ApplyResultDoc.of(result, system=vehicle.system, component=vehicle.component, full=full)
 
 
 def interrupted_doc(vehicle: Vehicle, rows: Iterable[ApplyRow]) -> InterruptedDoc:
     """The same for what was ended by somebody."""
-    from paramclient.documents import InterruptedDoc  # only here: loads pydantic
+    from paramclient.documents.setup import InterruptedDoc  # only here: loads pydantic
 
     return InterruptedDoc.of(rows, system=vehicle.system, component=vehicle.component)
 
@@ -156,7 +156,7 @@ def planned_code(plan: Plan, *, skip_invalid: bool) -> ExitCode:
 
 def planned_doc(vehicle: Vehicle, plan: Plan, *, full: bool) -> PlanDoc:
     """The plan for one vehicle, for programs."""
-    from paramclient.documents import PlanDoc  # only here: loads pydantic
+    from paramclient.documents.setup import PlanDoc  # only here: loads pydantic
 
     return PlanDoc.of(plan, system=vehicle.system, component=vehicle.component, full=full)
 
@@ -218,7 +218,7 @@ def met_code(plan: Plan) -> ExitCode:
 
 def verified_doc(vehicle: Vehicle, plan: Plan, *, full: bool) -> VerifiedDoc:
     """How one vehicle compares, for programs."""
-    from paramclient.documents import VerifiedDoc  # only here: loads pydantic
+    from paramclient.documents.setup import VerifiedDoc  # only here: loads pydantic
 
     return VerifiedDoc.of(plan, system=vehicle.system, component=vehicle.component, full=full)
 

@@ -13,7 +13,7 @@ from cyclopts import Parameter
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import print_json, printable, progress_bar, report, say
+from paramclient.cli.output import print_document, printable, progress_bar, report, say
 from paramclient.cli.session import Session, connect
 from paramclient.cli.sources import check_link, confirmed, names_vehicle
 from paramclient.component import Component
@@ -156,10 +156,9 @@ def _add(sets: list[ParamSet], whole: ParamSet, params: Iterable[Param], *, chan
 
 def _tell(file: Path, form: FileForm, sets: Sequence[ParamSet], *, as_json: bool) -> None:
     if as_json:
-        components = [
-            {"system": each.system, "component": each.component, "params": len(each)} for each in sets
-        ]
-        print_json({"path": str(file), "form": form, "components": components})
+        from paramclient.documents.command import SavedDoc  # only here: loads pydantic
+
+        print_document(SavedDoc.of(str(file), form, sets))
         return
     held = ", ".join(
         f"{len(each)} parameter{'' if len(each) == 1 else 's'} of {address(each)}" for each in sets

@@ -14,7 +14,9 @@ import anyio
 from paramclient.cli.options import LinkOptions
 from paramclient.client import ParamClient
 from paramclient.component import Component
+from paramclient.errors import UsageError
 from paramclient.links import LinkKind, ReplayLink, parse_link
+from paramclient.links.names import names_service
 from paramclient.protocol.result import Policy
 from paramclient.signing import Signing
 
@@ -80,7 +82,7 @@ async def connect(
     deadline = Deadline(options.timeout)
     async with ParamClient(
         url if is_live else _at_once(url),
-        cache=options.place,
+        cache=None if options.place is True else options.place,
         encoding=options.encoding,
         policy=policy,
         listen_only=options.listen_only,
@@ -96,7 +98,13 @@ async def connect(
 def listen(
     url: str, signing: Signing | None = None, *, listen_only: bool = False, tlog: Path | None = None
 ) -> ParamClient:
-    """A client that counts everything it hears, and neither reads nor writes a cache."""
+    """A client that counts everything it hears, and neither reads nor writes a cache.
+
+    Raises:
+        UsageError: no such link, or a service in its place.
+    """
+    if names_service(url):
+        raise UsageError("a service does not give the traffic of its links; ask where such a link is")
     return ParamClient(url, cache=False, traffic=True, signing=signing, listen_only=listen_only, tlog=tlog)
 
 

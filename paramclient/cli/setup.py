@@ -60,7 +60,7 @@ from paramclient.provision.looking import identified
 from paramclient.taken import before_last_apply
 
 if TYPE_CHECKING:
-    from paramclient.documents import SetUpDoc
+    from paramclient.documents.setup import SetUpDoc
 
 __all__ = ["apply", "restore", "verify"]
 
@@ -455,7 +455,7 @@ class _Show:
         if not self._is_fleet:
             print_document(told[0])
             return
-        from paramclient.documents import FleetSetupDoc  # only here: loads pydantic
+        from paramclient.documents.setup import FleetSetupDoc  # only here: loads pydantic
 
         failed = {(vehicle.system, vehicle.component): error for vehicle, error in (errors or {}).items()}
         print_document(FleetSetupDoc.of(told, failed))

@@ -13,7 +13,7 @@ from cyclopts import Parameter
 
 from paramclient.cli.options import Id, KeyOptions, Seconds
 from paramclient.cli.outcome import ExitCode
-from paramclient.cli.output import print_json, print_line, printable
+from paramclient.cli.output import print_document, print_line, printable
 from paramclient.cli.session import HEARING_PATIENCE, Deadline
 from paramclient.client import ParamClient
 from paramclient.component import Component
@@ -176,14 +176,16 @@ def _refused(address: tuple[int, int], what: str) -> VehicleError:
 
 def _tell(options: VehicleOptions, vehicle: Component, key: SigningKey | None) -> None:
     if options.json:
-        print_json(
-            {
-                "system": vehicle.system,
-                "component": vehicle.component,
-                "autopilot": vehicle.autopilot,
-                "signs": key is not None,
-                "fingerprint": None if key is None else key.fingerprint,
-            }
+        from paramclient.documents.command import SignsDoc  # only here: loads pydantic
+
+        print_document(
+            SignsDoc(
+                system=vehicle.system,
+                component=vehicle.component,
+                autopilot=vehicle.autopilot,
+                signs=key is not None,
+                fingerprint=None if key is None else key.fingerprint,
+            )
         )
         return
     who = f"{vehicle.system}/{vehicle.component} {vehicle.autopilot}"

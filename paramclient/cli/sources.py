@@ -29,6 +29,7 @@ from paramclient.errors import CacheError, UsageError
 from paramclient.files import ParamFile, read_file
 from paramclient.files.model import AUTOPILOT
 from paramclient.links import FORMS, parse_link
+from paramclient.links.names import names_service
 from paramclient.paramset import ParamSet
 from paramclient.protocol.result import FetchResult
 from paramclient.taken import Taken, cached_set, incomplete, taken
@@ -129,7 +130,8 @@ def check_link(text: str) -> None:
         UsageError: it does not; the text says what there is.
     """
     try:
-        parse_link(text)
+        if not names_service(text):
+            parse_link(text)
     except UsageError as error:
         problem = str(error).splitlines()[0]
         raise UsageError(

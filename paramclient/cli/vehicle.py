@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import AsyncGenerator, Iterable, Sequence
 from contextlib import aclosing, suppress
 from dataclasses import dataclass, replace
-from typing import Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal
 
 import anyio
 from cyclopts import Parameter
@@ -17,22 +17,20 @@ from paramclient.cli.metadata import (
     MetadataChoice,
     described_cells,
     from_file,
+    info_of,
     known_of_session,
     needs_reboot,
     parse_pairs,
     problems,
     resolved,
-    written_json,
 )
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.outcome import ExitCode, code_of, status_of
 from paramclient.cli.output import (
-    as_json,
     by_index,
     default_text,
     milliseconds,
     print_document,
-    print_json,
     print_line,
     print_table,
     printable,
@@ -44,12 +42,16 @@ from paramclient.cli.session import Session, connect
 from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError, ValueNotApplied
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
 from paramclient.metadata import Metadata
-from paramclient.notation import hash_text, rounded, time_text, value_json
+from paramclient.notation import hash_text, time_text
 from paramclient.protocol.result import FetchResult, Policy
 from paramclient.protocol.sampling import SAMPLE_SIZE, Sample
 from paramclient.protocol.table import Change
 from paramclient.taken import NO_DEFAULTS
 from paramclient.values import Param, ParamType, Trust, Value, check_name, format_value, type_name
+
+if TYPE_CHECKING:
+    from paramclient.documents.base import Document
+    from paramclient.documents.command import FetchedDoc, SetDoneDoc
 
 __all__ = ["fetch", "get", "set_", "watch"]
 
@@ -100,7 +102,7 @@ async def fetch(
     if result.sample is not None:
         report(_confidence(result.sample))
     if options.json:
-        print_json(fetched.as_json())
+        print_document(fetched.document())
     else:
         if not changed:
             rows = ((*_cells(param), param.trust) for param in fetched.params)
@@ -141,7 +143,7 @@ async def get(
         if described is None:
             described = await known_of_session(session, metadata)
     if options.json:
-        from paramclient.documents import GotDoc  # only here: loads pydantic
+        from paramclient.documents.param import GotDoc  # only here: loads pydantic
 
         print_document(GotDoc.of(params, described, errors))
     elif params and described is None:
@@ -190,7 +192,9 @@ async def set_(
             f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent"
         )
     if options.json:
-        print_json({"results": [outcome.as_json(described) for outcome in outcomes]})
+        from paramclient.documents.command import SetsDoneDoc  # only here: loads pydantic
+
+        print_document(SetsDoneDoc(results=[outcome.document(described) for outcome in outcomes]))
     else:
         print_table(
             ["name", "requested", "actual", "status"],
@@ -299,28 +303,19 @@ class _Fetched:
             f"{self.bytes_sent:,} sent{crc}"
         )
 
-    def as_json(self) -> dict[str, Any]:
-        component = self.session.component
-        return {
-            "system": component.system,
-            "component": component.component,
-            "autopilot": component.autopilot,
-            "uid": component.identity.uid,
-            "count": self.result.count,
-            "received": self.received,
-            "source": self.result.source,
-            "hash": hash_text(self.result.hash),
-            "missing": self.missing,
-            "cached": self.cached,
-            "sample": None if self.result.sample is None else _sample_json(self.result.sample),
-            "lost": self.result.lost,
-            "repeated": self.result.repeated,
-            "round_trip_s": rounded(self.result.round_trip),
-            "elapsed_s": rounded(self.result.elapsed),
-            "bytes_received": self.bytes_received,
-            "bytes_sent": self.bytes_sent,
-            "params": as_json(self.params),
-        }
+    def document(self) -> FetchedDoc:
+        """The same for programs."""
+        from paramclient.documents.command import FetchedDoc  # only here: loads pydantic
+
+        return FetchedDoc.of(
+            self.session.component,
+            self.result,
+            self.params,
+            missing=self.missing,
+            cached=self.cached,
+            bytes_received=self.bytes_received,
+            bytes_sent=self.bytes_sent,
+        )
 
 
 async def _fetch_all(
@@ -343,11 +338,6 @@ def _confidence(sample: Sample) -> str:
         f"{sample.size} of {sample.count} parameters were read and agreed. If others had changed, the chance "
         f"to see it so is {chances} of them."
     )
-
-
-def _sample_json(sample: Sample) -> dict[str, Any]:
-    chances = {str(each): round(sample.confidence(each), 4) for each in _SUPPOSED}
-    return {"size": sample.size, "count": sample.count, "confidence": chances}
 
 
 def _named(indices: Sequence[int]) -> str:
@@ -411,16 +401,19 @@ class _Written:
     reason: str = ""
     code: ExitCode = ExitCode.DONE
 
-    def as_json(self, metadata: Metadata | None) -> dict[str, Any]:
-        actual = None if self.actual is None else value_json(self.actual, self.type)
-        return {
-            "name": self.name,
-            "requested": value_json(self.requested, ParamType.REAL64),
-            "actual": actual,
-            "status": self.status,
-            **({"reason": self.reason} if self.reason else {}),
-            **written_json(self.name, self.actual, metadata),
-        }
+    def document(self, metadata: Metadata | None) -> SetDoneDoc:
+        """The same for programs."""
+        from paramclient.documents.command import SetDoneDoc  # only here: loads pydantic
+
+        return SetDoneDoc.of(
+            self.name,
+            self.type,
+            self.requested,
+            self.actual,
+            status=self.status,
+            reason=self.reason,
+            info=info_of(metadata, self.name),
+        )
 
     def cells(self) -> tuple[object, ...]:
         actual = None if self.actual is None else format_value(self.actual, self.type)
@@ -468,16 +461,16 @@ async def _print_news(
                     continue
                 if wanted and each.name not in wanted:
                     continue
-                text, json = _change_text(each), _change_json(each)
+                text = _change_text(each)
             elif isinstance(each, Heard) or each.component is not session.component:
                 continue
             else:
-                text, json = _event_text(each), _event_json(each)
-            at = time_text(session.now)
+                text = _event_text(each)
+            at = session.now
             if as_lines_of_json:
-                print_json({"time": at, **json})
+                print_document(_line(each, at))
             else:
-                print_line(f"{at}  {text}")
+                print_line(f"{time_text(at)}  {text}")
 
 
 async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | Event]:
@@ -503,11 +496,11 @@ async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | E
                 each.exception()  # both end with the link; one of them is told
 
 
-def _change_json(change: Change) -> dict[str, Any]:
-    old, new = (
-        None if param is None else value_json(param.value, param.type) for param in (change.old, change.new)
-    )
-    return {"name": change.name, "old": old, "new": new, "by": change.by}
+def _line(news: Change | Lost | Found | Rebooted | Resynced, at: float) -> Document:
+    """What has happened, for programs."""
+    from paramclient.documents.command import ChangeLineDoc, EventLineDoc  # only here: loads pydantic
+
+    return ChangeLineDoc.of(news, at) if isinstance(news, Change) else EventLineDoc.of(news, at)
 
 
 def _change_text(change: Change) -> str:
@@ -516,20 +509,6 @@ def _change_text(change: Change) -> str:
         for param in (change.old, change.new)
     )
     return f"{change.name}  {old} -> {new}  ({change.by})"
-
-
-def _event_json(event: Lost | Found | Rebooted | Resynced) -> dict[str, Any]:
-    component = event.component
-    told: dict[str, Any] = {
-        "event": type(event).__name__.lower(),
-        "system": component.system,
-        "component": component.component,
-    }
-    if isinstance(event, Lost | Found):
-        told["silence_s"] = rounded(event.silence)
-    elif isinstance(event, Resynced):
-        told |= {"changed": list(event.changed), "hash": hash_text(event.hash)}
-    return told
 
 
 def _event_text(event: Lost | Found | Rebooted | Resynced) -> str:

@@ -27,7 +27,7 @@ def show_file(file: ParamFile, component: int | None, *, changed: bool, json: bo
     else:
         shown = [*sets]
     if json:
-        from paramclient.documents import FileDoc  # only here: loads pydantic
+        from paramclient.documents.written import FileDoc  # only here: loads pydantic
 
         print_document(FileDoc.of(file, shown))
     else:

@@ -28,6 +28,7 @@ class Document(BaseModel):
     model_config = ConfigDict(
         frozen=True,
         allow_inf_nan=False,
+        defer_build=True,  # each command needs a few of them
         serialize_by_alias=True,
         validate_by_name=True,
         validate_by_alias=True,

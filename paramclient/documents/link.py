@@ -80,8 +80,12 @@ class HealthDoc(Document):
 
 
 class MeDoc(Document):
-    """Who asks, by the name of the token, and what that allows; where it is `read_only`, nobody may write."""
+    """Who asks, by the name of the token, and what that allows; where it is `read_only`, nobody may write.
+
+    `asker` is how they stand in the history.
+    """
 
     name: str
+    asker: str
     role: Literal["read", "write"]
     read_only: bool

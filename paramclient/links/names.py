@@ -17,7 +17,7 @@ from urllib.parse import parse_qsl
 
 from paramclient.errors import UsageError
 
-__all__ = ["FORMS", "LinkKind", "LinkSpec", "parse_link"]
+__all__ = ["FORMS", "LinkKind", "LinkSpec", "names_service", "parse_link"]
 
 FORMS: Final = """\
   udpin:HOST:PORT     listen for vehicles; also udp:HOST:PORT, udpin:PORT, HOST:PORT
@@ -27,7 +27,8 @@ FORMS: Final = """\
   serial:DEVICE:BAUD  a serial port; also /dev/ttyACM0,57600 and COM5:115200
   sim:px4             a simulated vehicle in this process; also sim:ardupilot, sim:px4?loss=0.05&seed=1
   replay:FILE         a telemetry log (.tlog); also replay:FILE?speed=10, and speed=0 for as fast as it goes
-  udpin://HOST:PORT   // may follow the first colon of each; an IPv6 address stands in brackets"""
+  udpin://HOST:PORT   // may follow the first colon of each; an IPv6 address stands in brackets
+  http://HOST:PORT    not a link, but a service that has some (paramclient serve); also https://HOST"""
 """The accepted forms, for people."""
 
 DEFAULT_BAUD: Final = 57600
@@ -98,6 +99,11 @@ def parse_link(text: str) -> LinkSpec:
         raise UsageError(f"link name {shown!r}: {problem}\naccepted forms:\n{FORMS}") from None
 
 
+def names_service(link: object) -> bool:
+    """Whether this is the address of a service, and not a link."""
+    return isinstance(link, str) and _SERVICE.match(link) is not None
+
+
 class _BadName(Exception):
     """What is wrong with a name, in words."""
 
@@ -109,6 +115,7 @@ _SCHEMES: dict[str, LinkKind] = {
 }
 _LISTENING = frozenset({LinkKind.UDPIN, LinkKind.TCPIN})
 
+_SERVICE = re.compile(r"\s*https?://", re.IGNORECASE)
 _SCHEME = re.compile(r"([A-Za-z][A-Za-z0-9+.-]*):(.*)")
 _HOST_PORT = re.compile(r"(?:\[([^\[\]]*)\]|([^:\[\]]*)):([^:]*)")
 _HOST_LABEL = re.compile(r"[A-Za-z0-9_]([A-Za-z0-9_-]{0,61}[A-Za-z0-9_])?")
@@ -119,6 +126,8 @@ _BARE_DEVICE = re.compile(r"/dev/|COM[0-9]", re.IGNORECASE)
 def _parse(name: str) -> LinkSpec:
     if _BARE_DEVICE.match(name):
         return _serial(name)
+    if names_service(name):
+        _fail("a service has links and is none; it goes only where a vehicle is wanted")
     scheme = _SCHEME.fullmatch(name)
     kind = _SCHEMES.get(scheme[1].lower()) if scheme else None
     if scheme is None or kind is None:

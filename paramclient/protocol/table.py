@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Final, NamedTuple
 
+from paramclient.protocol.authors import is_ours
 from paramclient.protocol.wire import MOST_PARAMETERS, NO_INDEX, ParamValue
 from paramclient.values import Encoding, Param, Trust, Value, as_sent, decode, from_bits, known_type, px4_hash
 
@@ -20,6 +21,8 @@ ENOUGH_NAMES: Final = 2_000
 MOST_NAMES_OF_LINK: Final = 400_000
 """Names that all tables of one link may hold together before each is held to `ENOUGH_NAMES`: 250 vehicles
 with 1,600 parameters each. A name takes about half a kilobyte."""
+MOST_OVERWRITTEN: Final = 1_024
+"""What we wrote and was replaced before the cache was told: some tens fit between two writes to the disk."""
 MOST_GONE: Final = MOST_NAMES
 """Names that have changed or gone and wait to be told to the cache, above which further gone ones are not
 told: the next whole table that is kept is without them."""
@@ -84,6 +87,7 @@ class Table:
         doubts: how often what had been heard was no longer to be relied on.
         passed_over: by a name that several parameters share, the indices of those that it does not mean.
         dirty: names whose value, type or index changed since `take_dirty` was called last.
+        overwritten: what writes of ours had made of them, and is no more; each with who did it.
     """
 
     def __init__(self, encoding: Encoding = Encoding.BYTEWISE, room: Room | None = None) -> None:
@@ -97,6 +101,7 @@ class Table:
         self.doubts = 0
         self.passed_over: dict[str, frozenset[int]] = {}
         self.dirty: dict[str, str] = {}
+        self.overwritten: list[tuple[Param, str]] = []
         self._hash: int | None = None
         self._hash_is_stale = False
         self._encoding = encoding
@@ -185,7 +190,7 @@ class Table:
             if old.index != index:
                 self.dirty.setdefault(name, by)
             return None
-        self.dirty[name] = by
+        self._news(name, old, by)
         if self._hash is not None:
             self._moved(name)
         return _new(Change, (name, old, new, by))
@@ -223,7 +228,7 @@ class Table:
             self.dirty.setdefault(name, "vehicle")
         if old is not None and old.same_value(new):
             return None
-        self.dirty[name] = "vehicle"
+        self._news(name, old, "vehicle")
         self._moved(name)
         return Change(name, old, new)
 
@@ -419,6 +424,19 @@ class Table:
         """Names that changed since the last call, each with who did it; gone names too."""
         dirty, self.dirty = self.dirty, {}
         return dirty
+
+    def take_overwritten(self) -> list[tuple[Param, str]]:
+        """Values of ours that have come and gone since the last call, each with who did it."""
+        overwritten, self.overwritten = self.overwritten, []
+        return overwritten
+
+    def _news(self, name: str, old: Param | None, by: str) -> None:
+        """A value has changed. One that was written for somebody is told of, however short it stood."""
+        before = self.dirty.get(name)
+        if old is not None and before is not None and is_ours(before):
+            self.overwritten.append((old, before))
+            del self.overwritten[:-MOST_OVERWRITTEN]
+        self.dirty[name] = by
 
     def _complement(self, heard: Param, cached: Param) -> list[Change]:
         """Add to what was heard what its message does not say."""

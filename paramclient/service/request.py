@@ -7,6 +7,7 @@ from collections.abc import Iterable, MutableMapping
 from dataclasses import dataclass, field
 from ipaddress import IPv6Address, ip_address
 from typing import Any, Final, TypeAlias
+from urllib.parse import unquote
 
 __all__ = ["ASK", "HOST", "SESSION_PATH", "Denied", "Request", "Scope"]
 
@@ -20,7 +21,7 @@ LONGEST_TARGET: Final = 8 * 1024
 
 SESSION_PATH: Final = "/api/v1/session"
 READ_BY_POST: Final = frozenset(
-    {"diff", "fetch", "files", "find", "plan", "read", "refreshed", "successor", "verify"}
+    {"diff", "fetch", "files", "find", "metadata", "plan", "read", "refreshed", "successor", "verify"}
 )
 """What asks by POST and changes nothing, by the last part of its path. All other methods than GET, and all
 other POSTs, need a token that may write: what is forgotten here is forbidden."""
@@ -82,9 +83,10 @@ class Request:
         raw = self.scope.get("raw_path") or self.path.encode()
         if len(raw) + len(self.scope.get("query_string", b"")) > LONGEST_TARGET:
             raise Denied(414, "address-too-long", "The address is too long.")
-        parts = self.path.split("/")
+        # a slash that is written %2F belongs to a name, as to that of a serial port
+        parts = [unquote(part) for part in raw.decode("ascii", "replace").split("/")]
         is_plain = (
-            self.path.startswith("/")
+            raw.startswith(b"/")
             and "" not in parts[1:-1]
             and not any(part in (".", "..") for part in parts)
             and not _UNPRINTABLE.search(self.path)

@@ -30,8 +30,12 @@ __all__ = [
     "Elsewhere",
     "GivenFile",
     "Moment",
+    "Number",
     "Source",
+    "LARGEST_UPLOAD",
+    "LONGEST_NAME",
     "cached",
+    "check_size",
     "key_of",
     "known_set",
     "parsed",
@@ -47,6 +51,9 @@ MOST_VALUES: Final = 65_535
 """Values of one request: as many as an index can count."""
 LONGEST_NAME: Final = 255
 """Characters of a file's name."""
+LARGEST_UPLOAD: Final = 2 * 1024 * 1024
+"""Bytes of a parameter file that somebody sends: ten thousand parameters in the longest of the forms. To read
+more takes more than a few seconds, in which everybody else has half of the processor."""
 LATEST: Final = 253_402_300_799.0
 """The last second of the year 9999: what stands beyond cannot be written as a date."""
 
@@ -97,6 +104,7 @@ class GivenFile(Body):
         Raises:
             FileError: it cannot be read.
             UsageError: it is not base64.
+            ServiceError: it is too large.
         """
         if self.text is not None:
             data = self.text.encode("utf-8", "surrogatepass")
@@ -105,6 +113,7 @@ class GivenFile(Body):
                 data = base64.b64decode(self.base64 or "", validate=True)
             except (binascii.Error, ValueError) as error:
                 raise UsageError(f"{self.name or 'the file'} is no base64: {error}") from None
+        check_size(len(data), LARGEST_UPLOAD)
         return loads(data, source=self.name, form=self.form)
 
 
@@ -274,6 +283,16 @@ def known_set(target: Followed) -> ParamSet:
         at=time.time(),
         source=f"link {target.line.name}",
     )
+
+
+def check_size(size: int, most: int) -> None:
+    """See that what somebody sends is not too large.
+
+    Raises:
+        ServiceError: it is.
+    """
+    if size > most:
+        raise ServiceError(413, "too-large", f"A file may have {most:,} bytes here, not more.", most=most)
 
 
 async def parsed(hub: Hub, read: Callable[[], ParamFile]) -> ParamFile:

@@ -22,6 +22,8 @@ router = APIRouter(prefix="/api/v1/components/{system}/{component}", tags=["desc
 
 MOST_PATTERNS: Final = 64
 """Patterns of one request."""
+LARGEST_DESCRIPTION: Final = 8 * 1024 * 1024
+"""Bytes of a file that describes parameters: ArduPilot's for one vehicle has half of that."""
 
 
 class Asked(Body):
@@ -66,7 +68,7 @@ async def described_by_file(
     name: Annotated[str, Query(max_length=LONGEST_NAME)] = "the file",
 ) -> DescribedDoc:
     """Take the descriptions of a file, for as long as the service runs."""
-    content = await body_of(request)
+    content = await body_of(request, LARGEST_DESCRIPTION)
     return _take(target, await hub.read_aside(lambda: read_content(content, source=name)))
 
 

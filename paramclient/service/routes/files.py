@@ -12,14 +12,21 @@ from fastapi import APIRouter, Query, Request, Response
 
 from paramclient.documents.written import FormDoc, FormsDoc, UploadedDoc
 from paramclient.errors import UsageError
-from paramclient.files import LARGEST_FILE, FileForm, ParamFile, dumps, loads
+from paramclient.files import FileForm, ParamFile, dumps, loads
 from paramclient.files.model import ENDINGS
 from paramclient.identity import autopilot_name
 from paramclient.paramset import ParamSet
 from paramclient.service.asking import Target, TheHub, answered
 from paramclient.service.hub import Hub
-from paramclient.service.problems import ServiceError
-from paramclient.service.wanted import LONGEST_NAME, known_set, parsed, state, when_of
+from paramclient.service.wanted import (
+    LARGEST_UPLOAD,
+    LONGEST_NAME,
+    check_size,
+    known_set,
+    parsed,
+    state,
+    when_of,
+)
 from paramclient.taken import differing, whole_set
 
 __all__ = ["attachment", "body_of", "moment", "router"]
@@ -83,7 +90,7 @@ async def files(
 
     Of a file with several components, `params` are those of the autopilot, or of the one that is named.
     """
-    data = await body_of(request)
+    data = await body_of(request, LARGEST_UPLOAD)
     read: Callable[[], ParamFile] = partial(loads, data, source=name, form=form)
     found = await parsed(hub, read)
     return UploadedDoc.of(found, found.choose(component, system=system))
@@ -118,13 +125,16 @@ async def attachment(hub: Hub, params: ParamSet, form: FileForm) -> Response:
     return Response(data, media_type="application/octet-stream", headers=headers)
 
 
-async def body_of(request: Request) -> bytes:
-    """All of the body, as far as a parameter file can be that long."""
+async def body_of(request: Request, most: int) -> bytes:
+    """All of the body, if it has no more bytes than these.
+
+    Raises:
+        ServiceError: it has.
+    """
     data = bytearray()
     async for piece in request.stream():
         data += piece
-        if len(data) > LARGEST_FILE:
-            raise ServiceError(413, "too-large", f"No parameter file has more than {LARGEST_FILE} bytes.")
+        check_size(len(data), most)
     return bytes(data)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from fastapi import APIRouter, Request, Response
 
 from paramclient.documents.link import HealthDoc, HealthLinkDoc, LinksDoc, MeDoc
-from paramclient.service.asking import TheHub
+from paramclient.service.asking import TheHub, asker_of
 from paramclient.service.metrics import MEDIA_TYPE, metrics_text
 from paramclient.version import __version__
 
@@ -34,7 +34,9 @@ async def metrics(hub: TheHub) -> Response:
 async def me(request: Request) -> MeDoc:
     """Who asks, and what that one may do."""
     state = request.scope["state"]
-    return MeDoc(name=state["name"], role=state["role"], read_only=state["read_only"])
+    return MeDoc(
+        name=state["name"], asker=asker_of(request), role=state["role"], read_only=state["read_only"]
+    )
 
 
 @router.get("/api/v1/links")

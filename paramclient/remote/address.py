@@ -1,0 +1,84 @@
+"""The address of a service, as users write it, and the token that it wants to see."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from typing import Final
+from urllib.parse import parse_qsl, urlsplit, urlunsplit
+
+from paramclient.errors import UsageError
+from paramclient.links import parse_link
+
+__all__ = ["TOKEN_VARIABLE", "ServiceAddress", "chosen_token"]
+
+TOKEN_VARIABLE: Final = "PARAMCLIENT_TOKEN"
+"""The environment variable that holds the token, for all programs that speak to services."""
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceAddress:
+    """Where a service is, and which of its links is meant.
+
+    Attributes:
+        base: `http://HOST:PORT`, with the path under which a proxy may have it, and without a last slash.
+        link: the name of one of its links, or None for all of them.
+    """
+
+    base: str
+    link: str | None = None
+
+    @classmethod
+    def read(cls, text: str) -> ServiceAddress:
+        """Read `http://HOST:8765` or `https://HOST/path?link=NAME`.
+
+        Raises:
+            UsageError: it is no such address.
+        """
+        shown = text.strip()
+        try:
+            parts = urlsplit(shown)
+            port = parts.port
+        except ValueError as error:
+            raise UsageError(f"address {shown!r}: {error}") from None
+        if parts.username is not None or parts.password is not None:
+            # not shown: it may be the token
+            raise UsageError("the address of a service holds no password; give the token with token=")
+        if parts.scheme.lower() not in ("http", "https") or not parts.hostname or port == 0:
+            raise UsageError(f"address {shown!r}: a service is named http://HOST:PORT")
+        if parts.fragment:
+            raise UsageError(f"address {shown!r}: what stands behind # means nothing to a service")
+        base = urlunsplit((parts.scheme.lower(), parts.netloc.lower(), parts.path.rstrip("/"), "", ""))
+        return cls(base, _chosen_link(parts.query, shown))
+
+    @property
+    def name(self) -> str:
+        """The canonical spelling, as the name of a link."""
+        return self.base if self.link is None else f"{self.base}?link={self.link}"
+
+
+def chosen_token(token: str | None) -> str | None:
+    """The token that is given, or that of the environment.
+
+    Raises:
+        UsageError: it has characters that no token has.
+    """
+    chosen = os.environ.get(TOKEN_VARIABLE) if token is None else token
+    if not chosen:
+        return None
+    if not (chosen.isascii() and chosen.isprintable() and " " not in chosen):
+        raise UsageError("a token is printable ASCII without spaces")
+    return chosen
+
+
+def _chosen_link(query: str, shown: str) -> str | None:
+    if not query:
+        return None
+    pairs = parse_qsl(query, keep_blank_values=True)
+    if [key for key, _ in pairs] != ["link"] or not pairs[0][1]:
+        raise UsageError(f"address {shown!r}: behind ? may stand one link=NAME, with %26 for an & in it")
+    name = pairs[0][1]
+    try:
+        return parse_link(name).name
+    except UsageError:
+        return name  # a link of another program's making: the service knows its name

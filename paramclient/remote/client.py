@@ -1,0 +1,365 @@
+"""A client whose links and cache are those of a service."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from contextlib import suppress
+from types import MappingProxyType, TracebackType
+from typing import Final, NoReturn
+
+import anyio
+import anyio.abc
+import httpx
+
+from paramclient.client import HEARING_PATIENCE, ParamClient
+from paramclient.component import Component, address_in_words
+from paramclient.errors import CacheError, ClientClosed, LinkError, NoReply, ParamClientError, UsageError
+from paramclient.events import Events
+from paramclient.ftp import Ftp
+from paramclient.links import Link
+from paramclient.protocol.result import Progress
+from paramclient.protocol.station import Address
+from paramclient.protocol.wire import AUTOPILOT_COMPONENT
+from paramclient.remote.address import ServiceAddress, chosen_token
+from paramclient.remote.component import Key, RemoteComponent
+from paramclient.remote.connection import telling
+from paramclient.remote.link import ServiceLink, not_given
+from paramclient.remote.problems import error_of
+from paramclient.remote.reading import Document, fetch_result_of, stats_of, understood
+from paramclient.remote.requests import Answer, Requests, Unreached
+from paramclient.remote.roster import Roster, key_of
+from paramclient.stats import ClientStats
+from paramclient.together import FetchedAll
+
+__all__ = ["RemoteClient"]
+
+OPENING_PATIENCE: Final = 10.0
+"""Seconds for a service to say what it has."""
+STATS_PAUSE: Final = 0.5
+"""Seconds between two questions for the numbers of the links, however often they are looked at."""
+OF_A_LINK: Final = frozenset({"_station", "_writer", "_carrier", "_wake", "_dispatch"})
+"""What other rooms of the package reach for that only a client with a link has."""
+
+
+class RemoteClient(ParamClient):
+    """The same as `ParamClient` over a service: `ParamClient("http://HOST:8765")` makes one.
+
+    It differs in this: The service has the links and keeps the cache, so the arguments for both are refused.
+    `params` of a component is a mirror of the service's; while the service cannot be reached, every value in
+    it is *cached*, and calls wait for it as they wait for a link that is away. A write that was under way
+    when the connection broke is not sent again: it raises LinkError, and whether it was done is not known.
+
+    With several links on the service, the components of all of them are there. Where two links have
+    one with the same ids, it is in `components` only when the address names the link
+    (`http://HOST:8765?link=udpin:0.0.0.0:14550`).
+
+    `stats` are those of the links, as they were when they were asked for last: on opening, with every fetch,
+    and soon after each look at them.
+
+    Args:
+        link: `http://HOST:PORT` or `https://HOST:PORT`, and `?link=NAME` for one of its links.
+        token: what the service wants to see; None for PARAMCLIENT_TOKEN of the environment.
+        transport: how requests travel; None for sockets.
+        others: those of `ParamClient`, as long as they say nothing.
+
+    Raises:
+        UsageError: no such address, or an argument that only a client with a link of its own takes; on
+            entering: the service does not take the token, or has no such link.
+        LinkError: on entering: it cannot be reached, or is no service of paramclient.
+    """
+
+    def __init__(
+        self,
+        link: str | Link | object,
+        *,
+        token: str | None = None,
+        transport: httpx.AsyncBaseTransport | None = None,
+        **others: object,
+    ) -> None:
+        defaults = inspect.signature(ParamClient.__init__).parameters
+        for name, value in others.items():
+            if name not in defaults:
+                raise TypeError(f"ParamClient() has no argument {name!r}")
+            if value is not defaults[name].default and value != defaults[name].default:
+                raise UsageError(
+                    f"{name} is for a client with a link of its own; over a service, that decides"
+                )
+        address = ServiceAddress.read(str(link))
+        self.cache = None
+        self._service = ServiceLink(address.name)
+        self._chosen = address.link
+        self._requests = Requests(address, chosen_token(token), transport)
+        self._roster = Roster(self, self._requests, address.link)
+        self._connection = self._roster.connection
+        self._subscriptions = self._roster.subscriptions
+        self._tasks: anyio.abc.TaskGroup | None = None
+        self._is_entered = False
+        self._links: list[Document] = []
+
+    # what is known
+
+    @property
+    def components(self) -> Mapping[Address, Component]:
+        """See `ParamClient.components`; without those whose ids are on several links."""
+        keys: dict[Address, list[Key]] = {}
+        for key in self._roster.components:
+            keys.setdefault(key[1:], []).append(key)
+        return MappingProxyType(
+            {at: self._roster.components[several[0]] for at, several in keys.items() if len(several) == 1}
+        )
+
+    @property
+    def autopilots(self) -> list[Component]:
+        """See `ParamClient.autopilots`."""
+        found: dict[int, RemoteComponent] = {}
+        for (system, number), component in self.components.items():
+            is_first = number == AUTOPILOT_COMPONENT or system not in found
+            if isinstance(component, RemoteComponent) and component.is_autopilot and is_first:
+                found[system] = component
+        return [found[system] for system in sorted(found)]
+
+    @property
+    def link(self) -> Link:
+        """The address of the service, in the place of a link."""
+        return self._service
+
+    @property
+    def listens_only(self) -> bool:
+        """Whether nothing is ever sent on any of the links."""
+        return bool(self._links) and all(each["listens_only"] for each in self._links)
+
+    @property
+    def bytes_received(self) -> int:
+        """As in `stats`."""
+        return self.stats.bytes_received
+
+    @property
+    def bytes_sent(self) -> int:
+        """As in `stats`."""
+        return self.stats.bytes_sent
+
+    @property
+    def stats(self) -> ClientStats:
+        """What the links of the service have done, as it was when that was asked for last."""
+        self._roster.are_links_stale.set()
+        return stats_of([each["stats"] for each in self._links if each["stats"] is not None])
+
+    def __repr__(self) -> str:
+        connection = self._connection
+        state = "closed" if self._tasks is None or connection.ended is not None else "open"
+        if state == "open" and connection.is_away:
+            state = "away"
+        heard = len(self._roster.components)
+        return f"<RemoteClient {self._service.name} {state}, {heard} component{'' if heard == 1 else 's'}>"
+
+    def __getattr__(self, name: str) -> NoReturn:
+        if name in OF_A_LINK:
+            raise not_given("what this needs")
+        raise AttributeError(f"{type(self).__name__!r} object has no attribute {name!r}")
+
+    # its life
+
+    async def __aenter__(self) -> RemoteClient:
+        if self._is_entered:
+            raise UsageError("a ParamClient is opened once; make a new one")
+        self._is_entered = True
+        await self._requests.open()
+        tasks = anyio.create_task_group()
+        await tasks.__aenter__()
+        try:
+            tasks.start_soon(self._connection.follow, name="paramclient follower of a service")
+            with anyio.fail_after(OPENING_PATIENCE):
+                await self._connection.reached()
+                await self._load_links()
+                await self._learn_who_we_are()
+                await self._roster.load_list()
+            tasks.start_soon(self._roster.run, name="paramclient loader")
+            tasks.start_soon(self._load_stats_when_wanted, name="paramclient statistics")
+        except BaseException as error:
+            await self._leave(tasks)
+            if isinstance(error, Unreached):
+                raise error.error from error.error.__cause__
+            if isinstance(error, TimeoutError) and not isinstance(error, ParamClientError):
+                name = self._service.name
+                raise LinkError(f"{name}: it does not answer", link=name) from None
+            raise
+        self._tasks = tasks
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        tasks = self._tasks
+        assert tasks is not None
+        closed = ClientClosed("the client was closed", link=self._service.name)
+        self._connection.end(closed)
+        for component in self._roster.components.values():
+            component._end(closed)
+        for events in list(self._subscriptions):
+            events.end(closed)
+        await self._leave(tasks)
+
+    async def _leave(self, tasks: anyio.abc.TaskGroup) -> None:
+        """End the tasks and the connections, also when cancelled."""
+        tasks.cancel_scope.cancel()
+        try:
+            # not told of the caller's exception: it would come out wrapped in a group
+            await tasks.__aexit__(None, None, None)
+        finally:
+            with anyio.CancelScope(shield=True):
+                await self._requests.close()
+
+    # calls
+
+    def events(self) -> Events:
+        """See `ParamClient.events`. What an event tells of a table is in `params` by then."""
+        events = Events()
+        self._subscriptions.add(events)
+        if self._connection.ended is not None:
+            events.end(self._connection.ended)
+        return events
+
+    def ftp(self, component: Component) -> Ftp:
+        """Refused: files go over the link itself."""
+        raise not_given("files over MAVFTP")
+
+    async def component(
+        self,
+        system: int | None = None,
+        component: int | None = None,
+        *,
+        timeout: float | None = HEARING_PATIENCE,
+    ) -> RemoteComponent:
+        """See `ParamClient.component`. It is waited for also on links that the service cannot open yet.
+
+        Raises:
+            UsageError: it is on several links, and the address of the service names none of them.
+            NoReply, LinkError: as there.
+        """
+        began = anyio.current_time()
+        answer = await self._connection.ask(
+            "POST",
+            "/find",
+            {"system": system, "component": component},
+            awaited=address_in_words(system, component),
+            timeout=timeout,
+            waits_for_ever=True,
+            link=self._chosen,
+        )
+        left = None if timeout is None else began + timeout - anyio.current_time()
+        found = await self._roster.given(answer, left)
+        if len(same := self._roster.same_ids(found)) > 1:
+            links = " and ".join(each.link_name for each in same)
+            ids = f"{found.system}/{found.component}"
+            raise UsageError(f"{ids} is on {links} of the service; name one: http://…?link=NAME")
+        return found
+
+    async def successor(
+        self, component: Component, system: int, *, timeout: float | None = HEARING_PATIENCE
+    ) -> RemoteComponent:
+        """See `ParamClient.successor`."""
+        assert isinstance(component, RemoteComponent)
+        awaited = f"{component.system}/{component.component} as system {system}"
+        answer = await component._ask("successor", {"system": system}, timeout, awaited, waits_for_ever=True)
+        return await self._roster.given(answer)
+
+    async def fetch_all(
+        self,
+        system: int | None = None,
+        *,
+        refresh: bool = False,
+        timeout: float | None = None,
+        progress: Callable[[Mapping[Address, Progress]], None] | None = None,
+    ) -> FetchedAll:
+        """See `ParamClient.fetch_all`. Where two links have the same ids, one of them is told."""
+        began = anyio.current_time()
+        before = {key: each._progress_count for key, each in self._roster.components.items()}
+
+        def tell() -> None:
+            told = self._roster.components.items()
+            assert progress is not None
+            progress({key[1:]: each._progress_since(before.get(key, 0)) for key, each in told})
+
+        async def fetch() -> Answer:
+            whose = "any component" if system is None else f"any component of system {system}"
+            answer = await self._connection.ask(
+                "POST",
+                "/fetch",
+                {"refresh": refresh} | ({} if system is None else {"system": system}),
+                awaited=f"the parameters of {whose}",
+                timeout=timeout,
+                link=self._chosen,
+            )
+            with understood(self._service.name):
+                ended = [
+                    (key_of(each), each["received"], each["count"]) for each in answer.document["results"]
+                ]
+            for key, received, count in ended:
+                component = self._roster.components.get(key)
+                await self._roster.until_current(component, answer.place)
+                if component is not None:
+                    component._end_progress(received, count)
+            await self._look_at_links()
+            return answer
+
+        answer = await telling(fetch, None if progress is None else tell)
+        elapsed = anyio.current_time() - began
+        with understood(self._service.name):
+            known = self._roster.components
+            results = {
+                key[1:]: fetch_result_of(each, known[key].params, elapsed)
+                for each in answer.document["results"]
+                if (key := key_of(each)) in known
+            }
+            silent: dict[Address, NoReply | CacheError] = {}
+            for each in answer.document["silent"]:
+                problem = each["problem"]
+                error = error_of(problem, status=problem["status"], link=self._service.name)
+                if isinstance(error, NoReply | CacheError):
+                    silent[each["system"], each["component"]] = error
+        return FetchedAll(results, silent)
+
+    def traffic_report(self) -> NoReturn:
+        """Refused: the links are the service's."""
+        raise not_given("a report of the traffic")
+
+    def signing_report(self) -> NoReturn:
+        """Refused: keys and signatures are the service's."""
+        raise not_given("a report of signatures")
+
+    async def _learn_who_we_are(self) -> None:
+        with suppress(LinkError):  # a service that keeps that to itself
+            answer = await self._requests.ask("GET", "/me")
+            with understood(self._service.name):
+                self._roster.asker = str(answer.document.get("asker", ""))
+
+    async def _load_links(self) -> None:
+        """The links and their numbers.
+
+        Raises:
+            UsageError: the one that is meant is not among them.
+        """
+        answer = await self._requests.ask("GET", "/links")
+        with understood(self._service.name):
+            links = [each for each in answer.document["links"] if self._chosen in (None, each["name"])]
+            stats_of([each["stats"] for each in links if each["stats"] is not None])
+            names = ", ".join(str(each["name"]) for each in answer.document["links"])
+        if not links and self._chosen is not None:
+            raise UsageError(f"the service has no link {self._chosen}; it has {names or 'none'}")
+        self._links = links
+
+    async def _look_at_links(self) -> None:
+        """The same as far as it goes: these numbers are worth no error."""
+        with suppress(Unreached, ParamClientError):
+            await self._load_links()
+
+    async def _load_stats_when_wanted(self) -> None:
+        while True:
+            await self._roster.are_links_stale.wait()
+            self._roster.are_links_stale = anyio.Event()
+            await self._look_at_links()
+            await anyio.sleep(STATS_PAUSE)
+
+    def _check_open(self) -> None:
+        self._connection.check_open()

@@ -1,0 +1,114 @@
+"""Problem documents (RFC 9457) back to the exceptions that they tell of."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+from paramclient.errors import (
+    AnotherVehicle,
+    CacheError,
+    CommandRefused,
+    FileError,
+    InvalidParameters,
+    LinkError,
+    NoReply,
+    ParamClientError,
+    Refused,
+    TypeMismatch,
+    UnknownParameter,
+    UsageError,
+    ValueNotApplied,
+    VehicleArmed,
+)
+from paramclient.remote.reading import number_of
+
+__all__ = ["NotHeard", "error_of"]
+
+Problem = Mapping[str, Any]
+
+_OF_USER: Final = (400, 401, 403, 413, 421, 422)
+"""States of answers (RFC 9110) that say that the request itself cannot be right, whoever else is told so."""
+
+
+class NotHeard(NoReply):
+    """The service does not know a component, which it may know in a moment: it may have started just now."""
+
+
+def error_of(problem: Problem, *, status: int, link: str) -> ParamClientError:
+    """The exception that a problem tells of: the same class, text and attributes.
+
+    Args:
+        problem: the document.
+        status: of the answer that it came with.
+        link: the name of our client's link, where the problem names none.
+
+    Raises:
+        KeyError, TypeError, ValueError: it is not what it says that it is.
+    """
+    detail = str(problem.get("detail") or problem.get("title") or f"the service answers {status}")
+    make = _MAKERS.get(str(problem.get("error")))
+    if make is not None:
+        return make(detail, problem)
+    if problem.get("error") in ("LinkError", "ClientClosed"):
+        return LinkError(detail, link=str(problem.get("link", link)))
+    if str(problem.get("type", "")).endswith(":unknown-component"):
+        return NotHeard(detail.rstrip("."), attempts=0, waited=0.0)
+    if status in _OF_USER or str(problem.get("type", "")).endswith(":ambiguous"):
+        return UsageError(detail)
+    return LinkError(f"{link}: {detail}", link=link)
+
+
+def _whom(problem: Problem) -> dict[str, Any]:
+    index = problem.get("index")
+    return {
+        "system": int(problem["system"]),
+        "component": int(problem["component"]),
+        "name": problem.get("name"),
+        "index": None if index is None else int(index),
+    }
+
+
+def _no_reply(detail: str, problem: Problem) -> NoReply:
+    return NoReply(
+        str(problem["awaited"]), attempts=int(problem["attempts"]), waited=float(problem["waited"])
+    )
+
+
+def _not_applied(detail: str, problem: Problem) -> ValueNotApplied:
+    return ValueNotApplied(
+        detail,
+        system=int(problem["system"]),
+        component=int(problem["component"]),
+        name=str(problem["name"]),
+        requested=number_of(problem["requested"]),
+        actual=number_of(problem["actual"]),
+    )
+
+
+def _command_refused(detail: str, problem: Problem) -> CommandRefused:
+    return CommandRefused(
+        int(problem["system"]), int(problem["component"]), int(problem["command"]), int(problem["code"])
+    )
+
+
+def _another(detail: str, problem: Problem) -> AnotherVehicle:
+    return AnotherVehicle(
+        int(problem["system"]), int(problem["component"]), str(problem["expected"]), str(problem["found"])
+    )
+
+
+_MAKERS: Final[dict[str, Callable[[str, Problem], ParamClientError]]] = {
+    "UsageError": lambda detail, problem: UsageError(detail),
+    "FileError": lambda detail, problem: FileError(detail),
+    "InvalidParameters": lambda detail, problem: InvalidParameters(dict(problem["problems"])),
+    "UnknownParameter": lambda detail, problem: UnknownParameter(detail, **_whom(problem)),
+    "TypeMismatch": lambda detail, problem: TypeMismatch(detail, **_whom(problem)),
+    "VehicleArmed": lambda detail, problem: VehicleArmed(detail, **_whom(problem)),
+    "Refused": lambda detail, problem: Refused(detail, code=int(problem["code"]), **_whom(problem)),
+    "CommandRefused": _command_refused,
+    "ValueNotApplied": _not_applied,
+    "AnotherVehicle": _another,
+    "NoReply": _no_reply,
+    "CacheError": lambda detail, problem: CacheError(detail),
+}

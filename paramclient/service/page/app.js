@@ -1,0 +1,407 @@
+/** The page: joins what is known, what is shown, and what the person does. */
+
+import { Stream } from "./api.js";
+import { chooseOther, drawBanner } from "./compare.js";
+import { Details } from "./details.js";
+import { showKeys } from "./dialogs.js";
+import { announce, button, byId, el, isNarrow, onceAFrame, setText } from "./dom.js";
+import { CellEditor } from "./editor.js";
+import { Grid } from "./grid.js";
+import { nameOf, review, told, undo } from "./review.js";
+import { NEWS_FOR, OTHERS, store } from "./store.js";
+import { defaultOf, many, parse } from "./values.js";
+import { complain, drawActions, drawVehicles, offerDescriptions } from "./vehicles.js";
+
+const FILTERS = {
+  all: { text: "All", has: () => true },
+  changed: { text: "Changed from default", has: (row) => row.isChanged === true },
+  differs: { text: "Differs", has: (row) => ["differs", "here"].includes(store.table.standing(row)) },
+  pending: { text: "Staged", has: (row) => store.table.pending.has(row.name) },
+  news: { text: "Changed by others", has: (row) => row.news !== null },
+};
+
+const shown = { words: [], group: "", filter: "all" };
+
+const grid = new Grid({
+  table: () => store.table,
+  open: (row) => edit(row),
+  show: (row) => details.open(row, true),
+  moved: (row) => details.follow(row),
+});
+const editor = new CellEditor({ grid, stage: (name, text, send) => store.stage(name, text, send) });
+const details = new Details({ leave: () => grid.root.focus({ preventScroll: true }) });
+
+function edit(row) {
+  if (!store.mayWrite) details.open(row, true);
+  else if (isNarrow()) details.open(row, true);
+  else editor.open(row, store.table.pending.get(row.name));
+}
+
+// what is shown
+
+function matches(row) {
+  if (shown.group && row.group !== shown.group) return false;
+  if (!FILTERS[shown.filter].has(row)) return false;
+  return shown.words.every(
+    (word) =>
+      row.words.includes(word) || row.text.toLowerCase() === word || (word.length > 1 && row.text.startsWith(word)),
+  );
+}
+
+/** Those whose name begins with what is searched for go first, then those with it in the name. */
+function ranked(rows) {
+  const [word] = shown.words;
+  if (!word) return rows;
+  const rank = ({ name }) => {
+    const place = name.toLowerCase().indexOf(word);
+    return place === 0 ? 0 : place > 0 ? 1 : 2;
+  };
+  return rows
+    .map((row) => [rank(row), row])
+    .sort(([a], [b]) => a - b)
+    .map(([, row]) => row);
+}
+
+function drawTable() {
+  const { table } = store;
+  const rows = table.sorted;
+  const chosen = ranked(rows.filter(matches));
+  grid.set(chosen);
+  setText(
+    byId("count"),
+    chosen.length === rows.length ? many(rows.length, "parameter") : `${chosen.length} of ${rows.length}`,
+  );
+  drawGroups();
+  drawChips();
+  drawEmpty(chosen.length, rows.length);
+  drawBar();
+  offerDescriptions();
+  const active = grid.active;
+  details.refresh(table.rows.get(details.name));
+  if (editor.row) editor.refresh(table.rows.get(editor.row.name));
+  if (active && grid.name === null) grid.name = active.name;
+}
+
+const draw = onceAFrame(() => {
+  drawTable();
+  if (store.table.other) drawBanner();
+});
+const drawState = onceAFrame(() => {
+  drawVehicles();
+  drawEmpty(grid.rows.length, store.table.rows.size);
+});
+
+function drawGroups() {
+  const { groups, pending, rows } = store.table;
+  const waiting = new Map();
+  for (const name of pending.keys()) {
+    const group = rows.get(name)?.group;
+    waiting.set(group, (waiting.get(group) ?? 0) + 1);
+  }
+  const key = JSON.stringify([store.selected, shown.group, [...groups], [...waiting]]);
+  const list = byId("groups");
+  if (list.dataset.shown === key) return;
+  list.dataset.shown = key;
+  const hadFocus = list.contains(document.activeElement);
+  const names = [...groups.keys()].sort((a, b) => Number(a === OTHERS) - Number(b === OTHERS) || a.localeCompare(b));
+  const total = rows.size;
+  const item = (group, text, count) =>
+    el(
+      "li",
+      {},
+      el(
+        "button",
+        {
+          type: "button",
+          class: `group${group === shown.group ? " chosen" : ""}`,
+          "aria-current": group === shown.group ? "true" : null,
+          on: { click: () => choose({ group }) },
+        },
+        el("span", { text }),
+        waiting.has(group) && el("i", { class: "dot warn" }),
+        el("small", { text: String(count) }),
+      ),
+    );
+  list.replaceChildren(item("", "All groups", total), ...names.map((name) => item(name, name, groups.get(name))));
+  if (hadFocus) list.querySelector(".chosen")?.focus();
+  const choice = byId("group-choice");
+  choice.replaceChildren(
+    el("option", { value: "", text: `All groups (${total})` }),
+    ...names.map((name) => el("option", { value: name, text: `${name} (${groups.get(name)})` })),
+  );
+  choice.value = shown.group;
+}
+
+function drawChips() {
+  const { table } = store;
+  const rows = table.sorted;
+  const counts = {};
+  for (const kind of Object.keys(FILTERS))
+    counts[kind] = kind === "all" ? rows.length : rows.reduce((sum, row) => sum + Number(FILTERS[kind].has(row)), 0);
+  const kinds = Object.keys(FILTERS).filter(
+    (kind) =>
+      kind === "all" ||
+      kind === "changed" ||
+      kind === shown.filter ||
+      counts[kind] ||
+      (kind === "differs" && table.other),
+  );
+  const key = JSON.stringify([shown.filter, kinds.map((kind) => [kind, counts[kind]])]);
+  const box = byId("chips");
+  if (box.dataset.shown === key) return;
+  box.dataset.shown = key;
+  const focused = box.contains(document.activeElement) ? document.activeElement.dataset.kind : null;
+  box.replaceChildren(
+    ...kinds.map((kind) =>
+      el(
+        "button",
+        {
+          type: "button",
+          class: `chip ${kind}`,
+          data: { kind },
+          "aria-pressed": String(kind === shown.filter),
+          on: { click: () => choose({ filter: kind }) },
+        },
+        el("span", { text: FILTERS[kind].text }),
+        kind !== "all" && el("small", { text: String(counts[kind]) }),
+      ),
+    ),
+  );
+  if (focused) [...box.children].find((chip) => chip.dataset.kind === focused)?.focus();
+}
+
+function drawEmpty(count, total) {
+  const { component, table } = store;
+  const box = byId("empty");
+  const text = emptyText(count, total, component, table);
+  box.hidden = !text;
+  byId("grid").classList.toggle("bare", Boolean(text));
+  setText(box, text);
+}
+
+function emptyText(count, total, component, table) {
+  if (count) return "";
+  if (!component) return store.isHeard ? "No vehicle has been heard yet. It appears here by itself." : "";
+  if (!total)
+    return component.fetch
+      ? "The parameters are on their way."
+      : table.isLoaded
+        ? "No parameters are known yet. Fetch asks the vehicle for them."
+        : "Loading …";
+  if (shown.filter === "changed" && !shown.words.length)
+    return table.sorted.some((row) => row.isChanged !== null)
+      ? "Nothing is changed from its default."
+      : "The defaults of this vehicle are not known.";
+  return "Nothing fits what is searched for.";
+}
+
+function drawBar() {
+  const { pending, sent } = store.table;
+  const bar = byId("bar");
+  const count = pending.size;
+  const key = JSON.stringify([store.selected, count, sent?.at, store.mayWrite]);
+  if (bar.dataset.shown === key) return;
+  bar.dataset.shown = key;
+  bar.hidden = !count && !sent;
+  if (count) {
+    bar.replaceChildren(
+      el("b", { text: `${many(count, "change")} staged` }),
+      button("Drop", () => store.unstageAll(), { kind: "quiet", label: "Drop all changes" }),
+      button("Review …", review, { kind: "strong" }),
+    );
+  } else if (sent) {
+    bar.replaceChildren(
+      el("span", { text: `Sent: ${told(sent.outcomes)}` }),
+      sent.outcomes.some((each) => each.isTaken) ? button("Undo …", undo, { kind: "quiet", drawing: "undo" }) : "",
+      button(
+        "",
+        () => {
+          store.table.sent = null;
+          draw();
+        },
+        { kind: "quiet only", drawing: "close", label: "Close" },
+      ),
+    );
+  }
+}
+
+/** Another choice of what is shown. */
+function choose(change) {
+  Object.assign(shown, change);
+  grid.root.scrollTop = 0;
+  byId("group-choice").value = shown.group;
+  drawTable();
+}
+
+// what the service says
+
+store.on("all", () => {
+  editor.close(false);
+  details.forget();
+  shown.group = "";
+  if (shown.filter !== "changed") shown.filter = "all";
+  drawActions();
+  drawVehicles();
+  drawBanner();
+  drawTable();
+});
+store.on("components", drawState);
+store.on("table", draw);
+store.on("pending", draw);
+store.on("other", () => {
+  shown.filter = store.table.other ? "differs" : "all";
+  drawBanner();
+  drawTable();
+});
+store.on("armed", (component) =>
+  announce(`${nameOf(component)} is ${component.is_armed ? "armed" : "not armed any more"}.`),
+);
+store.on("lost", (component) => announce(`${nameOf(component)} ${component.is_lost ? "is lost" : "is heard again"}.`));
+
+const news = [];
+store.on("news", ({ key, row }) => {
+  if (key !== store.selected) return;
+  if (!news.length) {
+    setTimeout(() => {
+      const [first] = news;
+      announce(
+        news.length === 1
+          ? `${first.name} is ${first.text} now, by ${first.news?.by}.`
+          : `${news.length} parameters were changed by others.`,
+      );
+      news.length = 0;
+    }, 1000);
+  }
+  news.push(row);
+});
+setInterval(() => {
+  for (const table of store.tables.values())
+    for (const row of table.rows.values()) if (row.news && Date.now() - row.news.at > NEWS_FOR) row.news = null;
+  draw();
+}, 60_000);
+
+const stream = new Stream({
+  begin: () =>
+    store.begin().catch((error) => {
+      complain(error);
+      setTimeout(() => stream.open(), 2000);
+    }),
+  take: (event) => store.take(event),
+  standing: (isOpen) => {
+    if (store.isHeard === isOpen) return;
+    const before = store.isHeard;
+    store.isHeard = isOpen;
+    byId("away").hidden = isOpen;
+    setText(
+      byId("away"),
+      isOpen
+        ? ""
+        : "The service does not answer. What is shown may be old; the page goes on by itself when it is back.",
+    );
+    setText(byId("standing"), isOpen ? "" : "not connected");
+    if (isOpen && before === false) announce("The service answers again.");
+    drawState();
+  },
+});
+
+// what the person does
+
+byId("search").addEventListener("input", () => {
+  choose({ words: byId("search").value.toLowerCase().split(/\s+/).filter(Boolean) });
+});
+byId("search").addEventListener("keydown", (event) => {
+  if (event.key === "Enter" || event.key === "ArrowDown") {
+    event.preventDefault();
+    grid.root.focus();
+    grid.go(0);
+  } else if (event.key === "Escape") {
+    event.preventDefault();
+    if (byId("search").value) {
+      byId("search").value = "";
+      choose({ words: [] });
+    } else grid.root.focus();
+  }
+});
+byId("group-choice").addEventListener("change", () => choose({ group: byId("group-choice").value }));
+byId("vehicle-choice").addEventListener("change", () => store.select(byId("vehicle-choice").value).catch(complain));
+byId("tools").append(
+  button("", showKeys, { kind: "quiet only", drawing: "help", label: "Keys" }),
+  button("", turnTheme, { kind: "quiet only", drawing: "theme", label: "Dark or light" }),
+);
+
+function turnTheme() {
+  const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
+  document.documentElement.dataset.theme = theme;
+  try {
+    localStorage.setItem("theme", theme);
+  } catch {
+    // a browser that keeps nothing shows it until it is closed
+  }
+}
+
+const KEYS = {
+  "/": () => {
+    byId("search").focus();
+    byId("search").select();
+  },
+  "?": showKeys,
+  g: () =>
+    (isNarrow()
+      ? byId("group-choice")
+      : (byId("groups").querySelector(".chosen") ?? byId("groups").querySelector("button"))
+    ).focus(),
+  v: () => (isNarrow() ? byId("vehicle-choice") : byId("vehicles").querySelector(".chosen"))?.focus(),
+  d: () => take((row) => defaultOf(row.document)),
+  t: () => take((row) => store.table.other?.values.get(row.name)?.text ?? null),
+  u: () => grid.active && store.unstage(grid.active.name),
+};
+
+/** Puts another value of the row that the person stands on onto the list. */
+function take(valueOf) {
+  const row = grid.active;
+  const text = row && store.mayWrite ? valueOf(row) : null;
+  if (text === null) return;
+  const read = parse(text, row.type);
+  if (!read.error) store.stage(row.name, read.text, read.send);
+}
+
+document.addEventListener("keydown", (event) => {
+  const isTyping = event.target.closest("input, select, textarea, dialog, #editor");
+  if ((event.ctrlKey || event.metaKey) && !event.altKey && !byId("dialog").open) {
+    if (event.key === "Enter") {
+      editor.form?.isConnected && editor.row ? editor.form.requestSubmit() : null;
+      review();
+    } else if (event.key.toLowerCase() === "z" && !isTyping) undo();
+    else return;
+    event.preventDefault();
+  } else if (!isTyping && !event.altKey && event.key in KEYS) {
+    event.preventDefault();
+    KEYS[event.key]();
+  } else if (event.key === "Escape" && !isTyping && !event.defaultPrevented) grid.root.focus({ preventScroll: true });
+});
+
+for (const list of [byId("groups"), byId("vehicles")]) {
+  list.addEventListener("keydown", (event) => {
+    const steps = { ArrowDown: 1, ArrowUp: -1 };
+    if (!(event.key in steps)) return;
+    event.preventDefault();
+    const buttons = [...list.querySelectorAll("button")];
+    buttons[buttons.indexOf(document.activeElement) + steps[event.key]]?.focus();
+  });
+}
+
+addEventListener("dragover", (event) => {
+  if (event.dataTransfer?.types.includes("Files")) event.preventDefault();
+});
+addEventListener("drop", (event) => {
+  const [file] = event.dataTransfer?.files ?? [];
+  if (!file) return;
+  event.preventDefault();
+  if (store.component) chooseOther(file);
+});
+addEventListener("beforeunload", (event) => {
+  if ([...store.tables.values()].some((table) => table.pending.size)) event.preventDefault();
+});
+
+drawActions();
+stream.open();

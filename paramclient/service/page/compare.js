@@ -1,0 +1,398 @@
+/** Comparison with a file, an earlier state or another vehicle: choosing it, and taking values over from it. */
+
+import { Problem, at, get, request } from "./api.js";
+import { announce, button, byId, el } from "./dom.js";
+import { closeDialog, openDialog } from "./dialogs.js";
+import { valueText } from "./details.js";
+import { Caution, OUTCOMES, nameOf, told } from "./review.js";
+import { keyOf, store } from "./store.js";
+import { many, moment, numberText } from "./values.js";
+
+/** A file beyond that is no parameter file; the service takes no more either. */
+const LARGEST_FILE = 4 * 2 ** 20;
+const PLAN_PATIENCE = 120_000;
+const JOB_PAUSE = 300;
+
+/** Lets the person choose what to compare with; `file` was given already, by dropping it onto the page. */
+export async function chooseOther(file = null) {
+  const { component } = store;
+  if (!component) return;
+  const fault = el("p", { class: "fault", role: "alert" });
+  const attempt = async (work) => {
+    fault.textContent = "";
+    try {
+      setOther(await work());
+      closeDialog();
+    } catch (error) {
+      fault.textContent = error.message;
+    }
+  };
+  const input = el("input", {
+    type: "file",
+    id: "file",
+    on: { change: () => input.files[0] && attempt(() => fromFile(input.files[0])) },
+  });
+  const snapshots = el("ul", { class: "choices" }, el("li", { class: "nothing", text: "Looking …" }));
+  const vehicles = el("ul", { class: "choices" }, el("li", { class: "nothing", text: "Looking …" }));
+  const content = el(
+    "div",
+    {},
+    fault,
+    el("h3", { text: "A file" }),
+    el(
+      "label",
+      { class: "drop", for: "file" },
+      el("span", { text: "A parameter file of any ground station; it can be dropped onto the page as well." }),
+      input,
+    ),
+    el("h3", { text: "An earlier state" }),
+    snapshots,
+    el("h3", { text: "Another vehicle" }),
+    vehicles,
+  );
+  if (file) attempt(() => fromFile(file));
+  fillSnapshots(component, snapshots, attempt);
+  fillVehicles(component, vehicles, attempt);
+  await openDialog(`Compare ${nameOf(component)} with …`, content, [button("Cancel", closeDialog, { kind: "quiet" })], {
+    focus: input,
+  });
+}
+
+/** What it is compared with, or null for nothing any more. */
+export function setOther(other) {
+  store.table.other = other;
+  store.tell("other");
+  if (other) announce(`Compared with ${other.label}.`);
+}
+
+async function fromFile(file) {
+  if (file.size > LARGEST_FILE)
+    throw new Problem(0, { detail: `${file.name} has ${file.size} bytes; that is no parameter file.` });
+  const read = await request("POST", `/files?${new URLSearchParams({ name: file.name })}`, file);
+  const source = { file: { name: file.name, base64: await base64(file) } };
+  return otherOf(file.name, read.params, source, true, read.notes ?? []);
+}
+
+async function fillSnapshots(component, list, attempt) {
+  try {
+    const { snapshots } = await get(at(component, "/snapshots"));
+    const kept = [...snapshots].sort((a, b) => b.id - a.id);
+    fill(list, kept, "No earlier state is kept.", (each) => [
+      `${moment(each.at ?? each.time)}`,
+      `${each.reason}, ${many(each.size, "parameter")}`,
+      () =>
+        attempt(async () => {
+          const state = await get(at(component, `/snapshots/${each.id}`));
+          return otherOf(`state of ${moment(each.at ?? each.time)}`, state.params, { snapshot: each.id }, false);
+        }),
+    ]);
+  } catch (error) {
+    list.replaceChildren(el("li", { class: "nothing", text: error.message }));
+  }
+}
+
+async function fillVehicles(component, list, attempt) {
+  const live = [...store.components.values()].filter((each) => keyOf(each) !== keyOf(component));
+  const keys = new Set(store.components.values().map((each) => `${each.key} ${each.component}`));
+  let cached = [];
+  try {
+    const { vehicles } = await get("/vehicles");
+    cached = vehicles.flatMap((vehicle) => vehicle.components.map((each) => ({ vehicle, each })));
+  } catch {
+    // a service without a cache knows those only that it hears
+  }
+  cached = cached.filter(({ vehicle, each }) => !keys.has(`${vehicle.key} ${each.component}`));
+  const choices = [
+    ...live.map((each) => [
+      nameOf(each),
+      `on ${each.link}`,
+      () =>
+        attempt(async () => {
+          const { params } = await get(at(each, "/params"));
+          const source = { component: { system: each.system, component: each.component, link: each.link } };
+          return otherOf(nameOf(each), params, source, false);
+        }),
+    ]),
+    ...cached.map(({ vehicle, each }) => [
+      `${vehicle.autopilot ?? ""} ${vehicle.key}`.trim(),
+      `component ${each.component}, in the cache`,
+      () =>
+        attempt(async () => {
+          const { params } = await get(`/vehicles/${encodeURIComponent(vehicle.key)}/${each.component}/params`);
+          return otherOf(vehicle.key, params, { vehicle: { key: vehicle.key, component: each.component } }, false);
+        }),
+    ]),
+  ];
+  fill(list, choices, "No other vehicle is known.", (each) => each);
+}
+
+function fill(list, items, nothing, parts) {
+  const made = items.map((item) => {
+    const [name, remark, choose] = parts(item);
+    return el(
+      "li",
+      {},
+      el(
+        "button",
+        { type: "button", class: "choice", on: { click: choose } },
+        el("b", { text: name }),
+        el("small", { text: remark }),
+      ),
+    );
+  });
+  list.replaceChildren(...(made.length ? made : [el("li", { class: "nothing", text: nothing })]));
+}
+
+function otherOf(label, params, source, isPartial, notes = []) {
+  const values = new Map();
+  for (const [name, param] of Object.entries(params)) {
+    values.set(name, { text: valueText(param, param.type ?? typeOf(name)) });
+  }
+  return { label, values, source, isPartial, notes };
+}
+
+const typeOf = (name) => store.table.rows.get(name)?.type ?? "REAL64";
+
+async function base64(file) {
+  const bytes = new Uint8Array(await file.arrayBuffer());
+  let text = "";
+  for (let at = 0; at < bytes.length; at += 4096) text += String.fromCharCode(...bytes.subarray(at, at + 4096));
+  return btoa(text);
+}
+
+/** The line that says what it is compared with, and what can be done with it. */
+export function drawBanner() {
+  const banner = byId("banner");
+  const { table } = store;
+  const { other } = table;
+  banner.hidden = !other;
+  byId("third").textContent = other ? other.label : "Default";
+  if (!other) return banner.replaceChildren();
+  const names = [...other.values.keys()];
+  const there = names.filter((name) => !table.rows.has(name)).length;
+  const differ = [...table.rows.values()].filter((row) => table.standing(row) === "differs").length;
+  const here = [...table.rows.values()].filter((row) => table.standing(row) === "here").length;
+  const counts = [`${differ} differ`, here && `${here} only here`, there && `${there} only there`]
+    .filter(Boolean)
+    .join(", ");
+  banner.replaceChildren(
+    el(
+      "span",
+      {},
+      "Compared with ",
+      el("b", { text: other.label }),
+      `: ${counts}.`,
+      other.notes.map((note) => el("small", { text: ` ${typeof note === "string" ? note : (note.text ?? "")}` })),
+    ),
+    store.mayWrite && button("Take over …", takeOver, { kind: "strong", disabled: !differ && !there }),
+    button("", () => setOther(null), { kind: "quiet only", drawing: "close", label: "End the comparison" }),
+  );
+}
+
+/** Plans what would be sent to be as the other is, lets the person choose of it, applies what was chosen. */
+export async function takeOver() {
+  const { component, table } = store;
+  const { other } = table;
+  const fault = el("p", { class: "fault", role: "alert" });
+  const summary = el("p", { class: "summary", role: "status", text: "Working out what would be set …" });
+  const body = el("tbody");
+  const apply = button("Apply", () => go(), { kind: "strong", disabled: true });
+  const cancel = button("Not now", () => (hasBegun ? stop() : closeDialog()), { kind: "quiet" });
+  const buttons = el("div", { class: "buttons" }, cancel, apply);
+  const armed = new Caution(component, () => refresh());
+  const all = el("input", {
+    type: "checkbox",
+    "aria-label": "All that would be set",
+    on: {
+      change: () => {
+        for (const line of lines)
+          if (!line.box.disabled && (line.status === "set" || !all.checked)) line.box.checked = all.checked;
+        refresh();
+      },
+    },
+  });
+  const table_ = el(
+    "table",
+    { class: "changes" },
+    el(
+      "thead",
+      {},
+      el(
+        "tr",
+        {},
+        el("th", {}, all),
+        ...["Name", "Now", "New", "Remark"].map((text) => el("th", { scope: "col", text })),
+      ),
+    ),
+    body,
+  );
+  let lines = [];
+  let job = null;
+  let hasBegun = false;
+  let isOver = false;
+
+  function refresh() {
+    const count = lines.filter((line) => line.box.checked).length;
+    const whole = lines.filter((line) => line.status === "set").length;
+    all.checked = count > 0 && count >= whole;
+    all.indeterminate = count > 0 && count < whole;
+    if (hasBegun) return;
+    apply.disabled = !count || armed.forbids;
+    apply.replaceChildren(el("span", { text: `Apply ${many(count, "value")}` }));
+  }
+
+  async function go() {
+    const chosen = lines.filter((line) => line.box.checked);
+    if (hasBegun || armed.forbids) return;
+    hasBegun = true;
+    for (const line of lines) line.box.disabled = true;
+    all.disabled = apply.disabled = true;
+    cancel.replaceChildren(el("span", { text: "Stop" }));
+    summary.textContent = "Applying …";
+    const include = chosen.filter((line) => line.status !== "set").map((line) => exactly(line.name));
+    try {
+      job = await request("POST", at(component, "/apply"), {
+        wanted: other.source,
+        only: chosen.map((line) => exactly(line.name)),
+        include,
+        allow_armed: armed.isArmed,
+        skip_invalid: true,
+        wait: false,
+      });
+      const ended = await followJob(job, (progress) => {
+        if (progress?.total)
+          summary.textContent = `${PHASES[progress.phase] ?? "Applying"}: ${progress.done} of ${progress.total}`;
+      });
+      show(ended, chosen);
+    } catch (error) {
+      fault.textContent = error.message;
+      summary.textContent = "";
+    }
+    job = null;
+    isOver = true;
+    buttons.replaceChildren(button("Done", closeDialog, { kind: "strong" }));
+    buttons.querySelector(".strong").focus();
+  }
+
+  function show(ended, chosen) {
+    const result = ended.result ?? {};
+    const outcomes = [];
+    for (const line of chosen) {
+      const row = result.params?.[line.name] ?? { status: ended.state === "done" ? "unchanged" : "failed" };
+      const word = OUTCOMES[row.status] ?? { text: row.status, kind: "warn" };
+      const made = row.status === "adjusted" ? `The vehicle made ${numberText(row.actual, row.type)} of it. ` : "";
+      line.remark.replaceChildren(
+        el("b", { class: `outcome ${word.kind}`, text: word.text }),
+        ` ${made}${row.reason ?? ""}`,
+      );
+      const known = table.rows.get(line.name)?.document;
+      const isTaken = ["set", "adjusted", "unproven"].includes(row.status);
+      outcomes.push({
+        name: line.name,
+        status: row.status,
+        isTaken,
+        before: line.before,
+        restore: line.restore ?? known?.value,
+      });
+    }
+    table.sent = { names: new Set(chosen.map((line) => line.name)), outcomes, at: Date.now() };
+    const late = result.reboot_required ?? [];
+    summary.textContent = `${told(outcomes)}${late.length ? ` Counts from the next start of the vehicle on: ${late.join(", ")}.` : ""}`;
+    fault.textContent = result.error ?? ended.problem?.detail ?? "";
+    announce(summary.textContent);
+    store.tell("pending");
+    store.tell("table");
+  }
+
+  function stop() {
+    if (job)
+      request("DELETE", `/jobs/${encodeURIComponent(job.id)}`).catch((error) => (fault.textContent = error.message));
+  }
+
+  const opened = openDialog(
+    `Take over from ${other.label}`,
+    el("div", {}, armed.element, fault, summary, table_),
+    buttons,
+    { isHeld: () => hasBegun && !isOver, kind: "wide", focus: cancel },
+  );
+  try {
+    const plan = await request("POST", at(component, "/plan"), { wanted: other.source }, { patience: PLAN_PATIENCE });
+    lines = linesOf(plan, table, other, refresh);
+    body.replaceChildren(...lines.map((line) => line.element));
+    const count = lines.filter((line) => line.status === "set").length;
+    const left = lines.length - count;
+    summary.textContent = count
+      ? `${many(count, "value")} would be set${left ? `; ${left} would be left out unless you choose them` : ""}.`
+      : "Nothing would be set.";
+    refresh();
+  } catch (error) {
+    summary.textContent = "";
+    fault.textContent = error.message;
+  }
+  await opened;
+}
+
+/** A pattern that means this name alone. */
+const exactly = (name) => name.replace(/[*?[]/g, "[$&]");
+
+const PHASES = { reading: "Reading", writing: "Writing", rebooting: "Starting again" };
+
+/** The lines of a plan in the order in which they would be sent, then those that would be left out. */
+function linesOf(plan, table, other, refresh) {
+  const staged = plan.stages.flatMap(({ purpose, steps }) =>
+    steps.map(({ name }) => [name, purpose === "the others" ? "" : purpose]),
+  );
+  const purposes = new Map(staged);
+  const names = [...purposes.keys(), ...Object.keys(plan.params).filter((name) => !purposes.has(name))];
+  return names
+    .map((name) => ({ name, planned: plan.params[name] }))
+    .filter(
+      ({ name, planned }) =>
+        planned && planned.status !== "unchanged" && (table.rows.has(name) || planned.category === "missing"),
+    )
+    .map(({ name, planned }) => {
+      const row = table.rows.get(name);
+      const { status } = planned;
+      const isDoubtful = status === "invalid" && planned.category === "out-of-range";
+      const isOut = !row || planned.category === "missing" || (status === "invalid" && !isDoubtful);
+      const box = el("input", {
+        type: "checkbox",
+        checked: status === "set",
+        disabled: isOut,
+        "aria-label": `Set ${name}`,
+        on: { change: refresh },
+      });
+      const word = status === "set" ? "" : isOut ? "cannot be set" : isDoubtful ? "doubtful" : "left out";
+      const remark = el(
+        "td",
+        { class: "remark" },
+        word && el("b", { class: `outcome ${isDoubtful ? "warn" : "quiet"}`, text: word }),
+        ` ${(planned.reason || purposes.get(name) || "").replace(/^left out: /, "")}`,
+      );
+      const element = el(
+        "tr",
+        { class: isOut ? "out" : "" },
+        el("td", { class: "pick" }, box),
+        el("th", { scope: "row", text: name }),
+        el("td", { class: "now", text: row?.text ?? "" }),
+        el("td", { class: "new", text: numberText(planned.wanted, row?.type ?? planned.type) }),
+        remark,
+      );
+      const restore = row?.document.bits ? { bits: row.document.bits } : row?.document.value;
+      return { name, status, box, remark, element, before: row?.text ?? "", restore };
+    });
+}
+
+/** Asks for a job until it is over; a service that cannot be reached for a while is asked on. */
+async function followJob(begun, tell) {
+  for (;;) {
+    try {
+      const job = await get(`/jobs/${encodeURIComponent(begun.id)}`);
+      tell(job.progress);
+      if (job.state !== "running") return job;
+    } catch (error) {
+      if (error.status !== 0) throw error;
+    }
+    await new Promise((resolve) => setTimeout(resolve, JOB_PAUSE));
+  }
+}

@@ -1,0 +1,110 @@
+/** The dialogs: one at a time, with the browser's own keeping of the focus. */
+
+import { onToken, request } from "./api.js";
+import { button, byId, el } from "./dom.js";
+
+let asking = null;
+let end = () => {};
+
+/** Opens the dialog with this content; what it returns ends when it is closed. Esc closes unless `isHeld()`. */
+export function openDialog(title, content, buttons, { isHeld = () => false, kind = "", focus = null } = {}) {
+  const dialog = byId("dialog");
+  closeDialog();
+  const heading = el("h2", { id: "dialog-title", text: title });
+  const close = button("", () => isHeld() || closeDialog(), { kind: "quiet only", drawing: "close", label: "Close" });
+  dialog.className = kind;
+  dialog.replaceChildren(
+    el("header", {}, heading, close),
+    el("div", { class: "scroll" }, content),
+    el("footer", {}, buttons),
+  );
+  dialog.oncancel = (event) => {
+    if (isHeld()) event.preventDefault();
+  };
+  return new Promise((resolve) => {
+    const back = document.activeElement;
+    end = () => {
+      end = () => {};
+      dialog.replaceChildren();
+      if (back?.isConnected) back.focus({ preventScroll: true });
+      resolve();
+    };
+    dialog.onclose = () => dialog.open || end();
+    dialog.showModal();
+    (focus ?? dialog.querySelector("footer .strong") ?? close).focus();
+  });
+}
+
+/** Ends it at once: the browser tells of its end later, when there may be another one. */
+export function closeDialog() {
+  byId("dialog").close();
+  end();
+}
+
+/** Asks for the token; all who wait for one wait for the same answer. */
+function askForToken() {
+  asking ??= ask().finally(() => {
+    asking = null;
+  });
+  return asking;
+}
+
+async function ask() {
+  let isDone = false;
+  const field = el("input", { type: "password", id: "token", autocomplete: "current-password", required: true });
+  const fault = el("p", { class: "fault", role: "alert" });
+  const form = el(
+    "form",
+    {
+      id: "token-form",
+      on: {
+        submit: async (event) => {
+          event.preventDefault();
+          try {
+            await request("POST", "/session", { token: field.value.trim() });
+            isDone = true;
+            closeDialog();
+          } catch (error) {
+            fault.textContent =
+              error.status === 401 || error.status === 403 ? "The service does not know this token." : error.message;
+            field.select();
+          }
+        },
+      },
+    },
+    el("p", { text: "This service is open to those who have a token. It is kept by the browser until it is closed." }),
+    el("label", { for: "token", text: "Token" }),
+    field,
+    fault,
+  );
+  const enter = el("button", { type: "submit", form: "token-form", class: "button strong", text: "Go on" });
+  while (!isDone) await openDialog("Token", form, [enter], { kind: "small", isHeld: () => !isDone, focus: field });
+}
+
+onToken(askForToken);
+
+/** The keys, for those who ask. */
+export function showKeys() {
+  const keys = [
+    ["/", "search"],
+    ["↑ ↓, Page Up, Page Down, Home, End", "move in the table"],
+    ["Enter", "edit the value; stage what was edited"],
+    ["Esc", "leave: the editor, the details, the search"],
+    ["Space or →", "all that is known of the parameter"],
+    ["↑ ↓ in a number", "one step more or less; with Shift, ten"],
+    ["d", "take the default"],
+    ["t", "take the value that is compared with"],
+    ["u", "drop the change of the parameter"],
+    ["Ctrl Enter", "review what is to be sent"],
+    ["Ctrl Z", "undo what was sent last, after a review"],
+    ["g", "go to the groups"],
+    ["v", "go to the vehicles"],
+    ["?", "this list"],
+  ];
+  const list = el(
+    "dl",
+    { class: "keys" },
+    keys.flatMap(([key, text]) => [el("dt", {}, el("kbd", { text: key })), el("dd", { text })]),
+  );
+  return openDialog("Keys", list, [button("Close", closeDialog, { kind: "strong" })]);
+}

@@ -1,0 +1,107 @@
+/** Elements, made so that no text can become markup: whatever is shown goes in by `textContent`. */
+
+/**
+ * An element. `props` are attributes, but for `class`, `text`, `on` (listeners) and `data`; an attribute that
+ * is false, null or undefined is left out. Children are elements or texts; null and false are passed over.
+ */
+export function el(tag, props = {}, ...children) {
+  const made = document.createElement(tag);
+  for (const [name, value] of Object.entries(props)) {
+    if (value === null || value === undefined || value === false) continue;
+    if (name === "class") made.className = value;
+    else if (name === "text") made.textContent = value;
+    else if (name === "on") for (const [type, listener] of Object.entries(value)) made.addEventListener(type, listener);
+    else if (name === "data") Object.assign(made.dataset, value);
+    else if (name in PROPERTIES) made[name] = value;
+    else made.setAttribute(name, value === true ? "" : value);
+  }
+  made.append(...children.flat().filter((child) => child !== null && child !== undefined && child !== false));
+  return made;
+}
+
+/** The element of this id; the page always has it. */
+export const byId = (id) => document.getElementById(id);
+
+/** One of the page's drawings, which say nothing that a text beside them does not say. */
+export function icon(name) {
+  const svg = document.createElementNS(SVG, "svg");
+  svg.setAttribute("viewBox", "0 0 16 16");
+  svg.setAttribute("class", "icon");
+  svg.setAttribute("aria-hidden", "true");
+  const path = document.createElementNS(SVG, "path");
+  path.setAttribute("d", DRAWINGS[name]);
+  svg.append(path);
+  return svg;
+}
+
+/** A button that has a text, a drawing, or both; `label` names one that has a drawing alone. */
+export function button(text, onclick, { kind = "", drawing = null, label = null, ...more } = {}) {
+  return el(
+    "button",
+    {
+      type: "button",
+      class: `button ${kind}`.trim(),
+      "aria-label": label,
+      title: label,
+      on: { click: onclick },
+      ...more,
+    },
+    drawing && icon(drawing),
+    text && el("span", { text }),
+  );
+}
+
+/** Sets a text only where it is another one, so that nothing is drawn or read out anew without need. */
+export function setText(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+/** Sets or takes away an attribute, under the same rule. */
+export function setAttribute(element, name, value) {
+  if (value === null || value === undefined || value === false) {
+    if (element.hasAttribute(name)) element.removeAttribute(name);
+  } else if (element.getAttribute(name) !== String(value)) element.setAttribute(name, value);
+}
+
+/** Tells those who listen to the page rather than look at it. */
+export function announce(text) {
+  const region = byId("spoken");
+  region.append(el("p", { text }));
+  while (region.children.length > MOST_SPOKEN) region.firstChild.remove();
+}
+
+/** Calls something once for all that happens until the next frame. */
+export function onceAFrame(work) {
+  let isDue = false;
+  return () => {
+    if (isDue) return;
+    isDue = true;
+    // a page that is not looked at gets no frames, and is to be right all the same when it is looked at again
+    const begin = document.hidden ? (run) => setTimeout(run, HIDDEN_PAUSE) : requestAnimationFrame;
+    begin(() => {
+      isDue = false;
+      work();
+    });
+  };
+}
+
+/** Whether there is room for the list alone, as on a phone. */
+export const isNarrow = () => matchMedia("(max-width: 760px)").matches;
+
+const SVG = "http://www.w3.org/2000/svg";
+const MOST_SPOKEN = 5;
+const HIDDEN_PAUSE = 200;
+const PROPERTIES = { value: 1, checked: 1, disabled: 1, hidden: 1, indeterminate: 1, selected: 1, max: 1 };
+const DRAWINGS = {
+  search: "M7 2.5a4.5 4.5 0 1 0 0 9 4.5 4.5 0 0 0 0-9ZM10.4 10.4 14 14",
+  keep: "M2.5 5h2.7l1-1.5h3.6l1 1.5h2.7v8h-11ZM8 11a2.2 2.2 0 1 0 0-4.4A2.2 2.2 0 0 0 8 11Z",
+  close: "M4 4l8 8M12 4l-8 8",
+  refresh: "M13 8a5 5 0 1 1-1.5-3.6M13 2v3h-3",
+  save: "M8 2.5v7M5 7l3 3 3-3M3 13h10",
+  compare: "M5 2.5v11M2.5 5 5 2.5 7.5 5M11 13.5v-11M8.5 11l2.5 2.5 2.5-2.5",
+  theme: "M8 2.5a5.5 5.5 0 1 0 0 11ZM8 2.5a5.5 5.5 0 0 1 0 11",
+  help: "M5.8 6a2.2 2.2 0 1 1 3.2 2c-.7.4-1 .8-1 1.6M8 12.2v.3",
+  undo: "M3 6.5h6.5a3.5 3.5 0 0 1 0 7H6M3 6.5 6 3.5M3 6.5l3 3",
+  left: "M10 3 5 8l5 5",
+  warning: "M8 2.5 14 13H2ZM8 6.5v3M8 11.3v.2",
+};

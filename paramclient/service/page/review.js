@@ -1,0 +1,262 @@
+/** What is to be sent, looked at before it is; what became of each; and the way back. */
+
+import { Problem, at, request } from "./api.js";
+import { announce, button, el } from "./dom.js";
+import { closeDialog, openDialog } from "./dialogs.js";
+import { valueText } from "./details.js";
+import { keyOf, store } from "./store.js";
+import { defaultOf, doubt, many, meaningOf, sameText } from "./values.js";
+
+const AT_ONCE = 4;
+/** A write may be repeated for long on a bad link; the service says when it gives up. */
+const WRITE_PATIENCE = 120_000;
+
+export const OUTCOMES = {
+  accepted: { text: "accepted", kind: "good" },
+  set: { text: "accepted", kind: "good" },
+  unchanged: { text: "had it already", kind: "good" },
+  adjusted: { text: "adjusted", kind: "warn" },
+  unproven: { text: "sent, not proven", kind: "warn" },
+  skipped: { text: "left out", kind: "quiet" },
+  refused: { text: "refused", kind: "bad" },
+  failed: { text: "failed", kind: "bad" },
+};
+
+/**
+ * What stands in the way of sending to an armed vehicle: a sentence, and a box to be ticked. It shows itself while
+ * the vehicle is armed, also where that happens meanwhile; `change` is called when it may have made a difference.
+ */
+export class Caution {
+  constructor(component, change) {
+    this.key = keyOf(component);
+    this.box = el("input", { type: "checkbox", on: { change } });
+    this.element = el(
+      "div",
+      { class: "armed", role: "alert", hidden: !this.isArmed },
+      el("p", {}, el("b", { text: "The vehicle is armed. " }), "Its motors may turn, and what is sent counts at once."),
+      el("label", {}, this.box, el("span", { text: "Send all the same" })),
+    );
+    const forget = store.on("armed", () => {
+      if (!this.element.isConnected) return forget();
+      this.element.hidden = !this.isArmed;
+      this.box.checked = false;
+      return change();
+    });
+  }
+
+  get isArmed() {
+    return Boolean(store.components.get(this.key)?.is_armed);
+  }
+
+  get forbids() {
+    return this.isArmed && !this.box.checked;
+  }
+}
+
+/** Shows what is pending, sends it when that is wanted, shows what became of it. */
+export async function review() {
+  const { component, table } = store;
+  const changes = [...table.pending.values()].sort((a, b) => (a.name < b.name ? -1 : 1));
+  if (!component || !changes.length) return;
+  const lines = new Map(
+    changes.map((change) => [change.name, lineOf(change, table.rows.get(change.name), () => drop(change.name))]),
+  );
+  const body = el(
+    "tbody",
+    {},
+    [...lines.values()].map((line) => line.element),
+  );
+  const table_ = el(
+    "table",
+    { class: "changes" },
+    el(
+      "thead",
+      {},
+      el(
+        "tr",
+        {},
+        ...["Name", "Now", "New", "Remark"].map((text) => el("th", { scope: "col", text })),
+        el("th", {}, el("span", { class: "unseen", text: "Drop" })),
+      ),
+    ),
+    body,
+  );
+  const armed = new Caution(component, () => refresh());
+  const summary = el("p", { class: "summary", role: "status" });
+  const send = button("", () => go(), { kind: "strong" });
+  const cancel = button("Not yet", closeDialog, { kind: "quiet" });
+  const buttons = el("div", { class: "buttons" }, cancel, send);
+  let isSending = false;
+  let sent = null;
+
+  function refresh() {
+    const count = lines.size;
+    if (isSending || sent) return;
+    send.disabled = !count || armed.forbids;
+    send.replaceChildren(el("span", { text: `Send ${many(count, "change")}` }));
+  }
+
+  function drop(name) {
+    lines.get(name).element.remove();
+    lines.delete(name);
+    table.pending.delete(name);
+    store.tell("pending");
+    refresh();
+    if (!lines.size) closeDialog();
+    else send.focus();
+  }
+
+  async function go() {
+    if (isSending || armed.forbids) return;
+    isSending = true;
+    send.disabled = cancel.disabled = true;
+    send.replaceChildren(el("span", { text: "Sending …" }));
+    sent = { names: new Set(lines.keys()), outcomes: [], at: Date.now() };
+    table.sent = sent;
+    const queue = [...lines.values()];
+    const worker = async () => {
+      for (let line = queue.shift(); line; line = queue.shift()) sent.outcomes.push(await sendOne(component, line));
+    };
+    await Promise.all(Array.from({ length: AT_ONCE }, worker));
+    for (const each of sent.outcomes) if (each.isTaken) table.pending.delete(each.name);
+    isSending = false;
+    store.tell("pending");
+    store.tell("table");
+    const said = told(sent.outcomes);
+    summary.textContent = said;
+    announce(said);
+    const late = sent.outcomes.filter((each) => each.isTaken && each.isLate).map((each) => each.name);
+    if (late.length) summary.append(el("br"), `Counts from the next start of the vehicle on: ${late.join(", ")}.`);
+    const way =
+      sent.outcomes.some((each) => each.isTaken) &&
+      button(
+        "Undo …",
+        () => {
+          closeDialog();
+          undo();
+        },
+        { kind: "quiet", drawing: "undo" },
+      );
+    const done = button("Done", closeDialog, { kind: "strong" });
+    buttons.replaceChildren(...[way, done].filter(Boolean));
+    done.focus();
+  }
+
+  refresh();
+  const focus = armed.isArmed ? armed.box : send;
+  await openDialog(`Review: ${nameOf(component)}`, el("div", {}, armed.element, table_, summary), buttons, {
+    isHeld: () => isSending,
+    kind: "wide",
+    focus,
+  });
+}
+
+/** Puts the values from before the last sending on the list, and shows it. Nothing is sent without a look. */
+export function undo() {
+  const { sent } = store.table;
+  if (!sent) return;
+  for (const each of sent.outcomes) if (each.isTaken) store.stage(each.name, each.before, each.restore);
+  if (store.table.pending.size) review();
+  else announce("There is nothing to undo: the vehicle has the values from before.");
+}
+
+/** How many of each outcome there were, in words. */
+export function told(outcomes) {
+  const counts = new Map();
+  for (const { status } of outcomes) {
+    const { text } = OUTCOMES[status] ?? { text: status };
+    counts.set(text, (counts.get(text) ?? 0) + 1);
+  }
+  const order = Object.values(OUTCOMES).map(({ text }) => text);
+  const sorted = [...counts].sort(([a], [b]) => order.indexOf(a) - order.indexOf(b));
+  return `${sorted.map(([text, count]) => `${count} ${text}`).join(", ")}.`;
+}
+
+/** A vehicle as it is called. */
+export function nameOf(component) {
+  return `${AUTOPILOTS[component.autopilot] ?? component.autopilot} ${component.system}/${component.component}`;
+}
+
+const AUTOPILOTS = {
+  px4: "PX4",
+  ardupilot: "ArduPilot",
+  ardupilotmega: "ArduPilot",
+  generic: "Generic",
+  unknown: "Unknown",
+};
+
+function lineOf(change, row, drop) {
+  const { name, text } = change;
+  const remarks = [];
+  if (row && !sameText(row.text, change.before, row.type)) remarks.push(`It was ${change.before} when you edited it.`);
+  if (row?.info?.reboot_required) remarks.push("Counts from the next start on.");
+  if (row?.info?.is_read_only) remarks.push("The vehicle sets it by itself.");
+  const standard = row ? defaultOf(row.document) : null;
+  if (standard !== null && sameText(text, standard, row.type)) remarks.push("The default.");
+  const units = row?.info?.units ? ` ${row.info.units}` : "";
+  const in_words = (value) => {
+    const meaning = meaningOf(value, row?.info, row?.type);
+    return meaning ? `${value} ${meaning}` : `${value}${units}`;
+  };
+  const doubts = row ? doubt(text, row.info, row.type) : "";
+  const remark = el(
+    "td",
+    { class: "remark" },
+    doubts && el("b", { class: "outcome warn", text: `${doubts} ` }),
+    remarks.join(" "),
+  );
+  const away = el(
+    "td",
+    { class: "drop-it" },
+    button("", drop, { kind: "quiet only", drawing: "close", label: `Drop ${name}` }),
+  );
+  const element = el(
+    "tr",
+    {},
+    el("th", { scope: "row", text: name }),
+    el("td", { class: "now", text: in_words(row?.text ?? "") }),
+    el("td", { class: "new", text: in_words(text) }),
+    remark,
+    away,
+  );
+  return { change, row, element, remark, away };
+}
+
+/** Sends one change, and writes what became of it into its line. */
+async function sendOne(component, { change, row, element, remark, away }) {
+  const { name, text, send } = change;
+  const before = { text: row.text, restore: row.document.bits ? { bits: row.document.bits } : row.document.value };
+  const outcome = {
+    name,
+    before: before.text,
+    restore: before.restore,
+    isTaken: false,
+    isLate: Boolean(row.info?.reboot_required),
+  };
+  away.replaceChildren();
+  element.classList.add("busy");
+  remark.textContent = "sending …";
+  try {
+    const { results } = await request(
+      "PATCH",
+      at(component, "/params"),
+      { values: { [name]: send } },
+      { patience: WRITE_PATIENCE },
+    );
+    const result = results[name];
+    if (result?.problem) throw new Problem(result.problem.status, result.problem);
+    outcome.status = result.status ?? "accepted";
+    outcome.isTaken = true;
+    outcome.reason =
+      outcome.status === "adjusted"
+        ? `The vehicle made ${valueText(result.actual, row.type)} of ${text}.`
+        : (result.reason ?? "");
+  } catch (error) {
+    outcome.status = error.document?.type?.endsWith(":no-reply") || !error.status ? "failed" : "refused";
+    outcome.reason = error.message;
+  }
+  const { text: word, kind } = OUTCOMES[outcome.status] ?? { text: outcome.status, kind: "warn" };
+  element.classList.remove("busy");
+  remark.replaceChildren(el("b", { class: `outcome ${kind}`, text: word }), outcome.reason ? ` ${outcome.reason}` : "");
+  return outcome;
+}

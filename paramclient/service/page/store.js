@@ -1,0 +1,319 @@
+/** What the page knows: vehicles, tables, what is to be sent, what was sent. It draws nothing. */
+
+import { ASKER, at, get } from "./api.js";
+import { isChanged, meaningOf, sameText, textOf } from "./values.js";
+
+/** Changes of others are marked for so long, in milliseconds. */
+export const NEWS_FOR = 600_000;
+const FEWEST_OF_A_GROUP = 2;
+export const OTHERS = "Others";
+
+export const keyOf = (component) => `${component.link} ${component.system}/${component.component}`;
+
+/** One parameter as it is shown: the service's document, and what is worked out of it once. */
+class Row {
+  constructor(document) {
+    this.news = null;
+    this.take(document);
+  }
+
+  take(document) {
+    const info = document.metadata ?? this.info;
+    this.document = { ...document, metadata: info };
+    this.info = info;
+    this.name = document.name;
+    this.type = document.type;
+    this.text = textOf(document);
+    this.meaning = meaningOf(this.text, info, this.type);
+    this.isChanged = isChanged(this.document);
+    this.description = info?.short_description ?? "";
+    this.words = `${this.name} ${this.description} ${this.meaning} ${info?.long_description ?? ""}`.toLowerCase();
+  }
+}
+
+/** The table of one component, and what somebody at this page has in mind for it. */
+class Table {
+  constructor() {
+    this.rows = new Map();
+    this.pending = new Map();
+    this.sent = null;
+    this.other = null;
+    this.seq = -1;
+    this.loads = 0;
+    this.isLoaded = false;
+    this.early = null;
+    this.forget();
+  }
+
+  /** Rows in the order of their names, each with its group. */
+  get sorted() {
+    if (!this.order) {
+      this.order = [...this.rows.values()].sort((a, b) => (a.name < b.name ? -1 : a.name > b.name ? 1 : 0));
+      this.groups = new Map();
+      const prefix = (row) => row.name.split("_", 1)[0];
+      const counts = new Map();
+      for (const row of this.order) counts.set(prefix(row), (counts.get(prefix(row)) ?? 0) + 1);
+      for (const row of this.order) {
+        row.group = row.info?.group || (counts.get(prefix(row)) < FEWEST_OF_A_GROUP ? OTHERS : prefix(row));
+        this.groups.set(row.group, (this.groups.get(row.group) ?? 0) + 1);
+      }
+    }
+    return this.order;
+  }
+
+  forget() {
+    this.order = null;
+    this.groups = new Map();
+  }
+
+  load(documents, seq) {
+    const before = this.rows;
+    this.rows = new Map();
+    for (const [name, document] of Object.entries(documents)) {
+      const row = before.get(name) ?? new Row({ name, ...document });
+      row.take({ name, ...document });
+      this.rows.set(name, row);
+    }
+    this.seq = seq;
+    this.isLoaded = true;
+    this.forget();
+    const early = this.early ?? [];
+    this.early = null;
+    for (const event of early) this.change(event);
+  }
+
+  /** Takes a change into the table; gives the row if it is news, or null. */
+  change(event) {
+    if (!this.isLoaded) {
+      this.early?.push(event); // while nothing is being loaded, all of it will be
+      return null;
+    }
+    if (event.seq <= this.seq) return null;
+    const row = this.rows.get(event.name);
+    if (event.new === null) {
+      this.rows.delete(event.name);
+      this.forget();
+      return null;
+    }
+    const document = { name: event.name, ...event.new };
+    if (!row) {
+      this.rows.set(event.name, new Row(document));
+      this.forget();
+      return null;
+    }
+    const before = row.text;
+    const isTrust = event.old && sameText(textOf(event.old), textOf(event.new), row.type);
+    row.take(document);
+    if (isTrust || sameText(before, row.text, row.type)) return null;
+    row.news = { at: Date.now(), by: authorOf(event.by), before };
+    return row;
+  }
+
+  /** How a row stands to what the table is compared with: "same", "differs", "here", "there", or null. */
+  standing(row) {
+    if (!this.other) return null;
+    const other = this.other.values.get(row.name);
+    if (other === undefined) return this.other.isPartial ? null : "here";
+    return sameText(row.text, other.text, row.type) ? "same" : "differs";
+  }
+}
+
+/** Everything. Those who draw subscribe by `on(kind, listener)`, which gives what ends that. */
+class Store {
+  constructor() {
+    this.me = { role: "read", name: "", read_only: true };
+    this.components = new Map();
+    this.tables = new Map();
+    this.links = new Map();
+    this.selected = null;
+    this.isHeard = null;
+    this.seq = -1;
+    this.early = null;
+    this.listeners = new Map();
+    this.loads = 0;
+  }
+
+  on(kind, listener) {
+    if (!this.listeners.has(kind)) this.listeners.set(kind, []);
+    this.listeners.get(kind).push(listener);
+    return () =>
+      this.listeners.set(
+        kind,
+        this.listeners.get(kind).filter((each) => each !== listener),
+      );
+  }
+
+  tell(kind, what) {
+    for (const listener of this.listeners.get(kind) ?? []) listener(what);
+  }
+
+  /** The component that is looked at, or null. */
+  get component() {
+    return this.components.get(this.selected) ?? null;
+  }
+
+  get table() {
+    return this.tables.get(this.selected) ?? NO_TABLE;
+  }
+
+  get mayWrite() {
+    return this.me.role === "write" && !this.me.read_only;
+  }
+
+  /** Loads what the service knows; what happens meanwhile is kept and taken in afterwards. */
+  async begin() {
+    const load = ++this.loads;
+    this.early = [];
+    for (const table of this.tables.values()) {
+      table.isLoaded = false;
+      table.early = null;
+    }
+    const [me, links, found] = await Promise.all([get("/me"), get("/links"), get("/components")]);
+    if (load !== this.loads) return;
+    this.me = me;
+    this.links = new Map(links.links.map((link) => [link.name, link]));
+    const documents = new Map(found.components.map((each) => [keyOf(each), each]));
+    if (this.component && !documents.has(this.selected)) documents.set(this.selected, gone(this.component));
+    this.components = documents;
+    this.seq = found.seq;
+    const early = this.early;
+    this.early = null;
+    for (const event of early) this.take(event);
+    if (!this.component) this.selected = first(this.components);
+    this.tell("all");
+    if (this.selected) await this.loadTable(this.selected);
+  }
+
+  async select(key) {
+    this.selected = key;
+    this.tell("all");
+    if (!this.table.isLoaded) await this.loadTable(key);
+  }
+
+  async loadTable(key) {
+    const component = this.components.get(key);
+    if (!component) return;
+    const table = this.tableOf(key);
+    table.isLoaded = false;
+    table.early = [];
+    const load = ++table.loads;
+    table.isLoading = true;
+    let found;
+    try {
+      found = await get(at(component, "/params", { metadata: "true" }));
+    } finally {
+      table.isLoading = load !== table.loads;
+    }
+    if (load !== table.loads) return;
+    table.load(found.params, found.seq);
+    if (key === this.selected) this.tell("table");
+  }
+
+  tableOf(key) {
+    if (!this.tables.has(key)) this.tables.set(key, new Table());
+    return this.tables.get(key);
+  }
+
+  take(event) {
+    if (this.early !== null) {
+      this.early.push(event);
+      return;
+    }
+    if (event.type === "link") {
+      const name = event.link ?? event.name;
+      this.links.set(name, { ...this.links.get(name), name, state: event.state, error: event.error });
+      this.tell("components");
+      return;
+    }
+    const key = keyOf(event);
+    if (event.type === "component") this.takeComponent(key, event);
+    else if (event.type === "change") this.takeChange(key, event);
+    else if (event.type === "params" || event.type === "resynced") {
+      if (this.tables.get(key)?.isLoaded && event.type === "params") this.reload(key);
+    } else if (event.type === "progress") {
+      const component = this.components.get(key);
+      if (component) component.fetch = event.done ? null : event;
+      this.tell("components");
+    }
+  }
+
+  takeComponent(key, event) {
+    if (event.seq <= this.seq) return;
+    if (event.why === "forgotten") {
+      if (key === this.selected && this.component) this.components.set(key, gone(this.component));
+      else this.components.delete(key);
+      const table = this.tables.get(key);
+      if (table) table.isLoaded = false; // what was staged waits for the vehicle to come back
+    } else {
+      const document = event.component_doc;
+      const before = this.components.get(key);
+      this.components.set(key, document);
+      if (before && Boolean(before.is_armed) !== Boolean(document.is_armed)) this.tell("armed", document);
+      if (before && before.is_lost !== document.is_lost) this.tell("lost", document);
+    }
+    const isBack = key === this.selected && event.why !== "forgotten" && !this.table.isLoaded && !this.table.isLoading;
+    if (isBack) this.loadTable(key).catch(() => {});
+    if (!this.component) {
+      const key = first(this.components);
+      if (key) this.select(key);
+      else this.tell("all");
+    } else this.tell("components");
+  }
+
+  takeChange(key, event) {
+    const table = this.tables.get(key);
+    if (!table) return;
+    const row = table.change(event);
+    if (row?.info?.is_volatile) row.news = null;
+    else if (row) {
+      if (event.by?.includes(ASKER)) row.news = null;
+      else this.tell("news", { key, row });
+    }
+    if (key === this.selected) this.tell("table");
+  }
+
+  /** Several reasons to load a table anew, one after the other, are one. */
+  reload(key) {
+    clearTimeout(this.reloading);
+    this.reloading = setTimeout(() => this.loadTable(key).catch(() => {}), 150);
+  }
+
+  /** Puts a value on the list of what is to be sent; one that the vehicle has already goes off it. */
+  stage(name, text, send) {
+    const row = this.table.rows.get(name);
+    if (!row) return;
+    if (sameText(text, row.text, row.type)) this.table.pending.delete(name);
+    else this.table.pending.set(name, { name, text, send, before: row.text });
+    this.tell("pending");
+  }
+
+  unstage(name) {
+    if (this.table.pending.delete(name)) this.tell("pending");
+  }
+
+  unstageAll() {
+    this.table.pending.clear();
+    this.tell("pending");
+  }
+}
+
+const NO_TABLE = new Table();
+
+/** One that the service does not know any more, and that somebody looks at: nobody is led to another unasked. */
+const gone = (component) => ({ ...component, is_lost: true, is_armed: null, state: "lost", silence_s: 0, fetch: null });
+
+/** Who changed a value, in words. */
+export function authorOf(by) {
+  if (!by || by === "vehicle") return "the vehicle";
+  if (by.includes(ASKER)) return "you";
+  if (by === "us") return "the service";
+  return by.startsWith("us for ") ? by.slice(7) : by;
+}
+
+/** Autopilots go before cameras and the like. */
+function first(components) {
+  const keys = [...components.keys()];
+  return keys.find((key) => components.get(key).component === 1) ?? keys[0] ?? null;
+}
+
+export const store = new Store();

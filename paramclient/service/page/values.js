@@ -1,0 +1,177 @@
+/** Values: as people read and write them, and when two are the same. */
+
+const BOUNDS = {
+  INT8: [-(2n ** 7n), 2n ** 7n - 1n],
+  UINT8: [0n, 2n ** 8n - 1n],
+  INT16: [-(2n ** 15n), 2n ** 15n - 1n],
+  UINT16: [0n, 2n ** 16n - 1n],
+  INT32: [-(2n ** 31n), 2n ** 31n - 1n],
+  UINT32: [0n, 2n ** 32n - 1n],
+  INT64: [-(2n ** 63n), 2n ** 63n - 1n],
+  UINT64: [0n, 2n ** 64n - 1n],
+};
+const WORDS = {
+  nan: "NaN",
+  "+nan": "NaN",
+  inf: "Infinity",
+  "+inf": "Infinity",
+  infinity: "Infinity",
+  "-inf": "-Infinity",
+  "-infinity": "-Infinity",
+};
+
+export const isFloat = (type) => type === "REAL32" || type === "REAL64";
+export const isWhole = (type) => type in BOUNDS;
+
+/**
+ * A value in text: a float always with a point or an exponent, an integer with all its digits also where a
+ * JavaScript number could not hold it (it is read from its bits).
+ */
+export function textOf(param) {
+  if (param === null || param === undefined) return "";
+  const { value, type } = param;
+  if ((type === "INT64" || type === "UINT64") && param.bits) {
+    const bits = BigInt(`0x${param.bits}`);
+    return String(type === "INT64" ? BigInt.asIntN(64, bits) : bits);
+  }
+  return numberText(value, type);
+}
+
+/** The same for a number that stands alone, as a default or a bound does. */
+export function numberText(value, type) {
+  if (typeof value !== "number") return String(value ?? "");
+  const text = Object.is(value, -0) ? "-0" : String(type === "REAL32" ? shortest(value) : value);
+  return isFloat(type) && /^-?\d+$/.test(text) ? `${text}.0` : text;
+}
+
+/** The shortest number that is the same float32: 0.07 for 0.07000000029802322. */
+function shortest(value) {
+  for (let digits = 1; digits < 9; digits++) {
+    const short = Number(value.toPrecision(digits));
+    if (Math.fround(short) === Math.fround(value)) return short;
+  }
+  return value;
+}
+
+/** What a value means, in the words of its description: `Loiter`, `GPS | Baro`; "" where it is a number only. */
+export function meaningOf(text, info, type) {
+  if (!info) return "";
+  const named = info.values?.[text.replace(/\.0$/, "")];
+  if (named !== undefined) return named;
+  const mask = info.bits ? maskOf(text, type) : null;
+  if (mask === null || mask === 0n) return "";
+  const names = Object.entries(info.bits)
+    .filter(([bit]) => (mask >> BigInt(bit)) & 1n)
+    .map(([, name]) => name);
+  const rest = Object.keys(info.bits).reduce((left, bit) => left & ~(1n << BigInt(bit)), mask);
+  return [...names, ...(rest ? [`0x${rest.toString(16)}`] : [])].join(" | ");
+}
+
+/** The bits that a number stands for, or null where it has none. */
+export function maskOf(text, type) {
+  const whole = text.replace(/\.0$/, "");
+  if (!/^-?\d+$/.test(whole)) return null;
+  const number = BigInt(whole);
+  if (number >= 0n) return number;
+  const bounds = BOUNDS[type];
+  return bounds ? number & (bounds[1] - bounds[0]) : null;
+}
+
+/** The number of this type that has these bits, in text. */
+export function textOfMask(mask, type) {
+  const bounds = BOUNDS[type];
+  return String(bounds && bounds[0] < 0n && mask > bounds[1] ? mask - (bounds[1] - bounds[0] + 1n) : mask);
+}
+
+/**
+ * What a person wrote, as a value of this type: `{text, send}`, where `send` is what the service is given, or
+ * `{error}` with a sentence. Integers may be hexadecimal; a comma is taken for a point, as field keyboards have it.
+ */
+export function parse(written, type) {
+  const text = written.trim();
+  if (text === "") return { error: "A value is missing." };
+  if (isWhole(type)) {
+    if (!/^[+-]?(\d{1,20}|0x[\da-f]{1,16})$/i.test(text))
+      return { error: `${type} takes a whole number, such as 12 or 0x1F.` };
+    const size = BigInt(text.replace(/^[+-]/, ""));
+    const number = text.startsWith("-") ? -size : size;
+    const [low, high] = BOUNDS[type];
+    if (number < low || number > high) return { error: `${type} holds ${low} to ${high}.` };
+    const isSafe = number >= Number.MIN_SAFE_INTEGER && number <= Number.MAX_SAFE_INTEGER;
+    const bits = () => BigInt.asUintN(64, number).toString(16).padStart(16, "0");
+    return { text: String(number), send: isSafe ? Number(number) : { bits: bits() } };
+  }
+  const word = WORDS[text.toLowerCase()];
+  if (word !== undefined) return { text: word, send: word };
+  const plain = text.replace(",", ".");
+  if (!/^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d{1,3})?$/i.test(plain))
+    return { error: "That is no number; 12, -1.5, 1e-3, nan and inf are." };
+  const number = type === "REAL64" ? Number(plain) : Math.fround(Number(plain));
+  if (!Number.isFinite(number)) return { error: `${text} is more than a ${type} holds.` };
+  return { text: numberText(Number(plain), type), send: Number(plain) };
+}
+
+/** What speaks against a value by the parameter's description, in a sentence; the vehicle has the last word. */
+export function doubt(text, info, type) {
+  if (!info) return "";
+  const units = info.units ? ` ${info.units}` : "";
+  const number = Number(text);
+  const as = (bound) => (type === "REAL32" ? Math.fround(bound) : bound);
+  if (Number.isNaN(number))
+    return typeof info.minimum === "number" || typeof info.maximum === "number" ? "NaN is in no range." : "";
+  if (typeof info.minimum === "number" && as(number) < as(info.minimum))
+    return `Below the minimum of ${info.minimum}${units}.`;
+  if (typeof info.maximum === "number" && as(number) > as(info.maximum))
+    return `Above the maximum of ${info.maximum}${units}.`;
+  return "";
+}
+
+/** Whether two values in text are one value of this type; for a REAL32 when they round to the same one. */
+export function sameText(a, b, type) {
+  if (a === b) return true;
+  if (isWhole(type) && /^-?\d+$/.test(a) && /^-?\d+$/.test(b)) return BigInt(a) === BigInt(b);
+  const [x, y] = [Number(a), Number(b)];
+  if (Number.isNaN(x) || Number.isNaN(y)) return false;
+  return type === "REAL32" ? Math.fround(x) === Math.fround(y) : x === y;
+}
+
+/** Whether a parameter has another value than the firmware's default; null where that is not known. */
+export function isChanged(param) {
+  if (typeof param.is_default === "boolean") return !param.is_default;
+  const standard = defaultOf(param);
+  return standard === null ? null : !sameText(textOf(param), standard, param.type);
+}
+
+/** The firmware's default in text, or null where it is not known. */
+export function defaultOf(param) {
+  const standard = param.default ?? param.metadata?.default;
+  return standard === null || standard === undefined ? null : numberText(standard, param.type);
+}
+
+/** A range in words: `0 to 12 1/s`. */
+export function rangeOf(info) {
+  const units = info?.units ? ` ${info.units}` : "";
+  const [low, high] = [info?.minimum, info?.maximum];
+  if (low !== undefined && high !== undefined) return `${low} to ${high}${units}`;
+  if (low !== undefined) return `from ${low} up${units}`;
+  return high !== undefined ? `up to ${high}${units}` : "";
+}
+
+/** A duration as it is said: `4 s`, `3 min`, `2 h`. */
+export function span(seconds) {
+  if (seconds < 90) return `${Math.max(0, Math.round(seconds))} s`;
+  return seconds < 5400
+    ? `${Math.round(seconds / 60)} min`
+    : seconds < 172800
+      ? `${Math.round(seconds / 3600)} h`
+      : `${Math.round(seconds / 86400)} days`;
+}
+
+/** A moment by the clock of who looks: the time today, else with the date. */
+export function moment(at) {
+  const when = new Date(typeof at === "number" ? at * 1000 : at);
+  const clock = when.toLocaleTimeString([], { hour: "2-digit", minute: "2-digit", second: "2-digit" });
+  return when.toDateString() === new Date().toDateString() ? clock : `${when.toLocaleDateString()} ${clock}`;
+}
+
+export const many = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;

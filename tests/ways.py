@@ -1,0 +1,111 @@
+"""The two ways to a vehicle: a client with a link of its own, and one over a service that has the link.
+
+A test module that imports `pytest_generate_tests` and `way` runs each of its tests both ways, as far as they
+open their clients with `a_client`: what users see must be the same.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from types import TracebackType
+from typing import Any, TypeVar
+
+import pytest
+
+from paramclient import Component, ParamClient
+from paramclient.remote import RemoteClient, RemoteComponent
+from paramclient.service import Hub, create_app
+from tests import shell
+from tests.asgi import ASGITransport
+
+__all__ = ["DIRECT", "ServedClient", "direct_only", "looks", "pytest_generate_tests", "served", "way"]
+
+DIRECT = "direct"
+SERVICE = "service"
+
+Test = TypeVar("Test", bound=Callable[..., object])
+
+
+def direct_only(reason: str) -> Callable[[Test], Test]:
+    """This test makes sense with a link of one's own alone, for this reason."""
+    assert reason
+
+    def mark(test: Test) -> Test:
+        test.direct_only = reason  # type: ignore[attr-defined]  # a mark of our own
+        return test
+
+    return mark
+
+
+def pytest_generate_tests(metafunc: pytest.Metafunc) -> None:
+    """Run each test both ways, but for those that are marked."""
+    is_direct = hasattr(metafunc.function, "direct_only")
+    metafunc.parametrize("way", [DIRECT] if is_direct else [DIRECT, SERVICE], indirect=True)
+
+
+@pytest.fixture(autouse=True)
+def way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The way that this test goes."""
+    chosen: str = request.param
+    if chosen == SERVICE:
+        monkeypatch.setattr(shell, "client_of", ServedClient)
+        monkeypatch.setattr(shell, "machine_of", lambda component: served(component)._machine)
+    return chosen
+
+
+class ServedClient(RemoteClient):
+    """A client over a service in this process that has this link, and ends with it.
+
+    Attributes:
+        hub: of the service.
+        own: the client that the service has made for the link; None before.
+    """
+
+    def __init__(self, link: Any, **options: Any) -> None:
+        super().__init__("http://127.0.0.1:8765")
+        self.own: ParamClient | None = None
+        self._is_served = False
+        first = ParamClient(link, **options)
+        unused = [first]
+
+        def make() -> ParamClient:
+            self.own = unused.pop() if unused else ParamClient(link, **options)
+            return self.own
+
+        self.hub = Hub([(first.link.name, make)], cache=False, fetches=False)
+        self._requests._transport = ASGITransport(create_app(self.hub))
+
+    async def __aenter__(self) -> ServedClient:
+        if self._is_served:
+            return await super().__aenter__()  # type: ignore[return-value]  # it refuses
+        self._is_served = True
+        await self.hub.__aenter__()
+        try:
+            await super().__aenter__()
+        except BaseException:
+            await self.hub.__aexit__(None, None, None)
+            raise
+        return self
+
+    async def __aexit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        try:
+            await super().__aexit__(kind, error, trace)
+        finally:
+            await self.hub.__aexit__(None, None, None)
+
+
+def looks(component: Component) -> str:
+    """Its `repr`, without a word on where its link is."""
+    return repr(component).replace("<Remote", "<")
+
+
+def served(component: Component) -> Component:
+    """The component as whoever has the link knows it."""
+    if not isinstance(component, RemoteComponent):
+        return component
+    client = component._client
+    assert isinstance(client, ServedClient)
+    assert client.own is not None
+    return client.own.components[component.system, component.component]
