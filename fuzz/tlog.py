@@ -7,6 +7,7 @@ import logging
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from string import ascii_lowercase, ascii_uppercase
 from typing import Final
 from unittest import mock
 
@@ -39,6 +40,8 @@ PASSES = (1000, 1000, 20_000, 300_000, 7_000_000, -5_000_000, YEAR - 1, YEAR + 1
 NAMES = ("A", "B", "C", "D", "_HASH_CHECK", "\x1b[2J")
 KINDS = (9, 6, 1, 5, 10)
 VALUES = (0, 1, 2, 0x3F800000, 0x7FC00000, 0xFFFFFFFF)
+
+_CAPITALS = str.maketrans(ascii_lowercase, ascii_uppercase)
 
 logger = logging.getLogger("paramclient")
 
@@ -99,10 +102,11 @@ def _check_import(kept: ParamCache, tables: Sequence[ImportedTable], records: Se
         table = kept.load(summary.key, summary.component)
         assert table is not None
         words = {
-            (name, kind, bits_of(decode(raw, kind, encoding)[0], kind))
+            (spelt, kind, bits_of(decode(raw, kind, encoding)[0], kind))
             for (_, component), each in said.items()
             if component == summary.component
             for name, kind, raw in each
+            for spelt in (name, name.translate(_CAPITALS))  # as ArduPilot's are taken
             for encoding in Encoding
         }
         for name, param in table.params.items():
