@@ -1,0 +1,30 @@
+"""A program on the companion computer. It has the vehicle through the service as over a link of its own.
+
+    python tune.py http://127.0.0.1:8765 MC_ROLL_P 6.5
+
+The token, where the service wants one, stands in the environment variable PARAMCLIENT_TOKEN.
+"""
+
+import asyncio
+import sys
+
+from paramclient import ParamClient
+
+
+async def main(service: str, name: str, value: float) -> None:
+    async with ParamClient(service) as client:
+        vehicle = await client.component(timeout=30)
+        result = await vehicle.fetch_all()
+        print(f"{result.received} parameters, {len(result.missing)} missing")
+        changes = vehicle.changes()
+        done = await vehicle.set(name, value)
+        print(f"{done.status}: {name} = {done.actual!r}")
+        async for change in changes:
+            if change.name == name and change.new is not None:
+                print(f"everybody is told: {name} = {change.new.value!r}, by {change.by}")
+                break
+
+
+if __name__ == "__main__":
+    service, name, value = sys.argv[1:]
+    asyncio.run(main(service, name, float(value)))
