@@ -460,6 +460,48 @@ def test_what_the_database_refuses_is_told_and_holds_nothing_up(
         assert "refuses what was written while it was away: not this one" in caplog.text
 
 
+def test_a_database_that_can_only_be_read_for_a_while_costs_no_line(server_url: str, tmp_path: Path) -> None:
+    """As a replica before it takes over, or one whose disk is full."""
+    with database_on(server_url) as url, ParamCache(url, local=tmp_path / "a") as cache:
+        cache.save(whole_table(3))
+        make_read_only(url, True)
+        for number in (5, 6):
+            cache.save(a_value(number))
+        assert values(cache)["PARAM_1"] == 6
+        assert "read-only" in str(cache.away)
+        make_read_only(url, False)
+        until(lambda: cache.away is None)
+        assert told(cache) == [(5, 1, 5), (6, 5, 6)]
+
+
+def make_read_only(url: str, is_so: bool) -> None:
+    """Have every session of a database begin anew, as one that may, or may not, only read."""
+    with psycopg.connect(url, autocommit=True) as connection:
+        name = connection.info.dbname
+        connection.execute("SET default_transaction_read_only = off")
+        connection.execute(f"ALTER DATABASE {name} SET default_transaction_read_only = {is_so}".encode())
+        connection.execute(
+            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity"
+            " WHERE datname = %s AND pid != pg_backend_pid()",
+            (name,),
+        )
+
+
+def test_what_waits_for_a_vehicle_that_is_held_is_not_refused(
+    server_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("paramclient.cache.postgres.LOCK_TIMEOUT", "50ms")
+    with database_on(server_url) as url, ParamCache(url, local=tmp_path / "a") as cache:
+        cache.save(whole_table(3))
+        with psycopg.connect(url) as other:
+            other.execute("SELECT key FROM paramclient.vehicle FOR UPDATE")
+            cache.save(a_value(5))
+            assert "holds a vehicle" in str(cache.away)
+        until(lambda: cache.away is None)
+        assert told(cache) == [(5, 1, 5)]
+        assert "refuses" not in caplog.text
+
+
 # Places and secrets
 
 

@@ -50,7 +50,7 @@ T = TypeVar("T")
 
 
 class Away(Exception):
-    """The database cannot be reached, or the connection broke. What was to be written may have been."""
+    """The database cannot be reached or used at present. What was to be written may have been."""
 
 
 class PostgresDatabase:
@@ -70,7 +70,7 @@ class PostgresDatabase:
 
         Raises:
             Away: it cannot be reached.
-            CacheError: it is of a later version, or may not be used.
+            CacheError: it is of a later version.
         """
         library, pools = _libraries()
         with self._translated():
@@ -109,7 +109,7 @@ class PostgresDatabase:
 
         Raises:
             Away: the database cannot be reached.
-            CacheError: it is damaged, or may not be read.
+            CacheError: it is damaged.
         """
         with self._translated(), self._connection() as connection:
             connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ READ ONLY")
@@ -209,13 +209,16 @@ class PostgresDatabase:
         except (pools.PoolClosed, pools.PoolTimeout) as error:
             raise Away(f"the database {place} does not answer") from error
         except library.errors.LockNotAvailable as error:
-            raise CacheError(f"another station holds a vehicle in the cache {place}") from error
+            raise Away(f"another station holds a vehicle in the cache {place}") from error
         except (library.OperationalError, library.InterfaceError) as error:
             text = self.address.without_password(" ".join(str(error).split()))
             raise Away(f"the database {place} cannot be reached: {text}") from None
-        except library.Error as error:
+        except (library.DataError, library.IntegrityError) as error:
             text = self.address.without_password(" ".join(str(error).split()))
-            raise CacheError(f"the cache {place} cannot be used: {text}") from error
+            raise CacheError(f"the cache {place} cannot take this: {text}") from None
+        except library.Error as error:  # read-only, forbidden, dropped: it lies with the database, not with us
+            text = self.address.without_password(" ".join(str(error).split()))
+            raise Away(f"the database {place} cannot be used: {text}") from None
         except Damaged as damage:
             raise CacheError(f"the cache {place} is damaged ({damage})") from damage
 
