@@ -162,6 +162,7 @@ class ParamClient:
             owned=self.cache is not cache,
             identity_of=self._station.identity_of,
             is_doubted=self._station.is_doubted,
+            renewed=self._dispatch,
         )
         self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self._components: dict[Address, Component] = {}
@@ -469,8 +470,7 @@ class ParamClient:
                     if component.system == machine.system:
                         self._read_cache(component)
             elif isinstance(event, Fetched) and event.result.complete and event.result.is_confirmed:
-                is_whole = event.result.source != "cache" and not event.result.resumed
-                self._writer.synced(machine, is_whole=is_whole)
+                self._writer.synced(machine, is_whole=event.result.source != "cache" and not event.result.resumed)
                 is_to_be_written = True
             elif isinstance(event, TableResynced):
                 self._writer.synced(machine, is_whole=False)

@@ -38,7 +38,7 @@ from tests import test_cache, test_fleet, test_snapshots
 from tests.caches import NOW, PX4, stored, update, values, whole_table
 from tests.commands import in_process
 from tests.postgres import GIVEN, PROGRAMS, WHY_NONE, Server, database_on, server
-from tests.shell import small_px4, swiftly
+from tests.shell import Tap, small_px4, swiftly
 
 PATIENCE = 60.0
 
@@ -685,6 +685,29 @@ async def test_what_another_station_hears_renews_what_is_only_cached_here(tmp_pa
             assert component.params["PARAM_01"] == live
             assert (await component.get("PARAM_02")).value != 77
         assert not cache.listeners
+
+
+@swiftly
+async def test_what_another_station_hears_is_told_at_once_while_nothing_is_heard_here(tmp_path: Path) -> None:
+    """The vehicle has flown out of reach of this station: nothing on the link brings the news to light."""
+    vehicle = Tap(small_px4())
+    with Told(tmp_path / "cache") as cache:
+        async with ParamClient(vehicle, cache=cache) as client:
+            component = await client.component()
+            await component.fetch_all()
+            await anyio.sleep(2.0)
+            vehicle.is_mute = True
+            await anyio.sleep(30.0)
+            assert component.sync_state == "lost"
+            changes = component.changes()
+            for value in range(77, 82):
+                await anyio.sleep(0.7)  # at another moment of what goes on once a second
+                heard = stored("PARAM_02", value, at=time.time() + value)
+                cache.save(update(heard, identity=component.identity, at=time.time()))
+                await anyio.to_thread.run_sync(cache.tell, CacheChange(component.identity.key, 1))
+                with anyio.fail_after(0.5):
+                    change = await anext(changes)
+                assert (change.name, change.new and change.new.value) == ("PARAM_02", value)
 
 
 class Told(ParamCache):
