@@ -39,6 +39,7 @@ from tests.caches import NOW, PX4, stored, update, values, whole_table
 from tests.commands import in_process
 from tests.postgres import GIVEN, PROGRAMS, WHY_NONE, Server, database_on, server
 from tests.shell import Tap, small_px4, swiftly
+from tests.test_service_process import served
 
 PATIENCE = 60.0
 
@@ -708,6 +709,17 @@ async def test_what_another_station_hears_is_told_at_once_while_nothing_is_heard
                 with anyio.fail_after(0.5):
                     change = await anext(changes)
                 assert (change.name, change.new and change.new.value) == ("PARAM_02", value)
+
+
+@pytest.mark.asyncio
+async def test_a_service_shares_it_too(
+    path: str, cache: ParamCache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    async with served("sim:px4", "--cache", path):
+        with anyio.fail_after(PATIENCE):
+            while not await anyio.to_thread.run_sync(cache.components):
+                await anyio.sleep(0.05)
 
 
 class Told(ParamCache):
