@@ -503,6 +503,51 @@ def test_what_waits_for_a_vehicle_that_is_held_is_not_refused(
         assert "refuses" not in caplog.text
 
 
+def test_without_room_for_the_local_copy_the_database_is_used_all_the_same(
+    server_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A full disk, or a folder that can only be read."""
+    with database_on(server_url) as url:
+        with ParamCache(url, local=tmp_path / "a") as cache:
+            cache.save(whole_table(3))
+        with ParamCache(url, local=tmp_path / "a") as a, ParamCache(url, local=tmp_path / "b") as b:
+            for each in (a, b):
+                assert values(each)["PARAM_1"] == 1
+            at_a: list[CacheChange] = []
+            a.subscribe(at_a.append)
+            with monkeypatch.context() as full:
+                full.setattr(LocalCopy, "_write", no_room)
+                with ParamCache(url, local=tmp_path / "a") as late:
+                    late.save(a_value(5))
+                    assert told(late) == [(5, 1, 5)]
+                until(lambda: len(at_a) == 1)
+                b.save(a_value(6))
+                until(lambda: len(at_a) == 2)
+            assert "not up to date: no room" in caplog.text
+            b.save(a_value(7))
+            until(lambda: len(at_a) == 3)
+            assert told(a) == [(5, 1, 5), (6, 5, 6), (7, 6, 7)]
+
+
+def no_room(*_: object) -> None:
+    raise CacheError("no room")
+
+
+def test_what_others_tell_in_the_same_database_is_not_for_us(
+    path: str, stations: tuple[ParamCache, ParamCache]
+) -> None:
+    a, b = stations
+    at_a: list[CacheChange] = []
+    a.subscribe(at_a.append)
+    with psycopg.connect(path, autocommit=True) as other:
+        for text in ("", "hello", "[1]", "7", '["a", {}, 1, 1]', '{"a": 1}'):
+            other.execute("SELECT pg_notify('paramclient', %s)", (text,))
+    b.save(whole_table(1))
+    until(lambda: at_a)
+    assert at_a == [CacheChange(PX4.key, 1)]
+    assert a.away is None
+
+
 # Places and secrets
 
 
