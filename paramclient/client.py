@@ -470,7 +470,8 @@ class ParamClient:
                     if component.system == machine.system:
                         self._read_cache(component)
             elif isinstance(event, Fetched) and event.result.complete and event.result.is_confirmed:
-                self._writer.synced(machine, is_whole=event.result.source != "cache" and not event.result.resumed)
+                is_whole = event.result.source != "cache" and not event.result.resumed
+                self._writer.synced(machine, is_whole=is_whole)
                 is_to_be_written = True
             elif isinstance(event, TableResynced):
                 self._writer.synced(machine, is_whole=False)
@@ -500,8 +501,7 @@ class ParamClient:
     def _read_cache(self, component: Component) -> None:
         """Look for its cached table, once it is known whose it is."""
         machine = component._machine
-        identity = self._station.identity_of(machine)
-        if identity is None or self._writer.follow(machine, identity):
+        if (identity := self._station.identity_of(machine)) is None or self._writer.follow(machine, identity):
             return
         assert self._tasks is not None, "nothing is heard before"
         self._tasks.start_soon(self._load, component, identity)

@@ -72,14 +72,14 @@ class WriteThrough:
         owned: bool,
         identity_of: Callable[[ComponentMachine], Identity | None],
         is_doubted: Callable[[ComponentMachine], bool],
-        renewed: Callable[[], None],
+        renewed: Callable[[], None] | None = None,
         clock: Callable[[], float] | None = None,
         now: Callable[[], float] = anyio.current_time,
     ) -> None:
         self._cache = cache
         self._identity_of = identity_of
         self._is_doubted = is_doubted
-        self._renewed = renewed
+        self._renewed = _nothing if renewed is None else renewed
         self._clock = _time_of_day if clock is None else clock
         self._now = now
         self._owned = owned

@@ -216,7 +216,7 @@ class PostgresDatabase:
         except (library.DataError, library.IntegrityError) as error:
             text = self.address.without_password(" ".join(str(error).split()))
             raise CacheError(f"the cache {place} cannot take this: {text}") from None
-        except library.Error as error:  # read-only, forbidden, dropped: it lies with the database, not with us
+        except library.Error as error:  # read-only, forbidden, dropped: not the fault of what is written
             text = self.address.without_password(" ".join(str(error).split()))
             raise Away(f"the database {place} cannot be used: {text}") from None
         except Damaged as damage:

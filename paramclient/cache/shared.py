@@ -155,6 +155,8 @@ class _Link:
                     break
                 try:
                     [result], before, after = self._database.write([(operation, self._writer, number)])
+                    if is_second and result is None:  # it may have been done the first time
+                        result = self._database.read(operation.done)
                 except Away as error:
                     self._lose(error)
                 else:
