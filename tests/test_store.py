@@ -457,6 +457,27 @@ def test_killed_under_load_nothing_is_lost_and_nothing_doubled(
             assert news == [1_000 + number for number in range(1, count + 1)]
 
 
+def test_a_database_that_stands_still_is_given_up(
+    fragile: tuple[Server, ParamCache, ParamCache], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its connections stay, and nothing is answered: as on a machine that swaps, or whose disk hangs."""
+    monkeypatch.setattr("paramclient.cache.postgres.ANSWER_TIMEOUT", 0.3)
+    monkeypatch.setattr("paramclient.cache.postgres.CONNECT_TIMEOUT", 1)
+    running, a, b = fragile
+    a.save(whole_table(3))
+    b.save(a_value(5))
+    until(lambda: is_copied(a))
+    running.stand_still()
+    try:
+        a.save(a_value(6))
+        assert a.away is not None
+        assert told(a) == [(5, 1, 5), (6, 5, 6)]
+    finally:
+        running.go_on()
+    until(lambda: a.away is None)
+    assert told(b) == [(5, 1, 5), (6, 5, 6)]
+
+
 def test_what_the_database_refuses_is_told_and_holds_nothing_up(
     own_server: Server, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
