@@ -478,6 +478,29 @@ def test_a_database_that_stands_still_is_given_up(
     assert told(b) == [(5, 1, 5), (6, 5, 6)]
 
 
+def test_another_database_under_the_same_name_is_not_taken_for_the_one_before(
+    server_url: str, tmp_path: Path
+) -> None:
+    """A backup of some days ago, or another one's database: the local copy is made anew from it."""
+    with database_on(server_url) as one, database_on(server_url) as other:
+        for url, first in ((one, 0), (other, 100)):
+            with ParamCache(url, local=tmp_path / "copy") as cache:
+                cache.save(whole_table(3, first=first))
+                until(lambda cache=cache: is_copied(cache))  # type: ignore[misc]  # bound now
+        with ParamCache(one, local=tmp_path / "copy") as cache:
+            cache.save(a_value(7))
+            until(lambda: is_copied(cache))
+            assert shown_in_copy(cache) == {"PARAM_0": 0, "PARAM_1": 7, "PARAM_2": 2}
+
+
+def shown_in_copy(cache: ParamCache) -> Mapping[str, int]:
+    store = cache._store
+    assert isinstance(store, SharedStore)
+    whole = store._link.local.read(lambda session: take_whole(session, PX4.key, 1))
+    assert whole is not None
+    return {name: row.bits for name, row in whole.rows.items()}
+
+
 def test_what_the_database_refuses_is_told_and_holds_nothing_up(
     own_server: Server, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:

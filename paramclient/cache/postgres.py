@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
+from uuid import uuid4
 
 from paramclient.cache.address import Address
 from paramclient.cache.database import Damaged
@@ -50,7 +51,8 @@ _MIGRATION_LOCK: Final = 0x5041524D_0000_0001
 _TRIES: Final = 5
 
 Revisions = dict[tuple[str, int], int]
-"""By key and component, a number that is another one whenever a table has been written to."""
+"""By key and component, a number that is another one whenever a table has been written to. It is drawn by
+lot: so it is another one also where a backup, or another database, has taken the place of the one before."""
 T = TypeVar("T")
 
 
@@ -184,10 +186,10 @@ class PostgresDatabase:
                 for operation, writer, number in operations
             ]
             connection.execute(
-                "UPDATE component c SET revision = nextval('revision')"
+                "UPDATE component c SET revision = %s"
                 " FROM unnest(%s::text[], %s::integer[]) AS touched (key, number)"
                 " WHERE vehicle = key AND component = coalesce(number, component)",
-                ([key for key, _ in tables], [component for _, component in tables]),
+                (uuid4().int >> 65, [key for key, _ in tables], [component for _, component in tables]),
             )
             after = _revisions(connection, keys)
             changed = {each for each in {*before, *after} if before.get(each) != after.get(each)}
