@@ -43,6 +43,8 @@ class Connection(H11Protocol):
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
+        if self._is_over():
+            return
         if self.transport.get_protocol() is not self:  # it is a WebSocket now
             self._stop()
         elif self.conn.their_state is not h11.IDLE:
@@ -57,6 +59,12 @@ class Connection(H11Protocol):
     def pause_writing(self) -> None:
         super().pause_writing()
         self._watch()
+
+    def shutdown(self) -> None:
+        is_idle = self.cycle is None or self.cycle.response_complete
+        super().shutdown()
+        if is_idle and not self._is_over() and not self.transport.get_write_buffer_size():
+            self.transport.abort()  # with TLS it would wait for the client, which may not look at it
 
     def send_400_response(self, msg: str) -> None:
         """Answer what is no HTTP, as a problem like all others."""
@@ -95,16 +103,24 @@ class Connection(H11Protocol):
 
     def _watch(self) -> None:
         """What has been written is to be taken, however slowly."""
+        if self._is_over():
+            return
         self._unsent = self.transport.get_write_buffer_size()
         if self._unsent and self._stall is None:
             self._stall = self.loop.call_later(STALL_PATIENCE, self._check)
 
     def _check(self) -> None:
         self._stall = None
+        if self._is_over():
+            return
         if 0 < self._unsent <= self.transport.get_write_buffer_size():
             self.transport.abort()
         else:
             self._watch()
+
+    def _is_over(self) -> bool:
+        """Whether the transport tells nothing any more: that of TLS drops all it has when closed twice."""
+        return getattr(self.transport, "_ssl_protocol", self) is None
 
     def _stop(self) -> None:
         self._head_has_come()
