@@ -397,6 +397,44 @@ def test_a_stale_edit_says_so_in_the_review(sight: Sight, bench: Bench) -> None:
     expect(sight.line("MC_ROLLRATE_P")).to_contain_text("when you edited it")
 
 
+@needs_browser
+def test_an_open_review_follows_what_others_change(sight: Sight, bench: Bench) -> None:
+    now, remark = (sight.line("MC_PITCHRATE_P").get_by_role("cell").nth(place) for place in (0, 2))
+    was = f"{bench.px4.values['MC_PITCHRATE_P']:.2f}"
+    sight.stage("MC_PITCHRATE_P", "0.2")
+    sight.review()
+    expect(now).to_have_text(was)
+    expect(remark).to_have_text("")
+    bench.do(bench.px4.set_param, "MC_PITCHRATE_P", 0.25)
+    expect(now).to_have_text("0.25")
+    expect(remark).to_have_text(f"It was {was} when you edited it.")
+    bench.do(bench.px4.set_param, "MC_PITCHRATE_P", 0.2)
+    expect(remark).to_contain_text("The vehicle has that already.")
+    sight.dialog.get_by_role("button", name="Send").click()
+    expect(sight.dialog.get_by_role("status")).to_have_text("1 accepted.")
+    bench.do(bench.px4.set_param, "MC_PITCHRATE_P", 0.3)
+    expect(sight.row("MC_PITCHRATE_P")).to_contain_text("0.3")
+    expect(remark).to_have_text("accepted")
+
+
+@needs_browser
+def test_an_open_plan_follows_what_others_change(sight: Sight, bench: Bench, tmp_path: Path) -> None:
+    sight.find("NOTHING_SUCH")
+    file = tmp_path / "other.param"
+    file.write_text("MC_YAWRATE_P,0.9\n")
+    sight.page.get_by_role("button", name="Compare").click()
+    sight.dialog.locator("input[type=file]").set_input_files(file)
+    expect(sight.row("MC_YAWRATE_P")).to_be_visible()  # what was searched for hides nothing of it
+    sight.page.get_by_role("button", name="Take over").click()
+    expect(sight.line("MC_YAWRATE_P")).to_be_visible()
+    bench.do(bench.px4.set_param, "MC_YAWRATE_P", 0.55)
+    expect(sight.line("MC_YAWRATE_P").get_by_role("cell").nth(1)).to_have_text("0.55")
+    sight.dialog.get_by_role("button", name="Apply").click()
+    sight.dialog.get_by_role("button", name="Done").click()
+    sight.page.get_by_role("button", name="Undo").click()
+    expect(sight.line("MC_YAWRATE_P").get_by_role("cell").nth(1)).to_have_text("0.55")
+
+
 # files, earlier states, other vehicles
 
 

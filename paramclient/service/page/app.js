@@ -250,6 +250,10 @@ store.on("table", draw);
 store.on("pending", draw);
 store.on("other", () => {
   shown.filter = store.table.other ? "differs" : "all";
+  if (store.table.other) {
+    byId("search").value = ""; // else what was searched for before hides what differs
+    shown.words = [];
+  }
   drawBanner();
   drawTable();
 });

@@ -1,7 +1,7 @@
 /** Comparison with a file, an earlier state or another vehicle: choosing it, and taking values over from it. */
 
 import { Problem, at, get, request } from "./api.js";
-import { announce, button, byId, el } from "./dom.js";
+import { announce, button, byId, el, setText } from "./dom.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
 import { Caution, OUTCOMES, nameOf, told } from "./review.js";
@@ -9,7 +9,7 @@ import { keyOf, store } from "./store.js";
 import { many, moment, numberText } from "./values.js";
 
 /** A file beyond that is no parameter file; the service takes no more either. */
-const LARGEST_FILE = 4 * 2 ** 20;
+const LARGEST_FILE = 2 * 2 ** 20;
 const PLAN_PATIENCE = 120_000;
 const JOB_PAUSE = 300;
 
@@ -309,6 +309,9 @@ export async function takeOver() {
       request("DELETE", `/jobs/${encodeURIComponent(job.id)}`).catch((error) => (fault.textContent = error.message));
   }
 
+  store.whileShown(table_, "table", () => {
+    if (!hasBegun) for (const line of lines) line.follow();
+  });
   const opened = openDialog(
     `Take over from ${other.label}`,
     el("div", {}, armed.element, fault, summary, table_),
@@ -369,17 +372,25 @@ function linesOf(plan, table, other, refresh) {
         word && el("b", { class: `outcome ${isDoubtful ? "warn" : "quiet"}`, text: word }),
         ` ${(planned.reason || purposes.get(name) || "").replace(/^left out: /, "")}`,
       );
+      const now = el("td", { class: "now" });
       const element = el(
         "tr",
         { class: isOut ? "out" : "" },
         el("td", { class: "pick" }, box),
         el("th", { scope: "row", text: name }),
-        el("td", { class: "now", text: row?.text ?? "" }),
+        now,
         el("td", { class: "new", text: numberText(planned.wanted, row?.type ?? planned.type) }),
         remark,
       );
-      const restore = row?.document.bits ? { bits: row.document.bits } : row?.document.value;
-      return { name, status, box, remark, element, before: row?.text ?? "", restore };
+      const line = { name, status, box, remark, element };
+      line.follow = () => {
+        const { text, document } = table.rows.get(name) ?? {};
+        line.before = text ?? "";
+        line.restore = document?.bits ? { bits: document.bits } : document?.value;
+        setText(now, line.before);
+      };
+      line.follow();
+      return line;
     });
 }
 

@@ -143,6 +143,11 @@ class Store {
       );
   }
 
+  /** The same for as long as an element is on the page. */
+  whileShown(element, kind, listener) {
+    const end = this.on(kind, (what) => (element.isConnected ? listener(what) : end()));
+  }
+
   tell(kind, what) {
     for (const listener of this.listeners.get(kind) ?? []) listener(what);
   }
