@@ -523,6 +523,20 @@ async def test_what_was_written_is_in_the_history_however_short_it_stood(path: P
     assert [line.old.value for line in lines] == [before, 100, 101, before, 100]
 
 
+@swiftly
+async def test_a_write_right_after_the_first_fetch_is_in_the_history(path: Path) -> None:
+    vehicle = small_px4()
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        before = (await component.fetch_all()).params["PARAM_01"].value
+        await component.set("PARAM_01", 77, asker="anna")
+    with ParamCache(path) as cache:
+        [line] = cache.component().history()
+    assert (line.name, line.old.value, line.new and line.new.value, line.by) == (
+        *("PARAM_01", before, 77, "us for anna"),
+    )
+
+
 @pytest.mark.parametrize("asker", ["", "x" * 129, "a\nb", "Änne", "\x7f"])
 @swiftly
 async def test_who_asks_is_told_in_printable_ascii(path: Path, asker: str) -> None:
