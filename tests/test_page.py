@@ -10,11 +10,15 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from anyio.from_thread import start_blocking_portal
 from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
 
+from paramclient import ParamCache, ParamClient
+from paramclient.links import SimLink
 from paramclient.service import Settings
 from paramclient.service.access import AccessSettings
 from paramclient.service.tokens import Tokens
+from paramclient.sim import PX4Vehicle
 from tests.page import BROWSER, BROWSER_OPTIONS, HIGHEST, HOSTILE, Bench, at_work
 
 FILES = Path(__file__).parent.parent / "paramclient/service/page"
@@ -621,6 +625,51 @@ def test_a_service_that_goes_and_comes_back(visit: Callable[..., Sight], tmp_pat
         expect(sight.value("MC_PITCH_P")).to_contain_text("3.25")
         sight.send()  # what was staged has waited
         assert second.px4.values["MC_ROLL_P"] == 7.5
+
+
+@needs_browser
+def test_a_vehicle_of_yesterday_is_looked_at(visit: Callable[..., Sight], tmp_path: Path) -> None:
+    _keep_yesterdays(tmp_path)
+    with at_work(tmp_path) as bench:
+        until(lambda: bench.is_synced(1))
+        sight = visit(bench.url)
+        sight.page.get_by_text("Not heard now").click()
+        kept = sight.page.get_by_role("list", name="Vehicles that are not heard now").get_by_role("button")
+        expect(kept).to_have_count(1)
+        kept.click()
+        expect(sight.page.get_by_role("heading", level=1)).to_have_text("PX4 9/1")
+        expect(sight.page.locator("#badges")).to_contain_text("in the cache, heard last")
+        expect(sight.page.locator("#count")).to_have_text("25 parameters")
+        expect(sight.page.get_by_role("button", name="Fetch")).to_have_count(0)
+        expect(sight.page.get_by_role("button", name="Snapshot")).to_have_count(0)
+        sight.find("PARAM_01")
+        sight.value("PARAM_01").click()
+        expect(sight.details).to_contain_text("1 → 77")
+        expect(sight.details.get_by_role("textbox")).to_have_count(0)
+        sight.page.get_by_role("button", name="Compare").click()
+        sight.dialog.get_by_role("button", name="PX4 1/1").click()
+        expect(sight.page.get_by_role("region", name="Comparison")).to_contain_text("25 only here")
+        expect(sight.page.get_by_role("button", name="Take over")).to_have_count(0)
+        sight.page.get_by_role("button", name="Save").click()
+        with sight.page.expect_download() as saved:
+            sight.dialog.get_by_role("button", name="QGroundControl").click()
+        assert "9\t1\tPARAM_01\t77\t" in saved.value.path().read_text()
+        sight.page.keyboard.press("Escape")
+        sight.choose("PX4 1/1")
+        expect(sight.page.get_by_role("button", name="Fetch")).to_be_visible()
+
+
+def _keep_yesterdays(folder: Path) -> None:
+    async def fetch() -> None:
+        vehicle = PX4Vehicle(system=9, table={f"PARAM_{number:02}": number for number in range(25)})
+        with ParamCache(folder / "cache.sqlite3") as cache:
+            async with ParamClient(SimLink(vehicle), cache=cache) as client:
+                await (await client.component()).fetch_all()
+            async with ParamClient(SimLink(vehicle), cache=cache) as client:
+                await (await client.component()).set("PARAM_01", 77)
+
+    with start_blocking_portal() as portal:  # the browser has a loop in this thread
+        portal.call(fetch)
 
 
 @needs_browser

@@ -33,7 +33,7 @@ export async function chooseOther(file = null) {
     on: { change: () => input.files[0] && attempt(() => fromFile(input.files[0])) },
   });
   const snapshots = el("ul", { class: "choices" }, el("li", { class: "nothing", text: "Looking …" }));
-  const vehicles = el("ul", { class: "choices" }, el("li", { class: "nothing", text: "Looking …" }));
+  const vehicles = el("ul", { class: "choices" });
   const content = el(
     "div",
     {},
@@ -91,39 +91,17 @@ async function fillSnapshots(component, list, attempt) {
   }
 }
 
-async function fillVehicles(component, list, attempt) {
-  const live = [...store.components.values()].filter((each) => keyOf(each) !== keyOf(component));
-  const keys = new Set(store.components.values().map((each) => `${each.key} ${each.component}`));
-  let cached = [];
-  try {
-    const { vehicles } = await get("/vehicles");
-    cached = vehicles.flatMap((vehicle) => vehicle.components.map((each) => ({ vehicle, each })));
-  } catch {
-    // a service without a cache knows those only that it hears
-  }
-  cached = cached.filter(({ vehicle, each }) => !keys.has(`${vehicle.key} ${each.component}`));
-  const choices = [
-    ...live.map((each) => [
+function fillVehicles(component, list, attempt) {
+  const others = [...store.components.values(), ...store.unheard].filter((each) => keyOf(each) !== keyOf(component));
+  fill(list, others, "No other vehicle is known.", (each) => {
+    const { key, link, system, component: id } = each;
+    const source = each.is_kept ? { vehicle: { key, component: id } } : { component: { system, component: id, link } };
+    return [
       nameOf(each),
-      `on ${each.link}`,
-      () =>
-        attempt(async () => {
-          const { params } = await get(at(each, "/params"));
-          const source = { component: { system: each.system, component: each.component, link: each.link } };
-          return otherOf(nameOf(each), params, source, false);
-        }),
-    ]),
-    ...cached.map(({ vehicle, each }) => [
-      `${vehicle.autopilot ?? ""} ${vehicle.key}`.trim(),
-      `component ${each.component}, in the cache`,
-      () =>
-        attempt(async () => {
-          const { params } = await get(`/vehicles/${encodeURIComponent(vehicle.key)}/${each.component}/params`);
-          return otherOf(vehicle.key, params, { vehicle: { key: vehicle.key, component: each.component } }, false);
-        }),
-    ]),
-  ];
-  fill(list, choices, "No other vehicle is known.", (each) => each);
+      each.is_kept ? `${each.uid ?? key}, in the cache since ${moment(each.last_seen)}` : `on ${link}`,
+      () => attempt(async () => otherOf(nameOf(each), (await get(at(each, "/params"))).params, source, false)),
+    ];
+  });
 }
 
 function fill(list, items, nothing, parts) {
