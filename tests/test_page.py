@@ -404,7 +404,7 @@ def test_a_stale_edit_says_so_in_the_review(sight: Sight, bench: Bench) -> None:
 @needs_browser
 def test_an_open_review_follows_what_others_change(sight: Sight, bench: Bench) -> None:
     now, remark = (sight.line("MC_PITCHRATE_P").get_by_role("cell").nth(place) for place in (0, 2))
-    was = f"{bench.px4.values['MC_PITCHRATE_P']:.2f}"
+    was = str(bench.px4.param("MC_PITCHRATE_P").value)[:4]
     sight.stage("MC_PITCHRATE_P", "0.2")
     sight.review()
     expect(now).to_have_text(was)

@@ -58,8 +58,9 @@ async def test_who_asks_what_is_in_the_cache_of_a_service_that_ends_is_told_so(t
             assert (await browser.get("/api/v1/vehicles")).status_code == 200
         async with a_browser(create_app(hub)) as late, asyncio.timeout(60):
             problem(await late.get("/api/v1/vehicles"), 503, "closing")
-            file = {"content": b"A,1", "headers": {"Content-Type": "application/octet-stream"}}
-            problem(await late.post("/api/v1/files?name=a.param", **file), 503, "closing")
+            headers = {"Content-Type": "application/octet-stream"}
+            answer = await late.post("/api/v1/files?name=a.param", content=b"A,1", headers=headers)
+            problem(answer, 503, "closing")
 
 
 @swiftly
