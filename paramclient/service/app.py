@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any, Final
 
+import anyio
 from fastapi import FastAPI, Request, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -57,7 +58,31 @@ def create_app(hub: Hub, settings: Settings | None = None) -> ASGIApp:
     _add_files(app, "page", index="/", prefix="/page/")
     _add_files(app, "reference", index="/docs", prefix="/docs/")
     access = Settings().access if settings is None else settings.access
-    return AccessMiddleware(_Stamped(app, hub), access)
+    return AccessMiddleware(_Stamped(_WithHeads(app), hub), access)
+
+
+class _WithHeads:
+    """Answers HEAD with the head of what GET would answer (RFC 9110, section 9.3.2)."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self._app(scope, receive, send)
+            return
+
+        answering = anyio.CancelScope()
+
+        async def send_head(message: Message) -> None:
+            """Let nothing of the body through, nor wait for it: that of a stream of events has no end."""
+            if message["type"] == "http.response.start":
+                await send(message)
+                await send({"type": "http.response.body", "body": b"", "more_body": False})
+                answering.cancel()
+
+        with answering:
+            await self._app({**scope, "method": "GET"}, receive, send_head)
 
 
 class _Stamped:

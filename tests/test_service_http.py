@@ -1,0 +1,42 @@
+"""What the service owes to HTTP itself: its methods, and names in addresses."""
+
+from __future__ import annotations
+
+from tests.served import C, met, problem, service
+from tests.shell import generic, swiftly
+
+
+@swiftly
+async def test_head_answers_what_get_does_without_a_body() -> None:
+    async with service(generic()) as (hub, browser):
+        await met(browser)
+        for path in ("/", "/health", "/metrics", "/openapi.json", "/api/v1/components", C, f"{C}/params"):
+            got, head = await browser.get(path), await browser.head(path)
+            assert (head.status_code, head.content) == (200, b""), path
+            assert head.headers["content-type"] == got.headers["content-type"]
+            assert "x-seq" in head.headers
+        missing = await browser.head("/api/v1/jobs/none")
+        assert (missing.status_code, missing.content) == (404, b"")
+        stream = await browser.head("/api/v1/events")
+        assert (stream.status_code, stream.content) == (200, b"")
+        assert stream.headers["content-type"].startswith("text/event-stream")
+        assert hub.feed.listeners == 0
+        assert (await browser.head(f"{C}/fetch")).status_code == 405
+
+
+@swiftly
+async def test_an_address_says_all_the_methods_that_it_knows() -> None:
+    async with service(generic()) as (_, browser):
+        await met(browser)
+        for path, allowed in (
+            ("/", "GET, HEAD, OPTIONS"),
+            (f"{C}/params", "GET, HEAD, OPTIONS, PATCH"),
+            (f"{C}/params/X", "GET, HEAD, OPTIONS, PUT"),
+            ("/api/v1/jobs/X", "DELETE, GET, HEAD, OPTIONS"),
+            (f"{C}/fetch", "OPTIONS, POST"),
+        ):
+            refused = await browser.request("TRACE", path)
+            problem(refused, 405, "method-not-allowed")
+            asked = await browser.options(path)
+            assert (asked.status_code, asked.content) == (204, b"")
+            assert refused.headers["allow"] == asked.headers["allow"] == allowed
