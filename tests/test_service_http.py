@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import pytest
+
+from paramclient.sim import GenericVehicle, SimParam
+from paramclient.values import ParamType
 from tests.served import C, met, problem, service
 from tests.shell import generic, swiftly
 
@@ -40,3 +44,24 @@ async def test_an_address_says_all_the_methods_that_it_knows() -> None:
             asked = await browser.options(path)
             assert (asked.status_code, asked.content) == (204, b"")
             assert refused.headers["allow"] == asked.headers["allow"] == allowed
+
+
+# names and numbers
+
+
+@pytest.mark.parametrize("number", ["1e400", "-1e400", "NaN", "Infinity"])
+@swiftly
+async def test_a_number_beyond_all_floats_is_not_written_as_an_infinity(number: str) -> None:
+    vehicle = GenericVehicle([SimParam("A", ParamType.REAL32, 1.0)])
+    headers = {"content-type": "application/json"}
+    async with service(vehicle) as (_, browser):
+        await met(browser)
+        one = await browser.put(f"{C}/params/A", content=f'{{"value":{number}}}', headers=headers)
+        many = await browser.patch(f"{C}/params", content=f'{{"values":{{"A":{number}}}}}', headers=headers)
+        wanted = f'{{"wanted":{{"values":{{"A":{number}}}}}}}'
+        whole = await browser.post(f"{C}/apply", content=wanted, headers=headers)
+        for answer in (one, many, whole):
+            problem(answer, 422, "invalid-request")
+        assert vehicle.params["A"].value == 1.0
+        word = await browser.put(f"{C}/params/A", json={"value": "Infinity"})
+        assert word.json()["actual"] == "Infinity"
