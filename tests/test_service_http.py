@@ -49,6 +49,26 @@ async def test_an_address_says_all_the_methods_that_it_knows() -> None:
 # names and numbers
 
 
+@swiftly
+async def test_a_name_with_a_slash_can_stand_in_an_address() -> None:
+    vehicle = GenericVehicle([SimParam("A/B", ParamType.REAL32, 1.0), SimParam("A", ParamType.REAL32, 2.0)])
+    async with service(vehicle) as (_, browser):
+        await met(browser)
+        for written in ("A%2FB", "A/B"):
+            assert (await browser.post(f"{C}/params/{written}/read", json={})).json()["value"] == 1.0
+            assert (await browser.put(f"{C}/params/{written}", json={"value": 1.0})).json()["name"] == "A/B"
+            assert (await browser.get(f"{C}/params/{written}")).json()["name"] == "A/B"
+        assert (await browser.post(f"{C}/params/A/read", json={})).json()["value"] == 2.0
+
+
+@swiftly
+async def test_an_index_is_written_in_plain_digits() -> None:
+    async with service(generic()) as (_, browser):
+        await met(browser)
+        assert (await browser.post(f"{C}/params/%231/read", json={})).json()["index"] == 1
+        problem(await browser.post(f"{C}/params/%23\N{ARABIC-INDIC DIGIT ONE}/read", json={}), 422, "usage")
+
+
 @pytest.mark.parametrize("number", ["1e400", "-1e400", "NaN", "Infinity"])
 @swiftly
 async def test_a_number_beyond_all_floats_is_not_written_as_an_infinity(number: str) -> None:
