@@ -87,7 +87,8 @@ class Table:
         doubts: how often what had been heard was no longer to be relied on.
         passed_over: by a name that several parameters share, the indices of those that it does not mean.
         dirty: names whose value, type or index changed since `take_dirty` was called last.
-        overwritten: what writes of ours had made of them or have replaced, and is no more; each with who did it.
+        overwritten: what writes of ours had made of them or have replaced, and is no more; each with who did
+            it.
     """
 
     def __init__(self, encoding: Encoding = Encoding.BYTEWISE, room: Room | None = None) -> None:
