@@ -423,6 +423,20 @@ async def test_whoever_asks_nothing_is_not_waited_for(monkeypatch: pytest.Monkey
             await reader.readuntil(b'"note"')
 
 
+async def test_a_body_that_does_not_come_is_not_waited_for_at_the_end(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with contextlib.AsyncExitStack() as stack:
+        async with served() as service:
+            reader, writer = await stack.enter_async_context(service.connection())
+            length = "Content-Length: 100"
+            head = service.head("POST", "/api/v1/find", "Content-Type: application/json", length)
+            writer.write(head + b"{")
+            await service.ask()  # by then it has come
+        assert await taken(reader) == b""
+    assert [record for record in caplog.records if record.levelno >= logging.ERROR] == []
+
+
 async def test_connections_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(connections, "MOST_CONNECTIONS", 3)
     async with served() as service, contextlib.AsyncExitStack() as stack:
