@@ -90,7 +90,7 @@ def read_private(path: str | os.PathLike[str], what: str, most: int) -> bytes:
     if os.name == "posix" and mode & OF_OTHERS:
         raise UsageError(
             f"{os.fspath(path)}: others than its owner can get at this {what} (mode {mode:o}); "
-            f"`chmod 600` ends that, and a {what.split()[-1]} that others may have read is better replaced"
+            "`chmod 600` ends that, and what others may have read is better replaced"
         )
     return data
 
