@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
+
 import pytest
 
 from paramclient.sim import GenericVehicle, SimParam
 from paramclient.values import ParamType
 from tests.served import C, met, problem, service
-from tests.shell import generic, swiftly
+from tests.shell import FlakyLink, generic, small_px4, swiftly
 
 
 @swiftly
@@ -44,6 +46,40 @@ async def test_an_address_says_all_the_methods_that_it_knows() -> None:
             asked = await browser.options(path)
             assert (asked.status_code, asked.content) == (204, b"")
             assert refused.headers["allow"] == asked.headers["allow"] == allowed
+
+
+# what others rely on
+
+
+@swiftly
+async def test_a_component_behind_a_link_that_is_away_is_not_up() -> None:
+    link = FlakyLink(small_px4())
+    async with service(link, fetches=True) as (_, browser):
+        await met(browser)
+        await asyncio.sleep(5)
+        for is_here in (True, False, True):
+            if not is_here:
+                await link.drop(stays_away=True)
+            link.is_away = not is_here
+            await asyncio.sleep(8)
+            told = (await browser.get("/metrics")).text
+            for name in ("up", "synced"):
+                sample = f'paramclient_component_{name}{{link="{link.name}",system="1",component="1"}}'
+                assert f"{sample} {int(is_here)}\n" in told
+
+
+@swiftly
+async def test_the_document_of_the_api_has_the_body_of_everything_that_takes_one() -> None:
+    async with service() as (_, browser):
+        paths = (await browser.get("/openapi.json")).json()["paths"]
+    for path, methods in paths.items():
+        for method, operation in methods.items():
+            assert ("requestBody" in operation) == (method in ("post", "put", "patch")), (method, path)
+    for path, method in (
+        ("/api/v1/files", "post"),
+        ("/api/v1/components/{system}/{component}/metadata", "put"),
+    ):
+        assert list(paths[path][method]["requestBody"]["content"]) == ["application/octet-stream"]
 
 
 # names and numbers
