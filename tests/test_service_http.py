@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 
 import pytest
 
@@ -80,6 +81,18 @@ async def test_the_document_of_the_api_has_the_body_of_everything_that_takes_one
         ("/api/v1/components/{system}/{component}/metadata", "put"),
     ):
         assert list(paths[path][method]["requestBody"]["content"]) == ["application/octet-stream"]
+
+
+@swiftly
+async def test_what_no_vehicle_has_is_no_failure_of_the_cache(tmp_path: Path) -> None:
+    async with service(small_px4(), cache=tmp_path / "cache.sqlite3", fetches=True) as (_, browser):
+        told = await browser.post("/api/v1/fleet/diff", json={"names": ["PARAM_01"]})
+        assert "holds no table" in problem(told, 404, "unknown-state")["detail"]
+        await met(browser)
+        await asyncio.sleep(5)
+        assert (await browser.post("/api/v1/fleet/diff", json={"names": ["PARAM_01"]})).status_code == 200
+        told = await browser.post("/api/v1/fleet/diff", json={"names": ["NOBODY_HAS"]})
+        assert "NOBODY_HAS" in problem(told, 404, "unknown-state")["detail"]
 
 
 # names and numbers
