@@ -9,7 +9,7 @@ from importlib import resources
 from typing import Any, Final
 
 import anyio
-from fastapi import FastAPI, Request, Response
+from fastapi import FastAPI, Request, Response, WebSocket
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from paramclient.service import problems
@@ -57,6 +57,7 @@ def create_app(hub: Hub, settings: Settings | None = None) -> ASGIApp:
         app.include_router(router)
     _add_files(app, "page", index="/", prefix="/page/")
     _add_files(app, "reference", index="/docs", prefix="/docs/")
+    app.add_api_websocket_route("/{path:path}", _nothing_there)
     access = Settings().access if settings is None else settings.access
     return AccessMiddleware(_Stamped(_WithHeads(app), hub), access)
 
@@ -113,6 +114,11 @@ class _Stamped:
         except Exception:
             if not is_answered:  # else it is a problem that was answered and logged
                 raise
+
+
+async def _nothing_there(socket: WebSocket) -> None:
+    """A WebSocket elsewhere is told so like any other request; without a route it would be a bare 403."""
+    raise ServiceError(404, "not-found", "There is nothing at this address.")
 
 
 def _add_files(app: FastAPI, folder: str, *, index: str, prefix: str) -> None:
