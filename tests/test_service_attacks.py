@@ -176,7 +176,7 @@ async def test_an_unknown_client_learns_nothing_and_changes_nothing() -> None:
         refused = await service.ask("DELETE", "/api/v1/components", bearer(BEN))
         assert (refused.status, refused.problem) == (403, "forbidden")
         me = json.loads((await service.ask("GET", "/api/v1/me", bearer(BEN))).body)
-        assert me == {"name": "ben", "role": "read", "read_only": False}
+        assert me == {"name": "ben", "asker": "ben@127.0.0.1", "role": "read", "read_only": False}
     assert vehicle.params["A"].value == 1.0
 
 

@@ -313,6 +313,25 @@ class Table:
                 changes.append(Change(name, None, new))
         return changes
 
+    def renew(self, params: Mapping[str, Param]) -> list[Change]:
+        """Take what another station has heard since, where a value is only *cached* here.
+
+        Args:
+            params: the table as it is cached now.
+        """
+        changes = []
+        for name, param in params.items():
+            old = self.params.get(name)
+            if old is None or old.trust is not Trust.CACHED or name in self.dirty or old.same_value(param):
+                continue
+            new = replace(param.with_trust(Trust.CACHED), index=old.index, default=old.default)
+            self.params[name] = new
+            self._wire.pop(name, None)  # should the vehicle say that again, it is a change
+            if self._hash is not None:
+                self._moved(name)
+            changes.append(Change(name, old, new))
+        return changes
+
     def move(self, count: int) -> None:
         """Another count was heard: which parameter has which index is open again."""
         if self.count is not None:
