@@ -285,6 +285,9 @@ async def test_no_path_leads_elsewhere() -> None:
     async with served() as service:
         for path, method in itertools.product(PATHS, ("GET", "OPTIONS")):
             answer = await service.ask(method, path)
+            if method == "OPTIONS" and answer.status == 204:  # which methods there are, of a kind of address
+                assert answer.body == b""
+                continue
             assert answer.status in (400, 404, 405), path
             assert answer.problem
             assert b"root:" not in answer.body
