@@ -18,7 +18,7 @@ BIN = $(VENV)/bin
 PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 TESTS ?=
 SESSIONS ?= 10000
-TARGETS ?= cache component files framer metadata pack
+TARGETS ?= cache component files framer metadata pack signing tlog
 SECONDS ?= 1800
 
 MEASURED = 'protocol/*' 'sim/*' 'cache/*' 'files/*' values.py errors.py identity.py params.py paramset.py

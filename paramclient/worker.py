@@ -19,7 +19,8 @@ Result = TypeVar("Result")
 
 
 class Worker:
-    """One thread for calls that block. They are done in order; `close` ends it.
+    """One thread for calls that block. They are done in order; `close` ends it. What is asked for later is
+    done in a thread for that alone.
 
     Not a thread of anyio's pool: that would be left behind, idle, until the event loop ends.
 
@@ -31,6 +32,8 @@ class Worker:
         self._name = name
         self._calls: SimpleQueue[Callable[[], None] | None] = SimpleQueue()
         self._thread: threading.Thread | None = None
+        self._under_way = 0
+        self._is_closed = False
 
     async def run(self, work: Callable[[], Result]) -> Result:
         """Do it in the thread. Cancelled, it is done all the same."""
@@ -47,9 +50,16 @@ class Worker:
             except BaseException as error:
                 future.set_exception(error)
             with suppress(anyio.RunFinishedError):
-                anyio.from_thread.run_sync(ended.set, token=token)
+                anyio.from_thread.run_sync(done, token=token)
 
+        def done() -> None:
+            self._under_way -= 1
+            ended.set()
+
+        self._under_way += 1
         self._calls.put(call)
+        if self._is_closed:
+            self._end()
         await ended.wait()
         return future.result()
 
@@ -58,12 +68,26 @@ class Worker:
         if self._thread is None:
             work()
             return
+        thread = self._thread
         try:
             await self.run(work)
         finally:
-            self._calls.put(None)
-        self._thread.join()  # at once: it has nothing more to do
+            with anyio.CancelScope(shield=True):
+                while self._under_way:  # others may have asked for more, and the thread tells them here
+                    await self.run(_nothing)
+            self._is_closed = True
+            self._end()
+        thread.join()  # at once: it has nothing more to do
+
+    def _end(self) -> None:
+        """Let the thread end when it has done what it was given."""
+        self._calls.put(None)
+        self._thread = None
 
     def _main(self) -> None:
         while (call := self._calls.get()) is not None:
             call()
+
+
+def _nothing() -> None:
+    return

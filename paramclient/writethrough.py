@@ -7,13 +7,16 @@ import math
 import os
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Final, TypeVar
 
 import anyio
+import anyio.from_thread
+import anyio.lowlevel
 
-from paramclient.cache import CachedComponent, ParamCache, StoredParam, TableState, TableUpdate
+from paramclient.cache import CacheChange, CachedComponent, ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.errors import CacheError, UsageError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentMachine
@@ -87,6 +90,8 @@ class WriteThrough:
         self._has_refused = False
         self._replacements = 0 if cache is None else cache.replacements
         self._has_written = False
+        self._news: set[CacheChange] = set()
+        self._end_news: Callable[[], None] = _nothing
 
     async def open(self) -> None:
         """Find out which components the cache knows."""
@@ -94,9 +99,12 @@ class WriteThrough:
             for each in await self._run(self._cache.components) or ():
                 address = (each.system, each.component)
                 self._tables[address] = self._tables.get(address, False) or each.hash is not None
+            told = partial(_pass_on, anyio.lowlevel.current_token(), self._hear_of)
+            self._end_news = await self._run(partial(self._cache.subscribe, told)) or _nothing
 
     async def close(self) -> None:
         """Write what is left, and end the thread."""
+        self._end_news()
         try:
             await self.flush()
             await self.flush()  # all of it, where the file had gone
@@ -201,6 +209,7 @@ class WriteThrough:
             if not await self.flush(is_last=False):
                 await anyio.sleep(RETRY_INTERVAL)
                 self._something_to_write.set()
+            await self._take_news()
 
     async def flush(self, *, is_last: bool = True) -> bool:
         """Write what is new; false when the cache could not take it. Cancelled, it loses nothing.
@@ -251,6 +260,21 @@ class WriteThrough:
             logger.debug("written: %s values", sum(len(new.update.params) for new in news))
             self._begin_anew(cache.replacements)
         return is_written
+
+    def _hear_of(self, change: CacheChange) -> None:
+        """Another station has written to a table."""
+        self._news.add(change)
+        self.wake()
+
+    async def _take_news(self) -> None:
+        """Bring up to date what is only cached here, where another station has heard it since."""
+        news, self._news = self._news, set()
+        for kept in list(self._kept.values()):
+            machine, identity = kept.machine, kept.identity
+            if CacheChange(identity.key, machine.component) in news and self._cache is not None:
+                cached = await self._run(partial(self._cache.load, identity.key, machine.component))
+                if cached is not None and self._kept.get(machine) is kept:
+                    machine.renew(cached.params)
 
     def _begin_anew(self, replacements: int) -> None:
         """Where the file is another one than before: nothing that was written earlier is in it."""
@@ -447,6 +471,14 @@ def _of_firmware(cached: CachedComponent, identity: Identity) -> Mapping[str, Pa
     if _firmware(cached.identity) == _firmware(identity):
         return cached.params
     return {name: replace(param, default=None) for name, param in cached.params.items()}
+
+
+def _pass_on(
+    token: anyio.lowlevel.EventLoopToken, told: Callable[[CacheChange], None], change: CacheChange
+) -> None:
+    """Tell something to the event loop, from another thread; to nobody where that has ended."""
+    with suppress(anyio.RunFinishedError):
+        anyio.from_thread.run_sync(told, change, token=token)
 
 
 def _nothing() -> None:

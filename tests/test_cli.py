@@ -717,7 +717,7 @@ async def test_watch_may_only_listen(
 ) -> None:
     vehicle = goings_and_comings()
     url = put(vehicle)
-    options = LinkOptions(cache=tmp_path / "cache.sqlite3", timeout=20.0)
+    options = LinkOptions(cache=str(tmp_path / "cache.sqlite3"), timeout=20.0)
     assert await vehicle_commands.watch(url, policy=Policy.CACHE_ONLY, options=options) == 0
     printed = capsys.readouterr()
     assert printed.err == "watching 0 parameters of 1/1 px4\n"

@@ -320,7 +320,16 @@ def bound_names(source: ast.Module) -> set[str]:
 
 def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
     """Start-up is part of the command's promise; mavutil, besides, changes the process that imports it."""
-    unwanted = ["rich", "cyclopts", "pydantic", "serialx", "yaml", "pymavlink.mavutil"]
+    unwanted = [
+        "rich",
+        "cyclopts",
+        "pydantic",
+        "serialx",
+        "yaml",
+        "pymavlink.mavutil",
+        "psycopg",
+        "psycopg_pool",
+    ]
     unwanted += ["paramclient.sim", "paramclient.testing", "paramclient.cli", "paramclient.provision"]
     unwanted += ["paramclient.documents", "paramclient.service", "fastapi", "starlette", "uvicorn", "httpx"]
     unwanted += ["paramclient.remote"]

@@ -755,7 +755,8 @@ def test_a_field_that_cannot_be_right_is_refused(fields: str, problem: str) -> N
             "'A' stands twice",
         ),
         ('{"a":' * 100_000, "nested that deep"),
-        ('{"A": %s}' % ("9" * 5000), "Exceeds the limit"),
+        ('{"A": %s}' % ("9" * 5000), "9…' is beyond the range of every type"),
+        ('{"A": %s.0}' % ("9" * 5000), "9…' is beyond the range of a double"),
     ],
 )
 def test_a_document_that_is_none_is_refused(text: str, problem: str) -> None:
@@ -785,6 +786,7 @@ def test_errors_in_a_document_name_the_line_of_the_parameter() -> None:
         ("!!python/object:os.system x", "an anchor or a tag"),
         ("*a", "an alias"),
         ("[" * 30 + "]" * 30, "more than 20 levels"),
+        ("9" * 5000, "9…' is beyond the range of every type"),
         ("1, value: 2", "'value' stands twice"),
         ("1, 2: 3", "a key that is no text"),
         ("{", "expected YAML"),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
@@ -26,7 +27,7 @@ from paramclient.cli import run
 from paramclient.identity import Identity
 from paramclient.links import LinkKind, ReplayLink, create_link, parse_link
 from paramclient.links.replay import LONGEST_PAUSE
-from paramclient.links.tlog import packed_time
+from paramclient.links.tlog import FIRST_WITHIN, packed_time
 from paramclient.logs import ImportedTable, import_log
 from paramclient.protocol import wire
 from paramclient.values import Encoding, Param, encode
@@ -142,6 +143,28 @@ async def test_a_file_that_is_no_log(tmp_path: Path) -> None:
                 raise AssertionError("it was opened")
     with pytest.raises(LinkError, match="Is a directory"):
         async with a_replay(tmp_path):
+            raise AssertionError("it was opened")
+    os.mkfifo(tmp_path / "pipe")
+    for endless in ("/dev/zero", tmp_path / "pipe"):
+        with pytest.raises(LinkError, match="is no regular file"):
+            async with a_replay(endless):
+                raise AssertionError("it was opened")
+
+
+@pytest.mark.parametrize("before", [FIRST_WITHIN - 100, FIRST_WITHIN])
+@swiftly
+async def test_a_log_begins_within_its_first_bytes(before: int, tmp_path: Path) -> None:
+    """Whatever stands before its first frame; what has none there may be a disk image."""
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(bytes(before) + whole(A=1).data)
+    if before < FIRST_WITHIN:
+        async with a_replay(path) as client:
+            assert (await (await client.component()).fetch_all()).complete
+        return
+    with path.open("r+b") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(LinkError, match="is no telemetry log"):
+        async with a_replay(path):
             raise AssertionError("it was opened")
 
 
@@ -495,7 +518,7 @@ def test_the_command_reads_logs(tmp_path: Path, capsys: pytest.CaptureFixture[st
     for names in ([], ["B"]):
         assert run(["watch", f"replay:{path}?speed=100", *names]) == 0  # it ends with the log
         told = capsys.readouterr().out.splitlines()
-        assert [line.partition("  ")[2] for line in told] == ["B  2 -> 4  (vehicle)"]
+        assert told == ["2023-11-14T22:18:21.000Z  B  2 -> 4  (vehicle)"], "with the time of the log"
     assert run(["watch", f"replay:{path}?speed=100", "A"]) == 0
     assert capsys.readouterr().out == ""
     assert run(["show", f"replay:{path}.gone"]) == 4

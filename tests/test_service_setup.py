@@ -243,7 +243,7 @@ async def test_two_set_ups_do_not_mix_and_one_can_be_ended(tmp_path: Path) -> No
         assert (busy["type"], busy["job"]) == ("urn:paramclient:busy", job)
         assert (await service.post(f"{HERE}/restore", {}, 409))["type"] == "urn:paramclient:busy"
         assert (await service.client.delete(f"/api/v1/jobs/{job}")).status_code == 204
-        told = await service.get(f"/api/v1/jobs/{job}")
+        told = await service.job(job, lambda told: told["state"] != "running")
         assert (told["state"], told["problem"]["type"]) == ("cancelled", "urn:paramclient:cancelled")
         tap.is_mute = False
         await service.post(f"{HERE}/apply", {**body, "wait": True})
@@ -270,6 +270,15 @@ async def test_what_was_written_before_it_was_ended_is_told(tmp_path: Path) -> N
         assert (told["state"], told["result"]["error"]) == ("cancelled", "interrupted")
         assert told["result"]["params"]
         assert {row["status"] for row in told["result"]["params"].values()} == {"unproven"}
+
+
+@swiftly
+async def test_the_service_ends_in_the_middle_of_a_set_up(tmp_path: Path) -> None:
+    tap = Tap(px4())
+    async with serving(tap, place=tmp_path) as service:
+        tap.is_mute = True
+        body = {"wanted": {"values": dict.fromkeys(TUNE, 7.5)}, "wait": False}
+        assert (await service.client.post(f"{HERE}/apply", json=body)).status_code == 202
 
 
 @swiftly
@@ -618,7 +627,7 @@ async def test_what_is_kept_of_a_vehicle_is_the_same_with_and_without_it(
         cached = await service.file(f"{there}/file", form="parm")
         assert loads(cached.content).choose(1).params == loads(live.content).choose(1).params
         for what in ("params", "history", "snapshots", "snapshots/1", "state?at=5", "file"):
-            for key in ("uid:00", "../../etc/passwd", "%27%20OR%201"):
+            for key in ("uid:00", "system:1@serial:/dev/ttyACM0:57600", "%27%20OR%201", "%"):
                 problem = await service.get(f"/api/v1/vehicles/{quote(key, safe='')}/1/{what}", 404)
                 assert problem["type"] == "urn:paramclient:unknown-vehicle"
 
@@ -693,5 +702,7 @@ async def test_who_may_only_read_changes_nothing(tmp_path: Path) -> None:
             for path in ("apply", "restore", "snapshots"):
                 assert (await client.post(f"{HERE}/{path}", json=body)).status_code == 403
             assert (await client.put(f"{HERE}/metadata", json={})).status_code == 403
-            assert (await client.post(f"{HERE}/plan", json=body)).status_code == 200
+            for path in ("plan", "verify", "diff"):
+                assert (await client.post(f"{HERE}/{path}", json=body)).status_code == 200
+            assert (await client.post(f"{HERE}/metadata", json={})).status_code == 404
     assert on_board.values["MODE"] == 3

@@ -20,7 +20,7 @@ import pytest
 from paramclient import ParamClient, UsageError, capture
 from paramclient.capture import Capture
 from paramclient.cli import run
-from paramclient.links.tlog import LONGEST_LEAP, Record, packed_time, read_records
+from paramclient.links.tlog import LATEST, LONGEST_LEAP, Record, packed_time, read_records
 from paramclient.protocol import wire
 from paramclient.protocol.sniff import MOST_PEERS, FrameCutter
 from paramclient.sim import ArduPilotVehicle
@@ -92,6 +92,13 @@ def test_a_clock_that_is_set_costs_no_frame(first: float, second: float, behind:
     found = records(log_of(*frames[:3], at=first) + log_of(*frames[3:], at=second))
     assert [each.data for each in found] == frames
     assert (found[0].at, found[3].at) == (first, second)
+
+
+def test_no_frame_is_later_than_the_latest_time() -> None:
+    """Not in many steps either: dates end with the year 9999."""
+    step = LONGEST_LEAP - 1
+    data = b"".join(packed_time(LATEST - step + number * step) + frame(number) for number in range(9))
+    assert [each.at for each in records(data)] == [LATEST - step, LATEST]
 
 
 @pytest.mark.parametrize("damaged", [0, 2, 4])
@@ -185,6 +192,19 @@ def test_the_command_writes_logs_too(tmp_path: Path, capsys: pytest.CaptureFixtu
     assert "flight.tlog exists" in capsys.readouterr().err
     assert run(["link", "sim:px4", "--seconds", "0.1", "--tlog", str(tmp_path / "link.tlog")]) == 0
     assert messages(tmp_path / "link.tlog")
+
+
+@pytest.mark.parametrize("now", [-86400.0, 30.0])
+@swiftly
+async def test_a_clock_that_was_never_set_ends_nothing(
+    now: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("paramclient.capture.time.time", lambda: now)
+    path = tmp_path / "flight.tlog"
+    async with a_client(small_px4(), tlog=path) as client:
+        assert (await (await client.component()).get("PARAM_07")).value == VALUES["PARAM_07"]
+    assert {each.at for each in records(path.read_bytes())} == {max(0.0, now)}
+    assert any(isinstance(each, wire.ParamValue) for each in messages(path))
 
 
 @swiftly

@@ -1,10 +1,13 @@
 """Tables, identities and history on disk: what a vehicle's parameters were when it was last heard.
 
 `records` says what goes in and comes out. The other rooms stand on one another: `store` is what is called,
-`merge` brings in what is of the past,
+and `interface` what it calls; `operations` are what can be written. `merge` brings in what is of the past,
 `tables` keeps tables and their history, `earlier` tells what they were before,
-`fleet` puts those of many vehicles beside each other, `rows` lays them into cells, `database` looks after
-the file.
+`fleet` puts those of many vehicles beside each other, `rows` lays them into cells. `session` is one
+transaction in the SQL of every database, `sqlite` in that of a file; `database` looks after the file.
+
+Where stations share a database, `shared` puts this together: `postgres` (with `migrations` and `address`),
+the local copy with its `outbox`, and `settle` for what comes from several stations. `transfer` copies tables.
 """
 
 from __future__ import annotations
@@ -14,6 +17,7 @@ from paramclient.cache.fleet import FleetDiff, FleetValue, FleetVehicle, Holder,
 from paramclient.cache.records import (
     BY_US,
     BY_VEHICLE,
+    CacheChange,
     CachedComponent,
     CachedSummary,
     CachedVehicle,
@@ -27,13 +31,16 @@ from paramclient.cache.records import (
 )
 from paramclient.cache.store import ParamCache, default_path
 from paramclient.cache.tables import HISTORY_LINES
+from paramclient.cache.transfer import CopyResult
 
 __all__ = [
     "BY_US",
     "BY_VEHICLE",
+    "CacheChange",
     "CachedComponent",
     "CachedSummary",
     "CachedVehicle",
+    "CopyResult",
     "FleetDiff",
     "FleetValue",
     "FleetVehicle",

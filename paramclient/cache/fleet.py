@@ -1,13 +1,12 @@
 """The same parameters of many vehicles beside each other: who differs, and since when.
 
-Only the parameters that are asked for are read. Rows stay the tuples that SQLite gives until it is known
-which values there are: a fleet has many vehicles and few values. The checksums of whole tables are not looked
-at here. Each function that takes a connection works inside its caller's transaction.
+Only the parameters that are asked for are read, and put together by value before anything is made of them: a
+fleet has many vehicles and few values. The checksums of whole tables are not looked at here. Each function
+that takes a session works inside its caller's transaction.
 """
 
 from __future__ import annotations
 
-import sqlite3
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -15,6 +14,7 @@ from fnmatch import fnmatchcase
 from typing import Final, TypeAlias
 
 from paramclient.cache.rows import cells, read_param
+from paramclient.cache.session import Session
 from paramclient.paramset import WrittenParam
 from paramclient.values import Param, same_bits
 
@@ -165,20 +165,19 @@ def spread(
     )
 
 
-def fleet_diff(
-    connection: sqlite3.Connection, component: int, wanted: Mapping[str, WrittenParam | None]
-) -> FleetDiff:
+def fleet_diff(session: Session, component: int, wanted: Mapping[str, WrittenParam | None]) -> FleetDiff:
     """Compare the vehicles in what is wanted, by name; None stands for: with each other."""
-    owners = _owners(connection, component)
+    owners = {
+        owner: FleetVehicle(key, system, complete)
+        for owner, key, system, complete in session.tables_of(component)
+    }
+    places = {owner: place for place, owner in enumerate(owners)}
     holders = [Holder(vehicle) for vehicle in owners.values()]
-    found: defaultdict[tuple[object, ...], list[Holder]] = defaultdict(list)
-    for owner, holder in zip(owners, holders, strict=True):
-        for row in _of_names(connection, "SELECT name, type, bits, is_raw FROM param", owner, wanted):
-            found[row].append(holder)
     values: defaultdict[str, dict[Cells, list[Holder]]] = defaultdict(dict)
-    for row, same in found.items():
-        name, *value = cells(row, "siii")
-        values[name][tuple(value)] = same
+    for some in _parts(list(wanted)):
+        for row, same in session.holders(list(owners), some).items():
+            name, *value = cells(row, "siii")
+            values[name][tuple(value)] = [holders[place] for place in sorted(places[each] for each in same)]
     names = []
     for name, written in wanted.items():
         without: list[Holder] = []
@@ -186,10 +185,10 @@ def fleet_diff(
             having = {holder.vehicle.key for same in values[name].values() for holder in same}
             without = [holder for holder in holders if holder.vehicle.key not in having]
         names.append(spread(name, written, values[name], without))
-    return FleetDiff(component, tuple(owners.values()), tuple(_dated(connection, owners, names)))
+    return FleetDiff(component, tuple(owners.values()), tuple(_dated(session, owners, names)))
 
 
-def names_like(connection: sqlite3.Connection, component: int, pattern: str) -> list[str]:
+def names_like(session: Session, component: int, pattern: str) -> list[str]:
     """The names that any vehicle has and that fit a pattern of the shell, in alphabetical order.
 
     What is no pattern stands for itself, whether any vehicle has it or not.
@@ -197,40 +196,17 @@ def names_like(connection: sqlite3.Connection, component: int, pattern: str) -> 
     start = pattern[: next((at for at, sign in enumerate(pattern) if sign in "*?["), len(pattern))]
     if start == pattern:
         return [pattern]
-    rows = connection.execute(
-        "SELECT DISTINCT name FROM component c CROSS JOIN param ON owner = c.id"
-        " WHERE component = ? AND name >= ? AND name < ?",
-        (component, start, f"{start}\U0010ffff"),
-    )
-    return sorted(name for row in rows for name in cells(row, "s") if fnmatchcase(name, pattern))
+    names = session.names_between(component, start, f"{start}\U0010ffff")
+    return sorted(name for name in names if fnmatchcase(name, pattern))
 
 
-def _owners(connection: sqlite3.Connection, component: int) -> dict[int, FleetVehicle]:
-    """The tables of a component, by their ids in the database."""
-    owners = {}
-    for row in connection.execute(
-        "SELECT c.id, key, system, complete FROM component c JOIN vehicle ON key = vehicle"
-        " WHERE component = ? ORDER BY last_seen DESC, key",
-        (component,),
-    ):
-        owner, key, system, complete = cells(row, "isii")
-        owners[owner] = FleetVehicle(key, system, bool(complete))
-    return owners
-
-
-def _of_names(
-    connection: sqlite3.Connection, select: str, owner: int, names: Iterable[str], end: str = ""
-) -> Iterator[tuple[object, ...]]:
-    """The rows of one table that are about these names."""
-    left = list(names)
-    while left:
-        chunk, left = left[:_CHUNK], left[_CHUNK:]
-        marks = ", ".join("?" * len(chunk))
-        yield from connection.execute(f"{select} WHERE owner = ? AND name IN ({marks}){end}", (owner, *chunk))
+def _parts(names: Sequence[str]) -> Iterator[Sequence[str]]:
+    for start in range(0, len(names), _CHUNK):
+        yield names[start : start + _CHUNK]
 
 
 def _dated(
-    connection: sqlite3.Connection, owners: Mapping[int, FleetVehicle], names: Iterable[NameSpread]
+    session: Session, owners: Mapping[int, FleetVehicle], names: Iterable[NameSpread]
 ) -> Iterator[NameSpread]:
     """The same, with the times of those that stand out."""
     names = list(names)
@@ -238,11 +214,9 @@ def _dated(
     for each in names:
         for holder in (*_others(each), *each.lacking):
             standing_out[holder.vehicle.key].append(each.name)
-    times = {
-        vehicle.key: _times(connection, owner, standing_out[vehicle.key])
-        for owner, vehicle in owners.items()
-        if vehicle.key in standing_out
-    }
+    ids = {vehicle.key: owner for owner, vehicle in owners.items()}
+    found = _times(session, {ids[key]: some for key, some in standing_out.items()})
+    times = {key: found[ids[key]] for key in standing_out}
 
     def dated(holders: Iterable[Holder], name: str) -> tuple[Holder, ...]:
         return tuple(Holder(each.vehicle, *times[each.vehicle.key].get(name, ())) for each in holders)
@@ -262,20 +236,25 @@ def _others(of: NameSpread) -> Iterator[Holder]:
     return (holder for value in of.values if not value.agrees for holder in value.holders)
 
 
-def _times(connection: sqlite3.Connection, owner: int, names: Sequence[str]) -> dict[str, tuple[float, bool]]:
-    """By name, since when it is as it is in one table, and whether that is the moment of a change."""
-    [row] = connection.execute("SELECT known_since FROM component WHERE id = ?", (owner,))
-    [begin] = cells(row, "F")
-    times: dict[str, tuple[float, bool]] = {}
-    for row in _of_names(connection, "SELECT name, heard_at FROM param", owner, names):
-        name, at = cells(row, "sf")
-        times[name] = (at if begin is None else min(at, begin), False)
-    last: dict[str, int] = {}
-    for row in _of_names(connection, "SELECT name, max(id), at FROM history", owner, names, " GROUP BY name"):
-        name, last[name], at = cells(row, "sif")
-        times[name] = (at, True)
-    for row in _of_names(connection, "SELECT name, max(line), at FROM birth", owner, names, " GROUP BY name"):
-        name, line, at = cells(row, "sif")
-        if line >= last.get(name, 0):
-            times[name] = (at, True)
+def _times(
+    session: Session, named: Mapping[int, Sequence[str]]
+) -> Mapping[int, dict[str, tuple[float, bool]]]:
+    """By table and name, since when it is as it is, and whether that is the moment of a change."""
+    rows: list[tuple[int, str, str, int, float]] = []
+    for start in range(0, max(map(len, named.values()), default=0), _CHUNK):
+        parts = {owner: names[start : start + _CHUNK] for owner, names in named.items()}
+        rows += session.since({owner: names for owner, names in parts.items() if names})
+    known = {owner: at for owner, _, what, _, at in rows if what == "known"}
+    times: defaultdict[int, dict[str, tuple[float, bool]]] = defaultdict(dict)
+    for owner, name, what, _, at in rows:
+        if what == "heard":
+            times[owner][name] = (min(at, known.get(owner, at)), False)
+    last: dict[tuple[int, str], int] = {}
+    for owner, name, what, line, at in rows:
+        if what == "line":
+            last[owner, name] = line
+            times[owner][name] = (at, True)
+    for owner, name, what, line, at in rows:
+        if what == "birth" and line >= last.get((owner, name), 0):
+            times[owner][name] = (at, True)
     return times

@@ -2,24 +2,14 @@
 
 from __future__ import annotations
 
-import sqlite3
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Final
+from typing import Final
 
-from paramclient.cache import earlier
 from paramclient.cache.records import BY_VEHICLE, CachedSummary, CachedVehicle, StoredParam, TableUpdate
 from paramclient.cache.rows import Row
-from paramclient.cache.tables import (
-    HISTORY_LINES,
-    applied,
-    hashed,
-    save,
-    stored_rows,
-    summaries,
-    vehicles,
-    write_rows,
-)
+from paramclient.cache.session import Line, Session
+from paramclient.cache.tables import HISTORY_LINES, applied, hashed, save, stored_rows, write_rows
 
 __all__ = ["merge"]
 
@@ -27,11 +17,9 @@ SAME_CHANGE: Final = 2.0
 """Seconds between two lines of history that tell of one change: who heard it live wrote it up to a quarter of
 a second later, or as much later as a slow disk took."""
 
-_LINE: Final = "at, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
-
 
 def merge(
-    connection: sqlite3.Connection,
+    session: Session,
     updates: Sequence[TableUpdate],
     based_on: Mapping[tuple[str, int], float],
 ) -> None:
@@ -41,7 +29,7 @@ def merge(
         key = (update.identity.key, update.component)
         past = tables.get(key)
         if past is None:
-            past = tables[key] = _Past(connection, based_on.get(key))
+            past = tables[key] = _Past(session, based_on.get(key))
         past.take(update)
     for past in tables.values():
         past.finish()
@@ -59,16 +47,16 @@ class _Past:
         lines: of history, to be put in their places.
     """
 
-    connection: sqlite3.Connection
+    session: Session
     based_on: float | None
     owner: int | None = None
     goes_on: bool = False
     overtaken: dict[str, StoredParam] = field(default_factory=dict)
-    lines: list[tuple[Any, ...]] = field(default_factory=list)
+    lines: list[Line] = field(default_factory=list)
 
     def take(self, update: TableUpdate) -> None:
         """Bring in one update."""
-        vehicle, found = _standing(self.connection, update)
+        vehicle, found = _standing(self.session, update)
         if found is None:
             self.goes_on = True
             self._save(update, vehicle)
@@ -90,7 +78,7 @@ class _Past:
         found = [self.overtaken.pop(name) for name in names if name in self.overtaken]
         if self.owner is None or not found:
             return
-        kept = stored_rows(self.connection, self.owner)
+        kept = stored_rows(self.session, self.owner)
         for item in found:
             name = item.param.name
             old, new = _row(item), kept.get(name)
@@ -104,56 +92,31 @@ class _Past:
         if not self.lines:
             return
         assert self.owner is not None
-        connection, owner = self.connection, self.owner
-        kept = connection.execute(
-            f"SELECT id, {_LINE} FROM history WHERE owner = ? ORDER BY id", (owner,)
-        ).fetchall()
-        lines: list[tuple[int | None, tuple[Any, ...]]] = [(number, line) for number, *line in kept]
+        lines: list[tuple[int | None, Line]] = list(self.session.lines(self.owner))
         for new in self.lines:
             later = (place for place, (_, line) in enumerate(lines) if line[0] > new[0])
             lines.insert(next(later, len(lines)), (None, new))
-        [(last,)] = connection.execute("SELECT ifnull(max(id), 0) FROM history")
         dropped, lines = lines[:-HISTORY_LINES], lines[-HISTORY_LINES:]
-        connection.execute("DELETE FROM history WHERE owner = ?", (owner,))
-        connection.executemany(
-            f"INSERT INTO history (id, owner, {_LINE}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
-            [(last + number, owner, *line) for number, (_, line) in enumerate(lines, start=1)],
-        )
-        self._renumber(
-            {old: last + number for number, (old, _) in enumerate(lines, start=1) if old is not None}
-        )
+        self.session.replace_lines(self.owner, lines)
         if dropped:
-            earlier.forget(connection, owner, max(line[0] for _, line in dropped))
-
-    def _renumber(self, places: Mapping[int, int]) -> None:
-        """Names that appeared did so behind a line of history, which has another number now."""
-        lines = self.connection.execute("SELECT DISTINCT line FROM birth WHERE owner = ?", (self.owner,))
-        # from the last one on: a new number is above every old one
-        for (line,) in sorted(lines.fetchall(), reverse=True):
-            behind = max((new for old, new in places.items() if old <= line), default=0)
-            self.connection.execute(
-                "UPDATE OR REPLACE birth SET line = ? WHERE owner = ? AND line = ?",
-                (behind, self.owner, line),
-            )
+            self.session.forget(self.owner, max(line[0] for _, line in dropped))
 
     def _save(self, update: TableUpdate, vehicle: CachedVehicle | None) -> None:
         if vehicle is not None and vehicle.last_seen > update.at:
             update = replace(update, identity=vehicle.identity)
-        save(self.connection, [update])
+        save(self.session, [update])
         self._widen(update, vehicle)
 
     def _widen(self, update: TableUpdate, vehicle: CachedVehicle | None) -> None:
         """The vehicle has been seen from the first time to the last, whichever was written first."""
         if vehicle is not None:
-            self.connection.execute(
-                "UPDATE vehicle SET first_seen = ?, last_seen = ? WHERE key = ?",
-                (min(vehicle.first_seen, update.at), max(vehicle.last_seen, update.at), vehicle.key),
-            )
+            first, last = min(vehicle.first_seen, update.at), max(vehicle.last_seen, update.at)
+            self.session.seen(vehicle.key, first, last)
 
     def _bring_in(self, update: TableUpdate, table: CachedSummary) -> None:
         """Bring in what an update has of values that are not kept of a later time."""
         assert self.owner is not None
-        before = stored_rows(self.connection, self.owner)
+        before = stored_rows(self.session, self.owner)
         whole_at = table.synced_at if table.complete and table.synced_at is not None else float("-inf")
         later: list[StoredParam] = []
         heard = {item.param.name for item in update.params}
@@ -162,7 +125,8 @@ class _Past:
         for item in update.params:
             name = item.param.name
             row = before.get(name)
-            if (max(whole_at, self._gone_at(name)) if row is None else row.heard_at) < item.heard_at:
+            gone_at = self.session.gone_at(self.owner, name) if row is None else row.heard_at
+            if (max(whole_at, gone_at) if row is None else gone_at) < item.heard_at:
                 # its place is that of another count, perhaps
                 later.append(replace(item, param=replace(item.param, index=None)))
                 continue
@@ -173,13 +137,13 @@ class _Past:
         self.catch_up(item.param.name for item in later)
         after, changes, births = applied(replace(update, params=later, removed=(), replace=False), before)
         if after != before:
-            write_rows(self.connection, self.owner, before, after)
+            write_rows(self.session, self.owner, before, after)
             if hashed(before) != hashed(after):
-                self.connection.execute("UPDATE component SET hash = NULL WHERE id = ?", (self.owner,))
-        earlier.write_births(self.connection, self.owner, births)
+                self.session.describe(self.owner, hash=None)
+        self.session.add_births(self.owner, births)
         self.lines += changes
 
-    def _line(self, old_item: StoredParam, item: StoredParam) -> Iterator[tuple[Any, ...]]:
+    def _line(self, old_item: StoredParam, item: StoredParam) -> Iterator[Line]:
         """The line of a change between two observations, unless it is there."""
         old, new = _row(old_item), _row(item)
         if old.same_value(new):
@@ -188,30 +152,19 @@ class _Past:
         if new.value not in around:
             yield (item.heard_at, item.param.name, item.by, *old.value, *new.value)
 
-    def _gone_at(self, name: str) -> float:
-        """When a name that is not kept went, by its lines of history."""
-        [(at,)] = self.connection.execute(
-            "SELECT max(at) FROM history WHERE owner = ? AND name = ? AND new_type IS NULL",
-            (self.owner, name),
-        )
-        return float("-inf") if at is None else float(at)
-
-    def _lines(self, name: str, after: float, until: float) -> list[tuple[Any, ...]]:
+    def _lines(self, name: str, after: float, until: float) -> list[Line]:
         """What a parameter became in a time, by its lines of history."""
-        return self.connection.execute(
-            "SELECT new_type, new_bits, new_is_raw FROM history"
-            " WHERE owner = ? AND name = ? AND at > ? AND at <= ?",
-            (self.owner, name, after, until),
-        ).fetchall()
+        assert self.owner is not None
+        return self.session.became(self.owner, name, after, until)
 
 
 def _standing(
-    connection: sqlite3.Connection, update: TableUpdate
+    session: Session, update: TableUpdate
 ) -> tuple[CachedVehicle | None, tuple[int, CachedSummary] | None]:
     """The vehicle and the table that are kept, as far as they are."""
     key = update.identity.key
-    vehicle = next((each for each in vehicles(connection) if each.key == key), None)
-    return vehicle, next(iter(summaries(connection, key, update.component)), None)
+    vehicle = next(iter(session.vehicles(key)), None)
+    return vehicle, next(iter(session.summaries(key, update.component)), None)
 
 
 def _row(item: StoredParam) -> Row:

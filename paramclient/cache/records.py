@@ -15,6 +15,7 @@ from paramclient.values import Param
 __all__ = [
     "BY_US",
     "BY_VEHICLE",
+    "CacheChange",
     "CachedComponent",
     "CachedSummary",
     "CachedVehicle",
@@ -163,6 +164,19 @@ class Snapshot(SnapshotSummary):
     """
 
     params: ParamSet = field(hash=False)
+
+
+@dataclass(frozen=True, slots=True)
+class CacheChange:
+    """A table that another station has written to.
+
+    Attributes:
+        key: the name under which the vehicle's tables are kept.
+        component: component id.
+    """
+
+    key: str
+    component: int
 
 
 @dataclass(frozen=True, slots=True)

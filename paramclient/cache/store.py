@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import os
-import sqlite3
 import time
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 
 import platformdirs
 
 from paramclient.cache import earlier, fleet, tables
-from paramclient.cache.database import Database
+from paramclient.cache.address import Address, is_address
 from paramclient.cache.fleet import FleetDiff
-from paramclient.cache.merge import merge
+from paramclient.cache.interface import Store
+from paramclient.cache.operations import Merge, Remove, Save, SetDown
 from paramclient.cache.records import (
+    CacheChange,
     CachedComponent,
     CachedSummary,
     CachedVehicle,
@@ -25,7 +25,9 @@ from paramclient.cache.records import (
     SnapshotSummary,
     TableUpdate,
 )
-from paramclient.cache.rows import read_param
+from paramclient.cache.session import Session
+from paramclient.cache.sqlite import SqliteStore
+from paramclient.cache.transfer import CopyResult, copy_store
 from paramclient.errors import CacheError
 from paramclient.identity import Identity
 from paramclient.paramset import ParamSet
@@ -39,28 +41,48 @@ def default_path() -> Path:
 
 
 class ParamCache:
-    """Tables, identities and history on disk. Usable with no link, by several threads and processes at once.
+    """Tables, identities and history. Usable with no link, by several threads and processes at once.
 
-    The file is opened by the first call that needs it. Reading creates nothing. Every call blocks, as a rule
+    They are in a file, or in a PostgreSQL that many stations share. The file is opened by the first call that
+    needs it. Reading creates nothing. Every call blocks, as a rule
     for milliseconds, and for a few seconds at most where another process holds the file. What a call has
     written survives the death of the process at any moment; a power cut may take the last calls, never the
     file. A file that is damaged, or newer than this version, is set aside with a warning in the log, and a
     fresh one begins.
 
+    Of a database (`postgresql://USER@HOST/NAME`), the tables that this program has to do with are also in a
+    local copy. While the database cannot be reached, that is what is read and written, `away` says why, and a
+    warning goes to the log. What was written goes to the database once it is back, in order and each change
+    once. Several stations that hear one vehicle write to one table: of each value the later observation
+    counts, and both are in the history. The clocks of the stations have to agree.
+
     Args:
-        path: the file; None for `default_path()`.
+        path: the file; None for `default_path()`; or the URL of a database.
+        local: where the local copy of a database is kept; None for a file in the user's cache folder.
 
     Attributes:
-        path: the file, absolute.
+        path: the file, absolute; of a database, the local copy.
 
     Raises:
+        UsageError: the URL cannot be read, or psycopg is missing.
         CacheError: from every method that reads or writes: the file cannot be used (read-only, disk full,
-            held for too long by another process), or the cache is closed. Nothing was written then.
+            held for too long by another process), the database was never reached from here or refuses, or
+            the cache is closed. Nothing was written then.
     """
 
-    def __init__(self, path: str | os.PathLike[str] | None = None) -> None:
-        self.path = Path(default_path() if path is None else path).resolve()
-        self._database = Database(self.path)
+    def __init__(
+        self, path: str | os.PathLike[str] | None = None, *, local: str | os.PathLike[str] | None = None
+    ) -> None:
+        self._store: Store
+        if isinstance(path, str) and is_address(path):
+            from paramclient.cache.shared import SharedStore  # loaded only where there is a database
+
+            address = Address.parse(path)
+            self.path = Path(default_path().with_name(address.name) if local is None else local).resolve()
+            self._store = SharedStore(address, self.path)
+        else:
+            self.path = Path(default_path() if path is None else path).resolve()
+            self._store = SqliteStore(self.path)
 
     def __enter__(self) -> ParamCache:
         return self
@@ -71,21 +93,31 @@ class ParamCache:
         self.close()
 
     def __repr__(self) -> str:
-        return f"<ParamCache {self.path}>"
+        return f"<ParamCache {self.place}>"
 
     def close(self) -> None:
-        """Close the file; later calls raise CacheError. A cache that is thrown away closes by itself."""
-        self._database.close()
+        """Close the cache; later calls raise CacheError. One that is thrown away closes by itself."""
+        self._store.close()
+
+    @property
+    def place(self) -> str:
+        """Where the cache is, for people: the file, or the URL of the database without a password."""
+        return self._store.place
+
+    @property
+    def away(self) -> str | None:
+        """Why a database is not used at present, but its local copy; None while it is, and for a file."""
+        return self._store.away
 
     @property
     def notes(self) -> tuple[str, ...]:
         """What went wrong with the file so far and was mended: one text for each file set aside."""
-        return tuple(self._database.notes)
+        return self._store.notes
 
     @property
     def replacements(self) -> int:
         """How often a fresh file was made, or another one found in its place: what was saved is not in it."""
-        return self._database.replacements
+        return self._store.replacements
 
     def save(self, update: TableUpdate | Sequence[TableUpdate]) -> None:
         """Write what was learnt, in one transaction: all of it is kept, or nothing.
@@ -98,7 +130,7 @@ class ParamCache:
         """
         updates = (update,) if isinstance(update, TableUpdate) else tuple(update)
         if updates:
-            self._database.write(lambda connection: tables.save(connection, updates))
+            self._store.do(Save(updates))
 
     def merge(
         self, updates: Sequence[TableUpdate], *, based_on: Mapping[tuple[str, int], float] | None = None
@@ -117,7 +149,7 @@ class ParamCache:
             UsageError: a time that is not in unix seconds.
         """
         if updates:
-            self._database.write(lambda connection: merge(connection, updates, based_on or {}))
+            self._store.do(Merge(updates, based_on or {}))
 
     def load(self, key: str, component: int) -> CachedComponent | None:
         """The table of a vehicle's component, or None.
@@ -126,11 +158,14 @@ class ParamCache:
             key: `Identity.key`.
             component: component id.
         """
-        return self._database.read(lambda connection: self._load(connection, key, component))
+        found = self._store.read(lambda session: self._load(session, key, component))
+        if found is not None:
+            self._store.follow(key, component)
+        return found
 
     def vehicles(self) -> list[CachedVehicle]:
         """Every vehicle, the one seen last first."""
-        return self._database.read(tables.vehicles)
+        return self._store.read(lambda session: session.vehicles())
 
     def components(self, vehicle: str | None = None) -> list[CachedSummary]:
         """Every table, without its parameters, ordered as `vehicles()`, then by component id.
@@ -142,11 +177,11 @@ class ParamCache:
             CacheError: there is no such vehicle, or more than one.
         """
 
-        def work(connection: sqlite3.Connection) -> list[CachedSummary]:
-            key = None if vehicle is None else self._choose(connection, vehicle)
-            return [summary for _, summary in tables.summaries(connection, key)]
+        def work(session: Session) -> list[CachedSummary]:
+            key = None if vehicle is None else self._choose(session, vehicle)
+            return [summary for _, summary in session.summaries(key)]
 
-        return self._database.read(work)
+        return self._store.read(work)
 
     def component(
         self, vehicle: str | None = None, *, system: int | None = None, component: int = 1
@@ -162,13 +197,13 @@ class ParamCache:
             CacheError: none fits, or more than one; the text says what there is.
         """
 
-        def work(connection: sqlite3.Connection) -> CachedComponent:
-            key = self._choose(connection, vehicle, system=system, component=component)
-            found = self._load(connection, key, component)
+        def work(session: Session) -> CachedComponent:
+            key = self._choose(session, vehicle, system=system, component=component)
+            found = self._load(session, key, component)
             assert found is not None, "what was chosen exists for the whole transaction"
             return found
 
-        return self._database.read(work)
+        return self._store.read(work)
 
     def history(
         self,
@@ -191,10 +226,8 @@ class ParamCache:
             CacheError: there is no such vehicle, or more than one.
         """
 
-        return self._database.read(
-            lambda connection: tables.history(
-                connection, self._choose(connection, vehicle), component, name, limit, since
-            )
+        return self._store.read(
+            lambda session: session.history(self._choose(session, vehicle), component, name, limit, since)
         )
 
     def snapshot(self, vehicle: str, component: int, *, reason: str, at: float | None = None) -> Snapshot:
@@ -212,23 +245,9 @@ class ParamCache:
             CacheError: there is no such table, or more than one.
         """
 
-        def work(connection: sqlite3.Connection) -> Snapshot:
-            key, owner = self._table(connection, vehicle, component)
-            [(_, state)] = tables.summaries(connection, key, component)
-            params = ParamSet.of(
-                (
-                    read_param(name, *row.value, row.param_index, row.default_bits)
-                    for name, row in tables.stored_rows(connection, owner).items()
-                ),
-                identity=state.identity,
-            )
-            return earlier.store(
-                connection, owner, params, at=moment, reason=reason, hash=state.hash, complete=state.complete
-            )
-
         moment = time.time() if at is None else at
-        self._database.read(lambda connection: self._table(connection, vehicle, component))
-        return self._database.write(work)
+        key, _ = self._store.read(lambda session: self._table(session, vehicle, component))
+        return self._store.do(SetDown(key, component, None, moment, reason))
 
     def store_snapshot(
         self,
@@ -259,28 +278,10 @@ class ParamCache:
             CacheError: a key was given, and there is no such table, or more than one.
         """
         moment = time.time() if at is None else at
-
-        def work(connection: sqlite3.Connection) -> Snapshot:
-            if isinstance(vehicle, Identity):
-                identity, autopilot = vehicle, vehicle.autopilot if component == 1 else 0
-                owner = tables.owner_of(connection, vehicle.key, component)
-                if owner is None:
-                    owner = tables.make(
-                        connection,
-                        TableUpdate(identity=vehicle, component=component, autopilot=autopilot, at=moment),
-                    )
-            else:
-                key, owner = self._table(connection, vehicle, component)
-                [(_, state)] = tables.summaries(connection, key, component)
-                identity = state.identity
-            whole = replace(params, identity=identity)
-            return earlier.store(
-                connection, owner, whole, at=moment, reason=reason, hash=hash, complete=complete
-            )
-
+        who = vehicle
         if isinstance(vehicle, str):
-            self._database.read(lambda connection: self._table(connection, vehicle, component))
-        return self._database.write(work)
+            who, _ = self._store.read(lambda session: self._table(session, vehicle, component))
+        return self._store.do(SetDown(who, component, params, moment, reason, hash, complete))
 
     def snapshots(self, vehicle: str, component: int | None = None) -> list[SnapshotSummary]:
         """The snapshots of a vehicle's tables, newest last.
@@ -292,9 +293,7 @@ class ParamCache:
         Raises:
             CacheError: there is no such vehicle, or more than one.
         """
-        return self._database.read(
-            lambda connection: earlier.snapshots(connection, self._choose(connection, vehicle), component)
-        )
+        return self._store.read(lambda session: session.snapshots(self._choose(session, vehicle), component))
 
     def state_at(self, vehicle: str, component: int, when: float) -> ParamSet:
         """A table as it was at a moment.
@@ -317,15 +316,15 @@ class ParamCache:
                 next to it), or the clock of this computer went through that moment twice.
         """
 
-        def work(connection: sqlite3.Connection) -> ParamSet:
-            key, owner = self._table(connection, vehicle, component)
+        def work(session: Session) -> ParamSet:
+            key, owner = self._table(session, vehicle, component)
             if isinstance(when, int):
-                return earlier.snapshot(connection, owner, when).params
-            [(_, state)] = tables.summaries(connection, key, component)
-            rows = tables.stored_rows(connection, owner)
-            return earlier.state_at(connection, owner, state.identity, rows, when)
+                return earlier.snapshot(session, owner, when).params
+            [(_, state)] = session.summaries(key, component)
+            rows = tables.stored_rows(session, owner)
+            return earlier.state_at(session, owner, state.identity, rows, when)
 
-        return self._database.read(work)
+        return self._store.read(work)
 
     def fleet_diff(self, wanted: Iterable[str] | ParamSet, *, component: int | None = None) -> FleetDiff:
         """Compare every vehicle in some parameters: which of them differ, and since when.
@@ -344,19 +343,55 @@ class ParamCache:
         names = () if written is not None else tuple(wanted)
         number = component or (written and written.component) or 1
 
-        def work(connection: sqlite3.Connection) -> FleetDiff:
-            chosen = {name: fleet.names_like(connection, number, name) for name in names}
+        def work(session: Session) -> FleetDiff:
+            chosen = {name: fleet.names_like(session, number, name) for name in names}
             plain: dict[str, None] = dict.fromkeys(each for like in chosen.values() for each in like)
-            found = fleet.fleet_diff(connection, number, plain if written is None else written)
+            found = fleet.fleet_diff(session, number, plain if written is None else written)
             if not found.vehicles:
-                raise CacheError(f"the cache {self.path} holds no table of component {number}")
+                raise CacheError(f"the cache {self.place} holds no table of component {number}")
             held = {each.name for each in found.names if each.values}
             for name, like in chosen.items():
                 if held.isdisjoint(like):
-                    raise CacheError(f"no vehicle in the cache {self.path} has a parameter {name}")
+                    raise CacheError(f"no vehicle in the cache {self.place} has a parameter {name}")
             return found
 
-        return self._database.read(work)
+        return self._store.read(work)
+
+    def subscribe(self, told: Callable[[CacheChange], None]) -> Callable[[], None]:
+        """Have something called when another station has written to a table of the database.
+
+        That is within a second. What was written while the database could not be reached is told when it is
+        back. Of a file nothing is told.
+
+        Args:
+            told: is called in a thread of the cache. It should be done soon, and may use the cache.
+
+        Returns:
+            What ends it.
+        """
+        return self._store.subscribe(told)
+
+    def copy_to(
+        self, target: ParamCache, *, progress: Callable[[str, int, int], None] | None = None
+    ) -> CopyResult:
+        """Bring every table into another cache, with history and snapshots, and see that it is there.
+
+        Each table is one transaction, and one of which everything is there already is left alone: ended at
+        any moment, it is begun again in the same way. What the other cache has of a table stays: of each
+        value the later observation counts, and no line of history is there twice.
+
+        Args:
+            progress: is told of each table: whose it is, its number, and how many there are.
+
+        Raises:
+            UsageError: both are the same.
+            CacheError: one of them cannot be used, its database is away, or something did not arrive.
+        """
+        result = copy_store(self._store, target._store, progress)
+        for each in (self, target):
+            if each.away is not None:
+                raise CacheError(f"{each.away}; copy again once it is back")
+        return result
 
     def remove(self, vehicle: str, component: int | None = None) -> int:
         """Forget a vehicle's tables with their history and snapshots; give the number of tables.
@@ -368,34 +403,32 @@ class ParamCache:
         Raises:
             CacheError: there is no such vehicle, or more than one.
         """
-        key = self._database.read(lambda connection: self._choose(connection, vehicle))
-        return self._database.write(lambda connection: tables.remove(connection, key, component))
+        key = self._store.read(lambda session: self._choose(session, vehicle))
+        return self._store.do(Remove(key, component))
 
-    def _table(self, connection: sqlite3.Connection, vehicle: str, component: int) -> tuple[str, int]:
+    def _table(self, session: Session, vehicle: str, component: int) -> tuple[str, int]:
         """The key of the vehicle that is meant, and the id of its table."""
-        key = self._choose(connection, vehicle, component=component)
-        owner = tables.owner_of(connection, key, component)
+        key = self._choose(session, vehicle, component=component)
+        owner = session.owner_of(key, component)
         assert owner is not None, "what was chosen exists for the whole transaction"
         return key, owner
 
-    def _load(self, connection: sqlite3.Connection, key: str, component: int) -> CachedComponent | None:
+    def _load(self, session: Session, key: str, component: int) -> CachedComponent | None:
         def history(name: str | None, limit: int | None) -> list[HistoryEntry]:
-            return self._database.read(
-                lambda connection: tables.history(connection, key, component, name, limit)
-            )
+            return self._store.read(lambda session: session.history(key, component, name, limit, None))
 
-        return tables.component(connection, key, component, history=history)
+        return tables.component(session, key, component, history=history)
 
     def _choose(
         self,
-        connection: sqlite3.Connection,
+        session: Session,
         vehicle: str | None,
         *,
         system: int | None = None,
         component: int | None = None,
     ) -> str:
         """The key of the one vehicle that fits; an exact key is preferred to the beginning of another id."""
-        kept = tables.vehicles(connection)
+        kept = session.vehicles()
         fits = [
             known
             for known in kept
@@ -414,5 +447,5 @@ class ParamCache:
         if fits:
             raise CacheError(f"{named} fits more than one vehicle in the cache: {'; '.join(map(str, fits))}")
         raise CacheError(
-            f"{named} is not in the cache {self.path}, which holds {'; '.join(map(str, kept)) or 'nothing'}"
+            f"{named} is not in the cache {self.place}, which holds {'; '.join(map(str, kept)) or 'nothing'}"
         )

@@ -20,7 +20,7 @@ from paramclient.cli.fleet import fleet_diff
 from paramclient.cli.history import history
 from paramclient.cli.link import link
 from paramclient.cli.logs import import_
-from paramclient.cli.offline import cache_list, cache_path, cache_remove, show
+from paramclient.cli.offline import cache_copy, cache_list, cache_path, cache_remove, show
 from paramclient.cli.outcome import ExitCode, code_of
 from paramclient.cli.output import printable, report, say
 from paramclient.cli.ports import ports
@@ -158,8 +158,14 @@ _app: Final = App(
 )
 _cache: Final = App(
     name="cache",
-    help="Look into the cache, with no link.",
-    help_epilogue=_examples("cache list", "cache history 1 MC_ROLL_P", "cache path", "cache remove 1"),
+    help="Look into the cache, or copy it, with no link.",
+    help_epilogue=_examples(
+        "cache list",
+        "cache history 1 MC_ROLL_P",
+        "cache path",
+        "cache remove 1",
+        "cache copy field.sqlite3 postgresql://me@office/fleet",
+    ),
 )
 
 _signing: Final = App(
@@ -292,6 +298,7 @@ _cache.command(cache_list, name="list")
 _cache.command(history, name="history", usage="Usage: paramclient cache history [OPTIONS] VEHICLE [NAME]")
 _cache.command(cache_path, name="path")
 _cache.command(cache_remove, name="remove")
+_cache.command(cache_copy, name="copy")
 _fleet.command(
     fleet_diff,
     name="diff",

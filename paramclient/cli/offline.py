@@ -1,12 +1,15 @@
-"""The commands that need no link: show, cache list, cache path, cache remove."""
+"""The commands that need no link: show, cache list, cache path, cache remove, cache copy."""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
+from paramclient.cache.address import is_address
 from paramclient.cli.logs import cache_of_log
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
@@ -40,7 +43,7 @@ from paramclient.values import Param, check_name, format_value, type_name
 if TYPE_CHECKING:
     from paramclient.documents.cached import CachedTableDoc
 
-__all__ = ["cache_list", "cache_path", "cache_remove", "show", "tables_of"]
+__all__ = ["cache_copy", "cache_list", "cache_path", "cache_remove", "show", "tables_of"]
 
 _DEFAULTS: Final = CacheOptions()
 
@@ -88,7 +91,7 @@ def show(
         _print_summaries(summaries)
         say("paramclient show VEHICLE shows one of them: by its system id, or the beginning of its key")
     elif not summaries:
-        say(f"the cache {printable(str(cache.path))} is empty")
+        say(f"the cache {printable(cache.place)} is empty")
     for view in [] if options.json else views:
         _print_table(view)
     if changed and tables and not any(_has_defaults(table) for table in tables):
@@ -105,18 +108,18 @@ def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
         from paramclient.documents.cached import CachedListDoc, CachedSummaryDoc  # only here: loads pydantic
 
         told = [CachedSummaryDoc.of(each) for each in summaries]
-        print_document(CachedListDoc(path=str(cache.path), components=told))
+        print_document(CachedListDoc(path=cache.place, components=told))
     elif summaries:
         _print_summaries(summaries)
     else:
-        say(f"the cache {printable(str(cache.path))} is empty")
+        say(f"the cache {printable(cache.place)} is empty")
     return ExitCode.DONE
 
 
 def cache_path(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
     """Print where the cache is kept."""
     with _open(options) as cache:
-        path = str(cache.path)
+        path = cache.place
     if options.json:
         from paramclient.documents.cached import PlaceDoc  # only here: loads pydantic
 
@@ -146,6 +149,40 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
     return ExitCode.DONE
 
 
+def cache_copy(source: str, target: str, /, *, json: bool = False) -> ExitCode:
+    """Bring every table of a cache into another one, with history and snapshots, and see that it is there.
+
+    What the other one has stays: of each value the later counts, and nothing is there twice. Ended at any
+    moment, it goes on when it is called again.
+
+    Args:
+        source: The cache: a file, or the postgresql:// URL of one that stations share.
+        target: The other one.
+        json: Print JSON, for programs.
+    """
+    if not is_address(source) and not Path(source).is_file():
+        raise CacheError(f"there is no cache {source}")
+
+    def told(key: str, number: int, count: int) -> None:
+        if sys.stderr.isatty():
+            say(f"{number} of {count}: {printable(key)}")
+
+    with ParamCache(source) as old, ParamCache(target) as new:
+        done = old.copy_to(new, progress=told)
+        place = new.place
+    if json:
+        from paramclient.documents.cached import CopiedDoc  # only here: loads pydantic
+
+        print_document(CopiedDoc(path=place, **asdict(done)))
+    else:
+        of = "table" if done.tables == 1 else "tables"
+        print_line(
+            f"copied {done.tables} {of} to {printable(place)}, {done.unchanged} were there already; in all"
+            f" {done.params} parameters, {done.lines} lines of history, {done.snapshots} snapshots, verified"
+        )
+    return ExitCode.DONE
+
+
 def tables_of(options: CacheOptions, vehicle: str, component: int | None) -> list[CachedComponent]:
     """The cached tables of a vehicle, or that of one of its components.
 
@@ -170,7 +207,7 @@ def _choose(cache: ParamCache, vehicle: str | None, component: int | None) -> li
     chosen = [each for each in summaries if component in (None, each.component)]
     if not chosen and (summaries or vehicle is not None):
         known = ", ".join(f"{each.system}/{each.component}" for each in summaries)
-        raise CacheError(f"component {component} is not in the cache {cache.path}, which holds {known}")
+        raise CacheError(f"component {component} is not in the cache {cache.place}, which holds {known}")
     return chosen
 
 

@@ -40,8 +40,8 @@ class CacheOptions:
     json: bool = False
     """Print JSON, for programs."""
 
-    cache: Path | None = None
-    """The cache file, instead of the user's own."""
+    cache: str | None = None
+    """The cache file, or the postgresql:// URL of one that stations share, instead of the user's own."""
 
 
 @Parameter(name="*")
@@ -114,8 +114,8 @@ class LinkOptions(SigningOptions):
     encoding: Encoding | None = None
     """How the component lays values into messages, where what it says of itself is wrong."""
 
-    cache: Path | None = None
-    """The cache file, instead of the user's own."""
+    cache: str | None = None
+    """The cache file, or the postgresql:// URL of one that stations share, instead of the user's own."""
 
     no_cache: bool = False
     """Neither read nor write a cache."""
@@ -133,7 +133,7 @@ class LinkOptions(SigningOptions):
     """Write everything on the link, both ways, to this telemetry log, which must not exist yet."""
 
     @property
-    def place(self) -> Path | bool:
+    def place(self) -> str | bool:
         """Where tables are kept, as `ParamClient` takes it.
 
         Raises:

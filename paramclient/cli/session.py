@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
@@ -14,7 +15,7 @@ from paramclient.cli.options import LinkOptions
 from paramclient.client import ParamClient
 from paramclient.component import Component
 from paramclient.errors import UsageError
-from paramclient.links import LinkKind, parse_link
+from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.links.names import names_service
 from paramclient.protocol.result import Policy
 from paramclient.signing import Signing
@@ -50,6 +51,13 @@ class Session:
     client: ParamClient
     component: Component
     deadline: Deadline
+
+    @property
+    def now(self) -> float:
+        """The time of day; of a log, when the last frame that was read from it was written."""
+        link = self.client.link
+        at = link.at if isinstance(link, ReplayLink) else None
+        return time.time() if at is None else at
 
     @property
     def who(self) -> str:

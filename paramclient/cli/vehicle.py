@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import AsyncGenerator, Iterable, Sequence
 from contextlib import aclosing, suppress
 from dataclasses import dataclass, replace
@@ -467,7 +466,7 @@ async def _print_news(
                 continue
             else:
                 text = _event_text(each)
-            at = time.time()
+            at = session.now
             if as_lines_of_json:
                 print_document(_line(each, at))
             else:

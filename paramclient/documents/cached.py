@@ -20,6 +20,7 @@ __all__ = [
     "CachedSummaryDoc",
     "CachedTableDoc",
     "CachedTablesDoc",
+    "CopiedDoc",
     "PlaceDoc",
     "RemovedDoc",
     "VehicleDoc",
@@ -159,6 +160,17 @@ class PlaceDoc(Document):
     """Where the cache is kept."""
 
     path: str
+
+
+class CopiedDoc(Document):
+    """What came of copying a cache: see `CopyResult`."""
+
+    path: str
+    tables: int
+    unchanged: int
+    params: int
+    lines: int
+    snapshots: int
 
 
 class RemovedDoc(Document):

@@ -54,7 +54,11 @@ def read_json(text: str, source: str) -> ParamFile:
     """
     try:
         content = json.loads(
-            text, object_pairs_hook=_unique, parse_constant=_no_constant, parse_float=_finite
+            text,
+            object_pairs_hook=_unique,
+            parse_constant=_no_constant,
+            parse_float=_finite,
+            parse_int=_whole,
         )
     except json.JSONDecodeError as error:
         raise FileError(
@@ -191,8 +195,15 @@ def _no_constant(word: str) -> NoReturn:
 def _finite(text: str) -> float:
     number = float(text)
     if math.isinf(number):
-        raise ValueError(f"{text} is beyond the range of a double")
+        raise ValueError(f"{shown(text)} is beyond the range of a double")
     return number
+
+
+def _whole(text: str) -> int:
+    try:
+        return int(text)
+    except ValueError:  # Python converts no more than some thousand digits
+        raise ValueError(f"{shown(text)} is beyond the range of every type") from None
 
 
 def _header(around: ParamFile) -> list[str]:

@@ -48,7 +48,7 @@ def load(text: str) -> Any:
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         raise NotYaml(error.problem or str(error), None if mark is None else mark.line + 1) from None
-    except (yaml.YAMLError, ValueError) as error:
+    except yaml.YAMLError as error:
         raise NotYaml(str(error).splitlines()[0], None) from None
 
 
@@ -86,6 +86,14 @@ class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[mi
         return mapping
 
 
+def _whole(_: _Loader, node: Any) -> int:
+    try:
+        return int(node.value)
+    except ValueError:  # Python converts no more than some thousand digits
+        raise _refused(node, f"{shown(node.value)} is beyond the range of every type") from None
+
+
+_Loader.add_constructor(f"{_STANDARD}int", _whole)
 _Loader.yaml_implicit_resolvers = {}  # none of those of YAML 1.1
 for _tag, _pattern, _first in _PLAIN_WORDS:
     _Loader.add_implicit_resolver(_STANDARD + _tag, _pattern, _first)

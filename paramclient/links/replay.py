@@ -31,6 +31,9 @@ class ReplayLink:
     Args:
         spec: of a name such as `replay:flight.tlog?speed=10`: ten times as fast as it was; 0 is as fast as it
             can be read, and nothing is as it was.
+
+    Attributes:
+        at: when the last frame that it has delivered was written, in unix seconds; None before the first.
     """
 
     is_stream = False
@@ -38,6 +41,7 @@ class ReplayLink:
 
     def __init__(self, spec: LinkSpec) -> None:
         self.name = spec.name
+        self.at: float | None = None
         self._path = spec.host
         self._speed = dict(spec.options).get("speed", 1.0)
         self._file: BinaryIO | None = None
@@ -59,7 +63,7 @@ class ReplayLink:
         self._closed = anyio.Event()
         self._due = anyio.current_time()
         self._is_over = False
-        self._next = next(self._records)
+        self._next = next(self._records, None)
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`."""
@@ -74,6 +78,7 @@ class ReplayLink:
         found: list[tuple[Peer, bytes]] = []
         while self._next is not None and self._due <= anyio.current_time() and len(found) < RECORDS_PER_READ:
             found.append((LOG_PEER, self._next.data))
+            self.at = self._next.at
             self._advance(self._next)
         self._is_over = not found
         return found

@@ -6,8 +6,11 @@ The form of Mission Planner, MAVProxy, QGroundControl and pymavlink.
 from __future__ import annotations
 
 import math
+import re
+import stat
 import struct
 from collections.abc import Iterator
+from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO, Final, NamedTuple
 
@@ -17,6 +20,8 @@ __all__ = ["Record", "open_log", "packed_time", "read_records"]
 
 BLOCK: Final = 65536
 """Bytes that are read at once."""
+FIRST_WITHIN: Final = 1 << 20
+"""Bytes in which a log's first frame begins: what is no log may be a disk image, too long to be read."""
 LONGEST_LEAP: Final = 366 * 86400.0
 """Seconds between two frames that are believed at once. A longer leap must be shared by the next frame: a
 clock that was not set begins with 1970 or 1980, and logs of many years may be joined; damage is alone."""
@@ -29,6 +34,7 @@ _LOOKED_AT: Final = _LONGEST_RECORD + 8 + 3
 """Bytes that say whether a record is one: it, and the beginning of the next one."""
 _MAGIC_V1: Final = 0xFE
 _MAGIC_V2: Final = 0xFD
+_MAGIC: Final = re.compile(b"[\xfd\xfe]").search
 
 
 class Record(NamedTuple):
@@ -44,8 +50,8 @@ class Record(NamedTuple):
 
 
 def packed_time(at: float) -> bytes:
-    """A time, in unix seconds, as it stands in a log."""
-    return _TIME.pack(round(at * 1e6))
+    """A time, in unix seconds, as it stands in a log: 1970 for a clock that stands before it."""
+    return _TIME.pack(max(0, round(at * 1e6)))
 
 
 def open_log(path: str, name: str) -> BinaryIO:
@@ -56,14 +62,20 @@ def open_log(path: str, name: str) -> BinaryIO:
         name: of the link, for the error.
 
     Raises:
-        LinkError: it cannot be read, or is no log.
+        LinkError: it cannot be read, or is no log. Nor is what is no regular file: it may have no end, or
+            keep us waiting.
     """
     try:
+        mode = Path(path).stat().st_mode
+        if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+            raise LinkError(f"{name}: {path} is no regular file", link=name)
         file = Path(path).open("rb")  # noqa: SIM115 - the caller closes it
+    except LinkError:
+        raise
     except OSError as error:
         raise LinkError(f"{name}: cannot open {path}: {error.strerror}", link=name) from error
     try:
-        if next(read_records(file), None) is None:
+        if next(read_records(BytesIO(file.read(FIRST_WITHIN))), None) is None:
             raise LinkError(f"{name}: {path} is no telemetry log, or holds no frame", link=name)
         file.seek(0)
     except OSError as error:
@@ -96,14 +108,19 @@ def read_records(file: BinaryIO) -> Iterator[Record]:
             return
         end = start + 8 + size
         at = _time_at(buffer, start)
-        if size and (_are_near(at, before) or _is_shared(buffer, end, at, alone=before == -math.inf)):
+        if (
+            size
+            and at <= LATEST
+            and (_are_near(at, before) or _is_shared(buffer, end, at, alone=before == -math.inf))
+        ):
             if end > len(buffer):
                 return
             yield Record(at, buffer[start + 8 : end])
             before = at
             start = end
         else:
-            start += 1
+            candidate = _MAGIC(buffer, start + 9)
+            start = max(start + 1, len(buffer) - 8) if candidate is None else candidate.start() - 8
 
 
 def _size_at(buffer: bytes, at: int) -> int | None:
@@ -129,5 +146,5 @@ def _is_shared(buffer: bytes, end: int, at: float, *, alone: bool) -> bool:
     """Whether what stands behind a record is one of about the same time; the end will do for one alone."""
     size = _size_at(buffer, end + 8)
     if size is None:
-        return alone and at <= LATEST
-    return size > 0 and at <= LATEST and _are_near(_time_at(buffer, end), at)
+        return alone
+    return size > 0 and _are_near(_time_at(buffer, end), at)

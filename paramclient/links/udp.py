@@ -43,7 +43,8 @@ DATAGRAMS_PER_READ: Final = 256
 """Datagrams that one `receive` gives at most, so that other tasks get their turn during a burst."""
 
 PEERS: Final = 256
-"""Addresses that a listening link remembers: one for each system id. Strangers cannot make it grow."""
+"""Addresses that a listening link remembers, one for each system id: what is for all goes to those. Strangers
+cannot make it grow, nor come between a vehicle and what is for it alone."""
 
 UNREACHABLE_PATIENCE: Final = 3.0
 """Seconds in which nothing found a way out, after which the socket is made anew: three heartbeats. It has its
@@ -168,7 +169,7 @@ class UdpIn(UdpLink):
     """`udpin`: bound to a port; speaks to everyone who has spoken MAVLink to it.
 
     Several vehicles may come from different addresses, or one after a restart from a new one. The `PEERS`
-    that were heard last are remembered.
+    that were heard last get what is for all; what is for one peer goes there, however many others speak.
     """
 
     async def _open(self, opening: int) -> None:
@@ -180,6 +181,9 @@ class UdpIn(UdpLink):
     @property
     def _has_own_address(self) -> bool:
         return self._host not in _EVERY_ADDRESS
+
+    def _destinations(self, peer: Peer | None) -> list[Address]:
+        return [peer] if isinstance(peer, tuple) else super()._destinations(peer)
 
 
 class UdpOut(UdpLink):

@@ -207,6 +207,10 @@ class ComponentMachine(Parts):
         self._report(changes)
         self.sync.compare(now)
 
+    def renew(self, params: Mapping[str, Param]) -> None:
+        """Take what another station has heard since, where a value is only *cached* here."""
+        self._report(self.table.renew(params))
+
     # what is asked of it
 
     def read(self, key: Key, now: float) -> Read:

@@ -87,7 +87,8 @@ class Table:
         doubts: how often what had been heard was no longer to be relied on.
         passed_over: by a name that several parameters share, the indices of those that it does not mean.
         dirty: names whose value, type or index changed since `take_dirty` was called last.
-        overwritten: what writes of ours had made of them or found, and is no more; each with who did it.
+        overwritten: what writes of ours had made of them or have replaced, and is no more; each with who did
+            it.
     """
 
     def __init__(self, encoding: Encoding = Encoding.BYTEWISE, room: Room | None = None) -> None:
@@ -312,6 +313,25 @@ class Table:
                 changes.append(Change(name, None, new))
         return changes
 
+    def renew(self, params: Mapping[str, Param]) -> list[Change]:
+        """Take what another station has heard since, where a value is only *cached* here.
+
+        Args:
+            params: the table as it is cached now.
+        """
+        changes = []
+        for name, param in params.items():
+            old = self.params.get(name)
+            if old is None or old.trust is not Trust.CACHED or name in self.dirty or old.same_value(param):
+                continue
+            new = replace(param.with_trust(Trust.CACHED), index=old.index, default=old.default)
+            self.params[name] = new
+            self._wire.pop(name, None)  # should the vehicle say that again, it is a change
+            if self._hash is not None:
+                self._moved(name)
+            changes.append(Change(name, old, new))
+        return changes
+
     def move(self, count: int) -> None:
         """Another count was heard: which parameter has which index is open again."""
         if self.count is not None:
@@ -431,8 +451,8 @@ class Table:
         return overwritten
 
     def _news(self, name: str, old: Param | None, by: str) -> None:
-        """A value has changed. One that was written for somebody is told of, however short it stood, with
-        what it was before."""
+        """A value has changed. What was written for somebody is told of, however short it stood, and with
+        what it has replaced, however short that was known."""
         before = self.dirty.get(name)
         if old is not None and before is not None and (is_ours(before) or is_ours(by)):
             self.overwritten.append((old, before))

@@ -52,6 +52,12 @@ class Connection(H11Protocol):
         elif self._head is None and not self.transport.is_closing():
             self._await_head()
 
+    def shutdown(self) -> None:
+        """The service ends. A body that is still on its way is not waited for: nothing would come of it."""
+        super().shutdown()
+        if self.conn.their_state is h11.SEND_BODY:
+            self.transport.abort()
+
     def on_response_complete(self) -> None:
         super().on_response_complete()
         self._watch()

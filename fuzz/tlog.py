@@ -1,0 +1,206 @@
+"""Telemetry logs: read as a simpler reader reads them, replayed whole, and imported with nothing made up."""
+
+from __future__ import annotations
+
+import io
+import logging
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from string import ascii_lowercase, ascii_uppercase
+from typing import Final
+from unittest import mock
+
+import anyio
+
+from fuzz.draw import Draw
+from paramclient.cache import ParamCache
+from paramclient.errors import LinkError
+from paramclient.links import tlog
+from paramclient.links.names import LinkKind, LinkSpec
+from paramclient.links.replay import ReplayLink
+from paramclient.links.tlog import Record, open_log, read_records
+from paramclient.logs import ImportedTable, import_log
+from paramclient.protocol import wire
+from paramclient.protocol.wire import NO_INDEX, Framer, Message
+from paramclient.values import Encoding, bits_of, decode
+
+__all__ = ["LONGEST", "run"]
+
+LONGEST: Final = 1024
+"""Bytes of an input: longer ones take their time and say nothing new."""
+
+YEAR = 366 * 86400 * 1_000_000
+END = 7_258_118_400 * 1_000_000
+BLOCKS = (1, 13, 64, 300, 65536)
+"""Sizes in which a log is read."""
+BEGINNINGS = (1_700_000_000_000_000, 1_700_000_000_000_000, 315_964_800_000_000, 20_000_000)
+PASSES = (1000, 1000, 20_000, 300_000, 7_000_000, -5_000_000, YEAR - 1, YEAR + 1, -40 * YEAR, 50 * YEAR)
+"""Microseconds between two frames."""
+NAMES = ("A", "B", "C", "D", "_HASH_CHECK", "\x1b[2J")
+KINDS = (9, 6, 1, 5, 10)
+VALUES = (0, 1, 2, 0x3F800000, 0x7FC00000, 0xFFFFFFFF)
+
+_CAPITALS = str.maketrans(ascii_lowercase, ascii_uppercase)
+
+logger = logging.getLogger("paramclient")
+
+
+def run(data: bytes) -> None:
+    """The first byte chooses between the bytes of a log, and pieces of which one is made."""
+    draw = Draw(data)
+    how = draw.number()
+    content = draw.rest() if how & 1 else _log(draw)
+    records = _check_reader(content, BLOCKS[(how >> 1) % len(BLOCKS)])
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "a.tlog"
+        path.write_bytes(content)
+        try:
+            open_log(str(path), "replay:a").close()
+        except LinkError:
+            assert not records
+        else:
+            assert records
+            with mock.patch.object(logger, "disabled", True):
+                anyio.run(_check_uses, path, records)
+
+
+def _check_reader(content: bytes, block: int) -> list[Record]:
+    with mock.patch.object(tlog, "BLOCK", block):
+        records = list(read_records(io.BytesIO(content)))
+    assert records == _records_of(content)
+    return records
+
+
+async def _check_uses(path: Path, records: Sequence[Record]) -> None:
+    link = ReplayLink(LinkSpec(LinkKind.REPLAY, str(path), options=(("speed", 0.0),)))
+    await link.open()
+    found: list[bytes] = []
+    while not link._is_over:
+        found += [data for _, data in await link.receive()]
+    await link.close()
+    assert found == [each.data for each in records]
+    if not _said(records):
+        return
+    with ParamCache(path.with_name("cache.sqlite3")) as kept:
+        tables = await import_log(path, kept)
+        before = _check_import(kept, tables, records)
+        assert await import_log(path, kept) == tables
+        assert _check_import(kept, tables, records) == before, "the second time changes something"
+
+
+def _check_import(kept: ParamCache, tables: Sequence[ImportedTable], records: Sequence[Record]) -> list[str]:
+    """All that is kept was said in the log by such a component, at a time of the log; told in full.
+
+    By which system it was said is left open: a vehicle that says the same id under two addresses is one.
+    """
+    said = _said(records)
+    times = {each.at for each in records}
+    assert {(each.system, each.component) for each in tables} <= said.keys()
+    told = []
+    for summary in kept.components():
+        table = kept.load(summary.key, summary.component)
+        assert table is not None
+        words = {
+            (spelt, kind, bits_of(decode(raw, kind, encoding)[0], kind))
+            for (_, component), each in said.items()
+            if component == summary.component
+            for name, kind, raw in each
+            for spelt in (name, name.translate(_CAPITALS))  # as ArduPilot's are taken
+            for encoding in Encoding
+        }
+        for name, param in table.params.items():
+            assert (name, param.type, bits_of(param.value, param.type)) in words
+        assert set(table.heard_at.values()) <= times
+        lines = list(kept.history(summary.key))
+        told.append(repr((summary, sorted(table.params.items()), sorted(table.heard_at.items()), lines)))
+    return sorted(told)
+
+
+def _said(records: Sequence[Record]) -> dict[tuple[int, int], set[tuple[str, int, bytes]]]:
+    """What parameters a log tells of, by who told it; from the bytes of each record alone."""
+    framer = Framer({22}, stream=False)
+    said: dict[tuple[int, int], set[tuple[str, int, bytes]]] = {}
+    for record in records:
+        for frame in framer.receive(record.data):
+            message = wire.decode(frame)
+            if isinstance(message, wire.ParamValue) and frame.system and message.param_id != "_HASH_CHECK":
+                words = said.setdefault((frame.system, frame.component), set())
+                words.add((message.param_id, message.param_type, message.raw))
+    return said
+
+
+def _records_of(content: bytes) -> list[Record]:
+    """The records of a log: from one whole to the next, at each place by what stands there and behind it."""
+    found: list[Record] = []
+    at = 0
+    last: int | None = None
+    while (here := _record_at(content, at)) is not None:
+        time, end = here
+        behind = _record_at(content, end)
+        is_proven = behind is not None and behind[1] > end and abs(behind[0] - time) <= YEAR
+        is_alone = behind is None and last is None
+        is_near = last is not None and abs(time - last) <= YEAR
+        if end > at and time <= END and (is_near or is_proven or is_alone):
+            if end > len(content):
+                break
+            found.append(Record(time / 1e6, content[at + 8 : end]))
+            last, at = time, end
+        else:
+            at += 1
+    return found
+
+
+def _record_at(content: bytes, at: int) -> tuple[int, int] | None:
+    """Time and end of what may stand there, no further than `at` if nothing does; None where the log ends."""
+    head = content[at : at + 11]
+    if len(head) < 11:
+        return None
+    time = int.from_bytes(head[:8], "big")
+    if head[8] == 0xFE:
+        return time, at + 16 + head[9]
+    if head[8] == 0xFD:
+        return time, at + 20 + head[9] + 13 * (head[10] & 1)
+    return time, at
+
+
+def _log(draw: Draw) -> bytes:
+    at = draw.one_of(BEGINNINGS)
+    log = b""
+    while not draw.is_over:
+        at = min(max(at + draw.one_of(PASSES), 0), 2**63)
+        record = at.to_bytes(8, "big") + _frame(draw)
+        match draw.number() % 16:
+            case 0:
+                record = record[: draw.number() % len(record)]
+            case 1:
+                place = draw.number() % len(record)
+                record = record[:place] + draw.take(1) + record[place + 1 :]
+            case 2:
+                record += draw.take(draw.number() % 24)
+        log += record
+    return log
+
+
+def _frame(draw: Draw) -> bytes:
+    system, component = draw.one_of((1, 1, 1, 2, 255, 0)), draw.one_of((1, 1, 100))
+    return wire.encode(
+        _message(draw), system=system, component=component, sequence=0, version=draw.one_of((2, 2, 2, 1))
+    )
+
+
+def _message(draw: Draw) -> Message:
+    name, raw = draw.one_of(NAMES), draw.one_of(VALUES).to_bytes(4, "little")
+    match draw.number() % 8:
+        case 0:
+            return wire.Heartbeat(2, draw.one_of((12, 3, 0)))
+        case 1:
+            return wire.AutopilotVersion(0, 0x01110000, bytes(8), uid=draw.number() % 3)
+        case 2:
+            return wire.ParamSet(1, 1, name, raw, draw.one_of(KINDS))
+        case 3:
+            return wire.SystemTime(0, draw.one_of((0, 1000, 1_000_000)))
+        case 4:
+            return wire.ParamRequestList(1, 1)
+    count, index = draw.one_of((4, 4, 3, 0, 65535)), draw.one_of((0, 1, 2, 3, NO_INDEX))
+    return wire.ParamValue(name, raw, draw.one_of(KINDS), count, index)

@@ -1,0 +1,148 @@
+"""What can be written to a cache: each a record, done in one transaction, wherever and whenever."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Generic, TypeVar
+
+from paramclient.cache import earlier, tables
+from paramclient.cache.merge import merge
+from paramclient.cache.records import Snapshot, TableUpdate
+from paramclient.cache.rows import read_param
+from paramclient.cache.session import Session
+from paramclient.cache.settle import settle
+from paramclient.errors import CacheError
+from paramclient.identity import Identity
+from paramclient.paramset import ParamSet
+
+__all__ = ["Merge", "Operation", "Remove", "Save", "SetDown"]
+
+T_co = TypeVar("T_co", covariant=True)
+
+
+class Operation(ABC, Generic[T_co]):
+    """One change of a cache. It happens as a whole, or not at all."""
+
+    @property
+    @abstractmethod
+    def tables(self) -> Iterable[tuple[str, int | None]]:
+        """The tables that it may change, by key and component; None for all of the vehicle's."""
+
+    @abstractmethod
+    def do(self, session: Session) -> T_co:
+        """Do it within a transaction."""
+
+
+@dataclass(frozen=True)
+class Save(Operation[None]):
+    """Write what was learnt, see `ParamCache.save`."""
+
+    updates: Sequence[TableUpdate]
+
+    @property
+    def tables(self) -> Iterable[tuple[str, int | None]]:
+        return {(each.identity.key, each.component) for each in self.updates}
+
+    def do(self, session: Session) -> None:
+        write = settle if session.is_shared else tables.save
+        write(session, self.updates)
+
+
+@dataclass(frozen=True)
+class Merge(Operation[None]):
+    """Write what was observed in the past, see `ParamCache.merge`."""
+
+    updates: Sequence[TableUpdate]
+    based_on: Mapping[tuple[str, int], float] = field(default_factory=dict)
+
+    @property
+    def tables(self) -> Iterable[tuple[str, int | None]]:
+        return {(each.identity.key, each.component) for each in self.updates}
+
+    def do(self, session: Session) -> None:
+        merge(session, self.updates, self.based_on)
+
+
+@dataclass(frozen=True)
+class SetDown(Operation[Snapshot]):
+    """Make a snapshot, see `ParamCache.store_snapshot`.
+
+    Attributes:
+        vehicle: who it is, or the key of one that is known.
+        params: what to set down; None for the table as it is kept, with its hash.
+        number: the one that it was given elsewhere, or None.
+    """
+
+    vehicle: Identity | str
+    component: int
+    params: ParamSet | None
+    at: float
+    reason: str
+    hash: int | None = None
+    complete: bool = True
+    number: int | None = None
+
+    @property
+    def tables(self) -> Iterable[tuple[str, int | None]]:
+        return [(self.vehicle if isinstance(self.vehicle, str) else self.vehicle.key, self.component)]
+
+    def do(self, session: Session) -> Snapshot:
+        [(key, _)] = self.tables
+        owner = session.owner_of(key, self.component)
+        if owner is None:
+            if isinstance(self.vehicle, str):
+                raise CacheError(f"the table of {key}, component {self.component}, has just been removed")
+            autopilot = self.vehicle.autopilot if self.component == 1 else 0
+            new = TableUpdate(
+                identity=self.vehicle, component=self.component, autopilot=autopilot, at=self.at
+            )
+            owner = session.make(new)
+        [(_, kept)] = session.summaries(key, self.component)
+        identity = kept.identity if isinstance(self.vehicle, str) else self.vehicle
+        shown = self.resolved(session)
+        assert shown.params is not None
+        return earlier.store(
+            session,
+            owner,
+            replace(shown.params, identity=identity),
+            at=self.at,
+            reason=self.reason,
+            hash=shown.hash,
+            complete=shown.complete,
+            number=self.number,
+        )
+
+    def resolved(self, session: Session) -> SetDown:
+        """The same with the parameters that the table has now, where it has none of its own."""
+        if self.params is not None:
+            return self
+        [(key, _)] = self.tables
+        found = session.summaries(key, self.component)
+        if not found:
+            raise CacheError(f"the table of {key}, component {self.component}, has just been removed")
+        [(owner, kept)] = found
+        return replace(self, params=_kept(session, owner), hash=kept.hash, complete=kept.complete)
+
+
+@dataclass(frozen=True)
+class Remove(Operation[int]):
+    """Forget tables, see `ParamCache.remove`."""
+
+    key: str
+    component: int | None
+
+    @property
+    def tables(self) -> Iterable[tuple[str, int | None]]:
+        return [(self.key, self.component)]
+
+    def do(self, session: Session) -> int:
+        return session.remove(self.key, self.component)
+
+
+def _kept(session: Session, owner: int) -> ParamSet:
+    rows = tables.stored_rows(session, owner)
+    return ParamSet.of(
+        read_param(name, *row.value, row.param_index, row.default_bits) for name, row in rows.items()
+    )

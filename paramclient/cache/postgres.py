@@ -1,0 +1,433 @@
+"""The cache in PostgreSQL: what that says in its own way. psycopg is loaded when a URL names a database.
+
+Everything stands in a schema of its own, `paramclient`. Who writes holds the vehicles that are written to by
+advisory locks, so that what is read before a change is what the change is made of. Reads see one moment.
+"""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections import defaultdict
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cache
+from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
+
+from paramclient.cache.address import Address
+from paramclient.cache.database import Damaged
+from paramclient.cache.migrations import CHANNEL, MIGRATIONS, SCHEMA
+from paramclient.cache.operations import Operation
+from paramclient.cache.rows import Row, cells
+from paramclient.cache.session import Session
+from paramclient.cache.transfer import OWN_NUMBERS
+from paramclient.errors import CacheError, UsageError
+
+if TYPE_CHECKING:
+    import psycopg
+    from psycopg_pool import ConnectionPool
+
+__all__ = ["Away", "PostgresDatabase", "PostgresSession", "Revisions"]
+
+CONNECT_TIMEOUT: Final = 3
+"""Seconds to reach the database before a station works on without it."""
+SILENCE: Final = 5_000
+"""Milliseconds that what was sent may stay unacknowledged before the connection is given up (Linux)."""
+LOCK_TIMEOUT: Final = "5s"
+"""How long another station's transaction may hold a vehicle; they take milliseconds."""
+IDLE_TIMEOUT: Final = "15s"
+"""When the database ends a transaction of a station that stands still, and would hold its vehicles."""
+MOST_CONNECTIONS: Final = 4
+"""Of one cache at once, beside the one that listens."""
+
+_LOCKS: Final = 0x5041524D  # `PARM`, the first half of every advisory lock
+_MIGRATION_LOCK: Final = 0x5041524D_0000_0001
+_TRIES: Final = 5
+
+Revisions = dict[tuple[str, int], int]
+"""By key and component, a number that is another one whenever a table has been written to."""
+T = TypeVar("T")
+
+
+class Away(Exception):
+    """The database cannot be reached, or the connection broke. What was to be written may have been."""
+
+
+class PostgresDatabase:
+    """A database that stations share. Safe to use from several threads.
+
+    Args:
+        address: where it is.
+    """
+
+    def __init__(self, address: Address) -> None:
+        self.address = address
+        self._pool: ConnectionPool[psycopg.Connection[tuple[Any, ...]]] | None = None
+        self._lock = threading.Lock()
+
+    def open(self) -> psycopg.Connection[tuple[Any, ...]]:
+        """Reach the database, and bring its schema up to date; give a connection that listens.
+
+        Raises:
+            Away: it cannot be reached.
+            CacheError: it is of a later version, or may not be used.
+        """
+        library, pools = _libraries()
+        with self._translated():
+            listener: psycopg.Connection[tuple[Any, ...]] = library.connect(
+                **self._options(), autocommit=True
+            )
+            try:
+                _migrate(listener, self.address.place)
+                listener.execute(f"LISTEN {CHANNEL}")
+                pool = pools.ConnectionPool(
+                    kwargs=self._options(),
+                    min_size=0,
+                    max_size=MOST_CONNECTIONS,
+                    timeout=CONNECT_TIMEOUT,
+                    num_workers=1,
+                    reconnect_timeout=CONNECT_TIMEOUT,
+                    open=True,
+                    name=self.address.place,
+                )
+            except BaseException:
+                listener.close()
+                raise
+        with self._lock:
+            before, self._pool = self._pool, pool
+        _end(before)
+        return listener
+
+    def close(self) -> None:
+        """Let go of every connection but the one that listens."""
+        with self._lock:
+            pool, self._pool = self._pool, None
+        _end(pool)
+
+    def read(self, work: Callable[[Session], T]) -> T:
+        """Do work that only reads, all of it of one moment.
+
+        Raises:
+            Away: the database cannot be reached.
+            CacheError: it is damaged, or may not be read.
+        """
+        with self._translated(), self._connection() as connection:
+            connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ READ ONLY")
+            return work(PostgresSession(connection))
+
+    def read_with_revision(
+        self, work: Callable[[Session], T], table: tuple[str, int]
+    ) -> tuple[T, int | None]:
+        """Do work that only reads one table; give also the revision of that.
+
+        Raises:
+            Away, CacheError: as `read`.
+        """
+        with self._translated(), self._connection() as connection:
+            connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ READ ONLY")
+            return work(PostgresSession(connection)), _revisions(connection, [table[0]]).get(table)
+
+    def write(
+        self, operations: Sequence[tuple[Operation[Any], str, int]]
+    ) -> tuple[list[Any], Revisions, Revisions]:
+        """Do operations in one transaction, each once.
+
+        Args:
+            operations: each with the number of its writer under which it is done: if that has done one of
+                this number or a higher one before, nothing happens.
+
+        Returns:
+            Their results, None where one was done before; the vehicles' revisions before and after.
+
+        Raises:
+            Away: the database cannot be reached. Whether they were done is open: do them again.
+            CacheError: one of them cannot be done, and none was.
+        """
+        with self._translated():
+            for _ in range(_TRIES - 1):
+                try:
+                    return self._write(operations)
+                except _libraries()[0].errors.DeadlockDetected:
+                    continue
+            return self._write(operations)
+
+    def revisions(self) -> Revisions:
+        """The revision of every table.
+
+        Raises:
+            Away, CacheError: as `read`.
+        """
+        with self._translated(), self._connection() as connection:
+            return _revisions(connection, None)
+
+    def _write(
+        self, operations: Sequence[tuple[Operation[Any], str, int]]
+    ) -> tuple[list[Any], Revisions, Revisions]:
+        tables = {table for operation, _, _ in operations for table in operation.tables}
+        keys = sorted({key for key, _ in tables})
+        with self._connection() as connection:
+            connection.execute(
+                "SELECT pg_advisory_xact_lock(%s, half) FROM"
+                " (SELECT DISTINCT hashtext(key) AS half FROM unnest(%s::text[]) AS key ORDER BY half) AS a",
+                (_LOCKS, keys),
+            )
+            before = _revisions(connection, keys)
+            session = PostgresSession(connection)
+            results = [
+                operation.do(session) if _is_new(connection, writer, number) else None
+                for operation, writer, number in operations
+            ]
+            connection.execute(
+                "UPDATE component c SET revision = nextval('revision')"
+                " FROM unnest(%s::text[], %s::integer[]) AS touched (key, number)"
+                " WHERE vehicle = key AND component = coalesce(number, component)",
+                ([key for key, _ in tables], [component for _, component in tables]),
+            )
+            after = _revisions(connection, keys)
+            changed = {each for each in {*before, *after} if before.get(each) != after.get(each)}
+            writer = operations[-1][1]
+            news = [json.dumps([writer, key, number, after.get((key, number))]) for key, number in changed]
+            connection.execute("SELECT pg_notify(%s, told) FROM unnest(%s::text[]) AS told", (CHANNEL, news))
+        return results, before, after
+
+    @contextmanager
+    def _connection(self) -> Iterator[psycopg.Connection[tuple[Any, ...]]]:
+        with self._lock:
+            pool = self._pool
+        if pool is None:
+            raise Away("the connection is closed")
+        with pool.connection() as connection:
+            yield connection
+
+    @contextmanager
+    def _translated(self) -> Iterator[None]:
+        """Errors of psycopg as ours, without the password."""
+        library, pools = _libraries()
+        place = self.address.place
+        try:
+            yield
+        except (pools.PoolClosed, pools.PoolTimeout) as error:
+            raise Away(f"the database {place} does not answer") from error
+        except library.errors.LockNotAvailable as error:
+            raise CacheError(f"another station holds a vehicle in the cache {place}") from error
+        except (library.OperationalError, library.InterfaceError) as error:
+            text = self.address.without_password(" ".join(str(error).split()))
+            raise Away(f"the database {place} cannot be reached: {text}") from None
+        except library.Error as error:
+            text = self.address.without_password(" ".join(str(error).split()))
+            raise CacheError(f"the cache {place} cannot be used: {text}") from error
+        except Damaged as damage:
+            raise CacheError(f"the cache {place} is damaged ({damage})") from damage
+
+    def _options(self) -> dict[str, Any]:
+        settings = {
+            "search_path": SCHEMA,
+            "lock_timeout": LOCK_TIMEOUT,
+            "idle_in_transaction_session_timeout": IDLE_TIMEOUT,
+        }
+        chosen = " ".join(f"-c {name}={value}" for name, value in settings.items())
+        given = self.address.options
+        defaults = {
+            "connect_timeout": CONNECT_TIMEOUT,
+            "tcp_user_timeout": SILENCE,
+            "keepalives_idle": 10,
+            "keepalives_interval": 5,
+            "keepalives_count": 2,
+            "application_name": "paramclient",
+            "client_encoding": "utf8",
+        }
+        return {**defaults, **given, "options": f"{chosen} {given.get('options', '')}".strip()}
+
+
+class PostgresSession(Session):
+    """One transaction on the database."""
+
+    is_shared = True
+    SNAPSHOT_ORDER: ClassVar[str] = "s.at, s.id"
+
+    def __init__(self, connection: psycopg.Connection[tuple[Any, ...]]) -> None:
+        self.connection = connection
+
+    def put_rows(self, owner: int, rows: Mapping[str, Row]) -> None:
+        if not rows:
+            return
+        columns = [list(column) for column in zip(*((name, *row) for name, row in rows.items()), strict=True)]
+        named = Row._fields
+        self.connection.execute(
+            f"INSERT INTO param (owner, name, {', '.join(named)}) SELECT %s, * FROM unnest(%s::text[],"
+            " %s::smallint[], %s::bigint[], %s::smallint[], %s::integer[], %s::smallint[],"
+            " %s::double precision[], %s::bigint[]) ON CONFLICT (owner, name) DO UPDATE"
+            f" SET ({', '.join(named)}) = ({', '.join(f'excluded.{name}' for name in named)})",
+            (owner, *columns),
+        )
+
+    def drop_rows(self, owner: int, names: Iterable[str]) -> None:
+        gone = list(names)
+        if gone:
+            self._do("DELETE FROM param WHERE owner = ? AND name = ANY (?)", (owner, gone))
+
+    def add_snapshot(
+        self, owner: int, row: Sequence[object], blob: bytes, crc: int, number: int | None = None
+    ) -> int:
+        given = super().add_snapshot(owner, row, blob, crc, number)
+        if number is not None and number < OWN_NUMBERS:
+            self._all(
+                "SELECT setval('snapshot_id_seq', greatest((SELECT last_value FROM snapshot_id_seq), ?))",
+                (number,),
+            )
+        return given
+
+    def names_between(self, component: int, first: str, end: str) -> list[str]:
+        found = self._all(
+            "SELECT DISTINCT name FROM component c JOIN param ON owner = c.id"
+            " WHERE component = ? AND name >= ? AND name < ?",
+            (component, first, end),
+        )
+        return [name for row in found for name in cells(row, "s")]
+
+    def holders(self, owners: Sequence[int], names: Sequence[str]) -> Mapping[tuple[Any, ...], list[int]]:
+        # by names alone, so that it is the index by names that is read
+        found = self._all(
+            "SELECT name, type, bits, is_raw, array_agg(owner) FROM param WHERE name = ANY (?)"
+            " GROUP BY name, type, bits, is_raw",
+            (list(names),),
+        )
+        meant = frozenset(owners)
+        holders = {tuple(value): [each for each in having if each in meant] for *value, having in found}
+        return {value: some for value, some in holders.items() if some}
+
+    def since(self, named: Mapping[int, Sequence[str]]) -> list[tuple[int, str, str, int, float]]:
+        owners = list(named)
+        found = [
+            (owner, "", "known", 0, at)
+            for owner, at in self._all(
+                "SELECT id, known_since FROM component WHERE id = ANY (?) AND known_since IS NOT NULL",
+                (owners,),
+            )
+        ]
+        by_names: defaultdict[tuple[str, ...], list[int]] = defaultdict(list)
+        for owner, names in named.items():
+            by_names[tuple(names)].append(owner)
+        for names, some in by_names.items():
+            asked = (some, list(names))
+            for what, select in (
+                ("heard", "SELECT owner, name, 0, heard_at FROM param WHERE {}"),
+                ("line", _LAST.format("history", "id")),
+                ("birth", _LAST.format("birth", "line")),
+            ):
+                rows = self._all(select.format("owner = ANY (?) AND name = ANY (?)"), asked)
+                found += [(owner, name, what, line, at) for owner, name, line, at in rows]
+        return found
+
+    def _all(self, sql: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
+        return self.connection.execute(_marked(sql), tuple(map(_sent, values))).fetchall()
+
+    def _do(self, sql: str, values: Sequence[object] = ()) -> int:
+        return self.connection.execute(_marked(sql), tuple(map(_sent, values))).rowcount
+
+    def _many(self, sql: str, rows: Iterable[Sequence[object]]) -> None:
+        sent = [tuple(map(_sent, row)) for row in rows]
+        if sent:
+            with self.connection.cursor() as cursor:
+                cursor.executemany(_marked(sql), sent)
+
+    def _insert(self, sql: str, values: Sequence[object]) -> int:
+        [(number,)] = self._all(f"{sql} RETURNING id", values)
+        return int(number)
+
+    def _numbers(self, count: int) -> Sequence[int]:
+        found = self._all("SELECT nextval('history_id_seq') FROM generate_series(1, ?)", (count,))
+        return sorted(number for (number,) in found)
+
+
+_LAST: Final = (
+    "SELECT DISTINCT ON (owner, name) owner, name, {1}, at FROM {0} WHERE {{}} ORDER BY owner, name, {1} DESC"
+)
+
+
+@cache
+def _marked(sql: str) -> bytes:
+    """A statement with psycopg's marks; no statement of ours has a question or percent mark in its text."""
+    return sql.replace("?", "%s").encode()
+
+
+def _sent(cell: object) -> object:
+    """A cell as PostgreSQL takes it: its text cannot hold a zero, nor half a character."""
+    if isinstance(cell, str):
+        return cell.encode("utf-8", "backslashreplace").decode().replace("\0", "\\x00")
+    return cell
+
+
+def _is_new(connection: psycopg.Connection[tuple[Any, ...]], writer: str, number: int) -> bool:
+    """Whether a writer has not done anything of this number yet; from now on it has."""
+    return bool(
+        connection.execute(
+            "INSERT INTO writer (id, done) VALUES (%s, %s) ON CONFLICT (id)"
+            " DO UPDATE SET done = excluded.done WHERE writer.done < excluded.done",
+            (writer, number),
+        ).rowcount
+    )
+
+
+def _revisions(connection: psycopg.Connection[tuple[Any, ...]], keys: Sequence[str] | None) -> Revisions:
+    which = "" if keys is None else " WHERE vehicle = ANY (%s)"
+    found = connection.execute(
+        f"SELECT vehicle, component, revision FROM component{which}".encode(),
+        () if keys is None else (list(keys),),
+    )
+    return {(key, component): revision for key, component, revision in found}
+
+
+def _migrate(connection: psycopg.Connection[tuple[Any, ...]], place: str) -> None:
+    """Bring the schema to this version; two stations that do so at once do it one after the other."""
+    if _version(connection) == len(MIGRATIONS):
+        return
+    # ahead of the transaction: what another one has made meanwhile is seen from its beginning on
+    connection.execute("SELECT pg_advisory_lock(%s)", (_MIGRATION_LOCK,))
+    try:
+        with connection.transaction():
+            version = _version(connection)
+            if version > len(MIGRATIONS):
+                raise CacheError(
+                    f"the cache {place} is of a later version of paramclient (its schema has {version},"
+                    f" this one knows {len(MIGRATIONS)}): upgrade"
+                )
+            if version == 0:
+                connection.execute(f"CREATE SCHEMA IF NOT EXISTS {SCHEMA}")
+                connection.execute("CREATE TABLE version (number integer NOT NULL)")
+                connection.execute("INSERT INTO version VALUES (0)")
+            for statement in (each for step in MIGRATIONS[version:] for each in step):
+                connection.execute(statement.encode())
+            connection.execute("UPDATE version SET number = %s", (len(MIGRATIONS),))
+    finally:
+        connection.execute("SELECT pg_advisory_unlock(%s)", (_MIGRATION_LOCK,))
+
+
+def _version(connection: psycopg.Connection[tuple[Any, ...]]) -> int:
+    [(found,)] = connection.execute("SELECT to_regclass(%s) IS NOT NULL", (f"{SCHEMA}.version",))
+    if not found:
+        return 0
+    [(number,)] = connection.execute("SELECT number FROM version")
+    return int(number)
+
+
+@cache
+def _libraries() -> tuple[Any, Any]:
+    """psycopg and its pool.
+
+    Raises:
+        UsageError: they are missing.
+    """
+    try:
+        import psycopg
+        import psycopg_pool
+    except ImportError as error:
+        raise UsageError(
+            f"a cache in PostgreSQL needs psycopg ({error}): pip install 'paramclient[postgres]'"
+        ) from error
+    return psycopg, psycopg_pool
+
+
+def _end(pool: ConnectionPool[Any] | None) -> None:
+    if pool is not None:
+        pool.close(timeout=CONNECT_TIMEOUT)

@@ -1,0 +1,291 @@
+"""Whole tables from one store into another: with their history, their snapshots, and who the vehicle is."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Final
+
+from paramclient.cache.earlier import SNAPSHOTS
+from paramclient.cache.operations import Operation
+from paramclient.cache.records import CachedSummary, CachedVehicle, TableState, TableUpdate
+from paramclient.cache.rows import Row
+from paramclient.cache.session import Line, Session
+from paramclient.cache.tables import HISTORY_LINES, hashed, stored_rows, write_rows, write_state
+from paramclient.errors import CacheError, UsageError
+
+if TYPE_CHECKING:
+    from paramclient.cache.interface import Store
+
+__all__ = [
+    "CopyResult",
+    "Join",
+    "OWN_NUMBERS",
+    "Shot",
+    "Whole",
+    "copy_store",
+    "put_shots",
+    "put_whole",
+    "take_whole",
+]
+
+OWN_NUMBERS: Final = 1 << 50
+"""From here on, stations give numbers to snapshots themselves, while the database is away; below, it does."""
+
+
+@dataclass(frozen=True)
+class Shot:
+    """A snapshot as it is kept.
+
+    Attributes:
+        row: at, reason, size, hash, complete.
+        blob: its parameters; None where the taker has them.
+        crc: its checksum.
+    """
+
+    row: tuple[object, ...]
+    blob: bytes | None = field(repr=False)
+    crc: int
+
+
+@dataclass(frozen=True)
+class Whole:
+    """All that is kept of one table.
+
+    Attributes:
+        births: name, time, and how many lines were there when it appeared.
+        shots: the snapshots by number.
+    """
+
+    vehicle: CachedVehicle
+    table: CachedSummary
+    known_since: float | None
+    rows: Mapping[str, Row]
+    lines: tuple[Line, ...]
+    births: tuple[tuple[str, float, int], ...]
+    setbacks: tuple[tuple[float, float], ...]
+    shots: Mapping[int, Shot]
+
+    def lacks(self, other: Whole) -> str | None:
+        """What another one has that this one does not know, nor anything later; None for nothing."""
+        for name, row in other.rows.items():
+            mine = self.rows.get(name)
+            if (mine is None and not self.was_removed(name)) or (
+                mine is not None and mine.heard_at < row.heard_at
+            ):
+                return f"parameter {name}"
+        gone = self.lines[0][0] if len(self.lines) >= HISTORY_LINES else 0.0
+        if any(line[0] >= gone for line in set(other.lines) - set(self.lines)):
+            return "a line of history"
+        shots = {shot.crc for shot in self.shots.values()}
+        if len(shots) < SNAPSHOTS and any(shot.crc not in shots for shot in other.shots.values()):
+            return "a snapshot"
+        return None
+
+    def was_removed(self, name: str) -> bool:
+        return any(line[1] == name and line[6] is None for line in self.lines)
+
+
+@dataclass(frozen=True)
+class CopyResult:
+    """What came of copying a cache.
+
+    Attributes:
+        tables: that were written.
+        unchanged: tables of which everything was there already.
+        params, lines, snapshots: in all tables of the cache that was copied.
+    """
+
+    tables: int
+    unchanged: int
+    params: int
+    lines: int
+    snapshots: int
+
+
+@dataclass(frozen=True)
+class Join(Operation[None]):
+    """Bring a whole table into a store: beside what it has of it already, of which the later counts."""
+
+    whole: Whole
+
+    @property
+    def tables(self) -> Iterable[tuple[str, int | None]]:
+        return [(self.whole.table.key, self.whole.table.component)]
+
+    def do(self, session: Session) -> None:
+        table = self.whole.table
+        there = take_whole(session, table.key, table.component)
+        owner = put_whole(session, self.whole if there is None else _joined(there, self.whole))
+        mine = set() if there is None else {shot.crc for shot in there.shots.values()}
+        for number, shot in self.whole.shots.items():
+            if shot.crc not in mine and shot.blob is not None:
+                is_free = number < OWN_NUMBERS and not session.has_snapshot(number)
+                session.add_snapshot(owner, shot.row, shot.blob, shot.crc, number if is_free else None)
+
+
+def copy_store(
+    source: Store, target: Store, progress: Callable[[str, int, int], None] | None = None
+) -> CopyResult:
+    """Copy every table of a store into another one, and see that it is there.
+
+    Each table is one transaction. What is there already is left alone: ended at any moment, it is begun again
+    in the same way, and goes on.
+
+    Args:
+        progress: is told of each table: whose it is, its number, and how many there are.
+
+    Raises:
+        CacheError: one of them cannot be used, or what was written is not what is read back.
+        UsageError: both are the same.
+    """
+    if source.place == target.place:
+        raise UsageError(f"{source.place} cannot be copied to itself")
+    listed = source.read(lambda session: [summary for _, summary in session.summaries()])
+    written = params = lines = shots = 0
+    for number, each in enumerate(listed, start=1):
+        if progress is not None:
+            progress(each.key, number, len(listed))
+        key, component = each.key, each.component
+        found = source.read(partial(take_whole, key=key, component=component))
+        if found is None:
+            continue  # it was removed meanwhile
+        if _lacking(target, found) is not None:
+            target.do(Join(found))
+            lacking = _lacking(target, found)
+            if lacking is not None:
+                raise CacheError(
+                    f"{lacking} of {key}, component {component}, did not arrive in {target.place}; copy again"
+                )
+            written += 1
+        params += len(found.rows)
+        lines += len(found.lines)
+        shots += len(found.shots)
+    return CopyResult(written, len(listed) - written, params, lines, shots)
+
+
+def take_whole(
+    session: Session, key: str, component: int, having: Collection[int] = frozenset()
+) -> Whole | None:
+    """All that is kept of a table, or None.
+
+    Args:
+        having: the numbers of the snapshots that are not needed.
+
+    Raises:
+        Damaged: its parameters are not what was written.
+        CacheError: a snapshot is not.
+    """
+    found = session.summaries(key, component)
+    if not found:
+        return None
+    [(owner, table)] = found
+    [vehicle] = session.vehicles(key)
+    _, _, known_since = session.described(owner)
+    numbered = session.lines(owner)
+    order = {number: place for place, (number, _) in enumerate(numbered, start=1)}
+    births = tuple(
+        (name, at, max((place for number, place in order.items() if number <= line), default=0))
+        for name, line, at in session.births(owner)
+    )
+    shots = {}
+    for summary in session.snapshots(key, component):
+        kept = session.snapshot(owner, summary.id)
+        assert kept is not None
+        _, row, blob, crc = kept
+        if not isinstance(blob, bytes) or not isinstance(crc, int):
+            raise CacheError(f"snapshot {summary.id} of {key}, component {component}, is damaged")
+        shots[summary.id] = Shot(tuple(row), None if summary.id in having else blob, crc)
+    return Whole(
+        vehicle,
+        table,
+        known_since,
+        stored_rows(session, owner),
+        tuple(line for _, line in numbered),
+        births,
+        tuple(session.setbacks(owner)),
+        shots,
+    )
+
+
+def put_whole(session: Session, whole: Whole) -> int:
+    """Put a table into a store, without its snapshots, in the place of what that has of it; give its id."""
+    table = whole.table
+    known = next(iter(session.vehicles(table.key)), None)
+    last = whole.vehicle if known is None or known.last_seen <= whole.vehicle.last_seen else known
+    owner = session.make(
+        TableUpdate(
+            identity=last.identity,
+            component=table.component,
+            autopilot=table.autopilot,
+            at=table.updated_at,
+        )
+    )
+    first = whole.vehicle.first_seen if known is None else min(known.first_seen, whole.vehicle.first_seen)
+    session.seen(table.key, first, last.last_seen)
+    before, _ = session.rows(owner)
+    write_rows(session, owner, before, whole.rows)
+    numbers = session.put_past(owner, whole.lines, whole.setbacks)
+    session.put_births(
+        owner, [(name, at, numbers[place - 1] if place else 0) for name, at, place in whole.births]
+    )
+    write_state(session, owner, _state(table))
+    session.describe(owner, known_since=whole.known_since)
+    return owner
+
+
+def put_shots(session: Session, owner: int, whole: Whole) -> None:
+    """Make the snapshots of a table those of another store, under the same numbers."""
+    there = {each.id for each in session.snapshots(whole.table.key, whole.table.component)}
+    session.drop_snapshots(there - whole.shots.keys())
+    for number, shot in whole.shots.items():
+        if number not in there and shot.blob is not None:
+            session.add_snapshot(owner, shot.row, shot.blob, shot.crc, number)
+
+
+def _lacking(target: Store, whole: Whole) -> str | None:
+    key, component = whole.table.key, whole.table.component
+    there = target.read(lambda session: take_whole(session, key, component))
+    return "everything" if there is None else there.lacks(whole)
+
+
+def _joined(there: Whole, new: Whole) -> Whole:
+    """What two stores have of one table; snapshots apart.
+
+    Where one of them has gone on from the other, earlier states can be told as before. Where they have grown
+    apart they cannot, before this moment: two views that knew nothing of each other make no chain.
+    """
+    later = new if there.table.updated_at < new.table.updated_at else there
+    rows = dict(there.rows)
+    for name, row in new.rows.items():
+        mine = rows.get(name)
+        if mine is None or mine.heard_at < row.heard_at:
+            rows[name] = row
+    rows = {name: row for name, row in rows.items() if name in later.rows or not later.was_removed(name)}
+    table = later.table if hashed(rows) == hashed(later.rows) else replace(later.table, hash=None)
+    lines = sorted(dict.fromkeys((*there.lines, *new.lines)), key=lambda line: float(line[0]))
+    for whole in (there, new):
+        if set(lines) == set(whole.lines) and whole is later:
+            return replace(whole, table=table, rows=rows)
+    return Whole(
+        later.vehicle,
+        table,
+        max(there.table.updated_at, new.table.updated_at),
+        rows,
+        tuple(lines[-HISTORY_LINES:]),
+        (),
+        (),
+        {},
+    )
+
+
+def _state(table: CachedSummary) -> TableState:
+    return TableState(
+        hash=table.hash,
+        count=table.count,
+        complete=table.complete,
+        volatile_known=table.volatile_known,
+        synced_at=table.synced_at,
+        file_works=table.file_works,
+    )

@@ -1,0 +1,148 @@
+"""A PostgreSQL of the tests: started from pgserver's or Debian's programs, or one that is given by URL."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import pwd
+import shutil
+import signal
+import subprocess
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.parse import quote
+from uuid import uuid4
+
+__all__ = ["GIVEN", "PROGRAMS", "Server", "WHY_NONE", "database_on", "server"]
+
+GIVEN = os.environ.get("PARAMCLIENT_TEST_POSTGRES")
+"""URL of a database in which the tests may make databases of their own; they do not end this server."""
+
+WHY_NONE = (
+    "PostgreSQL is missing: install pgserver or Debian's postgresql, or name a database, beside which"
+    " others may be made, by its URL, in PARAMCLIENT_TEST_POSTGRES"
+)
+
+_PATIENCE = 30.0
+
+
+def _programs() -> Path | None:
+    """Where `initdb` and `postgres` are. pgserver is not imported: it makes files and users of its own."""
+    found = importlib.util.find_spec("pgserver")
+    places = [Path(each) / "pginstall" / "bin" for each in (found and found.submodule_search_locations) or ()]
+    places += sorted(Path("/usr/lib/postgresql").glob("*/bin"), reverse=True)
+    return next((place for place in places if (place / "initdb").exists()), None)
+
+
+PROGRAMS = _programs()
+
+
+class Server:
+    """A server of its own in a folder, on a socket there; it can be ended and started again."""
+
+    def __init__(self, folder: Path) -> None:
+        assert PROGRAMS is not None
+        self.folder = folder
+        self._programs = PROGRAMS
+        self._process: subprocess.Popen[bytes] | None = None
+        self._user: str | None = None
+        if os.geteuid() == 0:  # PostgreSQL does not run as root
+            self._user = "nobody"
+            user = pwd.getpwnam(self._user)
+            os.chown(folder, user.pw_uid, user.pw_gid)
+        self._run("initdb", "--auth=trust", "--encoding=UTF8", "--locale=C", "--username=tests", "--no-sync")
+
+    @property
+    def url(self) -> str:
+        return f"postgresql://tests@/postgres?host={quote(str(self.folder))}"
+
+    def start(self) -> None:
+        """Start it, and wait until it answers."""
+        import psycopg
+
+        settings = {
+            "listen_addresses": "",
+            "unix_socket_directories": self.folder,
+            "fsync": "off",
+            "max_connections": 60,
+            "shared_buffers": "32MB",
+        }
+        self._process = subprocess.Popen(
+            [
+                self._programs / "postgres",
+                *("-D", self.folder / "data"),
+                *(word for name, value in settings.items() for word in ("-c", f"{name}={value}")),
+            ],
+            user=self._user,
+            cwd=self.folder,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        deadline = time.monotonic() + _PATIENCE
+        while True:
+            try:
+                psycopg.connect(self.url, connect_timeout=2).close()
+            except psycopg.OperationalError:
+                assert time.monotonic() < deadline, "PostgreSQL does not start"
+                time.sleep(0.02)
+            else:
+                return
+
+    def kill(self) -> None:
+        """End it as a power cut does: its first process and all that this has started."""
+        assert self._process is not None
+        pid = self._process.pid
+        self._process.send_signal(signal.SIGSTOP)  # so that it starts no other one meanwhile
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        for each in (*map(int, children), pid):
+            os.kill(each, signal.SIGKILL)
+        self._process.wait()
+        self._process = None
+
+    def stop(self) -> None:
+        """End it for good: what it holds is not needed any more."""
+        if self._process is not None:
+            self._process.send_signal(signal.SIGQUIT)
+            self._process.wait()
+            self._process = None
+
+    def _run(self, program: str, *arguments: str) -> None:
+        subprocess.run(
+            [self._programs / program, "-D", self.folder / "data", *arguments],
+            user=self._user,
+            cwd=self.folder,
+            check=True,
+            capture_output=True,
+        )
+
+
+@contextmanager
+def server() -> Iterator[Server]:
+    """A server that runs, in a folder that goes with it."""
+    folder = Path(tempfile.mkdtemp(prefix="pg"))  # short: it holds a socket
+    running = Server(folder)
+    try:
+        running.start()
+        yield running
+    finally:
+        running.stop()
+        shutil.rmtree(folder)
+
+
+@contextmanager
+def database_on(url: str) -> Iterator[str]:
+    """An empty database on a server; it goes with the block. Gives its URL."""
+    import psycopg
+
+    name = f"tests_{uuid4().hex}"
+    with psycopg.connect(url, autocommit=True) as connection:
+        connection.execute(f"CREATE DATABASE {name}")
+    start, _, query = url.partition("?")
+    yield f"{start.rpartition('/')[0]}/{name}{'?' * bool(query)}{query}"
+    with psycopg.connect(url, autocommit=True) as connection:
+        connection.execute(f"DROP DATABASE {name} WITH (FORCE)")
