@@ -53,8 +53,12 @@ class Connection(H11Protocol):
             self._await_head()
 
     def shutdown(self) -> None:
-        """The service ends. A body that is still on its way is not waited for: nothing would come of it."""
+        """The service ends. A body that is still on its way is not waited for: nothing would come of it. Nor
+        is a client of whom nothing is expected: over TLS it would have to answer, and may not look at it."""
+        is_idle = self.cycle is None or self.cycle.response_complete
         super().shutdown()
+        if is_idle and not self._is_over() and not self.transport.get_write_buffer_size():
+            self.transport.abort()
         if self.conn.their_state is h11.SEND_BODY:
             self.transport.abort()
 
@@ -65,12 +69,6 @@ class Connection(H11Protocol):
     def pause_writing(self) -> None:
         super().pause_writing()
         self._watch()
-
-    def shutdown(self) -> None:
-        is_idle = self.cycle is None or self.cycle.response_complete
-        super().shutdown()
-        if is_idle and not self._is_over() and not self.transport.get_write_buffer_size():
-            self.transport.abort()  # with TLS it would wait for the client, which may not look at it
 
     def send_400_response(self, msg: str) -> None:
         """Answer what is no HTTP, as a problem like all others."""
