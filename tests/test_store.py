@@ -302,6 +302,13 @@ def test_a_commit_whose_answer_was_lost_is_not_done_twice(
     assert told(b) == [(10, 1, 10), (11, 10, 11)]
 
 
+def test_a_reason_with_a_zero_in_it_does_no_harm(cache: ParamCache) -> None:
+    cache.save(whole_table(1))
+    made = cache.snapshot(PX4.key, 1, reason="a\0b")
+    assert made.reason == cache.snapshots(PX4.key)[0].reason == "a\\x00b"
+    assert cache.state_at(PX4.key, 1, made.id) == made.params
+
+
 def test_what_was_done_without_an_answer_is_told_all_the_same(
     stations: tuple[ParamCache, ParamCache], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -638,6 +645,7 @@ def test_a_password_is_told_to_nobody(tmp_path: Path, caplog: pytest.LogCaptureF
             cache.vehicles()
         with pytest.raises(CacheError):
             cache.save(whole_table(1))
+        assert "local copy" not in caplog.text, "there is none"
         texts = [repr(cache), cache.place, str(cache.away), str(cache.notes), caplog.text]
         texts += traceback.format_exception(caught.value)[-1:]
         assert all("geheim" not in text for text in texts)

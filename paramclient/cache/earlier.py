@@ -78,6 +78,7 @@ def store(
     assert params.identity is not None
     blob = _packed(params.identity, params)
     text = reason.encode("utf-8", "backslashreplace").decode()  # a file's name need not be UTF-8
+    text = text.replace("\0", "\\x00")  # PostgreSQL's text cannot hold it
     row = (kept_time(at), text, len(params), hash, int(complete))
     number = session.add_snapshot(owner, row, blob, _checksum(row, blob), number)
     session.trim_snapshots(owner, SNAPSHOTS)
