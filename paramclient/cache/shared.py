@@ -303,7 +303,9 @@ class _Link:
             self.away = str(error)
             self._is_here = False
         if is_news:
-            _log.warning("%s; going on with the local copy %s", error, self.local.path)
+            copy = self.local
+            meanwhile = f"going on with the local copy {copy.path}" if copy.exists else "trying again"
+            _log.warning("%s; %s", error, meanwhile)
         self._database.close()
         self._ring()
 
