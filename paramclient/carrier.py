@@ -165,9 +165,10 @@ class Carrier:
             self._look_at_the_clock(now)
             self._standstill.expect(math.inf)  # a slow link may hold us up
             everyone = self._asked
-            if not self._is_behind():
+            is_behind = self._is_behind(now)
+            if not is_behind or now >= self._behind_since + MOST_BEHIND:
                 self._asked = False
-                station.tick(now, everyone=everyone)
+                station.tick(now, everyone=everyone, is_behind=is_behind)
             self._dispatch()
             to_send = station.data_to_send()
             if to_send:
@@ -180,13 +181,15 @@ class Carrier:
                 self._asked |= everyone  # whose deadlines have not been noted
                 continue
             due = station.next_deadline(everyone=everyone)
-            if self._is_behind():
-                due = anyio.current_time() + LONGEST_TURN
+            now = anyio.current_time()
+            is_behind = self._is_behind(now)
+            if is_behind:
+                due = now + LONGEST_TURN
             self._standstill.expect(due)
-            wait = due - anyio.current_time()
+            wait = due - now
             with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):
                 await self._something_to_send.wait()
-            if anyio.current_time() - due > HELD_UP:
+            if is_behind or anyio.current_time() - due > HELD_UP:
                 await anyio.sleep(READING_TIME)
 
     def send_for_another(self, frame: bytes) -> None:
@@ -214,10 +217,9 @@ class Carrier:
         self.ended = error
         self._fail_calls(error)
 
-    def _is_behind(self) -> bool:
+    def _is_behind(self, now: float) -> bool:
         """Whether more has come than was read, so that nothing can be said not to have been answered."""
-        now = anyio.current_time()
-        return self._behind_since <= now < self._behind_since + MOST_BEHIND and now - self._read_at < HELD_UP
+        return self._behind_since <= now < self._read_at + HELD_UP
 
     async def _transmit(self, data: bytes, peer: Peer | None) -> None:
         for tap in self._taps:

@@ -26,7 +26,7 @@ from paramclient.protocol.wire import MAV_AUTOPILOT_PX4, Heartbeat
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, SimParam, Vehicle
 from paramclient.values import ParamType
 from paramclient.writethrough import DOWNLOAD_INTERVAL, LEAST_NEW
-from tests.shell import Tap, swiftly
+from tests.shell import Tap, swift_loop, swiftly
 
 MANY = 250
 PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
@@ -245,14 +245,16 @@ class Watched(Station):
     def __init__(self) -> None:
         super().__init__(link="flood", is_stream=False)
         self.ticks: list[float] = []
+        self.is_behind = False
         self.on_receive: Callable[[], None] = lambda: None
 
     def receive(self, data: bytes, peer: Peer, now: float) -> bool:
         self.on_receive()
         return True
 
-    def tick(self, now: float, *, everyone: bool = True) -> None:
+    def tick(self, now: float, *, everyone: bool = True, is_behind: bool = False) -> None:
         self.ticks.append(now)
+        self.is_behind = is_behind
 
     def next_deadline(self, *, everyone: bool = True) -> float:
         return anyio.current_time() + 0.01
@@ -281,6 +283,7 @@ async def test_time_outs_wait_until_what_has_come_is_read() -> None:
         await anyio.sleep(0.1)
         assert station.ticks[-1] > began + 1.0
         assert len(station.ticks) > 5
+        assert not station.is_behind
 
 
 @swiftly
@@ -291,7 +294,30 @@ async def test_time_outs_do_not_wait_for_ever() -> None:
     await carry(link, station, MOST_BEHIND + 1.0, lambda: None)
     meanwhile = [at - began for at in station.ticks if at > began + link.interval]
     assert MOST_BEHIND <= meanwhile[0] < MOST_BEHIND + 0.1
-    assert len(meanwhile) > 50
+    assert 50 < len(meanwhile) < 1.0 / LONGEST_TURN
+    assert station.is_behind, "and no further list begins"
+
+
+class Starved(Watched):
+    """Other programs have the processor whenever it has said until when to wait."""
+
+    def next_deadline(self, *, everyone: bool = True) -> float:
+        swift_loop().call_later(0.001, self._starve)
+        return super().next_deadline(everyone=everyone)
+
+    def _starve(self) -> None:
+        swift_loop().now += HELD_UP + 0.002
+
+
+@swiftly
+async def test_time_outs_wait_while_other_programs_have_the_processor() -> None:
+    """What has come is there, but the reader had no turn meanwhile."""
+    link, station = Flood(), Starved()
+    link.size = carrier.MANY
+    link.interval = LONGEST_TURN + 0.003  # the sender wakes before it
+    began = anyio.current_time()
+    await carry(link, station, 1.0, lambda: None)
+    assert not [at for at in station.ticks if at > began + link.interval + HELD_UP]
 
 
 @swiftly

@@ -189,11 +189,12 @@ class Station:
             if isinstance(message, ParamSet):
                 self._receive_foreign_set(message, (frame.system, frame.component), now)
 
-    def tick(self, now: float, *, everyone: bool = True) -> None:
+    def tick(self, now: float, *, everyone: bool = True, is_behind: bool = False) -> None:
         """Do what is due: our heartbeat, and every component's time-outs.
 
         Without `everyone`, only components that were heard or touched, or whose deadline has come, are
-        looked at: a share of the link that has become larger meanwhile is then used a little later.
+        looked at: a share of the link that has become larger meanwhile is then used a little later. With
+        `is_behind`, more has come than was given to `receive`, and no further list begins beside others.
         """
         if self._is_paused or self.is_log:
             return
@@ -211,7 +212,7 @@ class Station:
             if machine.next_deadline() <= now or machine.writes.is_held:  # for another component's word
                 machine.tick(now)
                 self._touched[machine] = None
-        if self._turns.tick(now):
+        if self._turns.tick(now, is_behind=is_behind):
             self._touch_all(self.components.values())
         if self.traffic is not None:
             self.traffic.sent(self.bytes_sent, now)

@@ -23,8 +23,13 @@ SHOWING_TIME: Final = 0.5
 GROWTH: Final = 2
 """How many times as many may run when those that run have shown room."""
 FAST_GROWTH: Final = 8
-"""The same for the first one, where values come in bursts that take no time: then the link is idle nearly all
-of it. Further ones could be more than the program has time for, which shows when its buffer is full."""
+"""The same where values come in bursts that take no time, until any were lost for want of room: then the link
+is idle nearly all of the time. So many begin at once, too: their bursts find room in any buffer."""
+SPREAD: Final = 0.00015
+"""Seconds between the beginnings of further ones there, for each that runs. Those that begin together bring
+nothing at first, and then more than can be read before it is lost: PX4 answers within 20 ms, and what one
+brings is to be seen before many have followed. As PX4's list of 1,000 values takes a second, no more than 80
+of them run beside each other: more than one core reads."""
 FAST_RETRY: Final = 0.25
 RETRY: Final = 5.0
 LONGEST_RETRY: Final = 60.0
@@ -85,6 +90,9 @@ class Turns:
     no time, soon, and as many again. One that stays silent takes nothing of the link: it is no longer counted
     once its time-out is over.
 
+    On a link that is faster than the program it is the program that has no room. So beyond the first few,
+    lists that come in bursts begin one after the other, and none while more has come than was read.
+
     Attributes:
         share: what all reads of the link may take of it together.
     """
@@ -98,6 +106,7 @@ class Turns:
         self._failures = 0
         self._again_at = -math.inf  # when more may be tried
         self._idle_since = -math.inf
+        self._begun_at = -math.inf  # when a turn was given last
         self._crowded_at = -math.inf  # when several lists came last
         self._lone: Stream | None = None  # the list that came alone last
         self._lone_at = -math.inf  # when that was
@@ -120,7 +129,7 @@ class Turns:
             self._limit = 1
             self._failures = self._came = self._passed = self._shown = 0
             self._again_at = -math.inf
-        if self.is_free:
+        if not self._waiting and self._room() > 0:
             self._begin(stream, now)
         else:
             self._waiting.append(stream)
@@ -159,8 +168,13 @@ class Turns:
         """When a list of another one came last."""
         return max(self._crowded_at, -math.inf if self._lone is stream else self._lone_at)
 
-    def tick(self, now: float) -> bool:
-        """Let the next ones begin, if there is room; whether any has."""
+    def tick(self, now: float, *, is_behind: bool = False) -> bool:
+        """Let the next ones begin, if there is room; whether any has.
+
+        Args:
+            now: the time.
+            is_behind: whether more has come than the program has read: then nobody begins beside another.
+        """
         self._now = now
         coming = [stream for stream in self._running if not stream.is_awaited]
         if len(coming) > 1:
@@ -174,8 +188,9 @@ class Turns:
             self._newest.update(coming if self._are_bursty else self._running)
         if self._newest:
             self._look(now)
-        room = self._limit - self._active() if self._waiting else 0
-        begins = min(room, len(self._waiting))
+        begins = min(self._room(), len(self._waiting))
+        if is_behind:
+            begins = min(begins, 1 - len(self._running))
         for _ in range(begins):
             self._begin(self._waiting.popleft(), now)
         return begins > 0
@@ -185,7 +200,7 @@ class Turns:
         if not self._waiting:
             return math.inf
         if self._active() < self._limit:
-            return self._now
+            return self._now if self._room() > 0 else self._next_at
         times = [stream.silent_at for stream in self._running if stream.silent_at > self._now]
         if not self._newest:
             times.append(max(self._again_at, self._now))
@@ -201,10 +216,23 @@ class Turns:
 
     def _begin(self, stream: Stream, now: float) -> None:
         self.has_begun(stream)
+        self._begun_at = now
         stream.begin(now)
 
     def _active(self) -> int:
         return sum(stream.silent_at > self._now for stream in self._running)
+
+    @property
+    def _next_at(self) -> float:
+        """When the next one begins beside many that come in bursts."""
+        return self._begun_at + SPREAD * len(self._running)
+
+    def _room(self) -> int:
+        """How many may begin now."""
+        room = self._limit - self._active()
+        if self._are_bursty:
+            room = min(room, max(FAST_GROWTH - len(self._running), int(self._now >= self._next_at)))
+        return room
 
     def _look(self, now: float) -> None:
         """Judge by what has come whether the newest lists had room."""
@@ -254,8 +282,7 @@ class Turns:
             self._paces = paces
             # several that began together have shown nothing of how each one comes alone
             if now >= self._again_at and (expected or len(active) == 1):
-                is_first = len(active) == 1 and not self._failures
-                growth = FAST_GROWTH if is_bursty and is_first else GROWTH
+                growth = FAST_GROWTH if is_bursty and not self._failures else GROWTH
                 is_careful = self._failures and not is_bursty
                 more = len(active) + 1 if is_careful else len(active) * growth
                 self._limit = max(self._limit, more)
