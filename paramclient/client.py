@@ -162,6 +162,7 @@ class ParamClient:
             owned=self.cache is not cache,
             identity_of=self._station.identity_of,
             is_doubted=self._station.is_doubted,
+            renewed=self._dispatch,
         )
         self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self._components: dict[Address, Component] = {}
@@ -500,8 +501,7 @@ class ParamClient:
     def _read_cache(self, component: Component) -> None:
         """Look for its cached table, once it is known whose it is."""
         machine = component._machine
-        identity = self._station.identity_of(machine)
-        if identity is None or self._writer.follow(machine, identity):
+        if (identity := self._station.identity_of(machine)) is None or self._writer.follow(machine, identity):
             return
         assert self._tasks is not None, "nothing is heard before"
         self._tasks.start_soon(self._load, component, identity)

@@ -40,7 +40,7 @@ from paramclient.values import Encoding, Param, check_name, check_value, decode,
 if TYPE_CHECKING:
     from paramclient.client import ParamClient
 
-__all__ = ["Component", "address_in_words", "patience_of"]
+__all__ = ["Component", "address_in_words", "check_accepted", "check_asked", "patience_of"]
 
 Result = TypeVar("Result")
 
@@ -176,10 +176,7 @@ class Component:
             NoReply: it did not answer.
             LinkError: the link failed, or the client was closed.
         """
-        if isinstance(name, str):
-            check_name(name)
-        elif not 0 <= name < MOST_PARAMETERS:
-            raise UsageError(f"parameter index {name}: indices are 0 to {MOST_PARAMETERS - 1}")
+        check_asked(name)
         machine = self._machine
         self._client._check_open()
         read = machine.read(name, anyio.current_time())
@@ -283,10 +280,7 @@ class Component:
         """
         self._client._check_open()
         self._client._station.check_refresh(refresh)
-        if accept not in ("verified", "sampled"):
-            raise UsageError(f'accept is "verified" or "sampled", not {accept!r}')
-        if sample < 1:
-            raise UsageError(f"a sample has at least one parameter, not {sample}")
+        check_accepted(accept, sample)
         sampled = None
         if accept == "sampled" and not refresh:
             sampled = Sampled(sample, random.getrandbits(32) if seed is None else seed)
@@ -519,6 +513,30 @@ def _param_of(message: ParamValue, encoding: Encoding) -> Param:
 def _read_of(machine: ComponentMachine, name: str | int) -> str:
     what = name if isinstance(name, str) else f"parameter {name}"
     return f"{what} of {machine.system}/{machine.component}"
+
+
+def check_asked(name: str | int) -> None:
+    """See that a parameter can have this name or this index.
+
+    Raises:
+        UsageError: it cannot.
+    """
+    if isinstance(name, str):
+        check_name(name)
+    elif not isinstance(name, int) or not 0 <= name < MOST_PARAMETERS:
+        raise UsageError(f"parameter index {name}: indices are 0 to {MOST_PARAMETERS - 1}")
+
+
+def check_accepted(accept: str, sample: int) -> None:
+    """See that a fetch can accept this.
+
+    Raises:
+        UsageError: it cannot.
+    """
+    if accept not in ("verified", "sampled"):
+        raise UsageError(f'accept is "verified" or "sampled", not {accept!r}')
+    if sample < 1:
+        raise UsageError(f"a sample has at least one parameter, not {sample}")
 
 
 def address_in_words(system: int | None, component: int | None) -> str:

@@ -21,6 +21,11 @@ LONGEST_FILE: Final = 1_000
 """Bytes of a key file that are looked at: a key, in text or not, with some blank lines."""
 OF_OTHERS: Final = 0o077
 """The bits of a file's mode that let others than its owner get at it."""
+READ_BY_GROUP: Final = 0o040
+"""What a credential of systemd has besides, since version 254: it stands for an entry of the access list that
+lets the user of the unit read it, and for no group (systemd's issue 29435)."""
+CREDENTIALS_VARIABLE: Final = "CREDENTIALS_DIRECTORY"
+"""The folder of the credentials of a unit, which nobody else can enter (systemd.exec, "Credentials")."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,10 +92,11 @@ def read_private(path: str | os.PathLike[str], what: str, most: int) -> bytes:
             data = file.read(most)
     except OSError as error:
         raise UsageError(f"{os.fspath(path)}: the {what} cannot be read: {error.strerror}") from error
-    if os.name == "posix" and mode & OF_OTHERS:
+    of_others = OF_OTHERS & ~READ_BY_GROUP if _is_credential(path) else OF_OTHERS
+    if os.name == "posix" and mode & of_others:
         raise UsageError(
             f"{os.fspath(path)}: others than its owner can get at this {what} (mode {mode:o}); "
-            f"`chmod 600` ends that, and a {what.split()[-1]} that others may have read is better replaced"
+            "`chmod 600` ends that, and what others may have read is better replaced"
         )
     return data
 
@@ -130,3 +136,9 @@ def refused_in_words(report: SigningReport | None) -> str:
     refused = {} if report is None else report.refused
     reasons = ", ".join(f"{count} for: {reason}" for reason, count in refused.items())
     return f" (frames were refused, {reasons})" if reasons else ""
+
+
+def _is_credential(path: str | os.PathLike[str]) -> bool:
+    """Whether systemd has given this file to the unit that we are."""
+    folder = os.environ.get(CREDENTIALS_VARIABLE, "")
+    return folder != "" and Path(path).resolve().parent == Path(folder).resolve()

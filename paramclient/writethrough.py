@@ -60,6 +60,7 @@ class WriteThrough:
         owned: whether `close` closes it.
         identity_of: says who the vehicle is that a component belongs to; None while that is open.
         is_doubted: says whether another vehicle may have taken its place by now.
+        renewed: is called when another station has brought tables up to date.
         clock: the time in unix seconds; None for that of this computer.
         now: the time of the components.
     """
@@ -71,12 +72,14 @@ class WriteThrough:
         owned: bool,
         identity_of: Callable[[ComponentMachine], Identity | None],
         is_doubted: Callable[[ComponentMachine], bool],
+        renewed: Callable[[], None] | None = None,
         clock: Callable[[], float] | None = None,
         now: Callable[[], float] = anyio.current_time,
     ) -> None:
         self._cache = cache
         self._identity_of = identity_of
         self._is_doubted = is_doubted
+        self._renewed = _nothing if renewed is None else renewed
         self._clock = _time_of_day if clock is None else clock
         self._now = now
         self._owned = owned
@@ -275,6 +278,7 @@ class WriteThrough:
                 cached = await self._run(partial(self._cache.load, identity.key, machine.component))
                 if cached is not None and self._kept.get(machine) is kept:
                     machine.renew(cached.params)
+                    self._renewed()
 
     def _begin_anew(self, replacements: int) -> None:
         """Where the file is another one than before: nothing that was written earlier is in it."""

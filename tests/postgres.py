@@ -93,14 +93,19 @@ class Server:
             else:
                 return
 
+    def stand_still(self) -> None:
+        """Have it answer nothing, and keep its connections."""
+        self._send_all(signal.SIGSTOP)
+
+    def go_on(self) -> None:
+        """Have it go on after `stand_still`."""
+        self._send_all(signal.SIGCONT)
+
     def kill(self) -> None:
         """End it as a power cut does: its first process and all that this has started."""
         assert self._process is not None
-        pid = self._process.pid
         self._process.send_signal(signal.SIGSTOP)  # so that it starts no other one meanwhile
-        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
-        for each in (*map(int, children), pid):
-            os.kill(each, signal.SIGKILL)
+        self._send_all(signal.SIGKILL)
         self._process.wait()
         self._process = None
 
@@ -110,6 +115,13 @@ class Server:
             self._process.send_signal(signal.SIGQUIT)
             self._process.wait()
             self._process = None
+
+    def _send_all(self, number: signal.Signals) -> None:
+        assert self._process is not None
+        pid = self._process.pid
+        children = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+        for each in (*map(int, children), pid):
+            os.kill(each, number)
 
     def _run(self, program: str, *arguments: str) -> None:
         subprocess.run(

@@ -278,6 +278,26 @@ def test_a_file_of_tokens_is_its_owners_alone(tmp_path: Path) -> None:
         Tokens.read(path)
 
 
+@pytest.mark.skipif(os.name != "posix", reason="there are no such modes")
+def test_a_credential_of_systemd_may_look_as_if_a_group_could_read_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CREDENTIALS_DIRECTORY", str(tmp_path))
+    path = tmp_path / "tokens"
+    path.write_text(f"anna write {ANNA}")
+    path.chmod(0o440)
+    assert tokens_from(path, {}) is not None
+    path.chmod(0o444)
+    with pytest.raises(UsageError, match="others than its owner"):
+        tokens_from(path, {})
+    (tmp_path / "further").mkdir()
+    elsewhere = tmp_path / "further" / "tokens"
+    elsewhere.write_text(f"anna write {ANNA}")
+    elsewhere.chmod(0o440)
+    with pytest.raises(UsageError, match="others than its owner"):
+        tokens_from(elsewhere, {})
+
+
 def test_tokens_that_are_made_differ_and_are_long() -> None:
     made = {new_token() for _ in range(100)}
     assert len(made) == 100

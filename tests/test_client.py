@@ -9,6 +9,7 @@ import math
 import os
 import socket
 import threading
+import time
 from collections.abc import Callable, Coroutine, Mapping
 from pathlib import Path
 from typing import Any
@@ -1516,3 +1517,24 @@ async def test_the_autopilots_are_the_vehicles_without_what_they_carry(way: str)
         addresses = [(each.system, each.component) for each in client.autopilots]
         assert addresses == [(1, 1), (2, 7), (3, 1)]
         assert len(client.components) == 4
+
+
+@swiftly
+@pytest.mark.parametrize("index", [-1, 32_768, 1.5])
+async def test_what_is_no_index_is_refused_and_ends_nothing(index: Any) -> None:
+    async with a_client(generic()) as client:
+        component = await client.component()
+        with pytest.raises(UsageError, match=f"parameter index {index}: indices are 0 to 32767"):
+            await component.get(index)
+        assert (await component.get(0)).index == 0
+
+
+@swiftly
+async def test_what_a_fetch_can_accept() -> None:
+    async with a_client(generic()) as client:
+        component = await client.component()
+        with pytest.raises(UsageError, match='accept is "verified" or "sampled", not \'all\''):
+            await component.fetch_all(accept="all")
+        with pytest.raises(UsageError, match="a sample has at least one parameter, not 0"):
+            await component.fetch_all(accept="sampled", sample=0)
+        assert (await component.fetch_all(accept="sampled", sample=10**9, seed=time.time_ns())).complete

@@ -523,6 +523,46 @@ async def test_what_was_written_is_in_the_history_however_short_it_stood(path: P
     assert [line.old.value for line in lines] == [before, 100, 101, before, 100]
 
 
+@swiftly
+async def test_a_write_is_told_of_as_ours_also_where_nobody_waits_for_it_any_more(path: Path) -> None:
+    vehicle = small_px4()
+    await session(vehicle, path)
+    async with ParamClient(Air.symmetric([vehicle], delay=0.2), cache=path) as client:
+        component = await client.component()
+        await component.fetch_all()
+        await component.get("PARAM_01")
+        with anyio.move_on_after(0.1):
+            await component.set("PARAM_01", 100, asker="anna")
+        await asyncio.sleep(1)
+        assert component.params["PARAM_01"].value == 100
+        await asyncio.sleep(10)
+        vehicle.set_param("PARAM_01", 7)
+        await asyncio.sleep(1)
+        await component.get("PARAM_01")
+    with ParamCache(path) as cache:
+        lines = cache.component().history("PARAM_01")
+    assert [(line.new and line.new.value, line.by) for line in lines] == [
+        (100, "us for anna"),
+        (7, "vehicle"),
+    ]
+
+
+@swiftly
+async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_before(path: Path) -> None:
+    vehicle = small_px4()
+    before = vehicle.params["PARAM_01"].value
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        await component.set("PARAM_01", 100, asker="anna")
+        await component.fetch_all()
+        await component.set("PARAM_02", 200)
+    with ParamCache(path) as cache:
+        lines = cache.component().history()
+    told = [(line.name, line.new and line.new.value, line.by) for line in lines]
+    assert told == [("PARAM_01", 100, "us for anna"), ("PARAM_02", 200, "us")]
+    assert lines[0].old.value == before
+
+
 @pytest.mark.parametrize("asker", ["", "x" * 129, "a\nb", "Änne", "\x7f"])
 @swiftly
 async def test_who_asks_is_told_in_printable_ascii(path: Path, asker: str) -> None:

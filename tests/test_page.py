@@ -10,11 +10,15 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
+from anyio.from_thread import start_blocking_portal
 from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
 
+from paramclient import ParamCache, ParamClient
+from paramclient.links import SimLink
 from paramclient.service import Settings
 from paramclient.service.access import AccessSettings
 from paramclient.service.tokens import Tokens
+from paramclient.sim import PX4Vehicle
 from tests.page import BROWSER, BROWSER_OPTIONS, HIGHEST, HOSTILE, Bench, at_work
 
 FILES = Path(__file__).parent.parent / "paramclient/service/page"
@@ -397,6 +401,44 @@ def test_a_stale_edit_says_so_in_the_review(sight: Sight, bench: Bench) -> None:
     expect(sight.line("MC_ROLLRATE_P")).to_contain_text("when you edited it")
 
 
+@needs_browser
+def test_an_open_review_follows_what_others_change(sight: Sight, bench: Bench) -> None:
+    now, remark = (sight.line("MC_PITCHRATE_P").get_by_role("cell").nth(place) for place in (0, 2))
+    was = str(bench.px4.param("MC_PITCHRATE_P").value)[:4]
+    sight.stage("MC_PITCHRATE_P", "0.2")
+    sight.review()
+    expect(now).to_have_text(was)
+    expect(remark).to_have_text("")
+    bench.do(bench.px4.set_param, "MC_PITCHRATE_P", 0.25)
+    expect(now).to_have_text("0.25")
+    expect(remark).to_have_text(f"It was {was} when you edited it.")
+    bench.do(bench.px4.set_param, "MC_PITCHRATE_P", 0.2)
+    expect(remark).to_contain_text("The vehicle has that already.")
+    sight.dialog.get_by_role("button", name="Send").click()
+    expect(sight.dialog.get_by_role("status")).to_have_text("1 accepted.")
+    bench.do(bench.px4.set_param, "MC_PITCHRATE_P", 0.3)
+    expect(sight.row("MC_PITCHRATE_P")).to_contain_text("0.3")
+    expect(remark).to_have_text("accepted")
+
+
+@needs_browser
+def test_an_open_plan_follows_what_others_change(sight: Sight, bench: Bench, tmp_path: Path) -> None:
+    sight.find("NOTHING_SUCH")
+    file = tmp_path / "other.param"
+    file.write_text("MC_YAWRATE_P,0.9\n")
+    sight.page.get_by_role("button", name="Compare").click()
+    sight.dialog.locator("input[type=file]").set_input_files(file)
+    expect(sight.row("MC_YAWRATE_P")).to_be_visible()  # what was searched for hides nothing of it
+    sight.page.get_by_role("button", name="Take over").click()
+    expect(sight.line("MC_YAWRATE_P")).to_be_visible()
+    bench.do(bench.px4.set_param, "MC_YAWRATE_P", 0.55)
+    expect(sight.line("MC_YAWRATE_P").get_by_role("cell").nth(1)).to_have_text("0.55")
+    sight.dialog.get_by_role("button", name="Apply").click()
+    sight.dialog.get_by_role("button", name="Done").click()
+    sight.page.get_by_role("button", name="Undo").click()
+    expect(sight.line("MC_YAWRATE_P").get_by_role("cell").nth(1)).to_have_text("0.55")
+
+
 # files, earlier states, other vehicles
 
 
@@ -583,6 +625,51 @@ def test_a_service_that_goes_and_comes_back(visit: Callable[..., Sight], tmp_pat
         expect(sight.value("MC_PITCH_P")).to_contain_text("3.25")
         sight.send()  # what was staged has waited
         assert second.px4.values["MC_ROLL_P"] == 7.5
+
+
+@needs_browser
+def test_a_vehicle_of_yesterday_is_looked_at(visit: Callable[..., Sight], tmp_path: Path) -> None:
+    _keep_yesterdays(tmp_path)
+    with at_work(tmp_path) as bench:
+        until(lambda: bench.is_synced(1))
+        sight = visit(bench.url)
+        sight.page.get_by_text("Not heard now").click()
+        kept = sight.page.get_by_role("list", name="Vehicles that are not heard now").get_by_role("button")
+        expect(kept).to_have_count(1)
+        kept.click()
+        expect(sight.page.get_by_role("heading", level=1)).to_have_text("PX4 9/1")
+        expect(sight.page.locator("#badges")).to_contain_text("in the cache, heard last")
+        expect(sight.page.locator("#count")).to_have_text("25 parameters")
+        expect(sight.page.get_by_role("button", name="Fetch")).to_have_count(0)
+        expect(sight.page.get_by_role("button", name="Snapshot")).to_have_count(0)
+        sight.find("PARAM_01")
+        sight.value("PARAM_01").click()
+        expect(sight.details).to_contain_text("1 → 77")
+        expect(sight.details.get_by_role("textbox")).to_have_count(0)
+        sight.page.get_by_role("button", name="Compare").click()
+        sight.dialog.get_by_role("button", name="PX4 1/1").click()
+        expect(sight.page.get_by_role("region", name="Comparison")).to_contain_text("25 only here")
+        expect(sight.page.get_by_role("button", name="Take over")).to_have_count(0)
+        sight.page.get_by_role("button", name="Save").click()
+        with sight.page.expect_download() as saved:
+            sight.dialog.get_by_role("button", name="QGroundControl").click()
+        assert "9\t1\tPARAM_01\t77\t" in saved.value.path().read_text()
+        sight.page.keyboard.press("Escape")
+        sight.choose("PX4 1/1")
+        expect(sight.page.get_by_role("button", name="Fetch")).to_be_visible()
+
+
+def _keep_yesterdays(folder: Path) -> None:
+    async def fetch() -> None:
+        vehicle = PX4Vehicle(system=9, table={f"PARAM_{number:02}": number for number in range(25)})
+        with ParamCache(folder / "cache.sqlite3") as cache:
+            async with ParamClient(SimLink(vehicle), cache=cache) as client:
+                await (await client.component()).fetch_all()
+            async with ParamClient(SimLink(vehicle), cache=cache) as client:
+                await (await client.component()).set("PARAM_01", 77)
+
+    with start_blocking_portal() as portal:  # the browser has a loop in this thread
+        portal.call(fetch)
 
 
 @needs_browser

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import gc
+import socket
 import sys
 import threading
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,9 +22,11 @@ from paramclient.service import Hub, Listening, serve
 from tests.commands import in_process
 from tests.shell import PATIENCE, small_px4, tasks_beside, until
 
+CERT, KEY = (Path(__file__).parent / "data" / name for name in ("tls_station.pem", "tls_station.key"))
+
 
 @contextmanager
-def running(vehicle: Any, port: int = 0) -> Iterator[str]:
+def running(vehicle: Any, port: int = 0, **tls: Path) -> Iterator[str]:
     """The address of a service with this vehicle."""
     started = threading.Event()
     told: list[Any] = []
@@ -34,7 +39,7 @@ def running(vehicle: Any, port: int = 0) -> Iterator[str]:
             started.set()
 
         hub = Hub([vehicle], cache=False)
-        await serve(hub, listening=Listening("127.0.0.1", port), stop=stop, listens=listens)
+        await serve(hub, listening=Listening("127.0.0.1", port, **tls), stop=stop, listens=listens)
 
     thread = threading.Thread(target=asyncio.run, args=(run(),))
     thread.start()
@@ -118,3 +123,74 @@ def test_without_its_library_it_says_how_to_install_it(monkeypatch: pytest.Monke
     monkeypatch.setattr("importlib.util.find_spec", lambda name, package=None: None)
     with pytest.raises(UsageError, match=r"pip install 'paramclient\[remote\]'"):
         ParamClient("http://127.0.0.1:1")
+
+
+@pytest.mark.parametrize("loop", ["asyncio", "trio"])
+def test_over_tls_on_both_event_loops(loop: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    vehicle = small_px4()
+
+    async def work(url: str) -> None:
+        async with ParamClient(url) as one, ParamClient(url) as other:
+            component = await one.component()
+            changes = (await other.component()).changes()
+            assert (await component.fetch_all()).complete
+            assert (await component.set("PARAM_01", 77)).actual == 77
+            async for change in changes:
+                if change.name == "PARAM_01" and change.new is not None and change.new.value == 77:
+                    break
+            with anyio.move_on_after(0):
+                await component.get("PARAM_02")
+            assert (await component.get("PARAM_01")).value == 77
+
+    async def enter(url: str) -> None:
+        async with ParamClient(url):
+            pass
+
+    with running(vehicle, tls_cert=CERT, tls_key=KEY) as url:
+        with pytest.raises(LinkError, match="its certificate is not trusted: self-signed certificate"):
+            anyio.run(enter, url, backend=loop)
+        monkeypatch.setenv("SSL_CERT_FILE", str(CERT))
+        anyio.run(work, url, backend=loop)
+    with running(vehicle) as url, pytest.raises(LinkError, match="TLS: "):
+        anyio.run(enter, url.replace("http:", "https:"), backend=loop)
+
+
+@pytest.mark.parametrize("loop", ["asyncio", "trio"])
+def test_a_handshake_that_is_cancelled_leaves_no_connection_open(loop: str) -> None:
+    async def give_up_in_the_middle(listener: socket.socket) -> None:
+        port = listener.getsockname()[1]
+
+        async def greeted() -> None:
+            reached, _ = await anyio.to_thread.run_sync(listener.accept)
+            with reached:
+                assert await anyio.to_thread.run_sync(reached.recv, 1)
+                tasks.cancel_scope.cancel()
+
+        async def enter() -> None:
+            async with ParamClient(f"https://127.0.0.1:{port}"):
+                pass
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(greeted)
+            tasks.start_soon(enter)
+
+    gc.collect()
+    with warnings.catch_warnings(record=True) as told, socket.create_server(("127.0.0.1", 0)) as listener:
+        warnings.simplefilter("always")
+        anyio.run(give_up_in_the_middle, listener, backend=loop)
+        gc.collect()
+    assert [str(each.message) for each in told if issubclass(each.category, ResourceWarning)] == []
+
+
+@pytest.mark.asyncio
+async def test_a_service_ends_in_good_order_while_somebody_listens_over_tls(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("SSL_CERT_FILE", str(CERT))
+    with anyio.fail_after(PATIENCE):
+        with running(small_px4(), tls_cert=CERT, tls_key=KEY) as url:
+            client = ParamClient(url)
+            await client.__aenter__()
+        await until(lambda: "away" in repr(client))
+        await client.__aexit__(None, None, None)
+    assert [record.message for record in caplog.records if record.levelname == "ERROR"] == []

@@ -52,6 +52,18 @@ async def test_it_begins_without_a_vehicle_and_with_a_link_that_is_not_there() -
 
 
 @swiftly
+async def test_who_asks_what_is_in_the_cache_of_a_service_that_ends_is_told_so(tmp_path: Path) -> None:
+    with ParamCache(tmp_path / "cache.sqlite3") as cache:
+        async with Hub([small_px4()], cache=cache) as hub, a_browser(create_app(hub)) as browser:
+            assert (await browser.get("/api/v1/vehicles")).status_code == 200
+        async with a_browser(create_app(hub)) as late, asyncio.timeout(60):
+            problem(await late.get("/api/v1/vehicles"), 503, "closing")
+            headers = {"Content-Type": "application/octet-stream"}
+            answer = await late.post("/api/v1/files?name=a.param", content=b"A,1", headers=headers)
+            problem(answer, 503, "closing")
+
+
+@swiftly
 async def test_a_link_that_drops_is_away_until_it_is_back() -> None:
     link = FlakyLink(generic())
     async with service(link) as (hub, browser):

@@ -285,6 +285,9 @@ async def test_no_path_leads_elsewhere() -> None:
     async with served() as service:
         for path, method in itertools.product(PATHS, ("GET", "OPTIONS")):
             answer = await service.ask(method, path)
+            if method == "OPTIONS" and answer.status == 204:  # which methods there are, of a kind of address
+                assert answer.body == b""
+                continue
             assert answer.status in (400, 404, 405), path
             assert answer.problem
             assert b"root:" not in answer.body
@@ -421,6 +424,20 @@ async def test_whoever_asks_nothing_is_not_waited_for(monkeypatch: pytest.Monkey
             await asyncio.sleep(0.5)
             service.hub.feed.publish("note", {})
             await reader.readuntil(b'"note"')
+
+
+async def test_a_body_that_does_not_come_is_not_waited_for_at_the_end(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    async with contextlib.AsyncExitStack() as stack:
+        async with served() as service:
+            reader, writer = await stack.enter_async_context(service.connection())
+            length = "Content-Length: 100"
+            head = service.head("POST", "/api/v1/find", "Content-Type: application/json", length)
+            writer.write(head + b"{")
+            await service.ask()  # by then it has come
+        assert await taken(reader) == b""
+    assert [record for record in caplog.records if record.levelno >= logging.ERROR] == []
 
 
 async def test_connections_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:

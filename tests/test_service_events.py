@@ -483,14 +483,18 @@ async def test_a_websocket_carries_the_same_events_and_resumes() -> None:
 @swiftly
 async def test_a_websocket_that_cannot_be_opened_is_a_problem_too(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream, "MOST_LISTENERS", 0)
-    for query, status in (("", 429), ("system=x", 422)):
+    for path, query, status in (
+        ("/api/v1/ws", "", 429),
+        ("/api/v1/ws", "system=x", 422),
+        ("/api/v1/events", "", 404),
+    ):
         sent: list[Message] = []
 
         async def send(message: Message, sent: list[Message] = sent) -> None:
             sent.append(message)
 
         async with Hub([], cache=False) as hub:
-            await call_app(hub, "/api/v1/ws", send, kind="websocket", query=query)
+            await call_app(hub, path, send, kind="websocket", query=query)
         assert sent[0]["type"] == "websocket.http.response.start"
         assert sent[0]["status"] == status
         assert json.loads(sent[1]["body"])["status"] == status

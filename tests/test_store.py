@@ -38,7 +38,8 @@ from tests import test_cache, test_fleet, test_snapshots
 from tests.caches import NOW, PX4, stored, update, values, whole_table
 from tests.commands import in_process
 from tests.postgres import GIVEN, PROGRAMS, WHY_NONE, Server, database_on, server
-from tests.shell import small_px4, swiftly
+from tests.shell import Tap, small_px4, swiftly
+from tests.test_service_process import served
 
 PATIENCE = 60.0
 
@@ -294,18 +295,44 @@ def test_a_commit_whose_answer_was_lost_is_not_done_twice(
 ) -> None:
     a, b = stations
     a.save(whole_table(3))
-    write = PostgresDatabase.write
-
-    def half(self: PostgresDatabase, *arguments: Any) -> Any:
-        monkeypatch.undo()
-        write(self, *arguments)
-        raise Away("the answer was lost")
-
-    monkeypatch.setattr(PostgresDatabase, "write", half)
+    lose_an_answer(monkeypatch)
     a.save(a_value(10))
     until(lambda: a.away is None)
     a.save(a_value(11))
     assert told(b) == [(10, 1, 10), (11, 10, 11)]
+
+
+def test_a_reason_with_a_zero_in_it_does_no_harm(cache: ParamCache) -> None:
+    cache.save(whole_table(1))
+    made = cache.snapshot(PX4.key, 1, reason="a\0b")
+    assert made.reason == cache.snapshots(PX4.key)[0].reason == "a\\x00b"
+    assert cache.state_at(PX4.key, 1, made.id) == made.params
+
+
+def test_what_was_done_without_an_answer_is_told_all_the_same(
+    stations: tuple[ParamCache, ParamCache], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    a, b = stations
+    a.save([whole_table(3), whole_table(2, component=2)])
+    lose_an_answer(monkeypatch)
+    made = a.snapshot(PX4.key, 1, reason="before")
+    assert [each.id for each in b.snapshots(PX4.key)] == [made.id]
+    assert b.state_at(PX4.key, 1, made.id) == made.params
+    lose_an_answer(monkeypatch)
+    assert a.remove(PX4.key) == 2
+    assert b.vehicles() == []
+
+
+def lose_an_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Break the connection at the next commit: it is done, and nobody hears that it is."""
+    write = PostgresDatabase.write
+
+    def half(self: PostgresDatabase, *arguments: Any) -> Any:
+        monkeypatch.setattr(PostgresDatabase, "write", write)
+        write(self, *arguments)
+        raise Away("the answer was lost")
+
+    monkeypatch.setattr(PostgresDatabase, "write", half)
 
 
 def test_two_stations_make_the_schema_at_once(server_url: str, tmp_path: Path) -> None:
@@ -437,6 +464,50 @@ def test_killed_under_load_nothing_is_lost_and_nothing_doubled(
             assert news == [1_000 + number for number in range(1, count + 1)]
 
 
+def test_a_database_that_stands_still_is_given_up(
+    fragile: tuple[Server, ParamCache, ParamCache], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its connections stay, and nothing is answered: as on a machine that swaps, or whose disk hangs."""
+    monkeypatch.setattr("paramclient.cache.postgres.ANSWER_TIMEOUT", 0.3)
+    monkeypatch.setattr("paramclient.cache.postgres.CONNECT_TIMEOUT", 1)
+    running, a, b = fragile
+    a.save(whole_table(3))
+    b.save(a_value(5))
+    until(lambda: is_copied(a))
+    running.stand_still()
+    try:
+        a.save(a_value(6))
+        assert a.away is not None
+        assert told(a) == [(5, 1, 5), (6, 5, 6)]
+    finally:
+        running.go_on()
+    until(lambda: a.away is None)
+    assert told(b) == [(5, 1, 5), (6, 5, 6)]
+
+
+def test_another_database_under_the_same_name_is_not_taken_for_the_one_before(
+    server_url: str, tmp_path: Path
+) -> None:
+    """A backup of some days ago, or another one's database: the local copy is made anew from it."""
+    with database_on(server_url) as one, database_on(server_url) as other:
+        for url, first in ((one, 0), (other, 100)):
+            with ParamCache(url, local=tmp_path / "copy") as cache:
+                cache.save(whole_table(3, first=first))
+                until(lambda cache=cache: is_copied(cache))  # type: ignore[misc]  # bound now
+        with ParamCache(one, local=tmp_path / "copy") as cache:
+            cache.save(a_value(7))
+            until(lambda: is_copied(cache))
+            assert shown_in_copy(cache) == {"PARAM_0": 0, "PARAM_1": 7, "PARAM_2": 2}
+
+
+def shown_in_copy(cache: ParamCache) -> Mapping[str, int]:
+    store = cache._store
+    assert isinstance(store, SharedStore)
+    whole = store._link.local.read(lambda session: take_whole(session, PX4.key, 1))
+    assert whole is not None
+    return {name: row.bits for name, row in whole.rows.items()}
+
+
 def test_what_the_database_refuses_is_told_and_holds_nothing_up(
     own_server: Server, tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -458,6 +529,93 @@ def test_what_the_database_refuses_is_told_and_holds_nothing_up(
         until(lambda: cache.away is None)
         assert told(cache) == [(11, 1, 11)]
         assert "refuses what was written while it was away: not this one" in caplog.text
+
+
+def test_a_database_that_can_only_be_read_for_a_while_costs_no_line(server_url: str, tmp_path: Path) -> None:
+    """As a replica before it takes over, or one whose disk is full."""
+    with database_on(server_url) as url, ParamCache(url, local=tmp_path / "a") as cache:
+        cache.save(whole_table(3))
+        make_read_only(url, True)
+        for number in (5, 6):
+            cache.save(a_value(number))
+        assert values(cache)["PARAM_1"] == 6
+        until(lambda: "read-only" in str(cache.away))
+        make_read_only(url, False)
+        until(lambda: cache.away is None)
+        assert told(cache) == [(5, 1, 5), (6, 5, 6)]
+
+
+def make_read_only(url: str, is_so: bool) -> None:
+    """Have every session of a database begin anew, as one that may, or may not, only read."""
+    with psycopg.connect(url, autocommit=True) as connection:
+        name = connection.info.dbname
+        connection.execute("SET default_transaction_read_only = off")
+        connection.execute(f"ALTER DATABASE {name} SET default_transaction_read_only = {is_so}".encode())
+        connection.execute(
+            "SELECT pg_terminate_backend(pid) FROM pg_stat_activity"
+            " WHERE datname = %s AND pid != pg_backend_pid()",
+            (name,),
+        )
+
+
+def test_what_waits_for_a_vehicle_that_is_held_is_not_refused(
+    server_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr("paramclient.cache.postgres.LOCK_TIMEOUT", "50ms")
+    with database_on(server_url) as url, ParamCache(url, local=tmp_path / "a") as cache:
+        cache.save(whole_table(3))
+        with psycopg.connect(url) as other:
+            other.execute("SELECT key FROM paramclient.vehicle FOR UPDATE")
+            cache.save(a_value(5))
+            assert "holds a vehicle" in str(cache.away)
+        until(lambda: cache.away is None)
+        assert told(cache) == [(5, 1, 5)]
+        assert "refuses" not in caplog.text
+
+
+def test_without_room_for_the_local_copy_the_database_is_used_all_the_same(
+    server_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A full disk, or a folder that can only be read."""
+    with database_on(server_url) as url:
+        with ParamCache(url, local=tmp_path / "a") as cache:
+            cache.save(whole_table(3))
+        with ParamCache(url, local=tmp_path / "a") as a, ParamCache(url, local=tmp_path / "b") as b:
+            for each in (a, b):
+                assert values(each)["PARAM_1"] == 1
+            at_a: list[CacheChange] = []
+            a.subscribe(at_a.append)
+            with monkeypatch.context() as full:
+                full.setattr(LocalCopy, "_write", no_room)
+                with ParamCache(url, local=tmp_path / "a") as late:
+                    late.save(a_value(5))
+                    assert told(late) == [(5, 1, 5)]
+                until(lambda: len(at_a) == 1)
+                b.save(a_value(6))
+                until(lambda: len(at_a) == 2)
+            assert "not up to date: no room" in caplog.text
+            b.save(a_value(7))
+            until(lambda: len(at_a) == 3)
+            assert told(a) == [(5, 1, 5), (6, 5, 6), (7, 6, 7)]
+
+
+def no_room(*_: object) -> None:
+    raise CacheError("no room")
+
+
+def test_what_others_tell_in_the_same_database_is_not_for_us(
+    path: str, stations: tuple[ParamCache, ParamCache]
+) -> None:
+    a, b = stations
+    at_a: list[CacheChange] = []
+    a.subscribe(at_a.append)
+    with psycopg.connect(path, autocommit=True) as other:
+        for text in ("", "hello", "[1]", "7", '["a", {}, 1, 1]', '{"a": 1}'):
+            other.execute("SELECT pg_notify('paramclient', %s)", (text,))
+    b.save(whole_table(1))
+    until(lambda: at_a)
+    assert at_a == [CacheChange(PX4.key, 1)]
+    assert a.away is None
 
 
 # Places and secrets
@@ -487,6 +645,7 @@ def test_a_password_is_told_to_nobody(tmp_path: Path, caplog: pytest.LogCaptureF
             cache.vehicles()
         with pytest.raises(CacheError):
             cache.save(whole_table(1))
+        assert "local copy" not in caplog.text, "there is none"
         texts = [repr(cache), cache.place, str(cache.away), str(cache.notes), caplog.text]
         texts += traceback.format_exception(caught.value)[-1:]
         assert all("geheim" not in text for text in texts)
@@ -643,6 +802,41 @@ async def test_what_another_station_hears_renews_what_is_only_cached_here(tmp_pa
             assert component.params["PARAM_01"] == live
             assert (await component.get("PARAM_02")).value != 77
         assert not cache.listeners
+
+
+@swiftly
+async def test_what_another_station_hears_is_told_at_once_while_nothing_is_heard_here(tmp_path: Path) -> None:
+    """The vehicle has flown out of reach of this station: nothing on the link brings the news to light."""
+    vehicle = Tap(small_px4())
+    cache = Told(tmp_path / "cache")
+    with cache:
+        async with ParamClient(vehicle, cache=cache) as client:
+            component = await client.component()
+            await component.fetch_all()
+            await anyio.sleep(2.0)
+            vehicle.is_mute = True
+            await anyio.sleep(30.0)
+            assert component.sync_state == "lost"
+            changes = component.changes()
+            for value in range(77, 82):
+                await anyio.sleep(0.7)  # at another moment of what goes on once a second
+                heard = stored("PARAM_02", value, at=time.time() + value)
+                cache.save(update(heard, identity=component.identity, at=time.time()))
+                await anyio.to_thread.run_sync(cache.tell, CacheChange(component.identity.key, 1))
+                with anyio.fail_after(0.5):
+                    change = await anext(changes)
+                assert (change.name, change.new and change.new.value) == ("PARAM_02", value)
+
+
+@pytest.mark.asyncio
+async def test_a_service_shares_it_too(
+    path: str, cache: ParamCache, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    async with served("sim:px4", "--cache", path):
+        with anyio.fail_after(PATIENCE):
+            while not await anyio.to_thread.run_sync(cache.components):  # noqa: ASYNC110 - it is in a database
+                await anyio.sleep(0.05)
 
 
 class Told(ParamCache):

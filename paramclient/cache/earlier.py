@@ -31,6 +31,7 @@ from paramclient.values import Value, known_type
 __all__ = [
     "CLOCK_SLACK",
     "SNAPSHOTS",
+    "kept_time",
     "read_written",
     "snapshot",
     "state_at",
@@ -77,7 +78,8 @@ def store(
     assert params.identity is not None
     blob = _packed(params.identity, params)
     text = reason.encode("utf-8", "backslashreplace").decode()  # a file's name need not be UTF-8
-    row = (round(time_cell(at), 3), text, len(params), hash, int(complete))
+    text = text.replace("\0", "\\x00")  # PostgreSQL's text cannot hold it
+    row = (kept_time(at), text, len(params), hash, int(complete))
     number = session.add_snapshot(owner, row, blob, _checksum(row, blob), number)
     session.trim_snapshots(owner, SNAPSHOTS)
     return snapshot(session, owner, number)
@@ -112,6 +114,11 @@ def snapshot(session: Session, owner: int, number: int) -> Snapshot:
             f"snapshot {number} of {summary.key}",
         ),
     )
+
+
+def kept_time(at: float) -> float:
+    """The time of a snapshot as it is kept: to the millisecond."""
+    return round(time_cell(at), 3)
 
 
 def state_at(

@@ -34,6 +34,10 @@ class Operation(ABC, Generic[T_co]):
     def do(self, session: Session) -> T_co:
         """Do it within a transaction."""
 
+    def done(self, session: Session) -> T_co | None:
+        """What `do` gave, where it is known only that it was done; None where that says nothing."""
+        return None
+
 
 @dataclass(frozen=True)
 class Save(Operation[None]):
@@ -114,6 +118,15 @@ class SetDown(Operation[Snapshot]):
             number=self.number,
         )
 
+    def done(self, session: Session) -> Snapshot:
+        """The snapshot of this time."""
+        [(key, _)] = self.tables
+        owner = session.owner_of(key, self.component)
+        number = None if owner is None else session.snapshot_at(owner, earlier.kept_time(self.at))
+        if owner is None or number is None:
+            raise CacheError(f"the table of {key}, component {self.component}, has just been removed")
+        return earlier.snapshot(session, owner, number)
+
     def resolved(self, session: Session) -> SetDown:
         """The same with the parameters that the table has now, where it has none of its own."""
         if self.params is not None:
@@ -128,10 +141,15 @@ class SetDown(Operation[Snapshot]):
 
 @dataclass(frozen=True)
 class Remove(Operation[int]):
-    """Forget tables, see `ParamCache.remove`."""
+    """Forget tables, see `ParamCache.remove`.
+
+    Attributes:
+        known: how many there were when that was asked for.
+    """
 
     key: str
     component: int | None
+    known: int = 0
 
     @property
     def tables(self) -> Iterable[tuple[str, int | None]]:
@@ -139,6 +157,10 @@ class Remove(Operation[int]):
 
     def do(self, session: Session) -> int:
         return session.remove(self.key, self.component)
+
+    def done(self, session: Session) -> int:
+        """How many there were."""
+        return self.known
 
 
 def _kept(session: Session, owner: int) -> ParamSet:

@@ -7,12 +7,15 @@ advisory locks, so that what is read before a change is what the change is made 
 from __future__ import annotations
 
 import json
+import socket
 import threading
+import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
+from uuid import uuid4
 
 from paramclient.cache.address import Address
 from paramclient.cache.database import Damaged
@@ -35,6 +38,9 @@ SILENCE: Final = 5_000
 """Milliseconds that what was sent may stay unacknowledged before the connection is given up (Linux)."""
 LOCK_TIMEOUT: Final = "5s"
 """How long another station's transaction may hold a vehicle; they take milliseconds."""
+ANSWER_TIMEOUT: Final = 20.0
+"""Seconds after which a statement without an answer means that the database stands still: its machine swaps,
+or its disk hangs. The longest of ours take a second or two, and wait five for a lock."""
 IDLE_TIMEOUT: Final = "15s"
 """When the database ends a transaction of a station that stands still, and would hold its vehicles."""
 MOST_CONNECTIONS: Final = 4
@@ -45,12 +51,13 @@ _MIGRATION_LOCK: Final = 0x5041524D_0000_0001
 _TRIES: Final = 5
 
 Revisions = dict[tuple[str, int], int]
-"""By key and component, a number that is another one whenever a table has been written to."""
+"""By key and component, a number that is another one whenever a table has been written to. It is drawn by
+lot: so it is another one also where a backup, or another database, has taken the place of the one before."""
 T = TypeVar("T")
 
 
 class Away(Exception):
-    """The database cannot be reached, or the connection broke. What was to be written may have been."""
+    """The database cannot be reached or used at present. What was to be written may have been."""
 
 
 class PostgresDatabase:
@@ -70,17 +77,18 @@ class PostgresDatabase:
 
         Raises:
             Away: it cannot be reached.
-            CacheError: it is of a later version, or may not be used.
+            CacheError: it is of a later version.
         """
-        library, pools = _libraries()
+        _, pools = _libraries()
         with self._translated():
-            listener: psycopg.Connection[tuple[Any, ...]] = library.connect(
-                **self._options(), autocommit=True
-            )
+            kind = _connection_kind()
+            listener: psycopg.Connection[tuple[Any, ...]] = kind.connect(**self._options(), autocommit=True)
             try:
-                _migrate(listener, self.address.place)
-                listener.execute(f"LISTEN {CHANNEL}")
+                with _watched(listener):
+                    _migrate(listener, self.address.place)
+                    listener.execute(f"LISTEN {CHANNEL}")
                 pool = pools.ConnectionPool(
+                    connection_class=kind,
                     kwargs=self._options(),
                     min_size=0,
                     max_size=MOST_CONNECTIONS,
@@ -109,7 +117,7 @@ class PostgresDatabase:
 
         Raises:
             Away: the database cannot be reached.
-            CacheError: it is damaged, or may not be read.
+            CacheError: it is damaged.
         """
         with self._translated(), self._connection() as connection:
             connection.execute("SET TRANSACTION ISOLATION LEVEL REPEATABLE READ READ ONLY")
@@ -178,10 +186,10 @@ class PostgresDatabase:
                 for operation, writer, number in operations
             ]
             connection.execute(
-                "UPDATE component c SET revision = nextval('revision')"
+                "UPDATE component c SET revision = %s"
                 " FROM unnest(%s::text[], %s::integer[]) AS touched (key, number)"
                 " WHERE vehicle = key AND component = coalesce(number, component)",
-                ([key for key, _ in tables], [component for _, component in tables]),
+                (uuid4().int >> 65, [key for key, _ in tables], [component for _, component in tables]),
             )
             after = _revisions(connection, keys)
             changed = {each for each in {*before, *after} if before.get(each) != after.get(each)}
@@ -196,7 +204,7 @@ class PostgresDatabase:
             pool = self._pool
         if pool is None:
             raise Away("the connection is closed")
-        with pool.connection() as connection:
+        with pool.connection() as connection, _watched(connection), connection.transaction():
             yield connection
 
     @contextmanager
@@ -209,13 +217,16 @@ class PostgresDatabase:
         except (pools.PoolClosed, pools.PoolTimeout) as error:
             raise Away(f"the database {place} does not answer") from error
         except library.errors.LockNotAvailable as error:
-            raise CacheError(f"another station holds a vehicle in the cache {place}") from error
+            raise Away(f"another station holds a vehicle in the cache {place}") from error
         except (library.OperationalError, library.InterfaceError) as error:
             text = self.address.without_password(" ".join(str(error).split()))
             raise Away(f"the database {place} cannot be reached: {text}") from None
-        except library.Error as error:
+        except (library.DataError, library.IntegrityError) as error:
             text = self.address.without_password(" ".join(str(error).split()))
-            raise CacheError(f"the cache {place} cannot be used: {text}") from error
+            raise CacheError(f"the cache {place} cannot take this: {text}") from None
+        except library.Error as error:  # read-only, forbidden, dropped: not the fault of what is written
+            text = self.address.without_password(" ".join(str(error).split()))
+            raise Away(f"the database {place} cannot be used: {text}") from None
         except Damaged as damage:
             raise CacheError(f"the cache {place} is damaged ({damage})") from damage
 
@@ -426,6 +437,50 @@ def _libraries() -> tuple[Any, Any]:
             f"a cache in PostgreSQL needs psycopg ({error}): pip install 'paramclient[postgres]'"
         ) from error
     return psycopg, psycopg_pool
+
+
+@cache
+def _connection_kind() -> Any:
+    """A connection that knows since when it waits for an answer."""
+
+    class Connection(_libraries()[0].Connection):  # type: ignore[misc]  # loaded here, where it is wanted
+        asked_at: float | None = None
+
+        def wait(self, *arguments: Any, **options: Any) -> Any:
+            self.asked_at = time.monotonic()
+            try:
+                return super().wait(*arguments, **options)
+            finally:
+                self.asked_at = None
+
+    return Connection
+
+
+@contextmanager
+def _watched(connection: Any) -> Iterator[None]:
+    """Break a connection on which a statement is not answered: whoever waits for that gets an error then."""
+    is_over = threading.Event()
+    line = socket.fromfd(connection.fileno(), socket.AF_INET, socket.SOCK_STREAM)  # of whatever kind it is
+
+    def watch() -> None:
+        left = ANSWER_TIMEOUT
+        while not is_over.wait(left):
+            asked_at = connection.asked_at
+            waited = 0.0 if asked_at is None else time.monotonic() - asked_at
+            left = ANSWER_TIMEOUT - waited
+            if left <= 0:
+                with suppress(OSError):
+                    line.shutdown(socket.SHUT_RDWR)
+                return
+
+    thread = threading.Thread(target=watch, name="paramclient cache watch", daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_over.set()
+        thread.join()
+        line.close()
 
 
 def _end(pool: ConnectionPool[Any] | None) -> None:

@@ -155,6 +155,8 @@ class _Link:
                     break
                 try:
                     [result], before, after = self._database.write([(operation, self._writer, number)])
+                    if is_second and result is None:  # it may have been done the first time
+                        result = self._database.read(operation.done)
                 except Away as error:
                     self._lose(error)
                 else:
@@ -248,7 +250,7 @@ class _Link:
             self._lose(error)
 
     def _take_up(self, listener: psycopg.Connection[tuple[Any, ...]], revisions: Revisions) -> None:
-        kept = self.local.revisions()
+        kept = self._kept()
         if self.away is not None:
             _log.warning("the database %s is back", self._address.place)
         with self._state:
@@ -270,20 +272,28 @@ class _Link:
             self._warn_of_copy(error)
 
     def _deliver(self) -> None:
-        """Do in the database what has waited, in order, until nothing waits."""
-        while entries := self.local.waiting(BATCH):
-            try:
+        """Do in the database what has waited, in order, until nothing waits.
+
+        What waits in a copy that cannot be used goes when it can, the next time that the database is reached.
+        """
+        try:
+            while entries := self.local.waiting(BATCH):
                 self._deliver_all(entries)
-            except CacheError:
-                for entry in entries:
-                    try:
-                        self._deliver_all([entry])
-                    except CacheError as error:
-                        _log.warning("the database refuses what was written while it was away: %s", error)
-                        self.local.refuse(entry, str(error))
+        except CacheError as error:
+            self._warn_of_copy(error)
 
     def _deliver_all(self, entries: Sequence[Entry]) -> None:
-        _, _, after = self._database.write([(each.operation, each.writer, each.number) for each in entries])
+        try:
+            operations = [(each.operation, each.writer, each.number) for each in entries]
+            _, _, after = self._database.write(operations)
+        except CacheError as error:
+            if len(entries) > 1:
+                for entry in entries:
+                    self._deliver_all([entry])
+                return
+            _log.warning("the database refuses what was written while it was away: %s", error)
+            self.local.refuse(entries[0], str(error))
+            return
         # the copies are made anew: others may have written meanwhile
         self.local.arrived(entries, [key for each in entries for key in _touched(each.operation, after)])
 
@@ -293,7 +303,9 @@ class _Link:
             self.away = str(error)
             self._is_here = False
         if is_news:
-            _log.warning("%s; going on with the local copy %s", error, self.local.path)
+            copy = self.local
+            meanwhile = f"going on with the local copy {copy.path}" if copy.exists else "trying again"
+            _log.warning("%s; %s", error, meanwhile)
         self._database.close()
         self._ring()
 
@@ -342,6 +354,14 @@ class _Link:
             except CacheError as error:
                 self._warn_of_copy(error)
 
+    def _kept(self) -> Revisions:
+        """Of which tables there is a copy, and of which revision; none where it cannot be read."""
+        try:
+            return self.local.revisions()
+        except CacheError as error:
+            self._warn_of_copy(error)
+            return {}
+
     def _warn_of_copy(self, error: CacheError) -> None:
         if not self._has_warned:
             _log.warning("the local copy is not up to date: %s", error)
@@ -386,7 +406,7 @@ class _Link:
             finally:
                 selector.unregister(file)
             self._silence()
-            told = [json.loads(each.payload) for each in listener.notifies(timeout=0)]
+            told = [_news(each.payload) for each in listener.notifies(timeout=0)]
         except Exception as error:  # whatever it is, the connection is of no more use
             if listener is self._listener and self._is_here and not self._is_closed:
                 text = self._address.without_password(" ".join(str(error).split()))
@@ -394,12 +414,12 @@ class _Link:
             return
         changed = set()
         with self._state:
-            for writer, key, component, revision in told:
+            for writer, key, component, revision in filter(None, told):
                 if writer != self._writer:
                     changed.add((key, component))
                     self._revisions[key, component] = revision
         if changed:
-            kept = self.local.revisions()
+            kept = self._kept()
             with self._state:
                 self._wanted |= changed & kept.keys()
             self._tell(changed)
@@ -427,6 +447,16 @@ def _touched(operation: Operation[Any], known: Revisions) -> Iterator[tuple[str,
             yield key, component
         else:
             yield from (each for each in known if each[0] == key)
+
+
+def _news(payload: str) -> tuple[Any, ...] | None:
+    """What a station has told; None where it was somebody else who did, as anybody in the database can."""
+    try:
+        writer, key, component, revision = json.loads(payload)
+    except (TypeError, ValueError):
+        return None
+    is_ours = isinstance(writer, str) and isinstance(key, str) and isinstance(component, int)
+    return (writer, key, component, revision) if is_ours else None
 
 
 def _numbered(operation: Operation[Any], number: int) -> SetDown:

@@ -403,8 +403,13 @@ class ParamCache:
         Raises:
             CacheError: there is no such vehicle, or more than one.
         """
-        key = self._store.read(lambda session: self._choose(session, vehicle))
-        return self._store.do(Remove(key, component))
+
+        def work(session: Session) -> tuple[str, int]:
+            key = self._choose(session, vehicle)
+            return key, len(session.summaries(key, component))
+
+        key, known = self._store.read(work)
+        return self._store.do(Remove(key, component, known))
 
     def _table(self, session: Session, vehicle: str, component: int) -> tuple[str, int]:
         """The key of the vehicle that is meant, and the id of its table."""

@@ -30,7 +30,7 @@ _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 async def serve(
     *links: str,
     listen: str = "127.0.0.1:8765",
-    cache: Path | None = None,
+    cache: str | None = None,
     no_cache: bool = False,
     fetch: Annotated[bool, Parameter(negative="--no-fetch")] = True,
     listen_only: bool = False,
@@ -53,7 +53,7 @@ async def serve(
     Args:
         links: The links, such as udpin:0.0.0.0:14550 or serial:/dev/ttyACM0:57600.
         listen: Where to listen, HOST:PORT; port 0 lets the system choose.
-        cache: The cache file, instead of the user's own.
+        cache: The cache file, or the postgresql:// URL of one that stations share, instead of the user's own.
         no_cache: Neither read nor write a cache.
         fetch: Bring the tables of everyone who is heard up to date without being asked to.
         listen_only: Send nothing to vehicles, and take what others on the links ask for.

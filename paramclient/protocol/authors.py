@@ -55,7 +55,8 @@ class Authors:
     """What is remembered for a few seconds of the changes of one component's values.
 
     Attributes:
-        foreign_sets: by name, the station that was heard setting it last, and when.
+        foreign_sets: by name, the station that was heard setting it last, and when; ourselves, where a write
+            was given up before its value had come.
     """
 
     __slots__ = ("_changed_at", "_doubts", "foreign_sets")
@@ -66,7 +67,7 @@ class Authors:
         self._doubts: dict[str, float] = {}  # what changed again: when to ask for it
 
     def foreign_set(self, name: str, station: str, now: float) -> None:
-        """Another station was heard setting a parameter."""
+        """Another station was heard setting a parameter; or ours has, and nobody waits for it any more."""
         self.foreign_sets.pop(name, None)
         self.foreign_sets[name] = (station, now)
         if len(self.foreign_sets) > MOST_FOREIGN_SETS:

@@ -133,6 +133,7 @@ class Parts(ABC):
         self._known_as: str | None = None  # the key of the identity that was reported
         self._saved_at = -math.inf  # when all that we have written will have been saved
         self._authors = Authors()
+        self.writes.left_open = self._authors.foreign_set
 
     @abstractmethod
     def begin_fetch(

@@ -87,7 +87,8 @@ class Table:
         doubts: how often what had been heard was no longer to be relied on.
         passed_over: by a name that several parameters share, the indices of those that it does not mean.
         dirty: names whose value, type or index changed since `take_dirty` was called last.
-        overwritten: what writes of ours had made of them, and is no more; each with who did it.
+        overwritten: what writes of ours had made of them or have replaced, and is no more; each with who did
+            it.
     """
 
     def __init__(self, encoding: Encoding = Encoding.BYTEWISE, room: Room | None = None) -> None:
@@ -450,9 +451,10 @@ class Table:
         return overwritten
 
     def _news(self, name: str, old: Param | None, by: str) -> None:
-        """A value has changed. One that was written for somebody is told of, however short it stood."""
+        """A value has changed. What was written for somebody is told of, however short it stood, and with
+        what it has replaced, however short that was known."""
         before = self.dirty.get(name)
-        if old is not None and before is not None and is_ours(before):
+        if old is not None and before is not None and (is_ours(before) or is_ours(by)):
             self.overwritten.append((old, before))
             del self.overwritten[:-MOST_OVERWRITTEN]
         self.dirty[name] = by

@@ -98,6 +98,8 @@ class Writes:
         queues: by name, those that are open, the one under way first; no name has an empty one.
         is_held: whether one waits for that.
         asked, retries: writes so far, and PARAM_SETs that were sent for another time.
+        left_open: is told the name and the author of a write of which nobody learns any more whether the
+            vehicle takes it.
     """
 
     def __init__(
@@ -122,6 +124,7 @@ class Writes:
         self.asked = self.retries = 0
         self.is_held = False
         self.queues: dict[str, deque[Write]] = {}
+        self.left_open: Callable[[str, str, float], None] = _nobody
 
     def __len__(self) -> int:
         return len(self.queues)
@@ -147,6 +150,7 @@ class Writes:
         if queue is None or write not in queue:
             return
         if queue[0] is write:
+            self._leave_open(write, now)
             self._leave(write, now)
         else:
             queue.remove(write)
@@ -361,9 +365,15 @@ class Writes:
         write.finish(result, now)
 
     def _fail(self, write: Write, error: Exception, now: float) -> None:
+        if isinstance(error, NoReply):
+            self._leave_open(write, now)
         self._leave(write, now)
         self._trace("%s/%s %s: not written: %s", *self._target, write.name, error)
         write.fail(error, now)
+
+    def _leave_open(self, write: Write, now: float) -> None:
+        if write.attempts:
+            self.left_open(write.name, write.by, now)
 
     def _leave(self, write: Write, now: float) -> None:
         if write.read is not None:
@@ -401,3 +411,7 @@ class Writes:
             component=component,
             name=write.name,
         )
+
+
+def _nobody(_name: str, _by: str, _now: float) -> None:
+    return

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn, SupportsFloat, SupportsI
 
 import anyio
 
-from paramclient.component import Component
+from paramclient.component import Component, check_accepted, check_asked
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.events import Changes, Event, Found, Heard, Lost
 from paramclient.identity import Identity
@@ -19,7 +19,7 @@ from paramclient.protocol.result import FetchResult, Progress
 from paramclient.protocol.sampling import SAMPLE_SIZE
 from paramclient.protocol.sync import SyncState
 from paramclient.protocol.table import Change
-from paramclient.protocol.wire import MAV_TYPE_GCS, SigningKey
+from paramclient.protocol.wire import MAV_TYPE_GCS, MOST_PARAMETERS, SigningKey
 from paramclient.protocol.writes import SetResult
 from paramclient.remote.connection import telling
 from paramclient.remote.link import not_given
@@ -169,7 +169,8 @@ class RemoteComponent(Component):
 
     async def get(self, name: str | int, *, timeout: float | None = None) -> Param:
         """See `Component.get`."""
-        body = {"name": check_name(name)} if isinstance(name, str) else {"index": name}
+        check_asked(name)
+        body = {"name": name} if isinstance(name, str) else {"index": name}
         what = name if isinstance(name, str) else f"parameter {name}"
         answer = await self._ask("read", body, timeout, f"{what} of {self.system}/{self.component}")
         with understood(self._client.link.name):
@@ -220,7 +221,8 @@ class RemoteComponent(Component):
         """See `Component.fetch_all`. Programs that fetch at the same time share one download."""
         began = anyio.current_time()
         before = self._progress_count
-        body: dict[str, Any] = {"refresh": refresh, "accept": accept, "sample": sample}
+        check_accepted(accept, sample)
+        body: dict[str, Any] = {"refresh": refresh, "accept": accept, "sample": min(sample, MOST_PARAMETERS)}
         if seed is not None:
             body["seed"] = seed
 

@@ -6,7 +6,8 @@ import errno
 import json
 import os
 import socket
-from collections.abc import AsyncGenerator, AsyncIterator, Mapping
+import ssl
+from collections.abc import AsyncGenerator, AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import aclosing, asynccontextmanager
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
@@ -190,7 +191,12 @@ class Requests:
     ) -> AsyncIterator[httpx.Response]:
         assert self._http is not None
         request = self._http.build_request(
-            method, self._base + path, json=body, params=query, headers=headers
+            method,
+            self._base + path,
+            json=body,
+            params=query,
+            headers=headers,
+            extensions={"trace": _handshake_watch()},
         )
         try:
             with anyio.fail_after(patience):
@@ -288,10 +294,29 @@ def _socket_options() -> list[tuple[int, int, int]]:
     return options
 
 
+def _handshake_watch() -> Callable[[str, Mapping[str, Any]], Awaitable[None]]:
+    """What closes a connection whose TLS handshake fails: when it is cancelled, httpcore leaves it open."""
+    stream: Any = None
+
+    async def trace(event: str, info: Mapping[str, Any]) -> None:
+        nonlocal stream
+        if event == "connection.connect_tcp.complete":
+            stream = info["return_value"]
+        elif event == "connection.start_tls.failed":
+            with anyio.CancelScope(shield=True):
+                await stream.aclose()
+
+    return trace
+
+
 def _reason(error: Exception) -> str:
     """Why, in words: the system's where there are any."""
     cause: BaseException | None = error
     while cause is not None:
+        if isinstance(cause, ssl.SSLCertVerificationError):
+            return f"its certificate is not trusted: {cause.verify_message}"
+        if isinstance(cause, ssl.SSLError):  # their numbers are not the system's
+            return f"TLS: {(cause.reason or str(cause)).replace('_', ' ').lower()}"
         if isinstance(cause, OSError) and cause.errno is not None and cause.errno in errno.errorcode:
             return os.strerror(cause.errno).lower()
         if isinstance(cause, OSError) and cause.strerror:

@@ -8,7 +8,8 @@ from dataclasses import dataclass, field
 from importlib import resources
 from typing import Any, Final
 
-from fastapi import FastAPI, Request, Response
+import anyio
+from fastapi import FastAPI, Request, Response, WebSocket
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from paramclient.service import problems
@@ -56,8 +57,33 @@ def create_app(hub: Hub, settings: Settings | None = None) -> ASGIApp:
         app.include_router(router)
     _add_files(app, "page", index="/", prefix="/page/")
     _add_files(app, "reference", index="/docs", prefix="/docs/")
+    app.add_api_websocket_route("/{path:path}", _nothing_there)
     access = Settings().access if settings is None else settings.access
-    return AccessMiddleware(_Stamped(app, hub), access)
+    return AccessMiddleware(_Stamped(_WithHeads(app), hub), access)
+
+
+class _WithHeads:
+    """Answers HEAD with the head of what GET would answer (RFC 9110, section 9.3.2)."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http" or scope["method"] != "HEAD":
+            await self._app(scope, receive, send)
+            return
+
+        answering = anyio.CancelScope()
+
+        async def send_head(message: Message) -> None:
+            """Let nothing of the body through, nor wait for it: that of a stream of events has no end."""
+            if message["type"] == "http.response.start":
+                await send(message)
+                await send({"type": "http.response.body", "body": b"", "more_body": False})
+                answering.cancel()
+
+        with answering:
+            await self._app({**scope, "method": "GET"}, receive, send_head)
 
 
 class _Stamped:
@@ -88,6 +114,11 @@ class _Stamped:
         except Exception:
             if not is_answered:  # else it is a problem that was answered and logged
                 raise
+
+
+async def _nothing_there(socket: WebSocket) -> None:
+    """A WebSocket elsewhere is told so like any other request; without a route it would be a bare 403."""
+    raise ServiceError(404, "not-found", "There is nothing at this address.")
 
 
 def _add_files(app: FastAPI, folder: str, *, index: str, prefix: str) -> None:

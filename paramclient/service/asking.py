@@ -119,8 +119,11 @@ class Raw(Body):
     raw: Annotated[str, Field(pattern="^[0-9a-fA-F]{8}$")]
 
 
+Finite = Annotated[StrictFloat, Field(allow_inf_nan=False)]
+"""A number of JSON: that of 1e400 would be read as an infinity, which only the word for it means."""
+
 ValueGiven = Annotated[
-    StrictInt | StrictFloat | Annotated[str, Field(max_length=400)] | Bits | Raw,
+    StrictInt | Finite | Annotated[str, Field(max_length=400)] | Bits | Raw,
     Field(description='A number, "NaN", "Infinity", the name of a value or of bits, or {"bits": …}.'),
 ]
 

@@ -43,12 +43,24 @@ class Connection(H11Protocol):
 
     def data_received(self, data: bytes) -> None:
         super().data_received(data)
+        if self._is_over():
+            return
         if self.transport.get_protocol() is not self:  # it is a WebSocket now
             self._stop()
         elif self.conn.their_state is not h11.IDLE:
             self._head_has_come()
         elif self._head is None and not self.transport.is_closing():
             self._await_head()
+
+    def shutdown(self) -> None:
+        """The service ends. A body that is still on its way is not waited for: nothing would come of it. Nor
+        is a client of whom nothing is expected: over TLS it would have to answer, and may not look at it."""
+        is_idle = self.cycle is None or self.cycle.response_complete
+        super().shutdown()
+        if is_idle and not self._is_over() and not self.transport.get_write_buffer_size():
+            self.transport.abort()
+        if self.conn.their_state is h11.SEND_BODY:
+            self.transport.abort()
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
@@ -95,16 +107,24 @@ class Connection(H11Protocol):
 
     def _watch(self) -> None:
         """What has been written is to be taken, however slowly."""
+        if self._is_over():
+            return
         self._unsent = self.transport.get_write_buffer_size()
         if self._unsent and self._stall is None:
             self._stall = self.loop.call_later(STALL_PATIENCE, self._check)
 
     def _check(self) -> None:
         self._stall = None
+        if self._is_over():
+            return
         if 0 < self._unsent <= self.transport.get_write_buffer_size():
             self.transport.abort()
         else:
             self._watch()
+
+    def _is_over(self) -> bool:
+        """Whether the transport tells nothing any more: that of TLS drops all it has when closed twice."""
+        return getattr(self.transport, "_ssl_protocol", self) is None
 
     def _stop(self) -> None:
         self._head_has_come()

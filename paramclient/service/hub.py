@@ -137,7 +137,12 @@ class Hub:
                 await self._reader.close(_nothing)
 
     async def aside(self, work: Callable[[], Result]) -> Result:
-        """Do what blocks, such as a look into the cache, in a thread. Cancelled, it is done all the same."""
+        """Do what blocks, such as a look into the cache, in a thread. Cancelled, it is done all the same.
+
+        Raises:
+            ServiceError: the service is ending.
+        """
+        self._check_open()
         return await self._worker.run(work)
 
     async def read_aside(self, work: Callable[[], Result]) -> Result:
@@ -145,8 +150,9 @@ class Hub:
         the cache.
 
         Raises:
-            ServiceError: too many wait for that.
+            ServiceError: too many wait for that, or the service is ending.
         """
+        self._check_open()
         if self._readings >= MOST_READINGS:
             raise ServiceError(429, "too-many", f"{MOST_READINGS} files are being read already.")
         self._readings += 1
@@ -221,12 +227,16 @@ class Hub:
                 is_ending = True
                 tasks.cancel_scope.cancel()
         if is_ending:
-            raise ServiceError(503, "closing", "The service is ending.")
+            self._check_open()
         if not found:
             reasons = [f"; {line.error}" for line in chosen if line.state == "failed" and line.error]
             awaited = address_in_words(system, component) + "".join(reasons)
             raise NoReply(awaited, attempts=0, waited=anyio.current_time() - began)
         return found[0]
+
+    def _check_open(self) -> None:
+        if self._closing.is_set():
+            raise ServiceError(503, "closing", "The service is ending.")
 
     def _add(self, link: str | Link | Endpoint | tuple[str, Callable[[], ParamClient]]) -> None:
         if isinstance(link, tuple):
@@ -257,7 +267,7 @@ class Hub:
     async def _welcome(self, followed: Followed) -> None:
         """See what is known of a component already, and bring its table up to date."""
         client = followed.component._client
-        with suppress(ParamClientError):
+        with suppress(ParamClientError, ServiceError):
             await followed.component._wait_for_cache()
             await self._recall(followed)
         machine = followed.component._machine

@@ -72,14 +72,20 @@ def metrics_text(hub: Hub) -> str:
     add(
         "component_up",
         "gauge",
-        "1 while the component is heard.",
-        [(labels, int(each.component.state != "lost")) for labels, each in everyone],
+        "1 while the component is heard, and its link is open.",
+        [
+            (labels, int(each.line.state == "open" and each.component.state != "lost"))
+            for labels, each in everyone
+        ],
     )
     add(
         "component_synced",
         "gauge",
         "1 while its table is known to be the vehicle's.",
-        [(labels, int(each.component.sync_state == "synced")) for labels, each in everyone],
+        [
+            (labels, int(each.line.state == "open" and each.component.sync_state == "synced"))
+            for labels, each in everyone
+        ],
     )
     add(
         "component_parameters",

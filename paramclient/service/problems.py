@@ -15,6 +15,7 @@ from fastapi.exceptions import RequestValidationError, WebSocketRequestValidatio
 from starlette.exceptions import HTTPException
 from starlette.requests import HTTPConnection
 from starlette.responses import Response
+from starlette.routing import Match
 
 from paramclient.documents.problem import Problem
 from paramclient.errors import (
@@ -112,11 +113,27 @@ async def _invalid(request: HTTPConnection, error: Exception) -> Response:
     return await _answer(request, _problem(422, "invalid-request", told, {"faults": faults}))
 
 
-async def _refused(_: Request, error: Exception) -> Response:
+async def _refused(request: Request, error: Exception) -> Response:
     assert isinstance(error, HTTPException)
+    headers = error.headers
+    if error.status_code == 405:
+        headers = {"allow": ", ".join(_methods(request))}
+        if request.method == "OPTIONS":
+            return Response(status_code=204, headers=headers)
     kind, detail = _OF_HTTP.get(error.status_code, (None, error.detail))
     problem = _problem(error.status_code, kind or _hyphened(_phrase(error.status_code)), detail, {})
-    return problem_response(problem, error.headers)
+    return problem_response(problem, headers)
+
+
+def _methods(request: Request) -> list[str]:
+    """What the address of a request knows, of all routes that lead there: a 405 has to say it (RFC 9110)."""
+    routes = request.app.router.routes
+    known = ["OPTIONS"]
+    for method in ("DELETE", "GET", "PATCH", "POST", "PUT"):
+        scope = {**request.scope, "method": method}
+        if any(route.matches(scope)[0] is Match.FULL for route in routes):
+            known += ["GET", "HEAD"] if method == "GET" else [method]
+    return sorted(known)
 
 
 async def _failed(request: HTTPConnection, error: Exception) -> Response:

@@ -37,6 +37,7 @@ __all__ = [
     "cached",
     "check_size",
     "key_of",
+    "known_to",
     "known_set",
     "parsed",
     "past",
@@ -198,7 +199,7 @@ async def state(hub: Hub, target: Followed, when: float | int | None) -> ParamSe
     cache = the_cache(hub)
     key, component = await key_of(hub, target), target.component.component
     if when is None:
-        return await _known(hub, lambda: before_last_apply(cache, key, component))
+        return await known_to(hub, lambda: before_last_apply(cache, key, component))
     return await past(hub, key, component, when)
 
 
@@ -228,8 +229,8 @@ async def past(hub: Hub, key: str, component: int, when: float | int | None) -> 
     cache = the_cache(hub)
     await cached(hub, key, component)
     if when is None:
-        return await _known(hub, lambda: cached_set(cache, key, component))
-    return await _known(hub, lambda: cache.state_at(key, component, when))
+        return await known_to(hub, lambda: cached_set(cache, key, component))
+    return await known_to(hub, lambda: cache.state_at(key, component, when))
 
 
 async def cached(hub: Hub, key: str, component: int) -> CachedComponent:
@@ -258,6 +259,14 @@ def the_cache(hub: Hub) -> ParamCache:
             409, "no-cache", "This service keeps no cache, and so knows nothing of earlier times."
         )
     return hub.cache
+
+
+async def known_to(hub: Hub, look: Callable[[], Result]) -> Result:
+    """What the cache knows. That it does not is no failure of the disk: that was read just now."""
+    try:
+        return await hub.aside(look)
+    except CacheError as error:
+        raise ServiceError(404, "unknown-state", str(error), error=type(error).__name__) from error
 
 
 def known_set(target: Followed) -> ParamSet:
@@ -313,14 +322,6 @@ def _choose(file: ParamFile, target: Followed, component: int | None) -> ParamSe
 
 async def _value(target: Followed, name: str, given: ValueGiven) -> WrittenParam:
     return WrittenParam(check_name(name), await value_of(target, name, given))
-
-
-async def _known(hub: Hub, look: Callable[[], Result]) -> Result:
-    """What the cache knows. That it does not is no failure of the disk: that was read just now."""
-    try:
-        return await hub.aside(look)
-    except CacheError as error:
-        raise ServiceError(404, "unknown-state", str(error), error=type(error).__name__) from error
 
 
 def _nothing() -> None:

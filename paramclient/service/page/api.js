@@ -28,8 +28,12 @@ export function onToken(ask) {
   askForToken = ask;
 }
 
-/** The address of a component's resource. */
+/** The address of a component's resource; of one that is in the cache alone (`is_kept`), of what is kept there. */
 export function at(component, what = "", query = {}) {
+  if (component.is_kept) {
+    const search = new URLSearchParams(query);
+    return `/vehicles/${encodeURIComponent(component.key)}/${component.component}${what}?${search}`;
+  }
   const search = new URLSearchParams({ link: component.link, ...query });
   return `/components/${component.system}/${component.component}${what}?${search}`;
 }

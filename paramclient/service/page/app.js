@@ -186,7 +186,7 @@ function emptyText(count, total, component, table) {
     return component.fetch
       ? "The parameters are on their way."
       : table.isLoaded
-        ? "No parameters are known yet. Fetch asks the vehicle for them."
+        ? `No parameters are known${component.is_kept ? "." : " yet. Fetch asks the vehicle for them."}`
         : "Loading …";
   if (shown.filter === "changed" && !shown.words.length)
     return table.sorted.some((row) => row.isChanged !== null)
@@ -250,6 +250,10 @@ store.on("table", draw);
 store.on("pending", draw);
 store.on("other", () => {
   shown.filter = store.table.other ? "differs" : "all";
+  if (store.table.other) {
+    byId("search").value = ""; // else what was searched for before hides what differs
+    shown.words = [];
+  }
   drawBanner();
   drawTable();
 });

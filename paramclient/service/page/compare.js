@@ -1,7 +1,7 @@
 /** Comparison with a file, an earlier state or another vehicle: choosing it, and taking values over from it. */
 
 import { Problem, at, get, request } from "./api.js";
-import { announce, button, byId, el } from "./dom.js";
+import { announce, button, byId, el, setText } from "./dom.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
 import { Caution, OUTCOMES, nameOf, told } from "./review.js";
@@ -9,7 +9,7 @@ import { keyOf, store } from "./store.js";
 import { many, moment, numberText } from "./values.js";
 
 /** A file beyond that is no parameter file; the service takes no more either. */
-const LARGEST_FILE = 4 * 2 ** 20;
+const LARGEST_FILE = 2 * 2 ** 20;
 const PLAN_PATIENCE = 120_000;
 const JOB_PAUSE = 300;
 
@@ -33,7 +33,7 @@ export async function chooseOther(file = null) {
     on: { change: () => input.files[0] && attempt(() => fromFile(input.files[0])) },
   });
   const snapshots = el("ul", { class: "choices" }, el("li", { class: "nothing", text: "Looking …" }));
-  const vehicles = el("ul", { class: "choices" }, el("li", { class: "nothing", text: "Looking …" }));
+  const vehicles = el("ul", { class: "choices" });
   const content = el(
     "div",
     {},
@@ -91,39 +91,17 @@ async function fillSnapshots(component, list, attempt) {
   }
 }
 
-async function fillVehicles(component, list, attempt) {
-  const live = [...store.components.values()].filter((each) => keyOf(each) !== keyOf(component));
-  const keys = new Set(store.components.values().map((each) => `${each.key} ${each.component}`));
-  let cached = [];
-  try {
-    const { vehicles } = await get("/vehicles");
-    cached = vehicles.flatMap((vehicle) => vehicle.components.map((each) => ({ vehicle, each })));
-  } catch {
-    // a service without a cache knows those only that it hears
-  }
-  cached = cached.filter(({ vehicle, each }) => !keys.has(`${vehicle.key} ${each.component}`));
-  const choices = [
-    ...live.map((each) => [
+function fillVehicles(component, list, attempt) {
+  const others = [...store.components.values(), ...store.unheard].filter((each) => keyOf(each) !== keyOf(component));
+  fill(list, others, "No other vehicle is known.", (each) => {
+    const { key, link, system, component: id } = each;
+    const source = each.is_kept ? { vehicle: { key, component: id } } : { component: { system, component: id, link } };
+    return [
       nameOf(each),
-      `on ${each.link}`,
-      () =>
-        attempt(async () => {
-          const { params } = await get(at(each, "/params"));
-          const source = { component: { system: each.system, component: each.component, link: each.link } };
-          return otherOf(nameOf(each), params, source, false);
-        }),
-    ]),
-    ...cached.map(({ vehicle, each }) => [
-      `${vehicle.autopilot ?? ""} ${vehicle.key}`.trim(),
-      `component ${each.component}, in the cache`,
-      () =>
-        attempt(async () => {
-          const { params } = await get(`/vehicles/${encodeURIComponent(vehicle.key)}/${each.component}/params`);
-          return otherOf(vehicle.key, params, { vehicle: { key: vehicle.key, component: each.component } }, false);
-        }),
-    ]),
-  ];
-  fill(list, choices, "No other vehicle is known.", (each) => each);
+      each.is_kept ? `${each.uid ?? key}, in the cache since ${moment(each.last_seen)}` : `on ${link}`,
+      () => attempt(async () => otherOf(nameOf(each), (await get(at(each, "/params"))).params, source, false)),
+    ];
+  });
 }
 
 function fill(list, items, nothing, parts) {
@@ -309,6 +287,9 @@ export async function takeOver() {
       request("DELETE", `/jobs/${encodeURIComponent(job.id)}`).catch((error) => (fault.textContent = error.message));
   }
 
+  store.whileShown(table_, "table", () => {
+    if (!hasBegun) for (const line of lines) line.follow();
+  });
   const opened = openDialog(
     `Take over from ${other.label}`,
     el("div", {}, armed.element, fault, summary, table_),
@@ -369,17 +350,25 @@ function linesOf(plan, table, other, refresh) {
         word && el("b", { class: `outcome ${isDoubtful ? "warn" : "quiet"}`, text: word }),
         ` ${(planned.reason || purposes.get(name) || "").replace(/^left out: /, "")}`,
       );
+      const now = el("td", { class: "now" });
       const element = el(
         "tr",
         { class: isOut ? "out" : "" },
         el("td", { class: "pick" }, box),
         el("th", { scope: "row", text: name }),
-        el("td", { class: "now", text: row?.text ?? "" }),
+        now,
         el("td", { class: "new", text: numberText(planned.wanted, row?.type ?? planned.type) }),
         remark,
       );
-      const restore = row?.document.bits ? { bits: row.document.bits } : row?.document.value;
-      return { name, status, box, remark, element, before: row?.text ?? "", restore };
+      const line = { name, status, box, remark, element };
+      line.follow = () => {
+        const { text, document } = table.rows.get(name) ?? {};
+        line.before = text ?? "";
+        line.restore = document?.bits ? { bits: document.bits } : document?.value;
+        setText(now, line.before);
+      };
+      line.follow();
+      return line;
     });
 }
 

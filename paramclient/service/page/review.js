@@ -1,7 +1,7 @@
 /** What is to be sent, looked at before it is; what became of each; and the way back. */
 
 import { Problem, at, request } from "./api.js";
-import { announce, button, el } from "./dom.js";
+import { announce, button, el, setText } from "./dom.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { valueText } from "./details.js";
 import { keyOf, store } from "./store.js";
@@ -36,11 +36,10 @@ export class Caution {
       el("p", {}, el("b", { text: "The vehicle is armed. " }), "Its motors may turn, and what is sent counts at once."),
       el("label", {}, this.box, el("span", { text: "Send all the same" })),
     );
-    const forget = store.on("armed", () => {
-      if (!this.element.isConnected) return forget();
+    store.whileShown(this.element, "armed", () => {
       this.element.hidden = !this.isArmed;
       this.box.checked = false;
-      return change();
+      change();
     });
   }
 
@@ -59,7 +58,7 @@ export async function review() {
   const changes = [...table.pending.values()].sort((a, b) => (a.name < b.name ? -1 : 1));
   if (!component || !changes.length) return;
   const lines = new Map(
-    changes.map((change) => [change.name, lineOf(change, table.rows.get(change.name), () => drop(change.name))]),
+    changes.map((change) => [change.name, lineOf(change, () => table.rows.get(change.name), () => drop(change.name))]),
   );
   const body = el(
     "tbody",
@@ -95,6 +94,10 @@ export async function review() {
     send.disabled = !count || armed.forbids;
     send.replaceChildren(el("span", { text: `Send ${many(count, "change")}` }));
   }
+
+  store.whileShown(table_, "table", () => {
+    if (!isSending && !sent) for (const line of lines.values()) line.follow();
+  });
 
   function drop(name) {
     lines.get(name).element.remove();
@@ -185,46 +188,52 @@ const AUTOPILOTS = {
   unknown: "Unknown",
 };
 
-function lineOf(change, row, drop) {
-  const { name, text } = change;
-  const remarks = [];
-  if (row && !sameText(row.text, change.before, row.type)) remarks.push(`It was ${change.before} when you edited it.`);
-  if (row?.info?.reboot_required) remarks.push("Counts from the next start on.");
-  if (row?.info?.is_read_only) remarks.push("The vehicle sets it by itself.");
-  const standard = row ? defaultOf(row.document) : null;
-  if (standard !== null && sameText(text, standard, row.type)) remarks.push("The default.");
-  const units = row?.info?.units ? ` ${row.info.units}` : "";
-  const in_words = (value) => {
-    const meaning = meaningOf(value, row?.info, row?.type);
-    return meaning ? `${value} ${meaning}` : `${value}${units}`;
-  };
-  const doubts = row ? doubt(text, row.info, row.type) : "";
-  const remark = el(
-    "td",
-    { class: "remark" },
-    doubts && el("b", { class: "outcome warn", text: `${doubts} ` }),
-    remarks.join(" "),
-  );
+/** A change in the review. `follow()` says anew how it stands to the value that the vehicle has now. */
+function lineOf(change, rowNow, drop) {
+  const { name } = change;
+  const now = el("td", { class: "now" });
+  const wanted = el("td", { class: "new" });
+  const remark = el("td", { class: "remark" });
   const away = el(
     "td",
     { class: "drop-it" },
     button("", drop, { kind: "quiet only", drawing: "close", label: `Drop ${name}` }),
   );
-  const element = el(
-    "tr",
-    {},
-    el("th", { scope: "row", text: name }),
-    el("td", { class: "now", text: in_words(row?.text ?? "") }),
-    el("td", { class: "new", text: in_words(text) }),
-    remark,
-    away,
-  );
-  return { change, row, element, remark, away };
+  const element = el("tr", {}, el("th", { scope: "row", text: name }), now, wanted, remark, away);
+  const follow = () => {
+    const row = rowNow();
+    const [doubts, remarks] = remarksOf(change, row);
+    setText(now, inWords(row?.text ?? "", row));
+    setText(wanted, inWords(change.text, row));
+    remark.replaceChildren(doubts && el("b", { class: "outcome warn", text: `${doubts} ` }), remarks);
+  };
+  follow();
+  return { change, rowNow, element, remark, away, follow };
 }
 
+/** What speaks against a change, and what else there is to say of it. */
+function remarksOf({ text, before }, row) {
+  if (!row) return ["The vehicle does not have it any more.", ""];
+  const { info, type } = row;
+  const remarks = [];
+  if (sameText(row.text, text, type)) remarks.push("The vehicle has that already.");
+  if (!sameText(row.text, before, type)) remarks.push(`It was ${before} when you edited it.`);
+  if (info?.reboot_required) remarks.push("Counts from the next start on.");
+  if (info?.is_read_only) remarks.push("The vehicle sets it by itself.");
+  const standard = defaultOf(row.document);
+  if (standard !== null && sameText(text, standard, type)) remarks.push("The default.");
+  return [doubt(text, info, type), remarks.join(" ")];
+}
+
+function inWords(value, row) {
+  const meaning = meaningOf(value, row?.info, row?.type);
+  return `${value} ${meaning || (row?.info?.units ?? "")}`.trim();
+}
 /** Sends one change, and writes what became of it into its line. */
-async function sendOne(component, { change, row, element, remark, away }) {
+async function sendOne(component, { change, rowNow, element, remark, away }) {
   const { name, text, send } = change;
+  const row = rowNow();
+  if (!row) return { name, isTaken: false, status: "skipped" };
   const before = { text: row.text, restore: row.document.bits ? { bits: row.document.bits } : row.document.value };
   const outcome = {
     name,

@@ -8,6 +8,9 @@ export const NEWS_FOR = 600_000;
 const FEWEST_OF_A_GROUP = 2;
 export const OTHERS = "Others";
 
+/** Links have no names that begin so. */
+const KEPT = "kept:";
+
 export const keyOf = (component) => `${component.link} ${component.system}/${component.component}`;
 
 /** One parameter as it is shown: the service's document, and what is worked out of it once. */
@@ -125,6 +128,7 @@ class Store {
     this.components = new Map();
     this.tables = new Map();
     this.links = new Map();
+    this.kept = new Map();
     this.selected = null;
     this.isHeard = null;
     this.seq = -1;
@@ -143,13 +147,24 @@ class Store {
       );
   }
 
+  /** The same for as long as an element is on the page. */
+  whileShown(element, kind, listener) {
+    const end = this.on(kind, (what) => (element.isConnected ? listener(what) : end()));
+  }
+
   tell(kind, what) {
     for (const listener of this.listeners.get(kind) ?? []) listener(what);
   }
 
   /** The component that is looked at, or null. */
   get component() {
-    return this.components.get(this.selected) ?? null;
+    return this.components.get(this.selected) ?? this.kept.get(this.selected) ?? null;
+  }
+
+  /** Those that are in the cache and on no link, the one heard last first. */
+  get unheard() {
+    const heard = new Set([...this.components.values()].map((each) => `${each.component} ${each.key}`));
+    return [...this.kept.values()].filter((each) => !heard.has(`${each.component} ${each.key}`));
   }
 
   get table() {
@@ -157,7 +172,7 @@ class Store {
   }
 
   get mayWrite() {
-    return this.me.role === "write" && !this.me.read_only;
+    return this.me.role === "write" && !this.me.read_only && !this.component?.is_kept;
   }
 
   /** Loads what the service knows; what happens meanwhile is kept and taken in afterwards. */
@@ -173,7 +188,8 @@ class Store {
     this.me = me;
     this.links = new Map(links.links.map((link) => [link.name, link]));
     const documents = new Map(found.components.map((each) => [keyOf(each), each]));
-    if (this.component && !documents.has(this.selected)) documents.set(this.selected, gone(this.component));
+    const before = this.components.get(this.selected);
+    if (before && !documents.has(this.selected)) documents.set(this.selected, gone(before));
     this.components = documents;
     this.seq = found.seq;
     const early = this.early;
@@ -181,7 +197,20 @@ class Store {
     for (const event of early) this.take(event);
     if (!this.component) this.selected = first(this.components);
     this.tell("all");
-    if (this.selected) await this.loadTable(this.selected);
+    await Promise.all([this.selected && this.loadTable(this.selected), this.loadKept()]);
+  }
+
+  /** Who is in the cache; a service without one knows those only that it hears. */
+  async loadKept() {
+    let vehicles = [];
+    try {
+      ({ vehicles } = await get("/vehicles"));
+    } catch (error) {
+      if (!error.status) throw error;
+    }
+    const found = vehicles.flatMap((vehicle) => vehicle.components.map((each) => kept(vehicle, each)));
+    this.kept = new Map(found.map((each) => [keyOf(each), each]));
+    this.tell("components");
   }
 
   async select(key) {
@@ -191,7 +220,7 @@ class Store {
   }
 
   async loadTable(key) {
-    const component = this.components.get(key);
+    const component = this.components.get(key) ?? this.kept.get(key);
     if (!component) return;
     const table = this.tableOf(key);
     table.isLoaded = false;
@@ -205,7 +234,7 @@ class Store {
       table.isLoading = load !== table.loads;
     }
     if (load !== table.loads) return;
-    table.load(found.params, found.seq);
+    table.load(found.params, found.seq ?? -1);
     if (key === this.selected) this.tell("table");
   }
 
@@ -240,8 +269,10 @@ class Store {
   takeComponent(key, event) {
     if (event.seq <= this.seq) return;
     if (event.why === "forgotten") {
-      if (key === this.selected && this.component) this.components.set(key, gone(this.component));
+      const before = this.components.get(key);
+      if (key === this.selected && before) this.components.set(key, gone(before));
       else this.components.delete(key);
+      this.loadKept().catch(() => {});
       const table = this.tables.get(key);
       if (table) table.isLoaded = false; // what was staged waits for the vehicle to come back
     } else {
@@ -301,6 +332,23 @@ const NO_TABLE = new Table();
 
 /** One that the service does not know any more, and that somebody looks at: nobody is led to another unasked. */
 const gone = (component) => ({ ...component, is_lost: true, is_armed: null, state: "lost", silence_s: 0, fetch: null });
+
+/** One that is in the cache, as those are that are heard: it is looked at, and nothing can be done with it. */
+const kept = (vehicle, { component, count, autopilot }) => ({
+  link: KEPT + vehicle.key,
+  system: vehicle.system,
+  component,
+  autopilot,
+  key: vehicle.key,
+  uid: vehicle.uid,
+  count,
+  last_seen: vehicle.last_seen,
+  state: "cached",
+  is_kept: true,
+  is_lost: false,
+  is_armed: null,
+  fetch: null,
+});
 
 /** Who changed a value, in words. */
 export function authorOf(by) {

@@ -6,7 +6,7 @@ import { chooseOther } from "./compare.js";
 import { closeDialog, openDialog } from "./dialogs.js";
 import { nameOf } from "./review.js";
 import { keyOf, store } from "./store.js";
-import { many, span } from "./values.js";
+import { many, moment, span } from "./values.js";
 
 const STATES = {
   new: "no parameters yet",
@@ -44,6 +44,7 @@ const AWAY = { away: "link away", failed: "link failed", opening: "link opening"
 
 /** How a component is, in words and as a kind of dot. */
 export function stateOf(component) {
+  if (component.is_kept) return { text: `in the cache, heard last ${moment(component.last_seen)}`, kind: "idle" };
   const link = store.links.get(component.link)?.state ?? component.link_state ?? "open";
   if (link !== "open") return { text: AWAY[link] ?? link, kind: "bad" };
   if (component.is_lost)
@@ -61,13 +62,27 @@ export function drawVehicles() {
   const components = [...store.components.values()].sort(
     (a, b) => a.system - b.system || a.component - b.component || (a.link < b.link ? -1 : 1),
   );
-  drawList(components);
-  drawChoice(components);
-  drawVehicle(store.component);
+  const { unheard, component } = store;
+  if (component?.is_kept && !unheard.includes(component)) unheard.unshift(component); // it has come back meanwhile
+  drawList(byId("vehicles"), components);
+  if (!components.length) byId("vehicles").append(el("li", { class: "nothing", text: "None heard yet." }));
+  drawKept(unheard);
+  drawChoice(components, unheard);
+  drawVehicle(component);
 }
 
-function drawList(components) {
-  const list = byId("vehicles");
+/** There may be hundreds of them, of whom nothing changes by itself. */
+function drawKept(unheard) {
+  const box = byId("kept-box");
+  const key = JSON.stringify([store.selected, unheard.map((each) => [keyOf(each), each.last_seen])]);
+  if (box.dataset.shown === key) return;
+  box.dataset.shown = key;
+  drawList(byId("kept"), unheard);
+  box.hidden = !unheard.length;
+  setText(byId("kept-count"), String(unheard.length));
+}
+
+function drawList(list, components) {
   const had = new Map([...list.children].map((item) => [item.dataset.key, item]));
   const items = components.map((component) => {
     const key = keyOf(component);
@@ -88,7 +103,8 @@ function drawList(components) {
     const [dot, name, remark] = choose.children;
     const state = stateOf(component);
     setText(name, nameOf(component));
-    setText(remark, `${component.is_armed ? "armed · " : ""}${state.text} · ${component.link}`);
+    const place = component.is_kept ? (component.uid ?? component.key) : component.link;
+    setText(remark, `${component.is_armed ? "armed · " : ""}${state.text} · ${place}`);
     dot.className = `dot ${component.is_armed ? "bad" : state.kind}`;
     choose.classList.toggle("chosen", key === store.selected);
     if (key === store.selected) choose.setAttribute("aria-current", "true");
@@ -97,18 +113,20 @@ function drawList(components) {
   });
   if (items.length !== list.children.length || items.some((item, place) => list.children[place] !== item))
     list.replaceChildren(...items);
-  if (!items.length) list.append(el("li", { class: "nothing", text: "None heard yet." }));
 }
 
-function drawChoice(components) {
+function drawChoice(components, unheard) {
   const choice = byId("vehicle-choice");
-  const wanted = components.map((each) => [keyOf(each), nameOf(each)]);
+  const named = (each) => `${nameOf(each)}, ${moment(each.last_seen)}`;
+  const live = components.map((each) => [keyOf(each), nameOf(each)]);
+  const wanted = [live, unheard.map((each) => [keyOf(each), named(each)])];
   if (JSON.stringify(wanted) !== choice.dataset.shown) {
     choice.dataset.shown = JSON.stringify(wanted);
-    choice.replaceChildren(...wanted.map(([value, text]) => el("option", { value, text })));
+    const [heard, kept] = wanted.map((each) => each.map(([value, text]) => el("option", { value, text })));
+    choice.replaceChildren(...heard, ...(kept.length ? [el("optgroup", { label: "Not heard now" }, kept)] : []));
   }
-  choice.hidden = !components.length;
-  if (store.selected) choice.value = store.selected;
+  choice.hidden = !choice.options.length;
+  choice.value = store.selected ?? "";
 }
 
 function drawVehicle(component) {
@@ -124,7 +142,8 @@ function drawVehicle(component) {
     byId("badges").replaceChildren(...badges.map(([kind, text]) => el("span", { class: `badge ${kind}`, text })));
   }
   const { link, count, vehicle_type: type, identity } = component;
-  const parts = [TYPES[type], versionOf(identity?.firmware), link, count && many(count, "parameter")];
+  const place = component.is_kept ? (component.uid ?? component.key) : link;
+  const parts = [TYPES[type], versionOf(identity?.firmware), place, count && many(count, "parameter")];
   setText(byId("subtitle"), parts.filter(Boolean).join(" · "));
   drawFetch(component);
 }
@@ -143,8 +162,9 @@ function drawFetch(component) {
   setText(byId("meter-text"), `${progressText(fetch)}${pace}`);
 }
 
-/** What can be done with a vehicle; made once for each role. */
+/** What can be done with a vehicle; made once for each role, and for those that are heard or not. */
 export function drawActions() {
+  const isHeard = !store.component?.is_kept;
   const actions = [
     button("Compare", () => chooseOther(), { drawing: "compare" }),
     button("Save", save, { drawing: "save" }),
@@ -156,7 +176,7 @@ export function drawActions() {
     }),
     store.mayWrite &&
       button("Snapshot", keepState, { drawing: "keep", label: "Snapshot: keep the present state, to go back to" }),
-    button("Fetch", fetchAll, { drawing: "refresh", label: "Fetch all parameters from the vehicle" }),
+    isHeard && button("Fetch", fetchAll, { drawing: "refresh", label: "Fetch all parameters from the vehicle" }),
   ];
   byId("actions").replaceChildren(...actions.filter(Boolean));
   byId("meter-cancel").replaceChildren(button("Stop", stopFetch, { kind: "quiet" }));
@@ -223,7 +243,8 @@ async function describe() {
 /** Offers that where nothing is described. */
 export function offerDescriptions() {
   const { table } = store;
-  byId("describe").hidden = !table.isLoaded || !table.rows.size || table.sorted.some((row) => row.info);
+  const isWanted = table.isLoaded && table.rows.size && !store.component?.is_kept;
+  byId("describe").hidden = !isWanted || table.sorted.some((row) => row.info);
 }
 
 async function stopFetch() {
@@ -281,7 +302,7 @@ async function save() {
 
   async function take(form) {
     fault.textContent = "";
-    state.textContent = "The vehicle is asked for all of it …";
+    state.textContent = component.is_kept ? "Reading …" : "The vehicle is asked for all of it …";
     try {
       const { name, content } = await download(at(component, "/file", { form }), SAVE_PATIENCE);
       const address = URL.createObjectURL(content);

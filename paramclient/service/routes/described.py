@@ -13,7 +13,7 @@ from paramclient.metadata import Metadata, metadata_of, read_content
 from paramclient.service.asking import Seconds, Target, TheHub, answered, may_write
 from paramclient.service.following import Followed
 from paramclient.service.problems import ServiceError
-from paramclient.service.routes.files import body_of
+from paramclient.service.routes.files import RAW_BODY, body_of
 from paramclient.service.wanted import LONGEST_NAME
 
 __all__ = ["router"]
@@ -60,7 +60,7 @@ async def described(request: Request, target: Target, body: Asked) -> DescribedD
     return _take(target, metadata)
 
 
-@router.put("/metadata", dependencies=[Depends(may_write)])
+@router.put("/metadata", dependencies=[Depends(may_write)], openapi_extra=RAW_BODY)
 async def described_by_file(
     request: Request,
     hub: TheHub,

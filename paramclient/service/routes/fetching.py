@@ -30,7 +30,7 @@ class Fetched(Body):
     refresh: bool = False
     accept: Literal["verified", "sampled"] = "verified"
     sample: Annotated[int, Field(ge=1, le=65_535)] = SAMPLE_SIZE
-    seed: Annotated[int, Field(ge=0, lt=1 << 32)] | None = None
+    seed: Annotated[int, Field(ge=-(1 << 63), lt=1 << 63)] | None = None
     timeout_s: Seconds = None
     wait: bool = True
 

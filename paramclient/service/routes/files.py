@@ -29,7 +29,7 @@ from paramclient.service.wanted import (
 )
 from paramclient.taken import differing, whole_set
 
-__all__ = ["attachment", "body_of", "moment", "router"]
+__all__ = ["RAW_BODY", "attachment", "body_of", "moment", "router"]
 
 router = APIRouter(prefix="/api/v1", tags=["files"])
 
@@ -39,6 +39,14 @@ LONGEST_STEM: Final = 100
 Form = Annotated[FileForm, Query(description="One of those that /forms says can be written.")]
 From = Annotated[str, Query(alias="from", max_length=64, description="live, known, snapshot:ID, or a time.")]
 Id = Annotated[int | None, Query(ge=1, le=255)]
+
+RAW_BODY: Final[dict[str, Any]] = {
+    "requestBody": {
+        "required": True,
+        "content": {"application/octet-stream": {"schema": {"type": "string", "format": "binary"}}},
+    }
+}
+"""For the document of the API: the body is a file as it is."""
 
 _FILE: Final[dict[int | str, dict[str, Any]]] = {
     200: {"content": {"application/octet-stream": {}}, "description": "The file"}
@@ -77,7 +85,7 @@ async def file(
     return await answered(request, work, target)
 
 
-@router.post("/files")
+@router.post("/files", openapi_extra=RAW_BODY)
 async def files(
     request: Request,
     hub: TheHub,

@@ -113,7 +113,7 @@ async def known_params(
     return Response(f"{head}{text}}}}}", media_type=JSON)
 
 
-@router.get("/params/{name}", responses={200: {"model": ParamDoc}}, response_class=Response)
+@router.get("/params/{name:path}", responses={200: {"model": ParamDoc}}, response_class=Response)
 async def known_param(target: Target, name: str) -> Response:
     """What is known of one parameter, with no traffic."""
     param = target.component.params.get(name)
@@ -131,14 +131,15 @@ async def read(request: Request, target: Target, body: Read) -> Response:
     return await _read(request, target, key, body.timeout_s)
 
 
-@router.post("/params/{name}/read", responses={200: {"model": ParamDoc}}, response_class=Response)
+@router.post("/params/{name:path}/read", responses={200: {"model": ParamDoc}}, response_class=Response)
 async def read_by_path(request: Request, target: Target, name: str, body: Asked) -> Response:
     """The same for one whose name can stand in an address; `#17` is the one with this index."""
-    key = int(name[1:]) if name.startswith("#") and name[1:].isdecimal() and len(name) <= 6 else name
+    digits = name[1:] if name.startswith("#") else ""
+    key = int(digits) if digits.isascii() and digits.isdecimal() and len(digits) <= 5 else name
     return await _read(request, target, key, body.timeout_s)
 
 
-@router.put("/params/{name}", dependencies=[Depends(may_write)])
+@router.put("/params/{name:path}", dependencies=[Depends(may_write)])
 async def write(request: Request, target: Target, name: str, body: Write) -> SetResultDoc:
     """Write one parameter, and prove by its value that the vehicle has taken it."""
     asker = asker_of(request)

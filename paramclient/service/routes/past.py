@@ -27,6 +27,7 @@ from paramclient.service.wanted import (
     Moment,
     cached,
     key_of,
+    known_to,
     parsed,
     past,
     state,
@@ -223,7 +224,8 @@ async def fleet_diff(hub: TheHub, body: FleetCompared) -> FleetDiffDoc:
         if not wanted:
             raise UsageError("name the parameters to compare")
     await written(hub)
-    found = await hub.aside(lambda: cache.fleet_diff(wanted, component=body.component))
+    await hub.aside(cache.components)  # whether it can be read at all
+    found = await known_to(hub, lambda: cache.fleet_diff(wanted, component=body.component))
     return FleetDiffDoc.of(found)
 
 
