@@ -11,7 +11,7 @@ from urllib.parse import urlsplit
 
 import pytest
 from anyio.from_thread import start_blocking_portal
-from playwright.sync_api import Browser, Locator, Page, expect, sync_playwright
+from playwright.sync_api import Browser, Locator, Page, Route, expect, sync_playwright
 
 from paramclient import ParamCache, ParamClient
 from paramclient.links import SimLink
@@ -419,6 +419,25 @@ def test_an_open_review_follows_what_others_change(sight: Sight, bench: Bench) -
     bench.do(bench.px4.set_param, "MC_PITCHRATE_P", 0.3)
     expect(sight.row("MC_PITCHRATE_P")).to_contain_text("0.3")
     expect(remark).to_have_text("accepted")
+
+
+@needs_browser
+def test_a_table_that_cannot_be_loaded_anew_goes_on_from_what_was_known(sight: Sight, bench: Bench) -> None:
+    def fail(route: Route) -> None:
+        route.fulfill(status=503, content_type="application/problem+json", body="{}")
+
+    sight.page.route(re.compile(r"/params\?"), fail, times=1)
+    is_loaded = sight.page.evaluate(
+        """async () => {
+            const { store } = await import("/page/store.js");
+            await store.loadTable(store.selected).catch(() => {});
+            return store.table.isLoaded;
+        }"""
+    )
+    assert is_loaded
+    sight.find("MC_PITCHRATE_K")
+    bench.do(bench.px4.set_param, "MC_PITCHRATE_K", 1.25)
+    expect(sight.row("MC_PITCHRATE_K")).to_contain_text("1.25")
 
 
 @needs_browser

@@ -5,6 +5,8 @@ import { isChanged, meaningOf, sameText, textOf } from "./values.js";
 
 /** Changes of others are marked for so long, in milliseconds. */
 export const NEWS_FOR = 600_000;
+/** Milliseconds until a table that could not be loaded is asked for again. */
+const LOAD_AGAIN_AFTER = 2_000;
 const FEWEST_OF_A_GROUP = 2;
 export const OTHERS = "Others";
 
@@ -80,6 +82,16 @@ class Table {
     this.seq = seq;
     this.isLoaded = true;
     this.forget();
+    this.catchUp();
+  }
+
+  /** Goes on with what was loaded before, if anything was. */
+  keep() {
+    this.isLoaded = this.rows.size > 0;
+    this.catchUp();
+  }
+
+  catchUp() {
     const early = this.early ?? [];
     this.early = null;
     for (const event of early) this.change(event);
@@ -230,12 +242,26 @@ class Store {
     let found;
     try {
       found = await get(at(component, "/params", { metadata: "true" }));
+    } catch (error) {
+      if (load === table.loads) this.keepTable(key, !(error.status < 500));
+      throw error;
     } finally {
       table.isLoading = load !== table.loads;
     }
     if (load !== table.loads) return;
     table.load(found.params, found.seq ?? -1);
     if (key === this.selected) this.tell("table");
+  }
+
+  /** A table could not be loaded anew: what was known stays, with what has come since, and it is tried again. */
+  keepTable(key, mayWork) {
+    const table = this.tableOf(key);
+    table.keep();
+    if (key !== this.selected) return;
+    this.tell("table");
+    const load = table.loads;
+    const again = () => load === table.loads && key === this.selected && this.loadTable(key).catch(() => {});
+    if (mayWork) setTimeout(again, LOAD_AGAIN_AFTER);
   }
 
   tableOf(key) {
