@@ -85,6 +85,14 @@ class Bench:
         with urllib.request.urlopen(request, timeout=20) as answer:
             return json.loads(answer.read() or b"null")
 
+    def set(self, name: str, value: float) -> None:
+        """Another program sets a value of the PX4.
+
+        What is set on board itself is told once, and not at all where it was saved first: then it takes the
+        client's next look, half a minute later.
+        """
+        self.ask("PATCH", "/components/1/1/params?link=px4", {"values": {name: value}})
+
     def is_synced(self, system: int) -> bool:
         """Whether the table of this vehicle is here, whole."""
         components = self.ask("GET", "/components")["components"]

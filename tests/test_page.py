@@ -409,14 +409,14 @@ def test_an_open_review_follows_what_others_change(sight: Sight, bench: Bench) -
     sight.review()
     expect(now).to_have_text(was)
     expect(remark).to_have_text("")
-    bench.do(bench.px4.set_param, "MC_PITCHRATE_P", 0.25)
+    bench.set("MC_PITCHRATE_P", 0.25)
     expect(now).to_have_text("0.25")
     expect(remark).to_have_text(f"It was {was} when you edited it.")
-    bench.do(bench.px4.set_param, "MC_PITCHRATE_P", 0.2)
+    bench.set("MC_PITCHRATE_P", 0.2)
     expect(remark).to_contain_text("The vehicle has that already.")
     sight.dialog.get_by_role("button", name="Send").click()
     expect(sight.dialog.get_by_role("status")).to_have_text("1 accepted.")
-    bench.do(bench.px4.set_param, "MC_PITCHRATE_P", 0.3)
+    bench.set("MC_PITCHRATE_P", 0.3)
     expect(sight.row("MC_PITCHRATE_P")).to_contain_text("0.3")
     expect(remark).to_have_text("accepted")
 
@@ -436,7 +436,7 @@ def test_a_table_that_cannot_be_loaded_anew_goes_on_from_what_was_known(sight: S
     )
     assert is_loaded
     sight.find("MC_PITCHRATE_K")
-    bench.do(bench.px4.set_param, "MC_PITCHRATE_K", 1.25)
+    bench.set("MC_PITCHRATE_K", 1.25)
     expect(sight.row("MC_PITCHRATE_K")).to_contain_text("1.25")
 
 
@@ -450,7 +450,7 @@ def test_an_open_plan_follows_what_others_change(sight: Sight, bench: Bench, tmp
     expect(sight.row("MC_YAWRATE_P")).to_be_visible()  # what was searched for hides nothing of it
     sight.page.get_by_role("button", name="Take over").click()
     expect(sight.line("MC_YAWRATE_P")).to_be_visible()
-    bench.do(bench.px4.set_param, "MC_YAWRATE_P", 0.55)
+    bench.set("MC_YAWRATE_P", 0.55)
     expect(sight.line("MC_YAWRATE_P").get_by_role("cell").nth(1)).to_have_text("0.55")
     sight.dialog.get_by_role("button", name="Apply").click()
     sight.dialog.get_by_role("button", name="Done").click()
@@ -506,7 +506,7 @@ def test_an_earlier_state_is_kept_and_gone_back_to(sight: Sight, bench: Bench) -
     sight.page.get_by_role("button", name="Snapshot").click()
     expect(sight.page.get_by_text("The present state is kept; Compare shows it.")).to_be_visible()
     before = bench.px4.values["MC_YAWRATE_MAX"]
-    bench.do(bench.px4.set_param, "MC_YAWRATE_MAX", 123.0)
+    bench.set("MC_YAWRATE_MAX", 123.0)
     sight.find("MC_YAWRATE_MAX")
     expect(sight.value("MC_YAWRATE_MAX")).to_contain_text("123.0")
     sight.page.get_by_role("button", name="Compare").click()
