@@ -191,7 +191,10 @@ class Table:
             if old.index != index:
                 self.dirty.setdefault(name, by)
             return None
-        self._news(name, old, by)
+        if old is None:  # the short way for a first value
+            self.dirty[name] = by
+        else:
+            self._news(name, old, by)
         if self._hash is not None:
             self._moved(name)
         return _new(Change, (name, old, new, by))
