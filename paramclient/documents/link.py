@@ -45,7 +45,7 @@ class LinkDoc(Document):
     """One link: open; away, and being opened again by itself; failed, and tried again; or a log that is over.
 
     `error` is the reason for the last two, `name` what the service calls it, `stats` null while it is not
-    open. `clients` counts how often it was opened anew: everything that was known of it began again then.
+    open. `openings` counts how often it was opened anew: everything that was known of it began again then.
     """
 
     name: str

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING, Literal, TypeAlias
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from pydantic import Field
 
@@ -88,15 +88,7 @@ class PlanRowDoc(Document):
     @classmethod
     def of(cls, row: PlanRow) -> PlanRowDoc:
         """All of it."""
-        return cls(
-            status=row.status,
-            type=_type(row),
-            before=_value(row.before, row),
-            wanted=value_json(*typed(row.wanted.value, row.type)),
-            category=row.category,
-            reason=row.reason,
-            nearest=list(row.nearest),
-        )
+        return cls(status=row.status, **_members(row))
 
 
 class PlanDoc(Document):
@@ -144,15 +136,7 @@ class VerifiedRowDoc(Document):
     @classmethod
     def of(cls, row: PlanRow) -> VerifiedRowDoc:
         """All of it."""
-        return cls(
-            standing=row.standing,
-            type=_type(row),
-            before=_value(row.before, row),
-            wanted=value_json(*typed(row.wanted.value, row.type)),
-            category=row.category,
-            reason=row.reason,
-            nearest=list(row.nearest),
-        )
+        return cls(standing=row.standing, **_members(row))
 
 
 class VerifiedDoc(Document):
@@ -192,16 +176,7 @@ class AppliedRowDoc(Document):
     @classmethod
     def of(cls, row: ApplyRow) -> AppliedRowDoc:
         """All of it."""
-        return cls(
-            status=row.status,
-            type=_type(row),
-            before=_value(row.before, row),
-            wanted=value_json(*typed(row.wanted.value, row.type)),
-            actual=_value(row.actual, row),
-            category=row.category,
-            reason=row.reason,
-            nearest=list(row.nearest),
-        )
+        return cls(status=row.status, actual=_value(row.actual, row), **_members(row))
 
 
 class AddressDoc(Document):
@@ -323,8 +298,16 @@ class ApplyProgressDoc(Document):
         )
 
 
-def _type(row: ApplyRow | PlanRow) -> str | None:
-    return None if row.type is None else type_name(row.type)
+def _members(row: ApplyRow | PlanRow) -> dict[str, Any]:
+    """What every row tells of its parameter."""
+    return {
+        "type": None if row.type is None else type_name(row.type),
+        "before": _value(row.before, row),
+        "wanted": value_json(*typed(row.wanted.value, row.type)),
+        "category": row.category,
+        "reason": row.reason,
+        "nearest": list(row.nearest),
+    }
 
 
 def _value(value: Value | None, row: ApplyRow | PlanRow) -> Scalar | None:

@@ -54,8 +54,8 @@ class RemoteClient(ParamClient):
     one with the same ids, it is in `components` only when the address names the link
     (`http://HOST:8765?link=udpin:0.0.0.0:14550`).
 
-    `stats` are those of the links, as they were when they were asked for last: on opening, with every fetch,
-    and soon after each look at them.
+    `stats` are those of the links, as they were when they were asked for last: on opening, with every
+    `fetch_all` of the client, when a link's state changes, and soon after each look at them.
 
     Args:
         link: `http://HOST:PORT` or `https://HOST:PORT`, and `?link=NAME` for one of its links.

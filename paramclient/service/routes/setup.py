@@ -95,6 +95,11 @@ class Restored(Body):
             raise ValueError("a state is that of a snapshot or of a time, not of both")
         return self
 
+    @property
+    def when(self) -> int | float | None:
+        """The snapshot's number, a time, or None."""
+        return self.at if self.snapshot is None else self.snapshot
+
 
 @router.post("/diff")
 async def diff(request: Request, hub: TheHub, target: Target, body: Compared) -> DiffDoc:
@@ -159,7 +164,6 @@ async def apply_(request: Request, hub: TheHub, target: Target, body: Applied) -
 )
 async def restore_(request: Request, hub: TheHub, target: Target, body: Restored) -> Document | Response:
     """Bring an earlier state of a component back, with its own identity and calibration."""
-    when = body.at if body.snapshot is None else body.snapshot
     asker = asker_of(request)
     if body.dry_run:
         found = await answered(request, lambda: _plan_back(hub, target, body), target)
@@ -169,7 +173,7 @@ async def restore_(request: Request, hub: TheHub, target: Target, body: Restored
     async def work(tell: Callable[[ApplyProgress], None]) -> ApplyResult:
         return await restore(
             target.component,
-            await state(hub, target, when),
+            await state(hub, target, body.when),
             include=body.include,
             info=target.metadata,
             reboot=body.reboot,
@@ -237,7 +241,7 @@ async def _plan(hub: Hub, target: Followed, body: Wanted) -> Plan:
 
 
 async def _plan_back(hub: Hub, target: Followed, body: Restored) -> Plan:
-    earlier = await state(hub, target, body.at if body.snapshot is None else body.snapshot)
+    earlier = await state(hub, target, body.when)
 
     async def work() -> Plan:
         include = (*await restored(target.component, earlier), *body.include)
