@@ -9,7 +9,7 @@ has kept: a warm start, one question for the hash each. Last, so many links are 
 Every size is measured in a process of its own. For each it prints, beside the targets at 250:
 
 - seconds by the clock on the wall, and of the CPU: of the whole process with the kernel's share for it, from
-  the call of `fetch_all` until it has returned;
+  the call of `fetch_all` until it has returned, without what it takes to set down the bytes that come;
 - the ratio of that CPU time to the bare framing of the same bytes: every datagram that came in that time goes
   once more, one at a time, through a `Framer` that makes the same frames of them and nothing else;
 - the share of it that the cache's thread took, and what it took afterwards until all is written;
@@ -36,6 +36,7 @@ from array import array
 from collections.abc import Sequence
 from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass
+from io import BytesIO
 from multiprocessing.connection import Connection
 from multiprocessing.synchronize import Event
 from pathlib import Path
@@ -195,27 +196,37 @@ def measure(sizes: Sizes, out: Connection) -> None:
 
 
 class Record:
-    """The datagrams that came, in order, in memory that is there from the beginning."""
+    """The datagrams that came, in order, in memory that is there from the beginning.
+
+    Attributes:
+        seconds: of the CPU, that it took to set them down.
+    """
 
     def __init__(self) -> None:
-        self._bytes = bytearray(os.urandom(1024 * 1024) * (ROOM // (1024 * 1024)))
-        self._ends = array("L", bytes(8 * ROOM // 32))
+        self._bytes = BytesIO(os.urandom(1024 * 1024) * (ROOM // (1024 * 1024)))
+        self._sizes = array("L", bytes(8 * ROOM // 32))
+        self.begin()
+
+    def begin(self) -> None:
+        """Begin anew."""
+        self._bytes.seek(0)
         self.count = 0
+        self.seconds = 0.0
 
-    def add(self, data: bytes) -> None:
-        begin = self._ends[self.count - 1] if self.count else 0
-        end = begin + len(data)
-        self._bytes[begin:end] = data
-        self._ends[self.count] = end
-        self.count += 1
+    def add(self, batch: list[tuple[Peer, bytes]]) -> None:
+        """Set down what has come at once."""
+        start = time.thread_time()
+        datagrams = [data for _, data in batch]
+        self._bytes.write(b"".join(datagrams))
+        for data in datagrams:
+            self._sizes[self.count] = len(data)
+            self.count += 1
+        self.seconds += time.thread_time() - start
 
-    def framing(self) -> float:
-        """Seconds of the CPU to frame all of it once more."""
-        begin = 0
-        datagrams = []
-        for end in self._ends[: self.count]:
-            datagrams.append(bytes(self._bytes[begin:end]))
-            begin = end
+    def framing(self, count: int) -> float:
+        """Seconds of the CPU to frame so many of them once more."""
+        self._bytes.seek(0)
+        datagrams = [self._bytes.read(size) for size in self._sizes[:count]]
         framer = Framer(HEARD, stream=False)
         start = time.process_time()
         for data in datagrams:
@@ -249,8 +260,7 @@ class RecordedLink(UdpIn):
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         batch = await super().receive()
-        for _, data in batch:
-            self._record.add(data)
+        self._record.add(batch)
         return batch
 
 
@@ -293,7 +303,7 @@ async def fetch(sizes: Sizes, path: Path, record: Record, before: float, vehicle
                     await client.component(system)
         await anyio.sleep(SETTLING_TIME)
         asked = requests_of(vehicles)
-        record.count = 0
+        record.begin()
         cache.seconds = 0.0
         async with anyio.create_task_group() as tasks:
             tasks.start_soon(watch.run)
@@ -302,6 +312,7 @@ async def fetch(sizes: Sizes, path: Path, record: Record, before: float, vehicle
                 for client in clients:
                     fetches.start_soon(fetch_one, client)
             elapsed, cpu = time.perf_counter() - began, time.process_time() - used
+            cpu -= record.seconds
             in_cache, datagrams = cache.seconds, record.count
             await anyio.sleep(SETTLING_TIME)
             tasks.cancel_scope.cancel()
@@ -309,13 +320,12 @@ async def fetch(sizes: Sizes, path: Path, record: Record, before: float, vehicle
         asked = requests_of(vehicles) - asked
         later = cache.seconds - in_cache
     whole = [result for fetched in results for result in fetched.results.values()]
-    record.count = datagrams
     return Phase(
         elapsed=elapsed,
         cpu=cpu,
         cache=in_cache,
         later=later,
-        framing=record.framing(),
+        framing=record.framing(datagrams),
         block=watch.block,
         computed=watch.computed,
         grown=grown,

@@ -47,11 +47,11 @@ from paramclient.ftp import Ftp
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
 from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.protocol.change import Change
 from paramclient.protocol.ftp import DirectoryEntry
 from paramclient.protocol.result import FetchResult, Policy, Progress
 from paramclient.protocol.sampling import Sample
 from paramclient.protocol.sync import SyncState
-from paramclient.protocol.table import Change
 from paramclient.protocol.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport
 from paramclient.protocol.wire import Refusal, SigningKey, SigningPolicy, SigningReport, SigningStream
 from paramclient.protocol.writes import SetResult

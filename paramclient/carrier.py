@@ -13,6 +13,7 @@ from typing import Final, Protocol
 import anyio
 import anyio.lowlevel
 
+from paramclient.crowd import LONGEST_TURN, MANY, Crowd
 from paramclient.errors import LinkError
 from paramclient.links import Link, Peer
 from paramclient.protocol.component import ComponentMachine
@@ -32,11 +33,6 @@ HELD_UP: Final = 0.02
 has come in that time is read before anything counts as not answered."""
 READING_TIME: Final = 0.002
 """Seconds that the reader is given for that: it is ready to go on, so one turn of the event loop would do."""
-LONGEST_TURN: Final = 0.005
-"""Seconds of what came at once after which other tasks get their turn: with the last value of a list its hash
-is proven, which takes 2 ms, and many lists may end at once."""
-MANY: Final = 128
-"""Datagrams read at once that show that there are more: a link gives up to 256."""
 MOST_BEHIND: Final = 3.0
 """Seconds for which time-outs wait for what has come to be read, on a link that brings more and more."""
 LINK_PATIENCE: Final = 10.0
@@ -117,6 +113,13 @@ class Carrier:
 
     async def read(self) -> None:
         """Take what comes, until the link fails for good."""
+        crowd = Crowd.of_this_loop()
+        try:
+            await self._read(crowd)
+        finally:
+            crowd.left(self)
+
+    async def _read(self, crowd: Crowd) -> None:
         before = anyio.current_time()
         while True:
             try:
@@ -133,11 +136,9 @@ class Carrier:
             if not chunks:
                 self._station.over(now)
                 self._asked = True
-            if len(chunks) < MANY:
-                self._behind_since = math.inf
-            else:
-                self._behind_since = min(self._behind_since, now)
-            give_way_at = time.perf_counter() + LONGEST_TURN
+            crowd.came(self, len(chunks), now)
+            self._behind_since = math.inf if len(chunks) < MANY else min(self._behind_since, now)
+            give_way_at = time.perf_counter() + crowd.turn(now)
             for peer, data in chunks:
                 is_news |= self._station.receive(data, peer, now)
                 for tap in self._taps:
@@ -146,7 +147,8 @@ class Carrier:
                     self._dispatch()
                     await anyio.lowlevel.checkpoint()
                     now = self._read_at = anyio.current_time()
-                    give_way_at = time.perf_counter() + LONGEST_TURN
+                    crowd.came(self, len(chunks), now)
+                    give_way_at = time.perf_counter() + crowd.turn(now)
             if is_news:
                 self._dispatch()
                 self.tell()
@@ -159,6 +161,7 @@ class Carrier:
     async def send(self) -> None:
         """Send what is to be sent, and do what is due, until the calls have failed for good."""
         station = self._station
+        crowd = Crowd.of_this_loop()
         while self.ended is None:
             self._something_to_send = anyio.Event()
             now = anyio.current_time()
@@ -168,7 +171,7 @@ class Carrier:
             is_behind = self._is_behind(now)
             if not is_behind or now >= self._behind_since + MOST_BEHIND:
                 self._asked = False
-                station.tick(now, everyone=everyone, is_behind=is_behind)
+                station.tick(now, everyone=everyone, is_behind=is_behind or crowd.is_behind(now))
             self._dispatch()
             to_send = station.data_to_send()
             if to_send:
@@ -185,6 +188,8 @@ class Carrier:
             is_behind = self._is_behind(now)
             if is_behind:
                 due = now + LONGEST_TURN
+            elif crowd.is_behind(now):
+                due = max(due, now + LONGEST_TURN)  # no list that waits for its turn may begin before
             self._standstill.expect(due)
             wait = due - now
             with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):

@@ -31,6 +31,7 @@ from paramclient.protocol.events import (
     Event,
     Fetched,
     ParamChanged,
+    ParamsMoved,
     TableResynced,
 )
 from paramclient.protocol.result import Policy, Progress
@@ -223,9 +224,8 @@ class ParamClient:
         return ClientStats.of(self._station, downloads=self._downloads, cache_hits=self._cache_hits)
 
     def __repr__(self) -> str:
-        state = "closed" if self._tasks is None or self._carrier.ended is not None else "open"
-        if state == "open" and self._carrier.is_away:
-            state = "away"
+        state = "away" if self._carrier.is_away else "open"
+        state = "closed" if self._tasks is None or self._carrier.ended is not None else state
         heard = len(self._components)
         return f"<ParamClient {self._link.name} {state}, {heard} component{'' if heard == 1 else 's'}>"
 
@@ -451,8 +451,8 @@ class ParamClient:
         is_to_be_written = False
         for event in self._station.events():
             machine = event.machine
-            if isinstance(event, ParamChanged):
-                self._components[machine.system, machine.component]._publish(event.change)
+            if isinstance(event, ParamChanged | ParamsMoved):
+                self._components[machine.system, machine.component]._moved(event)
                 is_to_be_written = True
                 continue
             logger.debug("%s", event)

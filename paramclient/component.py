@@ -11,12 +11,15 @@ from typing import TYPE_CHECKING, SupportsFloat, SupportsIndex, TypeVar
 
 import anyio
 
+from paramclient.asked import check_accepted, check_asked
 from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.events import Changes
 from paramclient.identity import Identity, autopilot_name
 from paramclient.params import ParamMap
 from paramclient.protocol.authors import check_asker
+from paramclient.protocol.change import Change
 from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import ParamChanged, ParamsMoved
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.overhear import OVERHEARING_PATIENCE
@@ -24,11 +27,9 @@ from paramclient.protocol.result import FetchResult, Progress, Sampled
 from paramclient.protocol.sampling import SAMPLE_SIZE
 from paramclient.protocol.station import Station
 from paramclient.protocol.sync import SyncState
-from paramclient.protocol.table import Change
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_MODE_FLAG_SAFETY_ARMED,
-    MOST_PARAMETERS,
     NO_INDEX,
     ParamValue,
     SigningKey,
@@ -40,7 +41,7 @@ from paramclient.values import Encoding, Param, check_name, check_value, decode,
 if TYPE_CHECKING:
     from paramclient.client import ParamClient
 
-__all__ = ["Component", "address_in_words", "check_accepted", "check_asked", "patience_of"]
+__all__ = ["Component", "address_in_words", "patience_of"]
 
 Result = TypeVar("Result")
 
@@ -151,13 +152,10 @@ class Component:
 
     def __repr__(self) -> str:
         last = self._machine.fetches.last
-        origin = f" from {last.source} in {last.elapsed:.2f} s" if last is not None else ""
-        known = len(self.params)
+        origin = "" if last is None else f" from {last.source} in {last.elapsed:.2f} s"
         of = f" of {self.count}" if self.count is not None and self.state in ("partial", "fetching") else ""
-        return (
-            f"<Component {self.system}/{self.component} {self.autopilot} {self.state} {known}{of} "
-            f"params{origin}>"
-        )
+        whose = f"{self.system}/{self.component} {self.autopilot}"
+        return f"<Component {whose} {self.state} {len(self.params)}{of} params{origin}>"
 
     async def get(self, name: str | int, *, timeout: float | None = None) -> Param:
         """Ask the vehicle for one parameter.
@@ -393,8 +391,7 @@ class Component:
             LinkError: while waiting, when the link failed for good or the client was closed. What had come
                 before is given first.
         """
-        changes = Changes()
-        self._subscriptions.add(changes)
+        self._listen(changes := Changes())
         if self._client._is_over:
             changes.end(self._client._carrier.ended)
         return changes
@@ -418,11 +415,21 @@ class Component:
                     await self._cache_is_read.wait()
                 self._client._check_open()
 
+    def _listen(self, changes: Changes) -> None:
+        """Tell of what changes from now on, for as long as this is held."""
+        self._subscriptions.add(changes)
+        self._machine.tells_changes = True
+
+    def _moved(self, event: ParamChanged | ParamsMoved) -> None:
+        """Something has changed."""
+        if isinstance(event, ParamChanged):
+            self._publish(event.change)
+        self._machine.tells_changes, self._machine.has_moved = len(self._subscriptions) > 0, False
+
     def _publish(self, change: Change) -> None:
         """Hand a change to everyone who listens."""
-        if self._subscriptions:  # to go through the set takes a while, also when there is nobody in it
-            for changes in list(self._subscriptions):
-                changes.push(change)
+        for changes in list(self._subscriptions):
+            changes.push(change)
 
     def _part(self) -> None:
         """It is lost, and not followed any more."""
@@ -513,30 +520,6 @@ def _param_of(message: ParamValue, encoding: Encoding) -> Param:
 def _read_of(machine: ComponentMachine, name: str | int) -> str:
     what = name if isinstance(name, str) else f"parameter {name}"
     return f"{what} of {machine.system}/{machine.component}"
-
-
-def check_asked(name: str | int) -> None:
-    """See that a parameter can have this name or this index.
-
-    Raises:
-        UsageError: it cannot.
-    """
-    if isinstance(name, str):
-        check_name(name)
-    elif not isinstance(name, int) or not 0 <= name < MOST_PARAMETERS:
-        raise UsageError(f"parameter index {name}: indices are 0 to {MOST_PARAMETERS - 1}")
-
-
-def check_accepted(accept: str, sample: int) -> None:
-    """See that a fetch can accept this.
-
-    Raises:
-        UsageError: it cannot.
-    """
-    if accept not in ("verified", "sampled"):
-        raise UsageError(f'accept is "verified" or "sampled", not {accept!r}')
-    if sample < 1:
-        raise UsageError(f"a sample has at least one parameter, not {sample}")
 
 
 def address_in_words(system: int | None, component: int | None) -> str:

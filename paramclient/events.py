@@ -12,7 +12,7 @@ import anyio
 
 from paramclient.errors import ParamClientError
 from paramclient.protocol import events as protocol
-from paramclient.protocol.table import Change
+from paramclient.protocol.change import Change
 
 if TYPE_CHECKING:
     from paramclient.component import Component
@@ -157,9 +157,9 @@ class Changes(Feed[Change]):
         """Add a change, or join it with one of the same parameter that waits."""
         earlier = self._waiting.pop(item.name, None)
         if earlier is not None:
-            item = item._replace(old=earlier.old)
+            item = Change(item.name, earlier.old, item.new, item.by)
             old, new = item.old, item.new
-            if old is new or (old is not None and new is not None and old.same_value(new)):
+            if (old is None and new is None) or (old is not None and new is not None and old.same_value(new)):
                 return
         self._waiting[item.name] = item
         if len(self._waiting) > MOST_CHANGES:

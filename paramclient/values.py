@@ -184,7 +184,7 @@ _REAL32 = int(ParamType.REAL32)
 _REAL64 = int(ParamType.REAL64)
 _BYTEWISE = Encoding.BYTEWISE
 _LAYOUTS = {int(kind): layout for kind, layout in _LAYOUT.items()}
-_FITTING = {number: layout for number, layout in _LAYOUTS.items() if layout.size <= 4}
+_FITTING = {number: (1 << 8 * each.size) - 1 for number, each in _LAYOUTS.items() if each.size <= 4}
 _BOUNDS = {int(kind): kind.bounds for kind in ParamType if kind.is_integer}
 
 
@@ -244,24 +244,28 @@ def decode(raw: bytes, number: int, encoding: Encoding) -> tuple[Value, int]:
         number: param_type as it stood in the message.
         encoding: how the component writes values.
     """
+    bits, is_raw = bits_of_wire(raw, number, encoding)
+    return from_bits(bits, number, is_raw=is_raw), bits
+
+
+def bits_of_wire(raw: bytes, number: int, encoding: Encoding) -> tuple[int, bool]:
+    """What `decode` reads, without making a value of it: its own bits, and whether they stay raw bytes."""
+    bits = int.from_bytes(raw, "little")
     if number == _REAL32:
-        return _FLOAT32.unpack(raw)[0], int.from_bytes(raw, "little")
+        return bits, False
     if encoding is _BYTEWISE:
-        layout = _FITTING.get(number)
-        if layout is None:
-            return raw, int.from_bytes(raw, "little")
-        own = raw[: layout.size]
-        return layout.unpack(own)[0], int.from_bytes(own, "little")
+        mask = _FITTING.get(number)
+        return (bits, True) if mask is None else (bits & mask, False)
     number32: float = _FLOAT32.unpack(raw)[0]
     if number == _REAL64:
-        return number32, int.from_bytes(_LAYOUT[ParamType.REAL64].pack(number32), "little")
+        return int.from_bytes(_LAYOUT[ParamType.REAL64].pack(number32), "little"), False
     bounds = _BOUNDS.get(number)
     if bounds is not None and math.isfinite(number32):
         whole = int(number32)
         low, high = bounds
         if low <= whole <= high:
-            return whole, whole & (high - low)  # as many ones as the type has bits
-    return raw, int.from_bytes(raw, "little")
+            return whole & (high - low), False  # as many ones as the type has bits
+    return bits, True
 
 
 def encode(value: Value, number: int, encoding: Encoding) -> bytes:

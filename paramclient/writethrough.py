@@ -16,7 +16,15 @@ import anyio
 import anyio.from_thread
 import anyio.lowlevel
 
-from paramclient.cache import CacheChange, CachedComponent, ParamCache, StoredParam, TableState, TableUpdate
+from paramclient.cache import (
+    CacheChange,
+    CachedComponent,
+    HeardParams,
+    ParamCache,
+    StoredParam,
+    TableState,
+    TableUpdate,
+)
 from paramclient.errors import CacheError, UsageError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentMachine
@@ -362,25 +370,25 @@ class WriteThrough:
         is_whole, kept.is_whole = kept.is_whole, False
         kept.state = state
         kept.written_at = anyio.current_time()
-        knows_volatile = bool(table.volatile) or table.volatile_known
+        volatile = table.volatile if table.volatile or table.volatile_known else None
+        known = table.params
         update = TableUpdate(
             identity=kept.identity,
             component=machine.component,
             autopilot=machine.who.autopilot or 0,
             at=now,
             table=state,
-            params=[
-                StoredParam(param, now, param.name in table.volatile if knows_volatile else None, by)
-                for param, by in (
-                    *overwritten,
-                    *(
-                        (table.params[name], dirty.get(name, "vehicle"))
-                        for name in (table.params if is_whole else dirty)
-                        if name in table.params
-                    ),
-                )
-            ],
-            removed=[name for name in dirty if name not in table.params],
+            params=HeardParams(
+                known.copy() if is_whole else known.only(dirty),
+                now,
+                volatile=volatile,
+                by=dirty,
+                overwritten=[
+                    StoredParam(param, now, None if volatile is None else param.name in volatile, by)
+                    for param, by in overwritten
+                ],
+            ),
+            removed=[name for name in dirty if name not in known],
             replace=is_whole,
         )
         return [_News(kept, dirty, overwritten, update, is_synced)]

@@ -15,6 +15,7 @@ from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.result import FetchResult
 from paramclient.protocol.station import Station
+from paramclient.protocol.table import Table
 from paramclient.protocol.wire import NO_INDEX, Framer, Message, ParamValue
 from paramclient.protocol.writes import SetResult
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint
@@ -54,6 +55,11 @@ def known(
         kind = ParamType.INT32 if isinstance(value, int) else ParamType.REAL32
     raw = encode(value, kind, Encoding.BYTEWISE)[: kind.size]
     return Param(name, value, kind, index, int.from_bytes(raw, "little"), Trust.CACHED)
+
+
+def listed(table: Table) -> list[Param]:
+    """The parameters of a table that have an index."""
+    return [param for param in table.params.values() if param.index is not None]
 
 
 def is_so(claim: bool) -> bool:

@@ -18,11 +18,11 @@ from paramclient.errors import (
 )
 from paramclient.protocol import table as table_room
 from paramclient.protocol.authors import DOUBT, FOREIGN_SET_MEMORY, MOST_FOREIGN_SETS
+from paramclient.protocol.change import Change
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentIdentified, Event, Fetched, ParamChanged
 from paramclient.protocol.station import Station
 from paramclient.protocol.sync import Upkeep
-from paramclient.protocol.table import Change
 from paramclient.protocol.wire import (
     CAPABILITY_PARAM_ENCODE_BYTEWISE,
     HASH_CHECK,
@@ -42,7 +42,7 @@ from paramclient.protocol.wire import (
 )
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
 from paramclient.values import Encoding, Param, ParamType, Trust, Value, px4_hash
-from tests.simulation import Simulation, is_so, known, param_value
+from tests.simulation import Simulation, is_so, known, listed, param_value
 
 OWN = (255, 190)
 PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
@@ -539,7 +539,7 @@ def test_what_was_heard_before_the_cache_was_read_stays() -> None:
     desk.cached(*params, confirmed=px4_hash(params), volatile_known=True)
     table = desk.machine.table
     assert (table.params["A"].value, table.params["B"].value) == (9, 2)
-    assert table.hash == px4_hash(table.listed()) != px4_hash(params)
+    assert table.hash == px4_hash(listed(table)) != px4_hash(params)
 
 
 def test_a_hash_that_cannot_be_computed_is_lost_when_something_has_moved() -> None:

@@ -9,10 +9,10 @@ import pytest
 
 from paramclient.errors import LinkError, NoReply
 from paramclient.protocol import wire
+from paramclient.protocol.change import Change
 from paramclient.protocol.events import Fetched, ParamChanged
 from paramclient.protocol.reads import Read
 from paramclient.protocol.result import FRESH_HASH, FetchResult
-from paramclient.protocol.table import Change
 from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
 from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
 from paramclient.sim.table import Table

@@ -28,6 +28,7 @@ from paramclient.protocol import sync as sync_room
 from paramclient.protocol import table as table_room
 from paramclient.protocol import traffic as traffic_room
 from paramclient.protocol.authors import Authors
+from paramclient.protocol.change import Change
 from paramclient.protocol.events import ComponentForgotten
 from paramclient.protocol.ftp import blocks as blocks_room
 from paramclient.protocol.ftp import reading as reading_room
@@ -36,7 +37,7 @@ from paramclient.protocol.ftp.blocks import Blocks
 from paramclient.protocol.ftp.packets import MOST_DATA
 from paramclient.protocol.station import Station
 from paramclient.protocol.sync import Upkeep
-from paramclient.protocol.table import Change, Room, Table
+from paramclient.protocol.table import Room, Table
 from paramclient.protocol.timing import INITIAL_TIMEOUT
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -305,7 +306,7 @@ def test_a_resync_tells_of_so_many_names_and_no_more(monkeypatch: pytest.MonkeyP
     session.fetch()
     say(session, param_value("ONE_MORE", 1.0, count=9))  # another count: it has fallen behind
     for name in "ABCDE":
-        session.machine.sync.changed(Change(name, None, known(name)))
+        session.machine.sync.changed(name, "vehicle")
     assert len(session.machine.sync._moved) == 3
 
 

@@ -1,11 +1,28 @@
-"""ParamMap: what users see of a table."""
+"""What tables keep of parameters, and what users see of a table."""
 
 from __future__ import annotations
 
-import pytest
+import gc
 
-from paramclient.params import ParamMap
-from paramclient.values import Param, ParamType
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from paramclient.params import (
+    CACHED,
+    NOWHERE,
+    ParamMap,
+    Params,
+    held_of,
+    is_listed,
+    kept,
+    param_of,
+    placed,
+    same_held,
+    to_hold,
+    trusted,
+)
+from paramclient.values import Encoding, Param, ParamType, Trust, decode, known_type
 
 
 def test_it_shows_the_table_as_it_is_now_and_cannot_be_written_to() -> None:
@@ -52,3 +69,76 @@ def test_what_differs_from_the_firmwares_defaults() -> None:
     }
     params = ParamMap(table)
     assert params.changed() == {"OTHER": table["OTHER"], "NOW_NAN": table["NOW_NAN"]}
+
+
+@given(
+    wire=st.tuples(st.integers(0, 255), st.binary(min_size=4, max_size=4), st.sampled_from(Encoding)),
+    index=st.none() | st.integers(0, 65_534),
+    trust=st.sampled_from(Trust),
+    default=st.none() | st.floats(width=32, allow_nan=False) | st.integers(-5, 5),
+)
+def test_what_is_kept_of_a_parameter_is_all_of_it(
+    wire: tuple[int, bytes, Encoding], index: int | None, trust: Trust, default: float | None
+) -> None:
+    number, raw, encoding = wire
+    value, bits = decode(raw, number, encoding)
+    param = Param("NAME", value, known_type(number), index, bits, trust, default)
+    params = Params()
+    params["NAME"] = param
+    found = params["NAME"]
+    assert (found, found.default) == (param, default)
+    assert repr(found.value) == repr(value)
+    assert type(found.type) is type(param.type)
+    assert list(params.values()) == [param]
+    assert list(params.items()) == [("NAME", param)]
+    assert params == {"NAME": param}
+    assert repr(params) == f"Params({{'NAME': {param!r}}})"
+    assert kept(ParamMap(params)) is params
+    assert kept({"NAME": param}) == params
+    assert is_listed(params.held["NAME"]) == (index is not None)
+
+
+def test_what_is_kept_can_be_changed_by_name_and_copied() -> None:
+    params = Params()
+    for at, name in enumerate("CAB"):
+        params[name] = Param(name, at, ParamType.INT32, at, at, default=at)
+    copied, some = params.copy(), params.only(["B", "X", "C"])
+    del params["A"]
+    params["C"] = Param("C", 7, ParamType.INT32, 0, 7)
+    assert (list(params), list(copied), list(some)) == (["C", "B"], ["C", "A", "B"], ["B", "C"])
+    assert (params["C"].value, params["C"].default) == (7, None)
+    assert (copied["C"].value, copied["C"].default, some["C"].default) == (0, 0, 0)
+    assert "A" not in params
+    assert "A" not in params.defaults
+    with pytest.raises(KeyError):
+        params["A"]
+
+
+def test_a_place_and_a_trust_change_nothing_else() -> None:
+    param = Param("A", -5, ParamType.INT16, 300, 0xFFFB, Trust.VERIFIED)
+    held = held_of(param)
+    assert param_of("A", placed(held, 7)) == Param("A", -5, ParamType.INT16, 7, 0xFFFB, Trust.VERIFIED)
+    assert param_of("A", placed(held, NOWHERE)).index is None
+    assert param_of("A", trusted(held, CACHED)) == param.with_trust(Trust.CACHED)
+    assert same_held(held, trusted(placed(held, 9), CACHED))
+
+
+@given(
+    number=st.integers(1, 10),
+    one=st.integers(0, 2**32 - 1) | st.sampled_from([0, 0x80000000]),
+    other=st.integers(0, 2**32 - 1) | st.sampled_from([0, 0x80000000]),
+    raw=st.sampled_from([(False, False), (True, False)]),
+)
+def test_the_same_value_is_told_as_by_the_parameters(
+    number: int, one: int, other: int, raw: tuple[bool, bool]
+) -> None:
+    one, other = (each & ((1 << 8 * min(ParamType(number).size, 4)) - 1) for each in (one, other))
+    first, second = to_hold(one, number, raw[0], 0, 1), to_hold(other, number, raw[1], 1, 2)
+    assert same_held(first, second) == param_of("A", first).same_value(param_of("A", second))
+
+
+def test_the_garbage_collector_goes_through_nothing_that_is_kept() -> None:
+    params = Params()
+    for at in range(100):
+        params[f"P{at}"] = Param(f"P{at}", 1.5, ParamType.REAL32, at, 0x3FC00000, default=2.5)
+    assert not any(map(gc.is_tracked, (*params.held.values(), *params.defaults.values())))

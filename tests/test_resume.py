@@ -17,7 +17,7 @@ from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from tests.caches import start
 from tests.shell import bits, swiftly
-from tests.simulation import Simulation, listing_ardupilot
+from tests.simulation import Simulation, listed, listing_ardupilot
 
 SIZE = 200
 TABLE = {f"P{number:03d}": number for number in range(SIZE)}
@@ -210,7 +210,7 @@ def test_when_a_moved_count_was_heard_indices_of_before_are_worth_nothing() -> N
     world = cancelled(vehicle, 180)
     assert world.set("P001", 0).actual == 0
     table = world.machine.table
-    assert (table.count, table.listed()) == (SIZE, [])
+    assert (table.count, listed(table)) == (SIZE, [])
     assert table.is_displaced
     result = world.fetch()
     assert is_right(result, vehicle)

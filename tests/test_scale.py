@@ -13,9 +13,10 @@ import anyio
 import anyio.lowlevel
 import pytest
 
-from paramclient import ParamCache, ParamClient, carrier, writethrough
+from paramclient import ParamCache, ParamClient, carrier, crowd, writethrough
 from paramclient.cache import CachedComponent, TableUpdate
-from paramclient.carrier import HELD_UP, LONGEST_TURN, MOST_BEHIND, Carrier
+from paramclient.carrier import HELD_UP, MOST_BEHIND, Carrier
+from paramclient.crowd import LONGEST_TURN
 from paramclient.links import Peer
 from paramclient.protocol import station as station_room
 from paramclient.protocol import wire
@@ -272,14 +273,14 @@ async def carry(link: Flood, station: Watched, seconds: float, dispatch: Callabl
 @swiftly
 async def test_time_outs_wait_until_what_has_come_is_read() -> None:
     link, station = Flood(), Watched()
-    link.size = carrier.MANY
+    link.size = crowd.MANY
     began = anyio.current_time()
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(carry, link, station, 2.0, lambda: None)
         await anyio.sleep(1.0)
         meanwhile = [at for at in station.ticks if at > began + link.interval]
         assert not meanwhile, "more was there after each reading"
-        link.size = carrier.MANY - 1
+        link.size = crowd.MANY - 1
         await anyio.sleep(0.1)
         assert station.ticks[-1] > began + 1.0
         assert len(station.ticks) > 5
@@ -289,7 +290,7 @@ async def test_time_outs_wait_until_what_has_come_is_read() -> None:
 @swiftly
 async def test_time_outs_do_not_wait_for_ever() -> None:
     link, station = Flood(), Watched()
-    link.size = carrier.MANY
+    link.size = crowd.MANY
     began = anyio.current_time()
     await carry(link, station, MOST_BEHIND + 1.0, lambda: None)
     meanwhile = [at - began for at in station.ticks if at > began + link.interval]
@@ -313,7 +314,7 @@ class Starved(Watched):
 async def test_time_outs_wait_while_other_programs_have_the_processor() -> None:
     """What has come is there, but the reader had no turn meanwhile."""
     link, station = Flood(), Starved()
-    link.size = carrier.MANY
+    link.size = crowd.MANY
     link.interval = LONGEST_TURN + 0.003  # the sender wakes before it
     began = anyio.current_time()
     await carry(link, station, 1.0, lambda: None)
@@ -324,7 +325,7 @@ async def test_time_outs_wait_while_other_programs_have_the_processor() -> None:
 async def test_time_outs_wait_for_nothing_that_does_not_come() -> None:
     """The last reading brought many, and then the link falls silent."""
     link, station = Flood(), Watched()
-    link.size = carrier.MANY
+    link.size = crowd.MANY
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(carry, link, station, 1.0, lambda: None)
         await anyio.sleep(0.5)
@@ -369,6 +370,55 @@ async def test_what_comes_at_once_gives_way_to_other_tasks(monkeypatch: pytest.M
     longest = max(part.count("r") for part in rounds)
     assert longest == most
     assert all(part.endswith("t") for part in rounds if "r" in part)
+
+
+def test_links_on_which_much_comes_share_the_turn() -> None:
+    readers = crowd.Crowd()
+    assert (readers.turn(1.0), readers.is_behind(1.0)) == (LONGEST_TURN, False)
+    readers.came("a", crowd.MANY, 1.0)
+    readers.came("b", crowd.SOME, 1.0)
+    readers.came("c", crowd.SOME - 1, 1.0)
+    assert (readers.turn(1.0), readers.is_behind(1.0)) == (LONGEST_TURN / 2, True)
+    readers.came("c", crowd.SOME, 1.0)
+    readers.came("a", crowd.SOME, 1.0)
+    assert (readers.turn(1.0), readers.is_behind(1.0)) == (LONGEST_TURN / 3, False)
+    readers.left("b")
+    assert readers.turn(1.0) == LONGEST_TURN / 2
+    for number in range(1_000):
+        readers.came(number, crowd.MANY, 1.0)
+    assert readers.turn(1.0) == crowd.SHORTEST_TURN
+    later = 1.0 + crowd.LASTING
+    assert (readers.turn(later), readers.is_behind(later)) == (LONGEST_TURN, False)
+
+
+def test_links_of_two_event_loops_share_nothing() -> None:
+    async def find() -> crowd.Crowd:
+        assert crowd.Crowd.of_this_loop() is crowd.Crowd.of_this_loop()
+        return crowd.Crowd.of_this_loop()
+
+    assert anyio.run(find) is not anyio.run(find)
+
+
+@swiftly
+async def test_no_list_begins_while_another_link_brings_more_than_is_read() -> None:
+    busy, quiet, station = Flood(), Flood(), Watched()
+    busy.size, quiet.size = crowd.MANY, 1
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(carry, quiet, station, 3.0, lambda: None)
+        await anyio.sleep(0.5)
+        seen = [station.is_behind]
+        tasks.start_soon(carry, busy, Watched(), 2.0, lambda: None)
+        for size in (crowd.MANY, 0, crowd.MANY):
+            busy.size = size
+            busy.is_stuck.set()
+            await anyio.sleep(0.5)
+            seen.append(station.is_behind)
+        assert seen == [False, True, False, True]
+        half_a_second = [at for at in station.ticks if at > anyio.current_time() - 0.5]
+        assert len(half_a_second) > 20, "what is due is done all the same"
+        await anyio.sleep(0.6)
+        assert not station.is_behind, "that one was closed"
+        tasks.cancel_scope.cancel()
 
 
 class Portions(ParamCache):

@@ -38,7 +38,7 @@ from paramclient.protocol.writes import Write
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
 from paramclient.values import ParamType, Trust
 from tests.shell import Tap
-from tests.simulation import Memory, Simulation, is_so
+from tests.simulation import Memory, Simulation, is_so, listed
 
 INTERVAL = 30.0
 NAMES = [f"P{number:02d}" for number in range(40)]
@@ -511,7 +511,7 @@ def test_after_five_seconds_without_a_word_it_is_lost() -> None:
     assert lost == ComponentLost(machine, LOST_AFTER)
     assert machine.state == "lost"
     assert state(world) is SyncState.LOST
-    assert [param.value for param in machine.table.listed()][2:4] == [0, 1]
+    assert [param.value for param in listed(machine.table)][2:4] == [0, 1]
     assert trusts(machine) == {Trust.CACHED}
     world.run(100.0)
     assert world.told(ComponentLost) == [lost], "once"

@@ -5,10 +5,11 @@ from __future__ import annotations
 import pytest
 
 from paramclient.protocol import table as room
-from paramclient.protocol.table import Change, Table
+from paramclient.protocol.change import Change
+from paramclient.protocol.table import Table
 from paramclient.protocol.wire import ParamValue
 from paramclient.values import Encoding, Param, ParamType, Trust, as_sent, px4_hash
-from tests.simulation import known, param_value
+from tests.simulation import known, listed, param_value
 
 
 def test_a_first_value() -> None:
@@ -82,7 +83,7 @@ def test_index_65535_keeps_the_one_that_is_known() -> None:
     assert table.params["A"].index == 3
     table.hear(param_value("B", 2.0), "vehicle")
     assert table.params["B"].index is None
-    assert [param.name for param in table.listed()] == ["A"]
+    assert [param.name for param in listed(table)] == ["A"]
 
 
 @pytest.mark.parametrize(("index", "count"), [(10, 10), (900, 10), (3, 65535), (0, 0)])
@@ -204,7 +205,7 @@ def hashed(*, proven: bool) -> Table:
     table = Table()
     for index, name in enumerate("ABV"):
         table.hear(param_value(name, 1.0, index=index), "vehicle")
-    table.confirm(px4_hash(table.listed(), leave_out="V"), frozenset("V"), proven=proven)
+    table.confirm(px4_hash(listed(table), leave_out="V"), frozenset("V"), proven=proven)
     return table
 
 
@@ -212,14 +213,14 @@ def test_a_hash_moves_with_the_values_once_it_is_known_what_it_covers() -> None:
     table = hashed(proven=True)
     before = table.hash
     table.hear(param_value("A", 2.0, index=0), "us")
-    assert table.hash == px4_hash(table.listed(), leave_out="V") != before
+    assert table.hash == px4_hash(listed(table), leave_out="V") != before
     table.hear(param_value("A", 1.0, index=0), "us")
     assert table.hash == before
 
 
 def test_a_hash_that_cannot_be_computed_ends_with_the_first_change() -> None:
     table = hashed(proven=False)
-    before = px4_hash(table.listed(), leave_out="V")
+    before = px4_hash(listed(table), leave_out="V")
     table.hear(param_value("V", 2.0, index=2), "vehicle")
     assert table.hash == before
     table.hear(param_value("A", 2.0, index=0), "us")
@@ -237,7 +238,7 @@ def test_what_is_not_covered_does_not_move_it() -> None:
 def test_a_parameter_that_goes_away_moves_it() -> None:
     table = hashed(proven=True)
     table.remove(lambda param: param.name == "A")
-    assert table.hash == px4_hash(table.listed(), leave_out="V")
+    assert table.hash == px4_hash(listed(table), leave_out="V")
 
 
 def test_without_confirmation_there_is_no_hash() -> None:

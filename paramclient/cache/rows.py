@@ -21,6 +21,7 @@ __all__ = [
     "read_identity",
     "read_param",
     "read_rows",
+    "signed",
     "time_cell",
 ]
 
@@ -66,7 +67,7 @@ def time_cell(at: float) -> float:
 def identity_cells(identity: Identity) -> tuple[object, ...]:
     """A vehicle's cells, in the order of the attributes."""
     *described, capabilities = astuple(identity)
-    return (*described, _signed(capabilities))
+    return (*described, signed(capabilities))
 
 
 def read_identity(row: Sequence[object]) -> Identity:
@@ -91,7 +92,7 @@ class Row(NamedTuple):
         """The cells of a parameter."""
         number = int(param.type)
         bits = param.bits
-        default = None if param.default is None else _signed(bits_of(param.default, number))
+        default = None if param.default is None else signed(bits_of(param.default, number))
         return _new(
             cls,
             (
@@ -171,6 +172,6 @@ def _value(number: int, bits: int, is_raw: bool) -> Value:
         raise Damaged(f"{bits} is not a value of type {number}") from None
 
 
-def _signed(number: int) -> int:
+def signed(number: int) -> int:
     """A 64-bit unsigned number as SQLite's integers, which are signed, can hold it."""
     return number - (1 << 64) if number >> 63 else number

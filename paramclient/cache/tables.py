@@ -17,6 +17,7 @@ from paramclient.cache.database import Damaged
 from paramclient.cache.records import (
     BY_VEHICLE,
     CachedComponent,
+    HeardParams,
     HistoryEntry,
     StoredParam,
     TableState,
@@ -117,30 +118,42 @@ def applied(
     """The rows after an update, the lines of history that it causes, and the new names with their times."""
     after = dict(before)
     births: list[tuple[str, float]] = []
-    heard = {item.param.name for item in update.params}
+    news = list(_news(update.params))
+    heard = {name for name, *_ in news}
     lines: list[Line] = [
         (update.at, name, BY_VEHICLE, *after.pop(name).value, None, None, None)
         for name in dict.fromkeys(before if update.replace else update.removed)
         if name in before and name not in heard
     ]
-    for item in update.params:
-        name = item.param.name
+    for name, new, volatile, by in news:
         old = after.get(name)
-        new = after[name] = _merged(item, old, whole=update.replace)
-        if not old:
+        if old is None:
+            after[name] = new
             births.append((name, new.heard_at))
-        elif not old.same_value(new):
-            lines.append((new.heard_at, name, item.by, *old.value, *new.value))
+            continue
+        if new.param_index is None and not update.replace:
+            new = new._replace(param_index=old.param_index)
+        if volatile is None:
+            new = new._replace(volatile=old.volatile)
+        after[name] = new
+        if not old.same_value(new):
+            lines.append((new.heard_at, name, by, *old.value, *new.value))
     return after, lines, births
 
 
-def _merged(item: StoredParam, old: Row | None, *, whole: bool) -> Row:
-    index, volatile = item.param.index, item.volatile
-    if index is None and old and not whole:
-        index = old.param_index
-    if volatile is None:
-        volatile = bool(old and old.volatile)
-    return Row.of(item.param, index, volatile, item.heard_at)
+def _news(params: Iterable[StoredParam]) -> Iterable[tuple[str, Row, bool | None, str]]:
+    """What is to be kept: names and rows, whether they are volatile, and who caused the changes."""
+    if isinstance(params, HeardParams):
+        return params.rows()
+    return (
+        (
+            item.param.name,
+            Row.of(item.param, item.param.index, bool(item.volatile), item.heard_at),
+            item.volatile,
+            item.by,
+        )
+        for item in params
+    )
 
 
 def hashed(rows: Mapping[str, Row]) -> dict[str, tuple[int, int, int]]:

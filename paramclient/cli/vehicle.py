@@ -43,9 +43,9 @@ from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError
 from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
 from paramclient.metadata import Metadata
 from paramclient.notation import hash_text, time_text
+from paramclient.protocol.change import Change
 from paramclient.protocol.result import FetchResult, Policy
 from paramclient.protocol.sampling import SAMPLE_SIZE, Sample
-from paramclient.protocol.table import Change
 from paramclient.taken import NO_DEFAULTS
 from paramclient.values import Param, ParamType, Trust, Value, check_name, format_value, type_name
 

@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from paramclient.logs import ImportedTable
     from paramclient.metadata import ParamInfo
     from paramclient.paramset import ParamSet
+    from paramclient.protocol.change import Change
     from paramclient.protocol.result import FetchResult
     from paramclient.protocol.sampling import Sample
-    from paramclient.protocol.table import Change
     from paramclient.values import Param, Value
 
 __all__ = [

@@ -74,26 +74,28 @@ class UdpLink(SocketLink):
         self.receive_buffer = 0
         self.lost_sends = 0
         self._local_port = 0  # of the opening before
+        self._room = memoryview(bytearray(_LARGEST_DATAGRAM))
         self._stuck_since: float | None = None
         self._peers: dict[Peer, Address] = {}
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`. At most `DATAGRAMS_PER_READ` at a time; empty datagrams are passed over."""
         sock = self._open_socket()
+        into, room = sock.recvfrom_into, self._room
         batch: list[tuple[Address, bytes]] = []
         while not batch:
             await self._readable(sock)
             for _ in range(DATAGRAMS_PER_READ):
                 try:
-                    data, address = sock.recvfrom(_LARGEST_DATAGRAM)
+                    size, address = into(room)
                 except BlockingIOError:
                     break
                 except OSError as error:
                     if error.errno not in _PASSING:
                         raise self._error(f"cannot receive: {reason(error)}") from error
                     continue  # an ICMP message about something that was sent earlier
-                if data:
-                    batch.append((address, data))
+                if size:
+                    batch.append((address, bytes(room[:size])))
         self._learn(batch)
         return [*batch]
 

@@ -10,13 +10,13 @@ from typing import Final
 from paramclient.errors import LinkError, NoReply, UsageError
 from paramclient.identity import autopilot_name
 from paramclient.protocol import events
+from paramclient.protocol.change import Change
 from paramclient.protocol.events import ParamChanged
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.parts import Parts
 from paramclient.protocol.reads import Key, Read
 from paramclient.protocol.restart import SAVING_TIME, Restart
 from paramclient.protocol.result import FetchResult, Policy, Sampled
-from paramclient.protocol.table import Change
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -75,6 +75,10 @@ class ComponentMachine(Parts):
         commands: what it is told to do.
         restart: the restart that it was told to make and that is under way, or None.
         fetches: what was and is being fetched.
+        tells_changes: whether somebody wants to be told of each change. An event for each value of a long
+            list takes a tenth of what the value takes, and the garbage collector goes through those that
+            wait.
+        has_moved: whether an event says that something has changed; who hands it out sets this back.
     """
 
     # what comes in
@@ -152,8 +156,8 @@ class ComponentMachine(Parts):
         change = table.hear(message, by, is_exact=is_ours and writes.wants(message))
         if change is not None:
             authors.changed(name, now, is_ours)
-            self.sync.changed(change)
-            self._emit(_new(ParamChanged, (self, change)))
+            self.sync.changed(name, by)
+            self._tell(change)
         elif name not in table.params:
             return  # more names than there can be
         fetch = self.fetches.current
@@ -339,18 +343,25 @@ class ComponentMachine(Parts):
                 self.reads.ask(name, now, urgent=False)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity."""
+        """When `tick` has something to do, or infinity. Asked often: what is idle is not asked in turn."""
+        fetch = self.fetches.current
+        first = self.presence.lost_at()
+        if fetch is not None:
+            first = min(first, fetch.next_deadline())
+        if self.restart is not None:
+            first = min(first, self.restart.next_deadline())
+        if len(self.reads):
+            first = min(first, self.reads.next_deadline())
+        if self.writes.queues:
+            first = min(first, self.writes.next_deadline())
+        if len(self.commands):
+            first = min(first, self.commands.next_deadline())
         return min(
-            self.reads.next_deadline(),
-            self.writes.next_deadline(),
+            first,
             self.files.next_deadline(),
-            self.commands.next_deadline(),
-            math.inf if self.restart is None else self.restart.next_deadline(),
-            math.inf if self.fetch is None else self.fetch.next_deadline(),
             self.who.next_deadline(),
             self.descriptions.next_deadline(),
             self.sync.next_deadline(),
-            self.presence.lost_at(),
             self._authors.next_deadline(),
         )
 
@@ -491,7 +502,7 @@ class ComponentMachine(Parts):
     def _moved(self, changes: list[Change]) -> None:
         """What a fetch has found out otherwise than by a PARAM_VALUE."""
         for change in changes:
-            self.sync.changed(change)
+            self.sync.changed(change.name, change.by)
         self._report(changes)
 
     def _write_ended(self, now: float) -> None:
@@ -506,7 +517,14 @@ class ComponentMachine(Parts):
 
     def _report(self, changes: list[Change]) -> None:
         for change in changes:
+            self._tell(change)
+
+    def _tell(self, change: Change) -> None:
+        if self.tells_changes:
             self._emit(ParamChanged(self, change))
+        elif not self.has_moved:
+            self.has_moved = True
+            self._emit(events.ParamsMoved(self))
 
 
 def _in_capitals(name: str) -> str:
@@ -516,5 +534,4 @@ def _in_capitals(name: str) -> str:
     return name.encode("latin-1").upper().decode("latin-1")
 
 
-_new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
 _WRITE_DENIED = re.compile(r"Param write denied \((\w{1,16})\)")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
-from paramclient.protocol.table import Change
+from paramclient.protocol.change import Change
 
 if TYPE_CHECKING:
     from paramclient.protocol.component import ComponentMachine
@@ -21,6 +21,7 @@ __all__ = [
     "Event",
     "Fetched",
     "ParamChanged",
+    "ParamsMoved",
     "TableResynced",
 ]
 
@@ -77,6 +78,13 @@ class ParamChanged(NamedTuple):
 
 
 @dataclass(frozen=True, slots=True)
+class ParamsMoved:
+    """Parameters have changed of which nobody wants to be told one by one."""
+
+    machine: ComponentMachine
+
+
+@dataclass(frozen=True, slots=True)
 class Fetched:
     """A fetch has ended with a result."""
 
@@ -107,6 +115,7 @@ Event: TypeAlias = (
     | ComponentRebooted
     | ComponentForgotten
     | ParamChanged
+    | ParamsMoved
     | Fetched
     | TableResynced
 )

@@ -30,7 +30,6 @@ from paramclient.protocol.repeated import Repeated, repeated_names
 from paramclient.protocol.result import Announcement, FetchResult, Means, Policy, Progress, Sampled
 from paramclient.protocol.sampling import Sampling
 from paramclient.protocol.wire import HASH_CHECK, ParamRequestRead, ParamValue
-from paramclient.values import Trust
 
 __all__ = ["Fetch"]
 
@@ -290,10 +289,9 @@ class Fetch(Operation[FetchResult]):
 
     def _compare(self, announcement: Announcement, now: float) -> None:
         table = self._table
-        listed = table.listed()
         known = "none" if table.hash is None else f"{table.hash:08x}"
         self._means.trace("%s/%s: hash %08x announced, %s here", *self._target, announcement.hash, known)
-        if announcement.hash != table.hash or announcement.count != len(listed):
+        if announcement.hash != table.hash or announcement.count != table.size:
             self._proof.before = announcement
             self._begin_download(now)
             return
@@ -496,7 +494,7 @@ class Fetch(Operation[FetchResult]):
         if self._file_was_silent and not missing:  # while the list has come
             self.file_failed = True
         if download.resumed and table.hash is None:
-            earlier = sum(param.trust is Trust.CACHED for param in table.listed())
+            earlier = table.only_cached
             notes += (FROM_MEMORY.format(earlier),) if earlier else ()
         self.finish(
             self._result("stream", count, missing, table.hash if not missing else None, now, notes), now
@@ -515,7 +513,7 @@ class Fetch(Operation[FetchResult]):
         download = self.download
         return FetchResult(
             *self._target,
-            dict(self._table.params),
+            self._table.params.copy(),
             source,
             count,
             received,

@@ -8,17 +8,21 @@ it equals the one the vehicle announced.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from itertools import combinations
 from typing import Final
 
-from paramclient.values import Param, crc32_px4, hash_chunk
+from paramclient.values import crc32_px4
 
-__all__ = ["find_volatile"]
+__all__ = ["find_volatile", "hash_of"]
 
 MOST_HASHED: Final = 1_000_000
 """Parameters that go into hashes while single names are tried, about a tenth of a second: trying one costs a
 hash of the whole table."""
+MOST_NAMES_REMEMBERED: Final = 4_096
+"""Names of which it is remembered whether they are of a group: those of a few firmwares. To look takes ten
+times as long, and all vehicles of a fleet have the same."""
 
 # Groups of PX4 parameters marked @volatile in one firmware or another: calibration that is learnt in flight,
 # flight counters, and what follows the place on earth.
@@ -40,7 +44,7 @@ _GROUPS = tuple(
 
 
 def find_volatile(
-    params: Sequence[Param], announced: int, *, believed: Iterable[str] = ()
+    bits: Mapping[str, int], announced: int, *, believed: Iterable[str] = ()
 ) -> tuple[frozenset[str], bool]:
     """The names that a vehicle left out when it computed its hash.
 
@@ -48,14 +52,14 @@ def find_volatile(
     two of them, and then the first guess with each single name taken out or in.
 
     Args:
-        params: the parameters that have an index.
+        bits: the bits of the parameters that have an index (see `Param.bits`), by name.
         announced: the vehicle's hash for exactly these.
         believed: names that an earlier download proved, or that changed under an unchanged hash.
 
     Returns:
         The names, and True when the hash agrees. Without agreement: the best guess, and False.
     """
-    chunks = sorted((param.name, hash_chunk(param)) for param in params)
+    chunks = _chunks(bits)
     guess: frozenset[str] | None = None
     for candidate in _candidates([name for name, _ in chunks], frozenset(believed)):
         if guess is None:
@@ -65,9 +69,31 @@ def find_volatile(
     return guess or frozenset(), False
 
 
+def hash_of(bits: Mapping[str, int], *, leave_out: frozenset[str]) -> int:
+    """The value of PX4's `_HASH_CHECK` for parameters given by their bits, see `px4_hash`."""
+    return crc32_px4(b"".join(chunk for name, chunk in _chunks(bits) if name not in leave_out))
+
+
+def _chunks(bits: Mapping[str, int]) -> list[tuple[str, bytes]]:
+    """What the hash takes in of each parameter, in its order; see `hash_chunk`."""
+    return [
+        (name, name.encode("latin-1") + (each & 0xFFFFFFFF).to_bytes(4, "little"))
+        for name, each in sorted(bits.items())
+    ]
+
+
+@lru_cache(maxsize=MOST_NAMES_REMEMBERED)
+def _group_of(name: str) -> re.Pattern[str] | None:
+    return next((group for group in _GROUPS if group.fullmatch(name)), None)
+
+
 def _candidates(names: Sequence[str], believed: frozenset[str]) -> Iterator[frozenset[str]]:
-    groups = [frozenset(name for name in names if group.fullmatch(name)) for group in _GROUPS]
-    groups = [group for group in groups if group]
+    found: dict[re.Pattern[str], set[str]] = {}
+    for name in names:
+        group = _group_of(name)
+        if group is not None:
+            found.setdefault(group, set()).add(name)
+    groups = [frozenset(found[group]) for group in _GROUPS if group in found]
     usual = frozenset().union(*groups)
     first = (believed & frozenset(names)) | usual
     yield first

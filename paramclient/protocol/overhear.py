@@ -125,7 +125,7 @@ class Overheard:
     def _is_proven(self, announcement: Announcement) -> bool:
         proof = Proof(self._table)
         proof.before = announcement
-        return proof.is_given(len(self._table.listed()))
+        return proof.is_given(self._table.size)
 
     def _result(
         self,
@@ -138,7 +138,7 @@ class Overheard:
         count = (self.count if self.names else self._table.count) or 0
         return FetchResult(
             *self._means.target,
-            dict(self._table.params),
+            self._table.params.copy(),
             source,
             count,
             count - len(missing),

@@ -8,12 +8,13 @@ from functools import partial
 from typing import Final
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError
+from paramclient.protocol.change import Change
 from paramclient.protocol.ftp import FileRead, FileTransfers
 from paramclient.protocol.ftp.packets import MOST_DATA
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.pack import LARGEST_FILE, Pack, decode, total_of
 from paramclient.protocol.result import Progress
-from paramclient.protocol.table import Change, Table
+from paramclient.protocol.table import Table
 from paramclient.protocol.turns import Seen, Turns
 from paramclient.protocol.wire import MOST_PARAMETERS, ParamValue
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 
 from paramclient.identity import Identity
 from paramclient.protocol.authors import Authors
+from paramclient.protocol.change import Change
 from paramclient.protocol.commands import Commands
 from paramclient.protocol.descriptions import Descriptions
 from paramclient.protocol.events import Event
@@ -22,7 +23,7 @@ from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.restart import Restart
 from paramclient.protocol.result import FetchResult, Means, Sampled
 from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
-from paramclient.protocol.table import Change, Room, Table
+from paramclient.protocol.table import Room, Table
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.trace import Trace, silent
 from paramclient.protocol.turns import Turns
@@ -133,6 +134,8 @@ class Parts(ABC):
         self._known_as: str | None = None  # the key of the identity that was reported
         self._saved_at = -math.inf  # when all that we have written will have been saved
         self._authors = Authors()
+        self.tells_changes = True
+        self.has_moved = False
         self.writes.left_open = self._authors.foreign_set
 
     @abstractmethod

@@ -48,7 +48,7 @@ class Proof:
         if announced is None or announced.count != count or (self._is_old and self.meanwhile is None):
             return False
         table = self._table
-        volatile, is_proven = find_volatile(table.listed(), announced.hash, believed=table.volatile)
+        volatile, is_proven = find_volatile(table.listed_bits(), announced.hash, believed=table.volatile)
         if is_proven:
             self._confirm(announced, volatile, proven=True)
         return is_proven
@@ -60,7 +60,7 @@ class Proof:
         where nothing else speaks for the table.
         """
         table = self._table
-        volatile, is_proven = find_volatile(table.listed(), after.hash, believed=table.volatile)
+        volatile, is_proven = find_volatile(table.listed_bits(), after.hash, believed=table.volatile)
         is_proven = is_proven and after.count == count
         if needs_proof and not is_proven:
             return None

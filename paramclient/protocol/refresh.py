@@ -63,7 +63,7 @@ class Refresh(Operation[None]):
         answer = read.result
         if answer is None or int.from_bytes(answer.raw, "little") != self._confirmed or self._is_writing():
             return
-        listed = table.listed()
+        listed = table.listed_bits()
         if answer.param_count != len(listed) or not table.complete:
             return
         now = table.params

@@ -7,12 +7,13 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from paramclient.protocol.change import Change
 from paramclient.protocol.following import Following
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.notes import MOVED
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.sampling import Sample
-from paramclient.protocol.table import Change, Table
+from paramclient.protocol.table import Table
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.trace import Trace, silent
 from paramclient.protocol.turns import Turns

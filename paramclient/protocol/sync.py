@@ -15,7 +15,7 @@ from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.result import Announcement, FetchResult, Policy
-from paramclient.protocol.table import MOST_NAMES, Change, Table
+from paramclient.protocol.table import MOST_NAMES, Table
 from paramclient.protocol.wire import HASH_CHECK, ParamValue
 from paramclient.values import Trust
 
@@ -211,9 +211,8 @@ class Sync:
         self._has_no_hash = False
         return self.announced
 
-    def changed(self, change: Change) -> None:
+    def changed(self, name: str, by: str) -> None:
         """A parameter has changed: the hash that was announced is of the past, unless that leaves it out."""
-        name, _, _, by = change
         if name not in self._table.volatile:
             if not is_ours(by):
                 self._moved_by_us_alone = False
@@ -264,7 +263,7 @@ class Sync:
         table = self._table
         complete = result.complete and table.complete and not result.has_moved
         if result.hash is None:  # what came before it was lost may have moved since
-            complete = complete and all(param.trust is not Trust.CACHED for param in table.listed())
+            complete = complete and not table.only_cached
         if not complete:
             self._fall()
         self.synced = complete
@@ -301,7 +300,7 @@ class Sync:
         table, announced = self._table, self.announced
         if announced is None or not announced.is_fresh(now) or announced.hash != table.hash:
             return False
-        if not table.complete or announced.count != len(table.listed()):
+        if not table.complete or announced.count != table.size:
             return False
         table.verify()
         self._moved_by_us_alone = True

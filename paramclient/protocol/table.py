@@ -2,15 +2,34 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import replace
-from typing import Final, NamedTuple
+from collections.abc import Callable, Collection, Mapping
+from typing import Final
 
+from paramclient.params import (
+    CACHED,
+    LIVE,
+    NOWHERE,
+    VERIFIED,
+    Held,
+    Params,
+    is_listed,
+    kept,
+    number_of,
+    param_of,
+    parts_of,
+    placed,
+    same_held,
+    to_hold,
+    trust_of,
+    trusted,
+)
 from paramclient.protocol.authors import is_ours
+from paramclient.protocol.change import Change
+from paramclient.protocol.hashing import hash_of
 from paramclient.protocol.wire import MOST_PARAMETERS, NO_INDEX, ParamValue
-from paramclient.values import Encoding, Param, Trust, Value, as_sent, decode, from_bits, known_type, px4_hash
+from paramclient.values import Encoding, Param, Trust, Value, as_sent, bits_of_wire, from_bits
 
-__all__ = ["MOST_NAMES", "Change", "Room", "Table"]
+__all__ = ["MOST_NAMES", "Room", "Table"]
 
 MOST_NAMES: Final = 65_535
 """Names that one table may hold: as many as can have an index, and as many again of parameters that are not
@@ -28,26 +47,7 @@ MOST_GONE: Final = MOST_NAMES
 told: the next whole table that is kept is without them."""
 
 _EXACT = 1 << 24  # up to here every integer is a float32
-_LIVE = Trust.LIVE  # each look into an enumeration takes a tenth of what a value takes here
-_KNOWN_TYPES = tuple(map(known_type, range(256)))
-_new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
-
-
-class Change(NamedTuple):
-    """One parameter that appeared, changed its value or went away. A named tuple: each first value makes one.
-
-    Attributes:
-        name: param_id.
-        old: what was known before, or None when the parameter is new.
-        new: what is known now, or None when the vehicle no longer has it.
-        by: "us" (our own `set`), "us for NAME" (one for which it was told who asked), "vehicle", or "station
-            S/C" when another station was heard setting it.
-    """
-
-    name: str
-    old: Param | None
-    new: Param | None
-    by: str = "vehicle"
+_new = tuple.__new__  # what the constructor of a tuple ends in, after several times the time
 
 
 class Room:
@@ -93,7 +93,9 @@ class Table:
 
     def __init__(self, encoding: Encoding = Encoding.BYTEWISE, room: Room | None = None) -> None:
         self._room = Room() if room is None else room
-        self.params: dict[str, Param] = {}
+        self.params = Params()
+        self._held = self.params.held
+        self._defaults = self.params.defaults
         self.count: int | None = None
         self.volatile: frozenset[str] = frozenset()
         self.volatile_known = False
@@ -117,7 +119,7 @@ class Table:
     def hash(self) -> int | None:
         if self._hash_is_stale:
             self._hash_is_stale = False
-            self._hash = px4_hash(self.listed(), leave_out=self.volatile)
+            self._hash = hash_of(self.listed_bits(), leave_out=self.volatile)
         return self._hash
 
     def confirm(self, announced: int, volatile: frozenset[str], *, proven: bool) -> None:
@@ -157,47 +159,57 @@ class Table:
                 would round.
         """
         name, raw, number, count, given = message
-        index: int | None = given
         if self.passed_over and given in self.passed_over.get(name, ()):
             return None
-        params = self.params
-        old = params.get(name)
-        if given == NO_INDEX:
-            index = None if old is None else old.index
-        elif count > MOST_PARAMETERS or given >= count:
-            index = None
-        if old is None:
-            if not self._room.has_some(len(params)):
-                return None
-            self._room.taken += 1
-        elif old.type == number and self._wire.get(name) == raw and not is_exact:
-            if old.index != index:
-                params[name] = Param(name, old.value, old.type, index, old.bits, Trust.LIVE, old.default)
-                self.dirty.setdefault(name, by)
-            return None
-        value, bits = decode(raw, number, self._encoding)
-        default: Value | None = None
-        is_rounded = False
-        if old is not None and old.type == number:
-            default = old.default
-            is_rounded = not is_exact and self._rounds(old, raw)
-        if is_rounded and old is not None:
-            value, bits = old.value, old.bits
-        elif self._filed:
-            self._filed.discard(name)
-        new = params[name] = Param(name, value, _KNOWN_TYPES[number], index, bits, _LIVE, default)
-        self._wire[name] = raw
-        if old is not None and old.same_value(new):
-            if old.index != index:
-                self.dirty.setdefault(name, by)
-            return None
+        everything = self._held
+        old = everything.get(name)
         if old is None:  # the short way for a first value
+            room = self._room
+            if not room.has_some(len(everything)):
+                return None
+            room.taken += 1
+            place = NOWHERE if given >= count or count > MOST_PARAMETERS else given
+            bits, is_raw = bits_of_wire(raw, number, self._encoding)
+            new = everything[name] = to_hold(bits, number, is_raw, LIVE, place)
+            self._wire[name] = raw
             self.dirty[name] = by
+            if self._hash is not None:
+                self._moved(name)
+            return _new(Change, (name, None, new, by, None))
+        return self._hear_again(name, old, message, by, is_exact=is_exact)
+
+    def _hear_again(
+        self, name: str, old: Held, message: ParamValue, by: str, *, is_exact: bool
+    ) -> Change | None:
+        """Take a PARAM_VALUE of a parameter that is known."""
+        _, raw, number, count, given = message
+        old_bits, old_number, old_is_raw, _, place = parts_of(old)
+        if given != NO_INDEX:
+            place = NOWHERE if given >= count or count > MOST_PARAMETERS else given
+        is_same_type = old_number == number
+        if is_same_type and self._wire.get(name) == raw and not is_exact:
+            new = to_hold(old_bits, number, old_is_raw, LIVE, place)
+            if placed(old, place) != old:
+                self._held[name] = new
+                self.dirty.setdefault(name, by)
+            return None
+        if is_same_type and not is_exact and self._rounds(old, raw):
+            bits, is_raw = old_bits, old_is_raw
         else:
-            self._news(name, old, by)
+            bits, is_raw = bits_of_wire(raw, number, self._encoding)
+            self._filed.discard(name)
+        if not is_same_type:
+            self._defaults.pop(name, None)
+        new = self._held[name] = to_hold(bits, number, is_raw, LIVE, place)
+        self._wire[name] = raw
+        if same_held(old, new):
+            if placed(old, place) != old:
+                self.dirty.setdefault(name, by)
+            return None
+        self._news(name, old, by)
         if self._hash is not None:
             self._moved(name)
-        return _new(Change, (name, old, new, by))
+        return _new(Change, (name, old, new, by, self._defaults.get(name)))
 
     def take(
         self, name: str, number: int, bits: int, index: int, default: int | None, *, is_older: bool
@@ -213,28 +225,33 @@ class Table:
             is_older: whether a PARAM_VALUE of it was heard since the file was asked for: then that counts,
                 unless it rounds what the file says.
         """
-        kind = known_type(number)
         initial = None if default is None else from_bits(default, number)
-        old = self.params.get(name)
+        old = self._held.get(name)
         if old is None:
-            if not self._room.has_some(len(self.params)):
+            if not self._room.has_some(len(self._held)):
                 return None
             self._room.taken += 1
         raw = as_sent(bits, number, self._encoding)
-        if is_older and old is not None and (old.type != number or self._wire.get(name) != raw):
-            self.params[name] = replace(old, index=index, default=initial)
+        is_default_news = initial != self._defaults.get(name)
+        if initial is None:
+            self._defaults.pop(name, None)
+        else:
+            self._defaults[name] = initial
+        if is_older and old is not None and (parts_of(old)[1] != number or self._wire.get(name) != raw):
+            self._held[name] = placed(old, index)
             self.dirty.setdefault(name, "vehicle")
             return None
-        new = self.params[name] = Param(name, from_bits(bits, number), kind, index, bits, _LIVE, initial)
+        is_raw = isinstance(from_bits(bits, number), bytes)
+        new = self._held[name] = to_hold(bits, number, is_raw, LIVE, index)
         self._wire[name] = raw
         self._filed.add(name)
-        if old is None or old.index != index or old.default != initial:
+        if old is None or placed(old, index) != old or is_default_news:
             self.dirty.setdefault(name, "vehicle")
-        if old is not None and old.same_value(new):
+        if old is not None and same_held(old, new):
             return None
         self._news(name, old, "vehicle")
         self._moved(name)
-        return Change(name, old, new)
+        return _new(Change, (name, old, new, "vehicle", initial))
 
     def use_encoding(self, encoding: Encoding) -> list[Change]:
         """Read everything that was heard in another encoding; give what looks different now."""
@@ -243,16 +260,16 @@ class Table:
         self._encoding = encoding
         changes = []
         for name, raw in self._wire.items():
-            old = self.params[name]
+            old = self._held[name]
+            bits, number, _, trust, place = parts_of(old)
             if name in self._filed:
-                self._wire[name] = as_sent(old.bits, old.type, encoding)
+                self._wire[name] = as_sent(bits, number, encoding)
                 continue
-            value, bits = decode(raw, old.type, encoding)
-            new = Param(name, value, old.type, old.index, bits, old.trust, old.default)
-            self.params[name] = new
-            if not old.same_value(new):
+            bits, is_raw = bits_of_wire(raw, number, encoding)
+            new = self._held[name] = to_hold(bits, number, is_raw, trust, place)
+            if not same_held(old, new):
                 self.dirty.setdefault(name, "vehicle")
-                changes.append(Change(name, old, new))
+                changes.append(self._change(name, old, new))
         return changes
 
     def restore(
@@ -275,7 +292,8 @@ class Table:
             placed: whether its indices still hold.
             complete, volatile, volatile_known: as the attributes.
         """
-        changes = self.fill(params, placed=placed and self.count in (None, count))
+        known = kept(params)
+        changes = self.fill(known, are_placed=placed and self.count in (None, count))
         if self.count not in (None, count):
             return changes
         self.count = count
@@ -285,35 +303,39 @@ class Table:
             if volatile_known:
                 self.rehash()  # what is in the table counts, not what stood beside it
             elif any(
-                name not in self.params or not self.params[name].same_value(param)
-                for name, param in params.items()
+                name not in self._held or not same_held(self._held[name], held)
+                for name, held in known.held.items()
                 if name not in volatile
             ):
                 self.unconfirm()
         return changes
 
-    def fill(self, params: Mapping[str, Param], *, placed: bool = True) -> list[Change]:
+    def fill(self, params: Mapping[str, Param], *, are_placed: bool = True) -> list[Change]:
         """Put in what the cache knows, as *cached*; what was heard on this link stays.
 
         To that it adds the firmware's default, and an integer that the message has rounded.
 
         Args:
             params: the cached table.
-            placed: whether its indices are still worth anything.
+            are_placed: whether its indices are still worth anything.
         """
         changes = []
-        for name, param in params.items():
-            old = self.params.get(name)
+        known = kept(params)
+        for name, cached in known.held.items():
+            old = self._held.get(name)
+            default = known.defaults.get(name)
             if old is not None:
-                if old.type == param.type and name not in self._filed:
-                    changes += self._complement(old, param)
-            elif self._room.has_some(len(self.params)):
+                if parts_of(old)[1] == parts_of(cached)[1] and name not in self._filed:
+                    changes += self._complement(name, old, cached, default)
+            elif self._room.has_some(len(self._held)):
                 self._room.taken += 1
-                new = param.with_trust(Trust.CACHED)
-                if not placed and new.index is not None:
-                    new = self._displaced(new)
-                self.params[name] = new
-                changes.append(Change(name, None, new))
+                new = trusted(cached, CACHED)
+                if not are_placed and is_listed(new):
+                    new = self._displaced(name, new)
+                self._held[name] = new
+                if default is not None:
+                    self._defaults[name] = default
+                changes.append(self._change(name, None, new))
         return changes
 
     def renew(self, params: Mapping[str, Param]) -> list[Change]:
@@ -323,16 +345,15 @@ class Table:
             params: the table as it is cached now.
         """
         changes = []
-        for name, param in params.items():
-            old = self.params.get(name)
-            if old is None or old.trust is not Trust.CACHED or name in self.dirty or old.same_value(param):
+        for name, cached in kept(params).held.items():
+            old = self._held.get(name)
+            if old is None or trust_of(old) != CACHED or name in self.dirty or same_held(old, cached):
                 continue
-            new = replace(param.with_trust(Trust.CACHED), index=old.index, default=old.default)
-            self.params[name] = new
+            new = self._held[name] = placed(trusted(cached, CACHED), parts_of(old)[4])
             self._wire.pop(name, None)  # should the vehicle say that again, it is a change
             if self._hash is not None:
                 self._moved(name)
-            changes.append(Change(name, old, new))
+            changes.append(self._change(name, old, new))
         return changes
 
     def move(self, count: int) -> None:
@@ -340,82 +361,77 @@ class Table:
         if self.count is not None:
             self.complete = False
             self.passed_over.clear()
-            for param in self.listed():
-                self.params[param.name] = self._displaced(param)
+            for name, held in self._held.items():
+                if is_listed(held):
+                    self._held[name] = self._displaced(name, held)
         self.count = count
 
     @property
     def is_displaced(self) -> bool:
         """Whether there are names whose index is open since the count moved."""
-        params = self.params
-        self.displaced = {name for name in self.displaced if name in params and params[name].index is None}
+        held = self._held
+        self.displaced = {name for name in self.displaced if name in held and not is_listed(held[name])}
         return bool(self.displaced)
 
     def place(self, names: Mapping[int, str]) -> None:
         """A download has settled which parameter has which index."""
+        everything, passed_over = self._held, self.passed_over
         for index, name in names.items():
-            param = self.params.get(name)
-            if index in self.passed_over.get(name, ()):
+            held = everything.get(name)
+            if held is None or (passed_over and index in passed_over.get(name, ())):
                 continue
-            if param is not None and param.index != index:
-                self.params[name] = replace(param, index=index)
+            now = placed(held, index)
+            if now != held:
+                everything[name] = now
                 self.dirty.setdefault(name, "vehicle")
 
     def settle(self, names: Mapping[int, str]) -> list[Change]:
         """A download is whole: place what it brought, and take out what the vehicle no longer has."""
         self.place(names)
         present = frozenset(names.values())
-        gone = self.remove(
-            lambda param: (
-                param.name not in present and (param.index is not None or param.name in self.displaced)
-            )
-        )
+        gone = [
+            name
+            for name, held in self._held.items()
+            if name not in present and (is_listed(held) or name in self.displaced)
+        ]
         self.displaced.clear()
-        return gone
+        return self._remove(gone)
 
     def present(self) -> dict[int, str]:
         """Names by index, as far as they are known under the count of now; none where two claim one index."""
         names: dict[int, str] = {}
         twice = set()
-        for param in self.listed():
-            assert param.index is not None
-            if names.setdefault(param.index, param.name) != param.name:
-                twice.add(param.index)
+        for name, held in self._held.items():
+            index = parts_of(held)[4]
+            if index != NOWHERE and names.setdefault(index, name) != name:
+                twice.add(index)
         count = self.count or 0
         return {index: name for index, name in names.items() if index < count and index not in twice}
 
     def verify(self) -> None:
         """The vehicle's hash has confirmed it: what is cached and counts into it becomes *verified*."""
-        unhashed = self.unhashed()
-        for param in self.listed():
-            if param.trust is Trust.CACHED and param.name not in unhashed:
-                self.params[param.name] = param.with_trust(Trust.VERIFIED)
+        if not self.volatile_known:
+            return  # the hash may say nothing of any of them
+        for name, held in self._held.items():
+            if trust_of(held) == CACHED and is_listed(held) and name not in self.volatile:
+                self._held[name] = trusted(held, VERIFIED)
 
     def doubt(self, *trusts: Trust) -> None:
         """It may have moved unheard: what was trusted like this is no more than *cached*."""
         self.doubts += Trust.LIVE in trusts
-        for name, param in self.params.items():
-            if param.trust in trusts:
+        doubted = {number_of(trust) for trust in trusts}
+        for name, held in self._held.items():
+            if trust_of(held) in doubted:
                 self._wire.pop(name, None)  # the next value counts, also if it is the same
-                self.params[name] = param.with_trust(Trust.CACHED)
+                self._held[name] = trusted(held, CACHED)
 
     def remove(self, condition: Callable[[Param], bool]) -> list[Change]:
         """Take out the parameters that meet a condition."""
-        gone = [param for param in self.params.values() if condition(param)]
-        for param in gone:
-            del self.params[param.name]
-            self._wire.pop(param.name, None)
-            self._filed.discard(param.name)
-            if param.name in self.dirty or len(self.dirty) < MOST_GONE:
-                self.dirty[param.name] = "vehicle"
-            if self._hash is not None:
-                self._moved(param.name)
-        self._room.taken -= len(gone)
-        return [Change(param.name, param, None) for param in gone]
+        return self._remove([param.name for param in self.params.values() if condition(param)])
 
     def forget(self) -> list[Change]:
         """It is another vehicle's: nothing is known of it."""
-        changes = self.remove(lambda param: True)
+        changes = self._remove(list(self._held))
         self.unconfirm()
         self.volatile = frozenset()
         self.volatile_known = False
@@ -425,23 +441,32 @@ class Table:
 
     def forget_defaults(self) -> None:
         """They were those of another firmware."""
-        for name, param in self.params.items():
-            if param.default is not None:
-                self.params[name] = replace(param, default=None)
+        self._defaults.clear()
 
-    def listed(self) -> list[Param]:
-        """The parameters that have an index: those that the count and the hash are about."""
-        return [param for param in self.params.values() if param.index is not None]
+    def listed_bits(self) -> dict[str, int]:
+        """The bits of those that have an index, which the count and the hash are about, by name."""
+        return {name: parts_of(held)[0] for name, held in self._held.items() if is_listed(held)}
+
+    @property
+    def size(self) -> int:
+        """How many those are."""
+        return sum(map(is_listed, self._held.values()))
+
+    @property
+    def only_cached(self) -> int:
+        """How many of those are no more than *cached*."""
+        return sum(trust_of(held) == CACHED and is_listed(held) for held in self._held.values())
 
     def gaps(self) -> tuple[int, tuple[int, ...]]:
         """How many parameters there should be, and the indices of those that are not known."""
-        present = {param.index for param in self.listed()}
+        present = {parts_of(held)[4] for held in self._held.values()}
+        present.discard(NOWHERE)
         count = len(present) if self.count is None else self.count
         return count, tuple(index for index in range(count) if index not in present)
 
     def unhashed(self) -> set[str]:
         """The names that the hash says nothing about: the volatile ones, or any while those are not known."""
-        return set(self.volatile) if self.volatile_known else {param.name for param in self.listed()}
+        return set(self.volatile) if self.volatile_known else set(self.listed_bits())
 
     def take_dirty(self) -> dict[str, str]:
         """Names that changed since the last call, each with who did it; gone names too."""
@@ -453,40 +478,59 @@ class Table:
         overwritten, self.overwritten = self.overwritten, []
         return overwritten
 
-    def _news(self, name: str, old: Param | None, by: str) -> None:
+    def _remove(self, names: Collection[str]) -> list[Change]:
+        """Take out these."""
+        changes = []
+        for name in names:
+            held = self._held.pop(name)
+            default = self._defaults.pop(name, None)
+            self._wire.pop(name, None)
+            self._filed.discard(name)
+            if name in self.dirty or len(self.dirty) < MOST_GONE:
+                self.dirty[name] = "vehicle"
+            if self._hash is not None:
+                self._moved(name)
+            changes.append(_new(Change, (name, held, None, "vehicle", default)))
+        self._room.taken -= len(changes)
+        return changes
+
+    def _change(self, name: str, old: Held | None, new: Held) -> Change:
+        return _new(Change, (name, old, new, "vehicle", self._defaults.get(name)))
+
+    def _news(self, name: str, old: Held | None, by: str) -> None:
         """A value has changed. What was written for somebody is told of, however short it stood, and with
         what it has replaced, however short that was known."""
         before = self.dirty.get(name)
         if old is not None and before is not None and (is_ours(before) or is_ours(by)):
-            self.overwritten.append((old, before))
+            self.overwritten.append((param_of(name, old, self._defaults.get(name)), before))
             del self.overwritten[:-MOST_OVERWRITTEN]
         self.dirty[name] = by
 
-    def _complement(self, heard: Param, cached: Param) -> list[Change]:
+    def _complement(self, name: str, heard: Held, cached: Held, default: Value | None) -> list[Change]:
         """Add to what was heard what its message does not say."""
-        new = heard if heard.default is not None else replace(heard, default=cached.default)
-        if self._rounds(cached, self._wire.get(heard.name, b"")):
-            new = replace(new, value=cached.value, bits=cached.bits)
-        self.params[heard.name] = new
-        if new.default != heard.default:
-            self.dirty.setdefault(heard.name, "vehicle")
-        if heard.same_value(new):
+        bits, number, is_raw, trust, place = parts_of(heard)
+        if self._rounds(cached, self._wire.get(name, b"")):
+            bits, _, is_raw, *_ = parts_of(cached)
+        if default is not None and name not in self._defaults:
+            self._defaults[name] = default
+            self.dirty.setdefault(name, "vehicle")
+        new = self._held[name] = to_hold(bits, number, is_raw, trust, place)
+        if same_held(heard, new):
             return []
-        self.dirty.setdefault(heard.name, "vehicle")
-        return [Change(heard.name, heard, new)]
+        self.dirty.setdefault(name, "vehicle")
+        return [self._change(name, heard, new)]
 
-    def _rounds(self, known: Param, raw: bytes) -> bool:
+    def _rounds(self, known: Held, raw: bytes) -> bool:
         """Whether a message rounds what is known exactly: an integer beyond the 24 bits of a float32."""
-        return (
-            self._encoding is Encoding.C_CAST
-            and isinstance(known.value, int)
-            and abs(known.value) > _EXACT
-            and as_sent(known.bits, known.type, self._encoding) == raw
-        )
+        if self._encoding is not Encoding.C_CAST:
+            return False
+        bits, number, is_raw, *_ = parts_of(known)
+        value = from_bits(bits, number, is_raw=is_raw)
+        return isinstance(value, int) and abs(value) > _EXACT and as_sent(bits, number, self._encoding) == raw
 
-    def _displaced(self, param: Param) -> Param:
-        self.displaced.add(param.name)
-        return replace(param, index=None)
+    def _displaced(self, name: str, held: Held) -> Held:
+        self.displaced.add(name)
+        return placed(held, NOWHERE)
 
     def _moved(self, name: str) -> None:
         if name in self.volatile:

@@ -57,6 +57,7 @@ class RoundTrip:
         "_backoff",
         "_samples",
         "_silences",
+        "_timeout",
         "_unanswered",
         "_was_answered",
         "heard_at",
@@ -74,6 +75,7 @@ class RoundTrip:
         self._answered = 0.0
         self._unanswered = 0.0
         self._was_answered = False
+        self._timeout: float | None = None
 
     @property
     def is_guessed(self) -> bool:
@@ -85,8 +87,10 @@ class RoundTrip:
 
     @property
     def timeout(self) -> float:
-        """Seconds to wait for an answer before asking again."""
-        return self._wait(0.0 if self.smoothed is None else self.smoothed + SERVING_TIME)
+        """Seconds to wait for an answer before asking again. Asked often, so it is worked out once."""
+        if self._timeout is None:
+            self._timeout = self._wait(0.0 if self.smoothed is None else self.smoothed + SERVING_TIME)
+        return self._timeout
 
     @property
     def prompt_timeout(self) -> float:
@@ -138,6 +142,7 @@ class RoundTrip:
         Where that is infinite, as after an absence, nobody knows: it tells nothing of the round trip.
         """
         self._was_answered = True
+        self._timeout = None
         if attempts <= 2:
             self._answered = self._answered * MEMORY + 1
             self._unanswered *= MEMORY
@@ -164,6 +169,7 @@ class RoundTrip:
         From the third on neither this nor an answer counts into the loss: what stays silent that long may
         have no answer at all.
         """
+        self._timeout = None
         if attempts <= 2:
             self._unanswered = self._unanswered * MEMORY + 1
             self._answered *= MEMORY

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from paramclient.errors import NoReply, ParamErrorCode, TypeMismatch, UsageError, ValueNotApplied
@@ -108,7 +108,7 @@ class Writes:
         round_trip: RoundTrip,
         send: Callable[[Message], None],
         reads: Reads,
-        params: dict[str, Param],
+        params: Mapping[str, Param],
         encoding: Callable[[], Encoding],
         is_certain: Callable[[], bool],
         trace: Trace = silent,
@@ -239,9 +239,11 @@ class Writes:
 
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity."""
-        timeout = self._round_trip.timeout
         earliest = math.inf
-        for queue in self.queues.values() if self._is_certain() else ():
+        if not self.queues or not self._is_certain():
+            return earliest
+        timeout = self._round_trip.timeout
+        for queue in self.queues.values():
             write = queue[0]
             earliest = min(earliest, write.verify_at)
             if write.attempts and write.read is None and not write.is_answered:

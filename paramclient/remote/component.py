@@ -10,15 +10,16 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn, SupportsFloat, SupportsI
 
 import anyio
 
-from paramclient.component import Component, check_accepted, check_asked
+from paramclient.asked import check_accepted, check_asked
+from paramclient.component import Component
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.events import Changes, Event, Found, Heard, Lost
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
+from paramclient.protocol.change import Change
 from paramclient.protocol.result import FetchResult, Progress
 from paramclient.protocol.sampling import SAMPLE_SIZE
 from paramclient.protocol.sync import SyncState
-from paramclient.protocol.table import Change
 from paramclient.protocol.wire import MAV_TYPE_GCS, MOST_PARAMETERS, SigningKey
 from paramclient.protocol.writes import SetResult
 from paramclient.remote.connection import telling

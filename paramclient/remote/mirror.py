@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from paramclient.protocol.table import Change
+from paramclient.protocol.change import Change
 from paramclient.values import Param, Trust
 
 __all__ = ["MOST_WAITING", "Mirror"]
@@ -68,7 +68,7 @@ class Mirror:
         if seq <= self._seq:
             return None
         self._seq = seq
-        name, _, new, by = change
+        name, new, by = change.name, change.new, change.by
         old = self._told.get(name)
         if new is None:
             self._told.pop(name, None)

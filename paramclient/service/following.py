@@ -14,7 +14,8 @@ from paramclient.documents.component import ComponentDoc, ProgressDoc
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.events import Changes
 from paramclient.notation import bits_text, value_json
-from paramclient.protocol.table import Change
+from paramclient.params import held_of, kept
+from paramclient.protocol.change import Change
 from paramclient.service.feed import COMPACT
 from paramclient.values import Param, Trust, type_name
 
@@ -43,14 +44,14 @@ class Followed:
         self.line = line
         self.metadata: Metadata | None = None
         self._feed = feed
-        self._shown: dict[str, Param] = dict(component.params)
+        self._shown = kept(component.params).copy()
         self._heard_at: dict[str, float] = {}
         self._texts: dict[str, str] = {}
         self._told: tuple[object, ...] | None = None
         self._is_fetching = False
         self._last_fetch: object = None
         self._sink = _Sink(self)
-        component._subscriptions.add(self._sink)
+        component._listen(self._sink)
 
     def __repr__(self) -> str:
         return f"<Followed {self.component!r} on {self.line.name}>"
@@ -83,7 +84,8 @@ class Followed:
     def text_of(self, param: Param) -> str:
         """A parameter of its table as JSON; that of a value that has not moved is made once."""
         name = param.name
-        if self._shown.get(name) is not param:
+        shown = self._shown
+        if shown.held.get(name) != held_of(param) or shown.defaults.get(name) != param.default:
             self._look_at_values()
         text = self._texts.get(name)
         if text is None:
@@ -148,7 +150,7 @@ class Followed:
 
     def changed(self, change: Change) -> None:
         """A value has changed."""
-        name, old, new, by = change
+        name, old, new, by = change.name, change.old, change.new, change.by
         if new is None:
             self._shown.pop(name, None)
             self._heard_at.pop(name, None)
@@ -166,12 +168,16 @@ class Followed:
 
     def _look_at_values(self) -> None:
         """See which parameters are others than were told: their trust, default or index has moved."""
-        params, shown = self.component.params, self._shown
+        params, shown = kept(self.component.params), self._shown
         last = self.component._machine.fetches.last
         if last is not self._last_fetch:
             self._last_fetch = last
             self._was_fetched()
-        moved = [param for name, param in params.items() if shown.get(name) is not param]
+        names = [name for name, held in params.held.items() if shown.held.get(name) != held]
+        if params.defaults != shown.defaults:
+            given, told = params.defaults, shown.defaults
+            names += [name for name in given.keys() | told.keys() if given.get(name) != told.get(name)]
+        moved = [params[name] for name in dict.fromkeys(names) if name in params]
         if not moved:
             return
         now = _now()
