@@ -8,13 +8,14 @@ from dataclasses import astuple, replace
 from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
-from paramclient.cache.database import Damaged
 from paramclient.errors import UsageError
 from paramclient.identity import Identity
 from paramclient.values import Param, Trust, Value, bits_of, from_bits, known_type, same_bits
 
 __all__ = [
+    "Damaged",
     "Row",
+    "YEAR_10000",
     "cells",
     "checksum",
     "identity_cells",
@@ -24,7 +25,8 @@ __all__ = [
     "time_cell",
 ]
 
-_YEAR_10000: Final = 253402300800.0
+YEAR_10000: Final = 253402300800.0
+"""Unix seconds in which no time that is stored can lie any more."""
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "i": (int,),
     "f": (float,),
@@ -40,6 +42,12 @@ _name: Final = itemgetter(0)
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
 
 
+class Damaged(Exception):
+    """The file does not hold what was written to it. Work may raise this; it never reaches a caller."""
+
+    kind = "damaged"
+
+
 def cells(row: Sequence[object], kinds: str) -> Any:
     """Give a row back whose cells are what they should be; else `Damaged`.
 
@@ -51,14 +59,14 @@ def cells(row: Sequence[object], kinds: str) -> Any:
     if times is None:  # a row like none before; those of a table are all like a few
         times = _TIMES[shape] = _times(row, kinds)
     for place in times:
-        if not 0 <= row[place] < _YEAR_10000:  # type: ignore[operator]  # the shape says that it is a float
+        if not 0 <= row[place] < YEAR_10000:  # type: ignore[operator]  # the shape says that it is a float
             raise Damaged(f"a cell holds {row[place]!r:.40}")
     return row
 
 
 def time_cell(at: float) -> float:
     """A time to be stored: unix seconds, before the year 10000; else UsageError."""
-    if not 0 <= at < _YEAR_10000:
+    if not 0 <= at < YEAR_10000:
         raise UsageError(f"{at!r} is not a time in unix seconds")
     return float(at)
 
