@@ -18,6 +18,7 @@ from hypothesis import strategies as st
 from paramclient.cache import ParamCache, sqlite
 from paramclient.cache.packed import Packed, pack, packed_row, row_checksum, unpack
 from paramclient.cache.rows import Damaged, Row
+from paramclient.cache.session import Session
 from paramclient.errors import UsageError
 from paramclient.values import ParamType
 from tests.caches import NOW, PX4, stored, update, values, whole_table
@@ -301,3 +302,22 @@ def test_a_table_can_become_empty_and_have_parameters_again(path: Path) -> None:
     with ParamCache(path) as cache:
         assert values(cache) == {"A": 1}
         assert not cache.notes
+
+
+def test_where_names_stand_is_remembered_of_a_few_firmwares(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sqlite, "_DIFFERENT", 2)
+    with ParamCache(path) as cache:
+        for number in range(5):
+            cache.save(update(stored("A", number), stored(f"B{number}", 1), component=number + 1))
+
+        def work(session: Session) -> None:
+            assert isinstance(session, sqlite.SqliteSession)
+            owners = [session.owner_of(PX4.key, number + 1) or 0 for number in range(5)]
+            found = session.holders([*owners, *owners], ["A", "B3", "C"])
+            own = {("A", 6, number, 0): [owner] * 2 for number, owner in enumerate(owners)}
+            assert found == own | {("B3", 6, 1, 0): [owners[3]] * 2}
+            assert len(session._places_of) == 2
+
+        cache._store.read(work)
