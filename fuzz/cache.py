@@ -1,14 +1,18 @@
 """The cache file, damaged in any way: only CacheError comes, nothing is lost, and nothing wrong is believed.
 
 The input says what is changed in a file that was written before; a whole file would leave the fuzzer with
-nothing but bytes that SQLite refuses at once.
+nothing but bytes that SQLite refuses at once. What is left of the input changes the bytes of a table, under a
+checksum that is right: so they come from one who wants them believed.
 """
 
 from __future__ import annotations
 
 import logging
+import sqlite3
+import struct
 import tempfile
-from contextlib import suppress
+import zlib
+from contextlib import closing, suppress
 from functools import cache
 from pathlib import Path
 from typing import Final
@@ -16,6 +20,8 @@ from unittest import mock
 
 from fuzz.draw import Draw
 from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
+from paramclient.cache.packed import pack, row_checksum, unpack
+from paramclient.cache.rows import Damaged
 from paramclient.errors import CacheError
 from paramclient.identity import Identity
 from paramclient.values import Param, ParamType, Trust
@@ -34,9 +40,14 @@ logger = logging.getLogger("paramclient.cache")
 
 
 def run(data: bytes) -> None:
-    """Damage a file, then read and write it as a client would."""
+    """Damage a file, then read and write it as a client would; then a blob, alone and in a file."""
     draw = Draw(data)
-    content = _damaged(_good_file(), draw)
+    _run_file(_damaged(_good_file(), draw))
+    if not draw.is_over:
+        _run_blob(_damaged(_good_blob(), draw))
+
+
+def _run_file(content: bytes) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cache.sqlite3"
         path.write_bytes(content)
@@ -48,6 +59,33 @@ def run(data: bytes) -> None:
         ]
         # the damaged file is set aside under another name, or stands where it was; nothing of it is cut off
         assert any(each.stat().st_size >= len(content) for each in files), [each.name for each in files]
+
+
+def _run_blob(changed: bytes) -> None:
+    with suppress(Damaged):
+        assert unpack(changed) == unpack(_good_blob()), "the checksum tells of every change"
+    blob = changed[:-4] + struct.pack("<I", zlib.crc32(changed[:-4]))
+    rows = None
+    with suppress(Damaged):
+        rows = unpack(blob)
+        assert unpack(pack(rows)) == rows
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "cache.sqlite3"
+        path.write_bytes(_good_file())
+        with closing(sqlite3.connect(path, isolation_level=None)) as file:
+            row = (len(rows or ()), AT, blob)
+            file.execute("UPDATE packed SET (size, heard_last, params) = (?, ?, ?)", row)
+            file.execute("UPDATE component SET checksum = ?", (row_checksum(*row),))
+        with mock.patch.object(logger, "disabled", True), ParamCache(path) as kept:
+            with suppress(CacheError):
+                kept.fleet_diff(["PARAM_*"])
+            table = kept.load(VEHICLE.key, 1)
+            assert (table is None) == bool(kept.notes)
+            assert table is None or (rows is not None and table.params.keys() == rows.keys())
+            kept.save(_update(VEHICLE, 3.0))
+            held = kept.load(VEHICLE.key, 1)
+            assert held is not None
+            assert {name: held.params[name].value for name in NAMES} == dict.fromkeys(NAMES, 3.0)
 
 
 def _use(path: Path) -> None:
@@ -82,6 +120,17 @@ def _update(identity: Identity, value: float) -> TableUpdate:
             for index, name in enumerate(NAMES)
         ],
     )
+
+
+@cache
+def _good_blob() -> bytes:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "cache.sqlite3"
+        path.write_bytes(_good_file())
+        with closing(sqlite3.connect(path)) as file:
+            [(blob,)] = file.execute("SELECT params FROM packed")
+    assert isinstance(blob, bytes)
+    return blob
 
 
 @cache

@@ -27,6 +27,7 @@ from paramclient.cache import (
     default_path,
     tables,
 )
+from paramclient.cache.session import Session
 from paramclient.errors import CacheError, UsageError
 from paramclient.identity import Identity
 from paramclient.values import Param, ParamType, Trust, same_bits
@@ -689,3 +690,22 @@ def test_defaults_are_kept_beside_the_values(path: Path) -> None:
         assert table is not None
         assert table.params.changed().keys() == {"FLOAT"}
         assert not table.history(), "a default is no change of the value"
+
+
+def test_when_a_value_was_heard_last(path: Path) -> None:
+    with ParamCache(path) as cache:
+
+        def heard_last(component: int) -> float:
+            def work(session: Session) -> float:
+                owner = session.owner_of(PX4.key, component)
+                assert owner is not None
+                return session.heard_last(owner)
+
+            return cache._store.read(work)
+
+        cache.save(update(*(stored(name, 1, at=NOW - ago) for name, ago in (("A", 5), ("B", 2), ("C", 9)))))
+        cache.save(update(component=2))
+        assert heard_last(1) == NOW - 2
+        assert heard_last(2) == float("-inf")
+        cache.save(update(at=NOW + 1, removed=["B"]))
+        assert heard_last(1) == NOW - 5

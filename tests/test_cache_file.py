@@ -26,9 +26,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from paramclient.cache import HISTORY_LINES, ParamCache, database, lock
-from paramclient.cache.database import APPLICATION_ID, MIGRATIONS, Damaged, Database
+from paramclient.cache.database import APPLICATION_ID, Database
+from paramclient.cache.packed import unpack
+from paramclient.cache.rows import Damaged, checksum
+from paramclient.cache.schema import MIGRATIONS
 from paramclient.errors import CacheError
 from paramclient.identity import Identity
+from paramclient.values import ParamType
 from tests.caches import (
     CACHE_ALONE,
     NOW,
@@ -100,12 +104,31 @@ def sound_file() -> bytes:
         return path.read_bytes()
 
 
-BACK_TO_2 = """
-    DROP TABLE snapshot; DROP TABLE setback; DROP TABLE birth; DROP INDEX history_of_param;
-    ALTER TABLE component DROP COLUMN known_since;
-    PRAGMA user_version = 2;
-"""
-"""Makes of the present file what the second version would have made."""
+def make_older(path: Path, version: int) -> None:
+    """Make of the present file what an earlier version would have made."""
+    with connect(path) as connection:
+        for statement in (MIGRATIONS[0][2], MIGRATIONS[1][0]):
+            assert isinstance(statement, str)
+            connection.execute(statement)
+        for owner, blob in connection.execute("SELECT owner, params FROM packed").fetchall():
+            rows = unpack(blob)
+            connection.executemany(
+                "INSERT INTO param (owner, name, type, bits, is_raw, param_index, volatile, heard_at,"
+                " default_bits) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                [(owner, name, *row) for name, row in rows.items()],
+            )
+            connection.execute("UPDATE component SET checksum = ? WHERE id = ?", (checksum(rows), owner))
+        connection.execute("DROP TABLE packed")
+        if version < 3:
+            connection.executescript(
+                "DROP TABLE snapshot; DROP TABLE setback; DROP TABLE birth; DROP INDEX history_of_param;"
+                "ALTER TABLE component DROP COLUMN known_since"
+            )
+        if version < 2:
+            connection.execute("ALTER TABLE param DROP COLUMN default_bits")
+            connection.execute("ALTER TABLE component DROP COLUMN file_works")
+        connection.execute(f"PRAGMA user_version = {version}")
+
 
 # Killed at any moment
 
@@ -397,6 +420,16 @@ def sound_but(change: str) -> Callable[[Path], None]:
     return make
 
 
+def older_but(change: str, version: int = 3) -> Callable[[Path], None]:
+    def make(path: Path) -> None:
+        path.write_bytes(sound_file())
+        make_older(path, version)
+        with connect(path) as connection:
+            connection.executescript(change)
+
+    return make
+
+
 def sound_with(at: int, byte: int) -> Callable[[Path], None]:
     def make(path: Path) -> None:
         content = bytearray(sound_file())
@@ -423,17 +456,30 @@ def sound_with(at: int, byte: int) -> Callable[[Path], None]:
         (lambda path: other_program(path, APPLICATION_ID), "tables are not those of version 0"),
         (lambda path: other_program(path, APPLICATION_ID, 1), "tables are not those of version 1"),
         (sound_but("PRAGMA user_version = -1"), "tables are not those of version -1"),
-        (sound_but("DROP TABLE history"), "tables are not those of version 3"),
-        (sound_but("ALTER TABLE param RENAME COLUMN bits TO bats"), "tables are not those"),
-        (sound_but("UPDATE param SET bits = 'much'"), "a cell holds 'much'"),
-        (sound_but("UPDATE param SET name = CAST(x'ff' || owner AS TEXT) WHERE param_index = 9"), "UTF-8"),
-        (sound_but("UPDATE param SET bits = bits + 1"), "not what was written"),
-        (sound_but("DELETE FROM param WHERE param_index = 9"), "not what was written"),
+        (sound_but("DROP TABLE history"), "tables are not those of version 4"),
+        (sound_but("ALTER TABLE packed RENAME COLUMN params TO rows"), "tables are not those"),
+        (sound_but("UPDATE component SET count = 'much'"), "a cell holds 'much'"),
+        (sound_but("UPDATE history SET name = CAST(x'ff' || owner AS TEXT)"), "UTF-8"),
+        (sound_but("UPDATE packed SET params = 'much'"), "a table is 'much'"),
+        (sound_but("UPDATE packed SET params = CAST(substr(params, 9) AS BLOB)"), "not what was written"),
+        (sound_but("UPDATE packed SET params = x''"), "not what was written"),
+        (sound_but("UPDATE packed SET params = (SELECT params FROM packed WHERE owner = 2)"), "not what was"),
+        (sound_but("UPDATE packed SET size = 1"), "not what was written"),
+        (sound_but("UPDATE packed SET heard_last = 1e9"), "not what was written"),
+        (sound_but("DELETE FROM packed"), "not what was written"),
+        (sound_but("UPDATE component SET checksum = 223132457"), "not what was written"),
+        (older_but("ALTER TABLE param RENAME COLUMN bits TO bats"), "tables are not those of version 3"),
+        (older_but("UPDATE param SET bits = 'much'"), "a cell holds 'much'"),
+        (older_but("UPDATE param SET name = CAST(x'ff' || owner AS TEXT) WHERE param_index = 9"), "UTF-8"),
+        (older_but("UPDATE param SET bits = bits + 1"), "not what was written"),
+        (older_but("UPDATE param SET bits = bits + 1 WHERE owner = 3", 2), "not what was written"),
+        (older_but("UPDATE param SET bits = bits + 1 WHERE owner = 3", 1), "not what was written"),
+        (older_but("DELETE FROM param WHERE param_index = 9"), "not what was written"),
+        (older_but("UPDATE param SET heard_at = 9e999"), "a cell holds inf"),
         (sound_but("UPDATE history SET old_bits = 1 << 40"), "is not a value of type 6"),
         (sound_but("UPDATE history SET new_type = -1"), "-1 is not a type"),
-        (sound_but("PRAGMA writable_schema = on; UPDATE sqlite_master SET rootpage = 3 WHERE name = 'param'"),
-         "reference to page 3"),
-        (sound_but("UPDATE param SET heard_at = 9e999"), "a cell holds inf"),
+        (sound_but("PRAGMA writable_schema = on;"
+                   "UPDATE sqlite_master SET rootpage = 3 WHERE name = 'packed'"), "reference to page 3"),
         (sound_but("UPDATE component SET synced_at = 1e15"), "a cell holds 1"),
         (sound_but("UPDATE vehicle SET first_seen = -1"), "a cell holds -1"),
     ],
@@ -500,7 +546,7 @@ def test_files_set_aside_in_one_second_get_numbers(path: Path, monkeypatch: pyte
 
 def test_an_older_file_is_brought_up_to_date(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path.write_bytes(sound_file())
-    steps = (*MIGRATIONS, ("CREATE TABLE more (a)", "INSERT INTO more SELECT count(*) FROM param"))
+    steps = (*MIGRATIONS, ("CREATE TABLE more (a)", "INSERT INTO more SELECT sum(size) FROM packed"))
     monkeypatch.setattr(database, "MIGRATIONS", steps)
     with ParamCache(path) as cache:
         assert len(values(cache)) == 300
@@ -517,11 +563,7 @@ def test_an_older_file_is_brought_up_to_date(path: Path, monkeypatch: pytest.Mon
 
 def test_a_file_from_before_there_were_defaults_keeps_its_tables(path: Path) -> None:
     path.write_bytes(sound_file())
-    with connect(path) as connection:  # as the first version made it; the checksums are the same
-        connection.executescript(BACK_TO_2)
-        connection.execute("ALTER TABLE param DROP COLUMN default_bits")
-        connection.execute("ALTER TABLE component DROP COLUMN file_works")
-        connection.execute("PRAGMA user_version = 1")
+    make_older(path, 1)  # the checksums are those of the later versions
     with ParamCache(path) as cache:
         assert len(values(cache)) == 300
         assert not cache.notes
@@ -534,8 +576,7 @@ def test_a_file_from_before_there_were_snapshots_has_a_past_from_its_last_write_
         cache.save(whole_table(300))
         cache.save(update(stored("PARAM_1", 5, at=NOW + 50), at=NOW + 50))
         cache.save(update(stored("ALONE", 1), component=154))
-    with connect(path) as connection:
-        connection.executescript(BACK_TO_2)
+    make_older(path, 2)
     with ParamCache(path) as cache:
         cache.save(update(stored("PARAM_1", 6, at=NOW + 99), stored("NEW", 1, at=NOW + 99), at=NOW + 99))
         state = cache.state_at(PX4.key, 1, NOW + 50)
@@ -550,13 +591,64 @@ def test_a_file_from_before_there_were_snapshots_has_a_past_from_its_last_write_
         works(cache)
 
 
+@pytest.mark.parametrize("version", [2, 3])
+def test_a_file_from_before_tables_were_packed_keeps_every_cell(path: Path, version: int) -> None:
+    odd = stored("\xdf\0", 4)
+    cells = [
+        stored("PLAIN", 1, index=0),
+        stored("LAST", (1 << 64) - 1, ParamType.INT64, at=NOW - 0.1, volatile=True),
+        stored("NAN", 0x7FA00001, ParamType.REAL32, index=1),
+        stored("RAW", 0xFFFFFFFF, 77, index=32767, is_raw=True),
+        stored("A", 3, index=1),
+        replace(odd, param=replace(odd.param, default=-5)),
+    ]
+    with ParamCache(path) as cache:
+        cache.save(update(*cells))
+        cache.save(update(component=154))
+        before = [cache.load(PX4.key, component) for component in (1, 154)]
+        summaries = cache.components()
+    assert before[0] is not None
+    assert list(before[0].params) == ["PLAIN", "A", "NAN", "RAW", "LAST", "\xdf\0"]
+    make_older(path, version)
+    with ParamCache(path) as cache:
+        after = [cache.load(PX4.key, component) for component in (1, 154)]
+        assert after == before
+        assert after[0] is not None
+        assert list(after[0].params) == list(before[0].params)
+        assert after[0].params["\xdf\0"].default == -5
+        assert cache.components() == summaries
+        cache.save(update(stored("PLAIN", 2, at=NOW + 5), at=NOW + 5))
+        assert [entry.old.value for entry in cache.history(PX4.key)] == [1]
+        assert not cache.notes
+        works(cache)
+    with connect(path) as connection:
+        assert not connection.execute("SELECT 1 FROM sqlite_master WHERE name = 'param'").fetchall()
+
+
+def test_a_file_that_cannot_be_brought_up_to_date_stays_what_it_was(
+    path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path.write_bytes(sound_file())
+    make_older(path, 3)
+    *steps, last = MIGRATIONS
+    monkeypatch.setattr(database, "MIGRATIONS", (*steps, (*last, "DROP TABLE nonesuch")))
+    with ParamCache(path) as cache, pytest.raises(CacheError, match="no such table: nonesuch"):
+        cache.save(whole_table(1))
+    with connect(path) as connection:
+        assert connection.execute("PRAGMA user_version").fetchone() == (3,)
+        assert connection.execute("SELECT count(*) FROM param").fetchone() == (600,)
+    monkeypatch.undo()
+    with ParamCache(path) as cache:
+        assert [values(cache, *table) for table in SOUND_TABLES] == list(SOUND_TABLES.values())
+        assert not cache.notes
+
+
 def test_a_past_that_the_clock_has_mixed_up_begins_after_all_of_it(path: Path) -> None:
     with ParamCache(path) as cache:
         cache.save(whole_table(3))
         cache.save(update(stored("PARAM_1", 5, at=NOW + 900), at=NOW + 900))
         cache.save(update(at=NOW + 10))
-    with connect(path) as connection:
-        connection.executescript(BACK_TO_2)
+    make_older(path, 2)
     with ParamCache(path) as cache:
         with pytest.raises(CacheError, match="begins at 2026-11-18T11:21:40Z"):
             cache.state_at(PX4.key, 1, NOW + 899)
@@ -614,7 +706,7 @@ def test_damage_that_comes_to_light_later_is_dealt_with_in_the_same_way(path: Pa
     path.write_bytes(sound_file())
     with connect(path) as connection:
         pages = connection.execute(
-            "SELECT rootpage FROM sqlite_master WHERE name IN ('param', 'history')"
+            "SELECT rootpage FROM sqlite_master WHERE name IN ('packed', 'history')"
         ).fetchall()
     with ParamCache(path) as reader, ParamCache(path) as writer:
         assert len(reader.vehicles()) == len(writer.vehicles()) == 2
@@ -639,13 +731,13 @@ def test_a_file_set_aside_takes_its_log_along(path: Path) -> None:
     with ParamCache(path) as first:
         first.save(whole_table(3))
         with connect(path) as connection:
-            connection.execute("UPDATE param SET bits = 'much'")
+            connection.execute("UPDATE packed SET params = 'much'")
         assert path.with_name(f"{path.name}-wal").stat().st_size
         assert values(first) == {}
         works(first)
     (kept,) = set_aside(path)
     with connect(kept) as connection:
-        assert connection.execute("SELECT DISTINCT bits FROM param").fetchall() == [("much",)]
+        assert connection.execute("SELECT params FROM packed").fetchall() == [("much",)]
 
 
 def test_a_header_that_forbids_writing_is_damage(path: Path) -> None:
@@ -701,7 +793,7 @@ def test_what_another_program_has_just_set_aside_is_not_set_aside_again(
     with ParamCache(path) as cache:
         assert len(values(cache)) == 300
         with connect(path) as other:
-            other.execute("UPDATE param SET bits = 'much'")
+            other.execute("UPDATE packed SET params = 'much'")
         path.with_name("other").write_bytes(sound_file())
         monkeypatch.setattr("paramclient.cache.database.locked", late)
         assert len(values(cache)) == 300

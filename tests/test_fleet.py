@@ -175,11 +175,11 @@ def test_damage_that_is_met_is_told_as_everywhere(tmp_path: Path) -> None:
     with ParamCache(path) as cache:
         cache.save(update(stored("A", 1), table=DONE))
     with closing(sqlite3.connect(path, isolation_level=None)) as other:
-        other.execute("UPDATE param SET bits = 'much'")
+        other.execute("UPDATE packed SET params = 'much'")
     with ParamCache(path) as cache:
         with pytest.raises(CacheError, match="holds no table"):
             cache.fleet_diff(wanted(A=1))
-        assert "a cell holds 'much'" in cache.notes[0]
+        assert "a table is 'much'" in cache.notes[0]
     assert len(set_aside(path)) == 1
 
 

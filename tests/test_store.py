@@ -31,7 +31,7 @@ from paramclient.cache.outbox import LocalCopy
 from paramclient.cache.postgres import Away, PostgresDatabase
 from paramclient.cache.rows import Row
 from paramclient.cache.session import Line
-from paramclient.cache.shared import SharedStore
+from paramclient.cache.shared import SharedStore, _Link
 from paramclient.cache.transfer import take_whole
 from paramclient.errors import CacheError, UsageError
 from tests import test_cache, test_fleet, test_snapshots
@@ -407,10 +407,29 @@ def test_a_station_works_on_locally_and_catches_up(fragile: tuple[Server, ParamC
 
 def is_copied(cache: ParamCache) -> bool:
     """Whether the local copy has what the database has."""
+    link = link_of(cache)
+    return link.local.revisions() == link._database.revisions()
+
+
+def link_of(cache: ParamCache) -> _Link:
     store = cache._store
     assert isinstance(store, SharedStore)
-    link = store._link
-    return link.local.revisions() == link._database.revisions()
+    return store._link
+
+
+def test_what_only_the_database_can_keep_is_kept_there(
+    cache: ParamCache, caplog: pytest.LogCaptureFixture
+) -> None:
+    cache.save(update(stored("A", 1, index=(1 << 31) - 1)))
+    assert values(cache) == {"A": 1}
+    cache.save(update(stored("B", 2), component=2))
+    until(lambda: (PX4.key, 2) in link_of(cache).local.revisions())
+    until(lambda: not link_of(cache)._wanted)
+    assert not is_copied(cache)
+    [record] = caplog.records
+    assert record.message == (
+        "the local copy is not up to date: a table cannot be kept: 2147483647 is no index"
+    )
 
 
 def test_what_waited_when_a_program_died_goes_with_the_next_one(own_server: Server, tmp_path: Path) -> None:

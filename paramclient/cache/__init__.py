@@ -4,7 +4,8 @@
 and `interface` what it calls; `operations` are what can be written. `merge` brings in what is of the past,
 `tables` keeps tables and their history, `earlier` tells what they were before,
 `fleet` puts those of many vehicles beside each other, `rows` lays them into cells. `session` is one
-transaction in the SQL of every database, `sqlite` in that of a file; `database` looks after the file.
+transaction in the SQL of every database, `sqlite` in that of a file, where `packed` makes a blob of a table;
+`database` looks after the file, and `schema` says what is in it.
 
 Where stations share a database, `shared` puts this together: `postgres` (with `migrations` and `address`),
 the local copy with its `outbox`, and `settle` for what comes from several stations. `transfer` copies tables.

@@ -21,121 +21,22 @@ import sys
 import threading
 import time
 import weakref
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import cache
-from itertools import count
+from itertools import chain, count
 from pathlib import Path
 from typing import Final, TypeAlias, TypeVar
 
 from paramclient.cache.lock import BUSY_TIMEOUT, locked
+from paramclient.cache.rows import Damaged
+from paramclient.cache.schema import MIGRATIONS, Step
 from paramclient.errors import CacheError
 
-__all__ = ["APPLICATION_ID", "Damaged", "Database", "MIGRATIONS"]
+__all__ = ["APPLICATION_ID", "Database"]
 
 APPLICATION_ID: Final = 0x5041524D
 """Stands in the file's header and says whose database it is: `PARM`."""
-
-MIGRATIONS: tuple[tuple[str, ...], ...] = (
-    (
-        """CREATE TABLE vehicle (
-            key TEXT NOT NULL PRIMARY KEY,
-            system INTEGER NOT NULL,
-            link TEXT NOT NULL,
-            uid TEXT,
-            autopilot INTEGER NOT NULL,
-            vehicle_type INTEGER NOT NULL,
-            firmware INTEGER NOT NULL,
-            git_hash TEXT NOT NULL,
-            board INTEGER NOT NULL,
-            vendor_id INTEGER NOT NULL,
-            product_id INTEGER NOT NULL,
-            capabilities INTEGER NOT NULL,
-            first_seen REAL NOT NULL,
-            last_seen REAL NOT NULL
-        )""",
-        """CREATE TABLE component (
-            id INTEGER PRIMARY KEY,
-            vehicle TEXT NOT NULL REFERENCES vehicle (key) ON DELETE CASCADE,
-            component INTEGER NOT NULL,
-            own_autopilot INTEGER NOT NULL,
-            hash INTEGER,
-            count INTEGER,
-            complete INTEGER NOT NULL DEFAULT 0,
-            volatile_known INTEGER NOT NULL DEFAULT 0,
-            synced_at REAL,
-            checksum INTEGER NOT NULL,
-            updated_at REAL NOT NULL,
-            UNIQUE (vehicle, component)
-        )""",
-        """CREATE TABLE param (
-            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
-            name TEXT NOT NULL,
-            type INTEGER NOT NULL,
-            bits INTEGER NOT NULL,
-            is_raw INTEGER NOT NULL,
-            param_index INTEGER,
-            volatile INTEGER NOT NULL,
-            heard_at REAL NOT NULL,
-            PRIMARY KEY (owner, name)
-        ) WITHOUT ROWID""",
-        """CREATE TABLE history (
-            id INTEGER PRIMARY KEY,
-            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
-            at REAL NOT NULL,
-            name TEXT NOT NULL,
-            old_type INTEGER NOT NULL,
-            old_bits INTEGER NOT NULL,
-            old_is_raw INTEGER NOT NULL,
-            new_type INTEGER,
-            new_bits INTEGER,
-            new_is_raw INTEGER,
-            by TEXT NOT NULL
-        )""",
-        "CREATE INDEX history_of_component ON history (owner)",
-    ),
-    (
-        "ALTER TABLE param ADD COLUMN default_bits INTEGER",
-        "ALTER TABLE component ADD COLUMN file_works INTEGER",
-    ),
-    (
-        # Which names a table has got since is not known of one that is older than this: it begins now.
-        "ALTER TABLE component ADD COLUMN known_since REAL",
-        """UPDATE component SET known_since = max(
-            updated_at,
-            ifnull((SELECT max(heard_at) FROM param WHERE owner = component.id), 0),
-            ifnull((SELECT max(at) FROM history WHERE owner = component.id), 0)
-        ) WHERE complete""",
-        """CREATE TABLE birth (
-            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
-            name TEXT NOT NULL,
-            line INTEGER NOT NULL,
-            at REAL NOT NULL,
-            PRIMARY KEY (owner, name, line)
-        ) WITHOUT ROWID""",
-        """CREATE TABLE setback (
-            id INTEGER PRIMARY KEY,
-            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
-            since REAL NOT NULL,
-            until REAL NOT NULL
-        )""",
-        "CREATE INDEX setback_of_component ON setback (owner)",
-        """CREATE TABLE snapshot (
-            id INTEGER PRIMARY KEY AUTOINCREMENT,
-            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
-            at REAL NOT NULL,
-            reason TEXT NOT NULL,
-            size INTEGER NOT NULL,
-            hash INTEGER,
-            complete INTEGER NOT NULL,
-            params BLOB NOT NULL,
-            checksum INTEGER NOT NULL
-        )""",
-        "CREATE INDEX snapshot_of_component ON snapshot (owner)",
-        "CREATE INDEX history_of_param ON history (owner, name)",
-    ),
-)
-"""The statements that lead from each schema version to the next; the version is the number of steps taken."""
 
 _TRIES: Final = 3
 """Rounds of one operation: the file may be renamed under it by another process, and be damaged, once each."""
@@ -159,12 +60,6 @@ _log = logging.getLogger("paramclient.cache")
 
 T = TypeVar("T")
 Work: TypeAlias = Callable[[sqlite3.Connection], T]
-
-
-class Damaged(Exception):
-    """The file does not hold what was written to it. Work may raise this; it never reaches a caller."""
-
-    kind = "damaged"
 
 
 class _Newer(Damaged):
@@ -480,10 +375,12 @@ def _code(error: sqlite3.Error) -> int | None:
     return code
 
 
-def _migrate(connection: sqlite3.Connection, steps: tuple[tuple[str, ...], ...]) -> None:
-    for statements in steps:
-        for statement in statements:
-            connection.execute(statement)
+def _migrate(connection: sqlite3.Connection, steps: Sequence[Step]) -> None:
+    for change in chain.from_iterable(steps):
+        if isinstance(change, str):
+            connection.execute(change)
+        else:
+            change(connection)
 
 
 def _schema_of(connection: sqlite3.Connection) -> frozenset[tuple[str, ...]]:
@@ -496,7 +393,7 @@ def _schema_of(connection: sqlite3.Connection) -> frozenset[tuple[str, ...]]:
 
 
 @contextmanager
-def _fresh(steps: tuple[tuple[str, ...], ...]) -> Iterator[sqlite3.Connection]:
+def _fresh(steps: tuple[Step, ...]) -> Iterator[sqlite3.Connection]:
     """An empty database in memory."""
     with closing(sqlite3.connect(":memory:", isolation_level=None)) as connection:
         _migrate(connection, steps)
@@ -504,6 +401,6 @@ def _fresh(steps: tuple[tuple[str, ...], ...]) -> Iterator[sqlite3.Connection]:
 
 
 @cache
-def _schema_after(steps: tuple[tuple[str, ...], ...]) -> frozenset[tuple[str, ...]]:
+def _schema_after(steps: tuple[Step, ...]) -> frozenset[tuple[str, ...]]:
     with _fresh(steps) as connection:
         return _schema_of(connection)

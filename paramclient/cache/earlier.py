@@ -19,9 +19,8 @@ from dataclasses import fields, replace
 from datetime import UTC, datetime
 from typing import Any, Final
 
-from paramclient.cache.database import Damaged
 from paramclient.cache.records import Snapshot
-from paramclient.cache.rows import Row, identity_cells, read_identity, read_param, time_cell
+from paramclient.cache.rows import Damaged, Row, identity_cells, read_identity, read_param, time_cell
 from paramclient.cache.session import Session
 from paramclient.errors import CacheError
 from paramclient.identity import Identity

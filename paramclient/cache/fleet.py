@@ -174,10 +174,9 @@ def fleet_diff(session: Session, component: int, wanted: Mapping[str, WrittenPar
     places = {owner: place for place, owner in enumerate(owners)}
     holders = [Holder(vehicle) for vehicle in owners.values()]
     values: defaultdict[str, dict[Cells, list[Holder]]] = defaultdict(dict)
-    for some in _parts(list(wanted)):
-        for row, same in session.holders(list(owners), some).items():
-            name, *value = cells(row, "siii")
-            values[name][tuple(value)] = [holders[place] for place in sorted(places[each] for each in same)]
+    for row, same in session.holders(list(owners), list(wanted)).items():
+        name, *value = cells(row, "siii")
+        values[name][tuple(value)] = [holders[place] for place in sorted(places[each] for each in same)]
     names = []
     for name, written in wanted.items():
         without: list[Holder] = []
@@ -198,11 +197,6 @@ def names_like(session: Session, component: int, pattern: str) -> list[str]:
         return [pattern]
     names = session.names_between(component, start, f"{start}\U0010ffff")
     return sorted(name for name in names if fnmatchcase(name, pattern))
-
-
-def _parts(names: Sequence[str]) -> Iterator[Sequence[str]]:
-    for start in range(0, len(names), _CHUNK):
-        yield names[start : start + _CHUNK]
 
 
 def _dated(

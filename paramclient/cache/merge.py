@@ -9,7 +9,7 @@ from typing import Final
 from paramclient.cache.records import BY_VEHICLE, CachedSummary, CachedVehicle, StoredParam, TableUpdate
 from paramclient.cache.rows import Row
 from paramclient.cache.session import Line, Session
-from paramclient.cache.tables import HISTORY_LINES, applied, hashed, save, stored_rows, write_rows
+from paramclient.cache.tables import HISTORY_LINES, applied, hashed, save
 
 __all__ = ["merge"]
 
@@ -78,7 +78,7 @@ class _Past:
         found = [self.overtaken.pop(name) for name in names if name in self.overtaken]
         if self.owner is None or not found:
             return
-        kept = stored_rows(self.session, self.owner)
+        kept = self.session.table(self.owner)
         for item in found:
             name = item.param.name
             old, new = _row(item), kept.get(name)
@@ -116,7 +116,7 @@ class _Past:
     def _bring_in(self, update: TableUpdate, table: CachedSummary) -> None:
         """Bring in what an update has of values that are not kept of a later time."""
         assert self.owner is not None
-        before = stored_rows(self.session, self.owner)
+        before = self.session.table(self.owner)
         whole_at = table.synced_at if table.complete and table.synced_at is not None else float("-inf")
         later: list[StoredParam] = []
         heard = {item.param.name for item in update.params}
@@ -137,7 +137,7 @@ class _Past:
         self.catch_up(item.param.name for item in later)
         after, changes, births = applied(replace(update, params=later, removed=(), replace=False), before)
         if after != before:
-            write_rows(self.session, self.owner, before, after)
+            self.session.put_table(self.owner, before, after)
             if hashed(before) != hashed(after):
                 self.session.describe(self.owner, hash=None)
         self.session.add_births(self.owner, births)

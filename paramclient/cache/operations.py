@@ -164,7 +164,7 @@ class Remove(Operation[int]):
 
 
 def _kept(session: Session, owner: int) -> ParamSet:
-    rows = tables.stored_rows(session, owner)
+    rows = session.table(owner)
     return ParamSet.of(
         read_param(name, *row.value, row.param_index, row.default_bits) for name, row in rows.items()
     )

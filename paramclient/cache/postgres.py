@@ -18,10 +18,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 from uuid import uuid4
 
 from paramclient.cache.address import Address
-from paramclient.cache.database import Damaged
 from paramclient.cache.migrations import CHANNEL, MIGRATIONS, SCHEMA
 from paramclient.cache.operations import Operation
-from paramclient.cache.rows import Row, cells
+from paramclient.cache.rows import Damaged, Row, cells, checksum, read_rows
 from paramclient.cache.session import Session
 from paramclient.cache.transfer import OWN_NUMBERS
 from paramclient.errors import CacheError, UsageError
@@ -255,11 +254,41 @@ class PostgresSession(Session):
 
     is_shared = True
     SNAPSHOT_ORDER: ClassVar[str] = "s.at, s.id"
+    SIZE: ClassVar[str] = "(SELECT count(*) FROM param WHERE owner = c.id)"
 
     def __init__(self, connection: psycopg.Connection[tuple[Any, ...]]) -> None:
         self.connection = connection
 
-    def put_rows(self, owner: int, rows: Mapping[str, Row]) -> None:
+    def table(self, owner: int) -> dict[str, Row]:
+        rows = self._rows(owner)
+        [(expected,)] = self._all("SELECT checksum FROM component WHERE id = ?", (owner,))
+        if checksum(rows) != expected:
+            raise Damaged("a table is not what was written")
+        return rows
+
+    def put_table(self, owner: int, before: Mapping[str, Row] | None, after: Mapping[str, Row]) -> None:
+        if before is None:
+            before = self._rows(owner)
+        gone = list(before.keys() - after.keys())
+        if gone:
+            self._do("DELETE FROM param WHERE owner = ? AND name = ANY (?)", (owner, gone))
+        self._put_rows(owner, {name: row for name, row in sorted(after.items()) if before.get(name) != row})
+        self.describe(owner, checksum=checksum(after))
+
+    def heard_last(self, owner: int) -> float:
+        [(at,)] = self._all("SELECT max(heard_at) FROM param WHERE owner = ?", (owner,))
+        return float("-inf") if at is None else float(at)
+
+    def _rows(self, owner: int) -> dict[str, Row]:
+        return read_rows(
+            self._all(
+                "SELECT name, type, bits, is_raw, param_index, volatile, heard_at, default_bits FROM param"
+                " WHERE owner = ? ORDER BY param_index IS NULL, param_index, name",
+                (owner,),
+            )
+        )
+
+    def _put_rows(self, owner: int, rows: Mapping[str, Row]) -> None:
         if not rows:
             return
         columns = [list(column) for column in zip(*((name, *row) for name, row in rows.items()), strict=True)]
@@ -271,11 +300,6 @@ class PostgresSession(Session):
             f" SET ({', '.join(named)}) = ({', '.join(f'excluded.{name}' for name in named)})",
             (owner, *columns),
         )
-
-    def drop_rows(self, owner: int, names: Iterable[str]) -> None:
-        gone = list(names)
-        if gone:
-            self._do("DELETE FROM param WHERE owner = ? AND name = ANY (?)", (owner, gone))
 
     def add_snapshot(
         self, owner: int, row: Sequence[object], blob: bytes, crc: int, number: int | None = None

@@ -2,30 +2,35 @@
 
 from __future__ import annotations
 
+import struct
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import astuple, replace
 from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
-from paramclient.cache.database import Damaged
 from paramclient.errors import UsageError
 from paramclient.identity import Identity
-from paramclient.values import Param, Trust, Value, bits_of, from_bits, known_type, same_bits
+from paramclient.params import CACHED, NOWHERE, Params, to_hold
+from paramclient.values import Param, ParamType, Trust, Value, bits_of, from_bits, known_type, same_bits
 
 __all__ = [
+    "Damaged",
     "Row",
+    "YEAR_10000",
     "cells",
     "checksum",
     "identity_cells",
     "read_identity",
     "read_param",
+    "read_params",
     "read_rows",
     "signed",
     "time_cell",
 ]
 
-_YEAR_10000: Final = 253402300800.0
+YEAR_10000: Final = 253402300800.0
+"""Unix seconds in which no time that is stored can lie any more."""
 _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "i": (int,),
     "f": (float,),
@@ -35,10 +40,19 @@ _KINDS: Final[dict[str, tuple[type, ...]]] = {
     "S": (str, type(None)),
 }
 _MASK_64: Final = (1 << 64) - 1
+_ENDS: Final = tuple(1 << 8 * (ParamType(each).size if 1 <= each <= 10 else 4) for each in range(256))
+"""By type: what the bits of a value are below. Of a type that MAVLink does not define they are the four bytes
+of the message, as they are of a value that is kept raw."""
 _TIMES: Final[dict[tuple[object, ...], tuple[int, ...]]] = {}
 """Where rows of a shape hold times: by the kinds and the types of cells that were found to be right."""
 _name: Final = itemgetter(0)
 _new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
+
+
+class Damaged(Exception):
+    """The file does not hold what was written to it. Work may raise this; it never reaches a caller."""
+
+    kind = "damaged"
 
 
 def cells(row: Sequence[object], kinds: str) -> Any:
@@ -52,14 +66,14 @@ def cells(row: Sequence[object], kinds: str) -> Any:
     if times is None:  # a row like none before; those of a table are all like a few
         times = _TIMES[shape] = _times(row, kinds)
     for place in times:
-        if not 0 <= row[place] < _YEAR_10000:  # type: ignore[operator]  # the shape says that it is a float
+        if not 0 <= row[place] < YEAR_10000:  # type: ignore[operator]  # the shape says that it is a float
             raise Damaged(f"a cell holds {row[place]!r:.40}")
     return row
 
 
 def time_cell(at: float) -> float:
     """A time to be stored: unix seconds, before the year 10000; else UsageError."""
-    if not 0 <= at < _YEAR_10000:
+    if not 0 <= at < YEAR_10000:
         raise UsageError(f"{at!r} is not a time in unix seconds")
     return float(at)
 
@@ -154,6 +168,26 @@ def read_param(
     if not 0 <= number <= 255:
         raise Damaged(f"{number} is not a type")
     return Param(name, value, known_type(number), index, bits & _MASK_64, Trust.CACHED, default)
+
+
+def read_params(rows: Mapping[str, Row]) -> Params:
+    """The parameters of a table, as it keeps them; their trust is CACHED."""
+    params = Params()
+    held, defaults = params.held, params.defaults
+    for name, (number, bits, is_raw, index, _, _, default_bits) in rows.items():
+        if not 0 <= number <= 255:
+            raise Damaged(f"{number} is not a type")
+        bits &= _MASK_64
+        if bits >= (_ENDS[0] if is_raw else _ENDS[number]):
+            raise Damaged(f"{bits} is not a value of type {number}")
+        place = NOWHERE if index is None else index
+        try:
+            held[name] = to_hold(bits, number, bool(is_raw), CACHED, place)
+        except struct.error as error:
+            raise Damaged(f"an index is {place}: {error}") from error
+        if default_bits is not None:
+            defaults[name] = _value(number, default_bits, False)
+    return params
 
 
 def _times(row: Sequence[object], kinds: str) -> tuple[int, ...]:

@@ -19,7 +19,6 @@ from paramclient.cache.rows import (
     identity_cells,
     read_identity,
     read_param,
-    read_rows,
     time_cell,
 )
 
@@ -35,7 +34,6 @@ _IDENTITY: Final = (
     " board, vendor_id, product_id, capabilities"
 )
 _LINE: Final = "at, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
-_ROW: Final = "name, type, bits, is_raw, param_index, volatile, heard_at, default_bits"
 _SUMMARY: Final = "s.id, vehicle, component, at, reason, size, s.hash, s.complete"
 
 
@@ -114,7 +112,7 @@ class Session(ABC):
     ) -> list[tuple[int, CachedSummary]]:
         """Tables with their ids, without parameters; of one vehicle or component where given."""
         rows = self._all(
-            "SELECT id, component, own_autopilot, (SELECT count(*) FROM param WHERE owner = c.id), hash,"
+            f"SELECT id, component, own_autopilot, {self.SIZE}, hash,"
             f" count, complete, volatile_known, synced_at, updated_at, file_works, key, {_IDENTITY}"
             " FROM component c JOIN vehicle ON key = vehicle"
             " WHERE key = coalesce(?, key) AND component = coalesce(?, component)"
@@ -158,28 +156,32 @@ class Session(ABC):
 
     # parameters
 
-    def rows(self, owner: int) -> tuple[dict[str, Row], int]:
-        """A table's parameters by index, then name, those without an index last; and its checksum."""
-        found = self._all(
-            f"SELECT {_ROW} FROM param WHERE owner = ? ORDER BY param_index IS NULL, param_index, name",
-            (owner,),
-        )
-        rows = read_rows(found)
-        [(expected,)] = self._all("SELECT checksum FROM component WHERE id = ?", (owner,))
-        return rows, expected
+    SIZE: ClassVar[str]
+    """What says in a statement how many parameters the table of `c.id` has."""
 
     @abstractmethod
-    def put_rows(self, owner: int, rows: Mapping[str, Row]) -> None:
-        """Insert parameters, or put them into the place of those of the same names."""
+    def table(self, owner: int) -> dict[str, Row]:
+        """A table's parameters by index, then name, those without an index last.
 
-    def drop_rows(self, owner: int, names: Iterable[str]) -> None:
-        """Delete parameters."""
-        self._many("DELETE FROM param WHERE owner = ? AND name = ?", [(owner, name) for name in names])
+        Raises:
+            Damaged: they are not what was written.
+        """
 
+    @abstractmethod
+    def put_table(self, owner: int, before: Mapping[str, Row] | None, after: Mapping[str, Row]) -> None:
+        """Make a table's parameters these.
+
+        Args:
+            before: what it has; None where that is not known, and may not be what was written.
+            after: what it is to have; something else.
+
+        Raises:
+            UsageError: something that cannot be kept.
+        """
+
+    @abstractmethod
     def heard_last(self, owner: int) -> float:
         """When any value of a table was heard last; minus infinity where it has none."""
-        [(at,)] = self._all("SELECT max(heard_at) FROM param WHERE owner = ?", (owner,))
-        return float("-inf") if at is None else float(at)
 
     # history
 

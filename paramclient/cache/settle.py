@@ -22,8 +22,6 @@ from paramclient.cache.tables import (
     forget_other_firmware,
     hashed,
     save,
-    stored_rows,
-    write_rows,
     write_state,
 )
 
@@ -110,7 +108,7 @@ def _bring_in(session: Session, update: TableUpdate, owner: int, table: CachedSu
     """Bring in what others have overtaken, wholly or in part."""
     forget_other_firmware(session, update.identity)
     session.make(update)
-    before = stored_rows(session, owner)
+    before = session.table(owner)
     gone_since = table.synced_at if table.complete and table.synced_at is not None else float("-inf")
     is_late = update.at < table.updated_at
     newer: list[StoredParam] = []
@@ -140,7 +138,7 @@ def _bring_in(session: Session, update: TableUpdate, owner: int, table: CachedSu
     )
     after, lines, births = applied(part, before)
     if after != before:
-        write_rows(session, owner, before, after)
+        session.put_table(owner, before, after)
     session.add_births(owner, births)
     _write_past(session, owner, older, lines, before)
     session.describe(owner, updated_at=max(table.updated_at, update.at))

@@ -32,7 +32,7 @@ from paramclient.cache.postgres import Away, PostgresDatabase, Revisions
 from paramclient.cache.records import CacheChange, Snapshot
 from paramclient.cache.session import Session
 from paramclient.cache.transfer import OWN_NUMBERS, Join, take_whole
-from paramclient.errors import CacheError
+from paramclient.errors import CacheError, UsageError
 
 if TYPE_CHECKING:
     import psycopg
@@ -323,7 +323,7 @@ class _Link:
                 stale = {key for key in touched if kept.get(key) != before.get(key)}
                 for key in touched - stale:
                     self.local.goes_on(key, after.get(key))
-        except CacheError as error:
+        except (CacheError, UsageError) as error:
             self._warn_of_copy(error)
         with self._state:
             for key in touched:
@@ -351,7 +351,7 @@ class _Link:
                     self.local.mirror(key, whole, revision)
             except Away as error:
                 self._lose(error)
-            except CacheError as error:
+            except (CacheError, UsageError) as error:  # a file cannot keep all that a database can
                 self._warn_of_copy(error)
 
     def _kept(self) -> Revisions:
@@ -362,7 +362,7 @@ class _Link:
             self._warn_of_copy(error)
             return {}
 
-    def _warn_of_copy(self, error: CacheError) -> None:
+    def _warn_of_copy(self, error: CacheError | UsageError) -> None:
         if not self._has_warned:
             _log.warning("the local copy is not up to date: %s", error)
         self._has_warned = True

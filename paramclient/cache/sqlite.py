@@ -5,22 +5,23 @@ from __future__ import annotations
 import sqlite3
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from itertools import chain
 from pathlib import Path
-from typing import Any, Final, TypeVar
+from typing import Any, ClassVar, Final, TypeVar
 
 from paramclient.cache.database import Database
 from paramclient.cache.operations import Operation
+from paramclient.cache.packed import Packed, packed_row, row_checksum
 from paramclient.cache.records import CacheChange
-from paramclient.cache.rows import Row, cells
+from paramclient.cache.rows import Damaged, Row, cells, checksum
 from paramclient.cache.session import Session
 
 __all__ = ["SqliteSession", "SqliteStore"]
 
-_PARAM: Final = "(?, ?, ?, ?, ?, ?, ?, ?, ?)"
-_ROWS_AT_ONCE: Final = 100
-"""Parameters that one statement writes: that takes half as long as one by one, and the interpreter's lock is
-passed on a hundredth as often. Some builds of SQLite allow 999 variables in one, which these fill."""
+_NOTHING: Final = checksum({})
+"""The checksum of a table without parameters: it has no row among the packed ones."""
+_DIFFERENT: Final = 16
+"""Sets of names of which it is remembered where each stands: a fleet has a few firmwares. Each set takes a
+hundred kilobytes."""
 
 T = TypeVar("T")
 
@@ -79,37 +80,54 @@ class SqliteStore:
 class SqliteSession(Session):
     """One transaction on a file. It holds the file's only write lock, where it writes."""
 
+    SIZE: ClassVar[str] = "ifnull((SELECT size FROM packed WHERE owner = c.id), 0)"
+
     def __init__(self, connection: sqlite3.Connection, *, is_shared: bool = False) -> None:
         self.connection = connection
         self.is_shared = is_shared
+        self._places_of: dict[bytes, Mapping[str, int]] = {}
 
-    def put_rows(self, owner: int, rows: Mapping[str, Row]) -> None:
-        cells_of = [(owner, name, *row) for name, row in rows.items()]
-        for first in range(0, len(cells_of), _ROWS_AT_ONCE):
-            some = cells_of[first : first + _ROWS_AT_ONCE]
-            self.connection.execute(
-                "REPLACE INTO param"
-                " (owner, name, type, bits, is_raw, param_index, volatile, heard_at, default_bits)"
-                f" VALUES {', '.join([_PARAM] * len(some))}",
-                [*chain.from_iterable(some)],
-            )
+    def table(self, owner: int) -> dict[str, Row]:
+        packed = self._packed(owner)
+        return {} if packed is None else packed.rows()
+
+    def put_table(self, owner: int, before: Mapping[str, Row] | None, after: Mapping[str, Row]) -> None:
+        if not after:
+            self._do("DELETE FROM packed WHERE owner = ?", (owner,))
+            self.describe(owner, checksum=_NOTHING)
+            return
+        row = packed_row(after)
+        # updated where it is: of a blob of the same length only the pages that differ are written
+        self._do(
+            "INSERT INTO packed (owner, size, heard_last, params) VALUES (?, ?, ?, ?)"
+            " ON CONFLICT (owner) DO UPDATE SET (size, heard_last, params)"
+            " = (excluded.size, excluded.heard_last, excluded.params)",
+            (owner, *row),
+        )
+        self.describe(owner, checksum=row_checksum(*row))
+
+    def heard_last(self, owner: int) -> float:
+        found = self._all("SELECT heard_last FROM packed WHERE owner = ?", (owner,))
+        return max((at for row in found for at in cells(row, "f")), default=float("-inf"))
 
     def names_between(self, component: int, first: str, end: str) -> list[str]:
-        # one after the other: a table's names are found by its index
-        rows = self.connection.execute(
-            "SELECT DISTINCT name FROM component c CROSS JOIN param ON owner = c.id"
-            " WHERE component = ? AND name >= ? AND name < ?",
-            (component, first, end),
-        )
-        return [name for row in rows for name in cells(row, "s")]
+        owners = self._all("SELECT id FROM component WHERE component = ?", (component,))
+        names: set[str] = set()
+        seen: set[bytes] = set()
+        for packed in filter(None, (self._packed(owner) for (owner,) in owners)):
+            if packed.named not in seen:
+                seen.add(packed.named)
+                names.update(self._places(packed))
+        return [name for name in names if first <= name < end]
 
     def holders(self, owners: Sequence[int], names: Sequence[str]) -> Mapping[tuple[Any, ...], list[int]]:
         found: defaultdict[tuple[Any, ...], list[int]] = defaultdict(list)
-        marks = ", ".join("?" * len(names))
-        select = f"SELECT name, type, bits, is_raw FROM param WHERE owner = ? AND name IN ({marks})"
         for owner in owners:
-            for row in self.connection.execute(select, (owner, *names)):
-                found[row].append(owner)
+            packed = self._packed(owner)
+            if packed is not None:
+                places = self._places(packed)
+                for value in packed.values((name, places[name]) for name in names if name in places):
+                    found[value].append(owner)
         return found
 
     def since(self, named: Mapping[int, Sequence[str]]) -> list[tuple[int, str, str, int, float]]:
@@ -120,8 +138,13 @@ class SqliteSession(Session):
                 "SELECT known_since FROM component WHERE id = ? AND known_since IS NOT NULL", (owner,)
             )
             found.extend((owner, "", "known", 0, *cells(row, "f")) for row in begins)
+            packed = self._packed(owner)
+            if packed is not None:
+                places = self._places(packed)
+                there = [name for name in names if name in places]
+                times = packed.heard_at(places[name] for name in there)
+                found.extend((owner, name, "heard", 0, at) for name, at in zip(there, times, strict=True))
             for what, select, end in (
-                ("heard", "SELECT name, 0, heard_at FROM param", ""),
                 ("line", "SELECT name, max(id), at FROM history", " GROUP BY name"),
                 ("birth", "SELECT name, max(line), at FROM birth", " GROUP BY name"),
             ):
@@ -130,6 +153,29 @@ class SqliteSession(Session):
                 ):
                     name, line, heard = cells(row, "sif")
                     found.append((owner, name, what, line, heard))
+        return found
+
+    def _packed(self, owner: int) -> Packed | None:
+        """A table's parameters, or None where it has none; `Damaged` where they are not what was written."""
+        [(expected, *row)] = self._all(
+            "SELECT checksum, size, heard_last, params FROM component LEFT JOIN packed ON owner = id"
+            " WHERE id = ?",
+            (owner,),
+        )
+        blob = row[-1]
+        if not isinstance(blob, bytes | None):
+            raise Damaged(f"a table is {blob!r:.40}")
+        if expected != (_NOTHING if blob is None else row_checksum(*row)):
+            raise Damaged("a table is not what was written")
+        return None if blob is None else Packed(blob)
+
+    def _places(self, packed: Packed) -> Mapping[str, int]:
+        """Where the names of a table stand: in the same places in those of one firmware, as a rule."""
+        found = self._places_of.get(packed.named)
+        if found is None:
+            if len(self._places_of) >= _DIFFERENT:
+                self._places_of.clear()
+            found = self._places_of[packed.named] = packed.places()
         return found
 
     def _all(self, sql: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:

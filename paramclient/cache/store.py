@@ -321,7 +321,7 @@ class ParamCache:
             if isinstance(when, int):
                 return earlier.snapshot(session, owner, when).params
             [(_, state)] = session.summaries(key, component)
-            rows = tables.stored_rows(session, owner)
+            rows = session.table(owner)
             return earlier.state_at(session, owner, state.identity, rows, when)
 
         return self._store.read(work)

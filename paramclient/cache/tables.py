@@ -13,7 +13,6 @@ from types import MappingProxyType
 from typing import Final
 
 from paramclient.cache import earlier
-from paramclient.cache.database import Damaged
 from paramclient.cache.records import (
     BY_VEHICLE,
     CachedComponent,
@@ -23,7 +22,7 @@ from paramclient.cache.records import (
     TableState,
     TableUpdate,
 )
-from paramclient.cache.rows import Row, checksum, read_param, time_cell
+from paramclient.cache.rows import Row, read_params, time_cell
 from paramclient.cache.session import Line, Session
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
@@ -35,9 +34,7 @@ __all__ = [
     "forget_other_firmware",
     "hashed",
     "save",
-    "stored_rows",
     "write_lines",
-    "write_rows",
     "write_state",
 ]
 
@@ -56,10 +53,10 @@ def save(session: Session, updates: Iterable[TableUpdate]) -> None:
         before: Mapping[str, Row] = {}
         after = before
         if update.params or update.removed or update.replace:  # else it is about the table as a whole only
-            before = stored_rows(session, owner)
+            before = session.table(owner)
             after, lines, births = applied(update, before)
             if after != before:
-                write_rows(session, owner, before, after)
+                session.put_table(owner, before, after)
             session.add_births(owner, births)
             write_lines(session, owner, lines)
         if update.table is not None:
@@ -79,15 +76,10 @@ def component(
 ) -> CachedComponent | None:
     """One table with its parameters, or None."""
     for owner, summary in session.summaries(key, number):
-        rows = stored_rows(session, owner)
+        rows = session.table(owner)
         return CachedComponent(
             **{field.name: getattr(summary, field.name) for field in fields(summary)},
-            params=ParamMap(
-                {
-                    name: read_param(name, *row.value, row.param_index, row.default_bits)
-                    for name, row in rows.items()
-                }
-            ),
+            params=ParamMap(read_params(rows)),
             volatile=frozenset(name for name, row in rows.items() if row.volatile),
             heard_at=MappingProxyType({name: row.heard_at for name, row in rows.items()}),
             _history=history,
@@ -95,27 +87,24 @@ def component(
     return None
 
 
-def stored_rows(session: Session, owner: int) -> dict[str, Row]:
-    """A table's parameters by index, then name, those without an index last; `Damaged` where one changed."""
-    rows, expected = session.rows(owner)
-    if checksum(rows) != expected:
-        raise Damaged("a table is not what was written")
-    return rows
-
-
 def forget_other_firmware(session: Session, identity: Identity) -> None:
     """Where a vehicle has another firmware than before: drop what was true of that one only."""
     for owner in session.of_other_firmware(identity.key, identity.firmware, identity.git_hash):
-        before = stored_rows(session, owner)
+        before = session.table(owner)
         after = {name: row._replace(default_bits=None) for name, row in before.items()}
-        write_rows(session, owner, before, after)
+        if after != before:
+            session.put_table(owner, before, after)
         session.describe(owner, file_works=None)
 
 
 def applied(
     update: TableUpdate, before: Mapping[str, Row]
-) -> tuple[dict[str, Row], list[Line], list[tuple[str, float]]]:
+) -> tuple[dict[str, Row], list[Line], Iterable[tuple[str, float]]]:
     """The rows after an update, the lines of history that it causes, and the new names with their times."""
+    if not before:
+        after = {name: row for name, row, _, _ in _news(update.params)}
+        if len(after) == len(update.params):  # no name twice, so nothing has changed
+            return after, [], ((name, row.heard_at) for name, row in after.items())
     after = dict(before)
     births: list[tuple[str, float]] = []
     news = list(_news(update.params))
@@ -159,13 +148,6 @@ def _news(params: Iterable[StoredParam]) -> Iterable[tuple[str, Row, bool | None
 def hashed(rows: Mapping[str, Row]) -> dict[str, tuple[int, int, int]]:
     """What the vehicle's hash covers of a table."""
     return {name: row.hashed for name, row in rows.items() if row.hashed is not None}
-
-
-def write_rows(session: Session, owner: int, before: Mapping[str, Row], after: Mapping[str, Row]) -> None:
-    """Make the stored rows of a table the ones after an update."""
-    session.drop_rows(owner, before.keys() - after.keys())
-    session.put_rows(owner, {name: row for name, row in sorted(after.items()) if before.get(name) != row})
-    session.describe(owner, checksum=checksum(after))
 
 
 def write_lines(session: Session, owner: int, lines: Sequence[Line]) -> None:

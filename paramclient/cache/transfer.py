@@ -12,7 +12,7 @@ from paramclient.cache.operations import Operation
 from paramclient.cache.records import CachedSummary, CachedVehicle, TableState, TableUpdate
 from paramclient.cache.rows import Row
 from paramclient.cache.session import Line, Session
-from paramclient.cache.tables import HISTORY_LINES, hashed, stored_rows, write_rows, write_state
+from paramclient.cache.tables import HISTORY_LINES, hashed, write_state
 from paramclient.errors import CacheError, UsageError
 
 if TYPE_CHECKING:
@@ -201,7 +201,7 @@ def take_whole(
         vehicle,
         table,
         known_since,
-        stored_rows(session, owner),
+        session.table(owner),
         tuple(line for _, line in numbered),
         births,
         tuple(session.setbacks(owner)),
@@ -224,8 +224,7 @@ def put_whole(session: Session, whole: Whole) -> int:
     )
     first = whole.vehicle.first_seen if known is None else min(known.first_seen, whole.vehicle.first_seen)
     session.seen(table.key, first, last.last_seen)
-    before, _ = session.rows(owner)
-    write_rows(session, owner, before, whole.rows)
+    session.put_table(owner, None, whole.rows)
     numbers = session.put_past(owner, whole.lines, whole.setbacks)
     session.put_births(
         owner, [(name, at, numbers[place - 1] if place else 0) for name, at, place in whole.births]

@@ -1,0 +1,153 @@
+"""The schema of the cache in a file, version after version."""
+
+from __future__ import annotations
+
+import sqlite3
+from collections.abc import Callable
+from typing import Final, TypeAlias
+
+from paramclient.cache.packed import packed_row, row_checksum
+from paramclient.cache.rows import Damaged, checksum, read_rows
+from paramclient.errors import UsageError
+
+__all__ = ["MIGRATIONS", "Step"]
+
+Step: TypeAlias = tuple[str | Callable[[sqlite3.Connection], None], ...]
+"""What leads from one version to the next: statements, and what statements cannot do."""
+
+
+def _pack_tables(connection: sqlite3.Connection) -> None:
+    """Make one blob of each table's parameters; `Damaged` where one is not what was written."""
+    for owner, expected in connection.execute("SELECT id, checksum FROM component").fetchall():
+        found = connection.execute(
+            "SELECT name, type, bits, is_raw, param_index, volatile, heard_at, default_bits FROM param"
+            " WHERE owner = ?",
+            (owner,),
+        )
+        rows = read_rows(found)
+        if checksum(rows) != expected:
+            raise Damaged("a table is not what was written")
+        if not rows:
+            continue
+        try:
+            row = packed_row(rows)
+        except UsageError as error:
+            raise Damaged(str(error)) from error
+        connection.execute(
+            "INSERT INTO packed (owner, size, heard_last, params) VALUES (?, ?, ?, ?)", (owner, *row)
+        )
+        connection.execute("UPDATE component SET checksum = ? WHERE id = ?", (row_checksum(*row), owner))
+
+
+MIGRATIONS: Final[tuple[Step, ...]] = (
+    (
+        """CREATE TABLE vehicle (
+            key TEXT NOT NULL PRIMARY KEY,
+            system INTEGER NOT NULL,
+            link TEXT NOT NULL,
+            uid TEXT,
+            autopilot INTEGER NOT NULL,
+            vehicle_type INTEGER NOT NULL,
+            firmware INTEGER NOT NULL,
+            git_hash TEXT NOT NULL,
+            board INTEGER NOT NULL,
+            vendor_id INTEGER NOT NULL,
+            product_id INTEGER NOT NULL,
+            capabilities INTEGER NOT NULL,
+            first_seen REAL NOT NULL,
+            last_seen REAL NOT NULL
+        )""",
+        """CREATE TABLE component (
+            id INTEGER PRIMARY KEY,
+            vehicle TEXT NOT NULL REFERENCES vehicle (key) ON DELETE CASCADE,
+            component INTEGER NOT NULL,
+            own_autopilot INTEGER NOT NULL,
+            hash INTEGER,
+            count INTEGER,
+            complete INTEGER NOT NULL DEFAULT 0,
+            volatile_known INTEGER NOT NULL DEFAULT 0,
+            synced_at REAL,
+            checksum INTEGER NOT NULL,
+            updated_at REAL NOT NULL,
+            UNIQUE (vehicle, component)
+        )""",
+        """CREATE TABLE param (
+            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
+            name TEXT NOT NULL,
+            type INTEGER NOT NULL,
+            bits INTEGER NOT NULL,
+            is_raw INTEGER NOT NULL,
+            param_index INTEGER,
+            volatile INTEGER NOT NULL,
+            heard_at REAL NOT NULL,
+            PRIMARY KEY (owner, name)
+        ) WITHOUT ROWID""",
+        """CREATE TABLE history (
+            id INTEGER PRIMARY KEY,
+            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
+            at REAL NOT NULL,
+            name TEXT NOT NULL,
+            old_type INTEGER NOT NULL,
+            old_bits INTEGER NOT NULL,
+            old_is_raw INTEGER NOT NULL,
+            new_type INTEGER,
+            new_bits INTEGER,
+            new_is_raw INTEGER,
+            by TEXT NOT NULL
+        )""",
+        "CREATE INDEX history_of_component ON history (owner)",
+    ),
+    (
+        "ALTER TABLE param ADD COLUMN default_bits INTEGER",
+        "ALTER TABLE component ADD COLUMN file_works INTEGER",
+    ),
+    (
+        # Which names a table has got since is not known of one that is older than this: it begins now.
+        "ALTER TABLE component ADD COLUMN known_since REAL",
+        """UPDATE component SET known_since = max(
+            updated_at,
+            ifnull((SELECT max(heard_at) FROM param WHERE owner = component.id), 0),
+            ifnull((SELECT max(at) FROM history WHERE owner = component.id), 0)
+        ) WHERE complete""",
+        """CREATE TABLE birth (
+            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
+            name TEXT NOT NULL,
+            line INTEGER NOT NULL,
+            at REAL NOT NULL,
+            PRIMARY KEY (owner, name, line)
+        ) WITHOUT ROWID""",
+        """CREATE TABLE setback (
+            id INTEGER PRIMARY KEY,
+            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
+            since REAL NOT NULL,
+            until REAL NOT NULL
+        )""",
+        "CREATE INDEX setback_of_component ON setback (owner)",
+        """CREATE TABLE snapshot (
+            id INTEGER PRIMARY KEY AUTOINCREMENT,
+            owner INTEGER NOT NULL REFERENCES component (id) ON DELETE CASCADE,
+            at REAL NOT NULL,
+            reason TEXT NOT NULL,
+            size INTEGER NOT NULL,
+            hash INTEGER,
+            complete INTEGER NOT NULL,
+            params BLOB NOT NULL,
+            checksum INTEGER NOT NULL
+        )""",
+        "CREATE INDEX snapshot_of_component ON snapshot (owner)",
+        "CREATE INDEX history_of_param ON history (owner, name)",
+    ),
+    (
+        # Beside the component: its row is written to at each save, and would carry the blob along.
+        """CREATE TABLE packed (
+            owner INTEGER PRIMARY KEY REFERENCES component (id) ON DELETE CASCADE,
+            size INTEGER NOT NULL,
+            heard_last REAL NOT NULL,
+            params BLOB NOT NULL
+        )""",
+        _pack_tables,
+        "DROP TABLE param",
+    ),
+)
+"""The changes that lead from each schema version to the next; the version is the number of steps taken. What
+stands here never changes."""
