@@ -24,6 +24,7 @@ __all__ = [
     "Params",
     "held_of",
     "is_listed",
+    "iter_parts",
     "kept",
     "number_of",
     "param_of",
@@ -50,6 +51,8 @@ to_hold = _LAYOUT.pack
 """Bits, the number of the type, whether it stays raw bytes, the number of the trust, and the place."""
 parts_of = _LAYOUT.unpack
 """The same, from what is kept."""
+iter_parts = _LAYOUT.iter_unpack
+"""The same of many, whose bytes follow each other."""
 _TRUST_AT: Final = 10
 _PLACE_AT: Final = 11
 _NO_PLACE: Final = NOWHERE.to_bytes(4, "little", signed=True)

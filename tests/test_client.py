@@ -1061,6 +1061,20 @@ async def test_several_tasks_may_wait_for_the_changes_of_one_subscription() -> N
 
 
 @swiftly
+async def test_who_listens_late_or_once_more_is_told_of_what_changes_from_then_on() -> None:
+    async with a_client(small_px4()) as client:
+        component = await client.component()
+        await component.fetch_all()
+        for name in ("PARAM_02", "PARAM_04"):
+            changes = component.changes()
+            await component.set(name, 77)
+            assert (await anext(changes)).name == name
+            del changes
+            await component.set("PARAM_06", 77)
+            await component.set("PARAM_06", 78)
+
+
+@swiftly
 async def test_changes_end_with_the_client_and_what_waits_comes_first() -> None:
     async with a_client(small_px4()) as client:
         component = await client.component()

@@ -20,7 +20,7 @@ from paramclient.protocol import table as table_room
 from paramclient.protocol.authors import DOUBT, FOREIGN_SET_MEMORY, MOST_FOREIGN_SETS
 from paramclient.protocol.change import Change
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import ComponentIdentified, Event, Fetched, ParamChanged
+from paramclient.protocol.events import ComponentIdentified, Event, Fetched, ParamChanged, ParamsMoved
 from paramclient.protocol.station import Station
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.wire import (
@@ -147,6 +147,21 @@ def test_a_value_goes_into_the_table_and_is_told() -> None:
     assert [(change.name, change.by) for change in desk.changes] == [("A", "vehicle")]
     desk.hear("A", 1.5, index=2)
     assert len(desk.changes) == 1
+
+
+def test_where_nobody_wants_to_know_each_change_it_is_told_once_that_there_are_some() -> None:
+    desk = Desk()
+    desk.events.clear()
+    desk.machine.tells_changes = False
+    desk.send_list("A", "B")
+    desk.cached(known("C", 1, index=2))
+    assert desk.events == [ParamsMoved(desk.machine)]
+    desk.machine.has_moved = False
+    desk.hear("A", 7.0)
+    assert desk.events == [ParamsMoved(desk.machine)] * 2
+    desk.machine.tells_changes = True
+    desk.hear("A", 8.0)
+    assert [change.new.value for change in desk.changes if change.new] == [8.0]
 
 
 def test_a_value_without_a_name_is_none() -> None:

@@ -194,11 +194,11 @@ async def test_a_socket_that_fails_is_opened_again(kind: str, monkeypatch: pytes
     script: list[int] = []
 
     class Faulty(socket.socket):
-        def recvfrom(self, *arguments: Any) -> Any:
+        def recvfrom_into(self, *arguments: Any) -> Any:
             if script:
                 number = script.pop(0)
                 raise OSError(number, os.strerror(number))
-            return super().recvfrom(*arguments)
+            return super().recvfrom_into(*arguments)
 
     with listening() as far, monkeypatch.context() as patch:
         patch.setattr(socket, "socket", Faulty)

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from paramclient.cache.earlier import SNAPSHOTS
 from paramclient.cache.fleet import FleetDiff, FleetValue, FleetVehicle, Holder, NameSpread
+from paramclient.cache.heard import HeardParams
 from paramclient.cache.records import (
     BY_US,
     BY_VEHICLE,
@@ -22,7 +23,6 @@ from paramclient.cache.records import (
     CachedComponent,
     CachedSummary,
     CachedVehicle,
-    HeardParams,
     HistoryEntry,
     Snapshot,
     SnapshotSummary,

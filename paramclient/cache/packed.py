@@ -21,9 +21,10 @@ import struct
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
 from itertools import repeat
-from operator import attrgetter, itemgetter, lt
+from operator import itemgetter, lt
 from typing import Any, Final, TypeVar
 
+from paramclient.cache.heard import FirstRows
 from paramclient.cache.rows import YEAR_10000, Damaged, Row
 from paramclient.errors import UsageError
 
@@ -36,7 +37,7 @@ _NO_INDEX: Final = (1 << 31) - 1
 """Stands for no index; above all others, so that these parameters come last."""
 _INDEX: Final = Row._fields.index("param_index")
 _CHARACTERS: Final = 0x110000
-_heard_at: Final = attrgetter("heard_at")
+_HEARD_AT: Final = Row._fields.index("heard_at")
 _new = tuple.__new__  # as in `rows`
 
 S = TypeVar("S", bound=Sequence[float])
@@ -49,8 +50,16 @@ def pack(rows: Mapping[str, Row]) -> bytes:
     Raises:
         UsageError: a name with half a character in it, or a number that is too large.
     """
-    names: Sequence[str] = tuple(rows)
-    columns: list[Sequence[Any]] = list(zip(*rows.values(), strict=True)) or [()] * len(Row._fields)
+    return _pack(*_columns(rows))
+
+
+def _columns(rows: Mapping[str, Row]) -> tuple[Sequence[str], list[Sequence[Any]]]:
+    if isinstance(rows, FirstRows):
+        return rows.columns()
+    return tuple(rows), list(zip(*rows.values(), strict=True)) or [()] * len(Row._fields)
+
+
+def _pack(names: Sequence[str], columns: list[Sequence[Any]]) -> bytes:
     indices = columns[_INDEX]
     if _NO_INDEX in indices:
         raise UsageError(f"a table cannot be kept: {_NO_INDEX} is no index")
@@ -91,7 +100,8 @@ def unpack(blob: bytes) -> dict[str, Row]:
 
 def packed_row(rows: Mapping[str, Row]) -> tuple[int, float, bytes]:
     """What is kept of a table that is not empty: its size, when a value was heard last, and its bytes."""
-    return len(rows), max(map(_heard_at, rows.values())), pack(rows)
+    names, columns = _columns(rows)
+    return len(names), max(columns[_HEARD_AT]), _pack(names, columns)
 
 
 def row_checksum(size: int, heard_last: float, blob: bytes) -> int:

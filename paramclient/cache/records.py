@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from typing import Final, overload
+from typing import Final
 
-from paramclient.cache.rows import Row, signed, time_cell
 from paramclient.identity import Identity, autopilot_name
-from paramclient.params import NOWHERE, ParamMap, Params, parts_of
+from paramclient.params import ParamMap
 from paramclient.paramset import ParamSet
-from paramclient.values import Param, bits_of
+from paramclient.values import Param
 
 __all__ = [
     "BY_US",
@@ -20,7 +19,6 @@ __all__ = [
     "CachedComponent",
     "CachedSummary",
     "CachedVehicle",
-    "HeardParams",
     "HistoryEntry",
     "Snapshot",
     "SnapshotSummary",
@@ -29,8 +27,6 @@ __all__ = [
     "TableUpdate",
     "by_station",
 ]
-
-_new = tuple.__new__  # what a named tuple's own constructor ends in, after twice the time
 
 BY_US: Final = "us"
 """A change that one of our own writes caused; `us for NAME` where it was told for whom."""
@@ -59,73 +55,6 @@ class StoredParam:
     heard_at: float
     volatile: bool | None = None
     by: str = BY_VEHICLE
-
-
-class HeardParams(Sequence[StoredParam]):
-    """Parameters to keep, as a table holds them: each `StoredParam` is made when it is asked for.
-
-    That is never, where a whole table of a thousand is written: the cells of its rows are made of what the
-    table holds.
-
-    Args:
-        params: as they are now: a copy of what the table holds.
-        heard_at: when the vehicle said so.
-        volatile: the names that it leaves out of its hash; None leaves what is known.
-        by: who caused the changes, by name; of the others it was the vehicle.
-        overwritten: what some of them were before, and is to be kept first.
-    """
-
-    def __init__(
-        self,
-        params: Params,
-        heard_at: float,
-        *,
-        volatile: frozenset[str] | None,
-        by: Mapping[str, str],
-        overwritten: Sequence[StoredParam] = (),
-    ) -> None:
-        self._params = params
-        self._heard_at = heard_at
-        self._volatile = volatile
-        self._by = by
-        self._overwritten = overwritten
-
-    def __len__(self) -> int:
-        return len(self._overwritten) + len(self._params)
-
-    @overload
-    def __getitem__(self, place: int) -> StoredParam: ...
-
-    @overload
-    def __getitem__(self, place: slice) -> Sequence[StoredParam]: ...
-
-    def __getitem__(self, place: int | slice) -> StoredParam | Sequence[StoredParam]:
-        return list(self)[place]
-
-    def __iter__(self) -> Iterator[StoredParam]:
-        yield from self._overwritten
-        for name, param in self._params.items():
-            is_volatile = None if self._volatile is None else name in self._volatile
-            yield StoredParam(param, self._heard_at, is_volatile, self._by.get(name, BY_VEHICLE))
-
-    def rows(self) -> Iterator[tuple[str, Row, bool | None, str]]:
-        """Each one's name and cells, whether it is volatile, and who caused its change."""
-        for item in self._overwritten:
-            param = item.param
-            row = Row.of(param, param.index, bool(item.volatile), item.heard_at)
-            yield param.name, row, item.volatile, item.by
-        at = time_cell(self._heard_at)
-        volatile, author_of = self._volatile, self._by.get
-        is_volatile = None
-        defaults = self._params.defaults
-        for name, held in self._params.held.items():
-            if volatile is not None:
-                is_volatile = name in volatile
-            bits, number, is_raw, _, place = parts_of(held)
-            index = None if place == NOWHERE else place
-            initial = signed(bits_of(defaults[name], number)) if name in defaults else None
-            row = _new(Row, (number, signed(bits), is_raw, index, int(is_volatile or 0), at, initial))
-            yield name, row, is_volatile, author_of(name, BY_VEHICLE)
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,10 +13,10 @@ from types import MappingProxyType
 from typing import Final
 
 from paramclient.cache import earlier
+from paramclient.cache.heard import HeardParams
 from paramclient.cache.records import (
     BY_VEHICLE,
     CachedComponent,
-    HeardParams,
     HistoryEntry,
     StoredParam,
     TableState,
@@ -55,7 +55,7 @@ def save(session: Session, updates: Iterable[TableUpdate]) -> None:
         if update.params or update.removed or update.replace:  # else it is about the table as a whole only
             before = session.table(owner)
             after, lines, births = applied(update, before)
-            if after != before:
+            if len(after) != len(before) or after != before:
                 session.put_table(owner, before, after)
             session.add_births(owner, births)
             write_lines(session, owner, lines)
@@ -99,12 +99,12 @@ def forget_other_firmware(session: Session, identity: Identity) -> None:
 
 def applied(
     update: TableUpdate, before: Mapping[str, Row]
-) -> tuple[dict[str, Row], list[Line], Iterable[tuple[str, float]]]:
+) -> tuple[Mapping[str, Row], list[Line], Iterable[tuple[str, float]]]:
     """The rows after an update, the lines of history that it causes, and the new names with their times."""
-    if not before:
-        after = {name: row for name, row, _, _ in _news(update.params)}
-        if len(after) == len(update.params):  # no name twice, so nothing has changed
-            return after, [], ((name, row.heard_at) for name, row in after.items())
+    if not before and isinstance(update.params, HeardParams):
+        first = update.params.first_rows()
+        if first is not None:
+            return first, [], ((name, first[name].heard_at) for name in first)
     after = dict(before)
     births: list[tuple[str, float]] = []
     news = list(_news(update.params))
