@@ -6,7 +6,9 @@ The vehicles are simulated PX4 autopilots in another process, each with a UDP so
 fetches all of them at once, with an empty cache; then another client does so again with what the first one
 has kept: a warm start, one question for the hash each. Last, so many links are open in one process.
 
-Every size is measured in a process of its own. For each it prints, beside the targets at 250:
+Every size is measured in a process of its own, which does as the command `paramclient` does: when all is
+loaded it calls `gc.freeze()`, so that full collections do not go through modules and classes. With
+`--no-freeze` it does not. For each it prints, beside the targets at 250:
 
 - seconds by the clock on the wall, and of the CPU: of the whole process with the kernel's share for it, from
   the call of `fetch_all` until it has returned, without what it takes to set down the bytes that come;
@@ -72,11 +74,12 @@ ROOM = 96 * 1024 * 1024
 
 @dataclass(frozen=True)
 class Sizes:
-    """What is measured: links, systems in all, parameters of each."""
+    """What is measured: links, systems in all, parameters of each; and whether `gc.freeze` is called."""
 
     links: int
     systems: int
     parameters: int
+    freeze: bool = True
 
 
 @dataclass(frozen=True)
@@ -115,6 +118,7 @@ def main() -> int:
     parser.add_argument("--systems", type=int, nargs="+", default=SYSTEMS, help="on one link, from 1 to 250")
     parser.add_argument("--links", type=int, default=LINKS, help="at once, with 12 systems each; 0 for none")
     parser.add_argument("--parameters", type=int, default=PARAMETERS, help="of each system, from 1,000 up")
+    parser.add_argument("--no-freeze", action="store_true", help="leave the garbage collector as it is")
     parser.add_argument("--check", action="store_true", help="fail when a target is missed")
     arguments = parser.parse_args()
     print(f"Python {sys.version.split()[0]}, {os.cpu_count()} cores, load {os.getloadavg()[0]:.1f}\n")
@@ -123,9 +127,10 @@ def main() -> int:
         f"{'cache':>7}{'later':>7}{'blocked':>14}{'MiB':>6}{'requests':>9}  right"
     )
     are_met = True
-    sizes = [Sizes(1, systems, arguments.parameters) for systems in arguments.systems]
+    rest = (arguments.parameters, not arguments.no_freeze)
+    sizes = [Sizes(1, systems, *rest) for systems in arguments.systems]
     if arguments.links:
-        sizes.append(Sizes(arguments.links, 12 * arguments.links, arguments.parameters))
+        sizes.append(Sizes(arguments.links, 12 * arguments.links, *rest))
     for each in sizes:
         cold, warm = measured(each)
         for name, phase in (("cold", cold), ("warm", warm)):
@@ -185,6 +190,8 @@ def measure(sizes: Sizes, out: Connection) -> None:
         here.recv()  # they are there
         record = Record()
         gc.collect()
+        if sizes.freeze:
+            gc.freeze()
         before = resident()
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "cache.sqlite3"

@@ -6,14 +6,14 @@ import logging
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from typing import Final, Protocol
 
 import anyio
 import anyio.lowlevel
 
-from paramclient.crowd import LONGEST_TURN, MANY, Crowd
+from paramclient.crowd import LONGEST_TURN, LOOK_AGAIN, MANY, SOME, Crowd
 from paramclient.errors import LinkError
 from paramclient.links import Link, Peer
 from paramclient.protocol.component import ComponentMachine
@@ -108,6 +108,7 @@ class Carrier:
         self._sent = anyio.Event()  # set when anything is sent
         self._behind_since = math.inf  # since when more comes than is read at once
         self._read_at = -math.inf
+        self._most_lists = math.inf  # as many as other links let run here
         self._asked = True  # whether anything may have been asked of anybody
         self._standstill = Standstill()
 
@@ -136,19 +137,15 @@ class Carrier:
             if not chunks:
                 self._station.over(now)
                 self._asked = True
-            crowd.came(self, len(chunks), now)
+            crowd.came(self, len(chunks))
             self._behind_since = math.inf if len(chunks) < MANY else min(self._behind_since, now)
-            give_way_at = time.perf_counter() + crowd.turn(now)
-            for peer, data in chunks:
-                is_news |= self._station.receive(data, peer, now)
-                for tap in self._taps:
-                    tap.received(data, peer)
-                if time.perf_counter() >= give_way_at:
-                    self._dispatch()
-                    await anyio.lowlevel.checkpoint()
-                    now = self._read_at = anyio.current_time()
-                    crowd.came(self, len(chunks), now)
-                    give_way_at = time.perf_counter() + crowd.turn(now)
+            self._read_at = math.inf
+            rest = iter(chunks)
+            if len(chunks) >= SOME or self._most_lists < math.inf:
+                is_news |= await self._take_turns(rest, crowd)
+            is_news |= self._take(rest, math.inf)
+            now = self._read_at = anyio.current_time()
+            crowd.taken(self, now)
             if is_news:
                 self._dispatch()
                 self.tell()
@@ -156,7 +153,30 @@ class Carrier:
             elif self._may_rest and not self._station.is_waiting:
                 await self._rest(min(REST, MOST_PER_REST * (now - before) / max(1, len(chunks))))
             before = now
-            self._read_at = anyio.current_time()
+
+    async def _take_turns(self, chunks: Iterator[tuple[Peer, bytes]], crowd: Crowd) -> bool:
+        """Take what has come, and give way to other tasks and to other links; whether it is news."""
+        is_news = is_done = False
+        while not is_done:
+            async with crowd.turn:
+                turn_ends = time.perf_counter() + LONGEST_TURN
+                is_news |= self._take(chunks, turn_ends)
+                is_done = time.perf_counter() < turn_ends
+                self._dispatch()
+                await anyio.lowlevel.checkpoint()  # before another link has its turn
+        return is_news
+
+    def _take(self, chunks: Iterator[tuple[Peer, bytes]], until: float) -> bool:
+        """Take what has come, until this time has passed; whether any of it is news."""
+        is_news = False
+        now = anyio.current_time()
+        for peer, data in chunks:
+            is_news |= self._station.receive(data, peer, now)
+            for tap in self._taps:
+                tap.received(data, peer)
+            if time.perf_counter() >= until:
+                break
+        return is_news
 
     async def send(self) -> None:
         """Send what is to be sent, and do what is due, until the calls have failed for good."""
@@ -169,9 +189,11 @@ class Carrier:
             self._standstill.expect(math.inf)  # a slow link may hold us up
             everyone = self._asked
             is_behind = self._is_behind(now)
+            most_lists = crowd.most_lists(self, station.bursts, now)
+            self._most_lists = most_lists = 1 if is_behind else most_lists
             if not is_behind or now >= self._behind_since + MOST_BEHIND:
                 self._asked = False
-                station.tick(now, everyone=everyone, is_behind=is_behind or crowd.is_behind(now))
+                station.tick(now, everyone=everyone, most_lists=most_lists)
             self._dispatch()
             to_send = station.data_to_send()
             if to_send:
@@ -188,13 +210,13 @@ class Carrier:
             is_behind = self._is_behind(now)
             if is_behind:
                 due = now + LONGEST_TURN
-            elif crowd.is_behind(now):
-                due = max(due, now + LONGEST_TURN)  # no list that waits for its turn may begin before
+            elif most_lists < math.inf:  # a list that waits for its turn may not begin, and wants to
+                due = max(due, now + LOOK_AGAIN)
             self._standstill.expect(due)
             wait = due - now
             with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):
                 await self._something_to_send.wait()
-            if is_behind or anyio.current_time() - due > HELD_UP:
+            if self._behind_since < math.inf or anyio.current_time() - due > HELD_UP:
                 await anyio.sleep(READING_TIME)
 
     def send_for_another(self, frame: bytes) -> None:

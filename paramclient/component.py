@@ -82,6 +82,7 @@ class Component:
         self._machine = machine
         self._heard_at = heard_at
         self._subscriptions: weakref.WeakSet[Changes] = weakref.WeakSet()
+        machine.tells_changes = False  # until somebody listens
         self.system = machine.system
         self.component = machine.component
         self.params = ParamMap(machine.table.params)

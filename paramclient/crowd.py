@@ -2,30 +2,41 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
+import anyio
 from anyio.lowlevel import RunVar
 
 __all__ = ["Crowd"]
 
-LONGEST_TURN: Final = 0.005
-"""Seconds of what came at once after which other tasks get their turn: with the last value of a list its hash
-is proven, which takes a millisecond, and many lists may end at once. All links on which much comes share it,
-as each of them has its turn before the event loop has come round."""
-SHORTEST_TURN: Final = 0.00025
-"""Seconds of it at the least: some tens of values, below which the way round itself costs more."""
+LONGEST_TURN: Final = 0.003
+"""Seconds of what came at once after which other tasks get their turn. With the last value of a list its hash
+is proven, which takes a millisecond more, and many lists may end at once."""
 SOME: Final = 16
 MANY: Final = 128
-"""Datagrams read at once that take a turn, and that show that there are more: a link gives up to 256."""
+"""Datagrams read at once for which a link waits for its turn, and that show that there are more: a link gives
+up to 256."""
 LASTING: Final = 0.02
-"""Seconds for which that says something of a link: who has more to read, reads again before that."""
+"""Seconds for which that says something of a link when it has done with them: who has more, reads again."""
+ENOUGH_LISTS: Final = 24
+"""Lists in bursts on all links together beside which no link begins a second one: so many take all the time
+that the program has."""
+LOOK_AGAIN: Final = 0.01
+"""Seconds after which a link that waits for the others looks at them again."""
 
 
 class Crowd:
-    """What the readers of one event loop know of each other; see `of_this_loop`."""
+    """What the readers of one event loop know of each other; see `of_this_loop`.
+
+    Attributes:
+        turn: who takes many datagrams holds it, and lets the event loop come round before the next one does.
+    """
 
     def __init__(self) -> None:
-        self._read: dict[object, tuple[float, int]] = {}  # by reader: when, and how many datagrams at once
+        self.turn = anyio.Lock(fast_acquire=True)
+        self._behind: dict[object, float] = {}  # by reader: until when there is more to be read
+        self._bursts: dict[object, int] = {}  # by reader: its lists that come in bursts
 
     @staticmethod
     def of_this_loop() -> Crowd:
@@ -36,24 +47,36 @@ class Crowd:
             _crowd.set(crowd := Crowd())
             return crowd
 
-    def came(self, reader: object, datagrams: int, now: float) -> None:
-        """A reader has read so many at once, or has not done with them yet."""
-        self._read[reader] = now, datagrams
+    def came(self, reader: object, datagrams: int) -> None:
+        """A reader has read so many at once, and will say when it has taken them."""
+        self._behind.pop(reader, None)
+        if datagrams >= MANY:
+            self._behind[reader] = math.inf
+
+    def taken(self, reader: object, now: float) -> None:
+        """It has."""
+        if reader in self._behind:
+            self._behind[reader] = now + LASTING
 
     def left(self, reader: object) -> None:
         """A reader has ended."""
-        self._read.pop(reader, None)
+        self._behind.pop(reader, None)
+        self._bursts.pop(reader, None)
 
-    def turn(self, now: float) -> float:
-        """Seconds after which a reader gives way to other tasks."""
-        return max(LONGEST_TURN / max(self._number(SOME, now), 1), SHORTEST_TURN)
+    def most_lists(self, reader: object, bursts: int, now: float) -> float:
+        """How many lists a link may have running beside each other: one in any case.
 
-    def is_behind(self, now: float) -> bool:
-        """Whether more has come on any link than was read."""
-        return self._number(MANY, now) > 0
+        No more, where more has come on any link than was read. A link that is alone has its own measure.
 
-    def _number(self, least: int, now: float) -> int:
-        return sum(datagrams >= least and now < at + LASTING for at, datagrams in self._read.values())
+        Args:
+            reader: of the link.
+            bursts: how many of its lists come in bursts now.
+        """
+        self._bursts[reader] = bursts
+        others = sum(self._bursts.values()) - bursts
+        if any(now < until for until in self._behind.values()):
+            return 1
+        return max(ENOUGH_LISTS - others, 1) if others else math.inf
 
 
 _crowd: RunVar[Crowd] = RunVar("paramclient crowd")

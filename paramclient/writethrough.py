@@ -101,6 +101,7 @@ class WriteThrough:
         self._has_refused = False
         self._replacements = 0 if cache is None else cache.replacements
         self._has_written = False
+        self._are_many = False
         self._news: set[CacheChange] = set()
         self._end_news: Callable[[], None] = _nothing
 
@@ -230,9 +231,10 @@ class WriteThrough:
         """
         portion: list[_News] = []
         size = 0
-        are_many = sum(machine.fetch is not None for machine in self._kept) > FEW_FETCHES
+        fetches = sum(machine.fetch is not None for machine in self._kept)
+        self._are_many = fetches > (0 if self._are_many else FEW_FETCHES)  # the last ones of many count too
         for kept in list(self._kept.values()) if self._cache is not None else ():
-            if are_many and not is_last and self._is_for_later(kept):
+            if self._are_many and not is_last and self._is_for_later(kept):
                 self._something_to_write.set()
             elif self._kept.get(kept.machine) is kept:
                 for new in self._news_of(kept):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar, TypedDict, Unpack
 
@@ -698,7 +698,7 @@ class Sessions(RuleBasedStateMachine):
             assert result.hash == vehicle.announced_hash()
 
     def compare_table(self, subject: Subject, params: object, *, is_volatile_old: bool = False) -> None:
-        assert isinstance(params, dict)
+        assert isinstance(params, Mapping)
         vehicle = subject.vehicle
         true = vehicle.values
         held: dict[str, Param] = {name: param for name, param in params.items() if param.index is not None}

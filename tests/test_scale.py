@@ -246,16 +246,16 @@ class Watched(Station):
     def __init__(self) -> None:
         super().__init__(link="flood", is_stream=False)
         self.ticks: list[float] = []
-        self.is_behind = False
+        self.most_lists = math.inf
         self.on_receive: Callable[[], None] = lambda: None
 
     def receive(self, data: bytes, peer: Peer, now: float) -> bool:
         self.on_receive()
         return True
 
-    def tick(self, now: float, *, everyone: bool = True, is_behind: bool = False) -> None:
+    def tick(self, now: float, *, everyone: bool = True, most_lists: float = math.inf) -> None:
         self.ticks.append(now)
-        self.is_behind = is_behind
+        self.most_lists = most_lists
 
     def next_deadline(self, *, everyone: bool = True) -> float:
         return anyio.current_time() + 0.01
@@ -284,7 +284,7 @@ async def test_time_outs_wait_until_what_has_come_is_read() -> None:
         await anyio.sleep(0.1)
         assert station.ticks[-1] > began + 1.0
         assert len(station.ticks) > 5
-        assert not station.is_behind
+        assert station.most_lists > 1
 
 
 @swiftly
@@ -296,7 +296,7 @@ async def test_time_outs_do_not_wait_for_ever() -> None:
     meanwhile = [at - began for at in station.ticks if at > began + link.interval]
     assert MOST_BEHIND <= meanwhile[0] < MOST_BEHIND + 0.1
     assert 50 < len(meanwhile) < 1.0 / LONGEST_TURN
-    assert station.is_behind, "and no further list begins"
+    assert station.most_lists == 1, "and no further list begins"
 
 
 class Starved(Watched):
@@ -372,23 +372,32 @@ async def test_what_comes_at_once_gives_way_to_other_tasks(monkeypatch: pytest.M
     assert all(part.endswith("t") for part in rounds if "r" in part)
 
 
-def test_links_on_which_much_comes_share_the_turn() -> None:
+def test_a_link_has_no_more_lists_than_the_others_leave_it() -> None:
     readers = crowd.Crowd()
-    assert (readers.turn(1.0), readers.is_behind(1.0)) == (LONGEST_TURN, False)
-    readers.came("a", crowd.MANY, 1.0)
-    readers.came("b", crowd.SOME, 1.0)
-    readers.came("c", crowd.SOME - 1, 1.0)
-    assert (readers.turn(1.0), readers.is_behind(1.0)) == (LONGEST_TURN / 2, True)
-    readers.came("c", crowd.SOME, 1.0)
-    readers.came("a", crowd.SOME, 1.0)
-    assert (readers.turn(1.0), readers.is_behind(1.0)) == (LONGEST_TURN / 3, False)
+    most = crowd.ENOUGH_LISTS
+    assert readers.most_lists("a", 10 * most, 1.0) == math.inf, "it has its own measure"
+    assert readers.most_lists("a", 0, 1.0) == math.inf
+    assert readers.most_lists("b", most - 3, 2.0) == math.inf
+    assert readers.most_lists("a", 1, 2.0) == 3
+    assert readers.most_lists("c", 0, 2.0) == 2
+    assert readers.most_lists("d", 9, 2.0) == 2
+    assert readers.most_lists("a", 1, 2.0) == 1
     readers.left("b")
-    assert readers.turn(1.0) == LONGEST_TURN / 2
-    for number in range(1_000):
-        readers.came(number, crowd.MANY, 1.0)
-    assert readers.turn(1.0) == crowd.SHORTEST_TURN
-    later = 1.0 + crowd.LASTING
-    assert (readers.turn(later), readers.is_behind(later)) == (LONGEST_TURN, False)
+    assert readers.most_lists("a", 1, 2.0) == most - 9
+
+
+def test_no_link_has_lists_beside_each_other_while_more_has_come_on_one_than_was_read() -> None:
+    readers = crowd.Crowd()
+    readers.came("b", crowd.MANY - 1)
+    assert readers.most_lists("a", 0, 1.0) == math.inf
+    readers.came("b", crowd.MANY)
+    assert readers.most_lists("a", 0, 1e6) == 1, "it is not done with them"
+    readers.taken("b", 2.0)
+    assert readers.most_lists("a", 0, 2.0) == 1
+    assert readers.most_lists("a", 0, 2.0 + crowd.LASTING) == math.inf
+    readers.came("b", crowd.MANY - 1)
+    readers.taken("b", 2.0)
+    assert readers.most_lists("a", 0, 2.0) == math.inf
 
 
 def test_links_of_two_event_loops_share_nothing() -> None:
@@ -406,18 +415,18 @@ async def test_no_list_begins_while_another_link_brings_more_than_is_read() -> N
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(carry, quiet, station, 3.0, lambda: None)
         await anyio.sleep(0.5)
-        seen = [station.is_behind]
+        seen = [station.most_lists]
         tasks.start_soon(carry, busy, Watched(), 2.0, lambda: None)
         for size in (crowd.MANY, 0, crowd.MANY):
             busy.size = size
             busy.is_stuck.set()
             await anyio.sleep(0.5)
-            seen.append(station.is_behind)
-        assert seen == [False, True, False, True]
+            seen.append(station.most_lists)
+        assert seen == [math.inf, 1, math.inf, 1]
         half_a_second = [at for at in station.ticks if at > anyio.current_time() - 0.5]
         assert len(half_a_second) > 20, "what is due is done all the same"
         await anyio.sleep(0.6)
-        assert not station.is_behind, "that one was closed"
+        assert station.most_lists > 1, "that one was closed"
         tasks.cancel_scope.cancel()
 
 
@@ -512,13 +521,14 @@ async def test_who_is_not_heard_at_all_for_a_while_is_waited_for() -> None:
         assert everything.results.keys() == {(1, 1), (2, 1), (3, 1)}
 
 
+@pytest.mark.parametrize("few", [0, 8])
 @pytest.mark.parametrize("seconds", [5, 40])
 @swiftly
 async def test_tables_that_are_fetched_in_numbers_are_written_once_or_in_growing_parts(
-    tmp_path: Path, seconds: int, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, seconds: int, few: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each part costs as much as all of the table: so half of it must be new."""
-    monkeypatch.setattr(writethrough, "FEW_FETCHES", 0)
+    monkeypatch.setattr(writethrough, "FEW_FETCHES", few)
     vehicles: list[Vehicle] = []
     for system in range(1, 13):
         table = [SimParam(f"P_{index:03}", ParamType.INT32, index) for index in range(200)]

@@ -234,10 +234,10 @@ def test_nobody_begins_beside_others_while_more_has_come_than_was_read() -> None
         road.now += STEP
         road.lanes[0].came += 10
         road.lanes[0].passed += 10
-        assert not road.turns.tick(road.now, is_behind=True)
+        assert not road.turns.tick(road.now, most=1)
     assert road.running == 1
     road.end(road.lanes[0])
-    assert road.turns.tick(road.now, is_behind=True), "else it would wait for nobody"
+    assert road.turns.tick(road.now, most=1), "else it would wait for nobody"
     assert road.running == 1
     road.run()
     assert road.running == FAST_GROWTH
@@ -460,7 +460,7 @@ def test_a_program_that_stays_behind_follows_one_after_the_other(monkeypatch: py
     vehicles = [PX4Vehicle(system=system, table=table(60)) for system in range(1, 5)]
     world = Simulation(*vehicles)
     tick, next_deadline = world.station.tick, world.station.next_deadline
-    monkeypatch.setattr(world.station, "tick", functools.partial(tick, is_behind=True))
+    monkeypatch.setattr(world.station, "tick", functools.partial(tick, most_lists=1))
     monkeypatch.setattr(world.station, "next_deadline", lambda: max(next_deadline(), world.now + STEP))
     fetches = begin_all(world, 4)
     while not all(fetch.done for fetch in fetches):

@@ -212,6 +212,12 @@ class Download(Operation[None]):
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
         name, _, _, count, index = message
+        stream = self._stream
+        if count == self.count and index == stream.front + 1 and self._goes_straight_on(index):
+            self.names[index] = name
+            self._vain = 0
+            stream.goes_on(index, now)
+            return
         if index >= count or count > MOST_PARAMETERS:
             if index == NO_INDEX and self.count is not None and count <= MOST_PARAMETERS:
                 # pushed, or an answer by name: it goes by the count of now, where ArduPilot's stream does not
@@ -233,10 +239,8 @@ class Download(Operation[None]):
             self._start_over(count)
         if index >= self.count:
             return
-        names, holes = self.names, self._stream.holes
-        is_repeated = index in names
-        if is_repeated:
-            self.repeated += 1
+        names, holes = self.names, stream.holes
+        self.repeated += (is_repeated := index in names)
         names[index] = name
         if holes:
             holes.pop(index, None)
@@ -247,6 +251,14 @@ class Download(Operation[None]):
         if (holes and self.held_since is None) or self._asked or not self._is_streaming:
             self._ask_for_gaps(now)
             self._finish_if_complete(now)
+
+    def _goes_straight_on(self, index: int) -> bool:
+        """Whether the next value of a list that runs brings nothing but itself: so it is with nearly all."""
+        stream, left = self._stream, (self.count or 0) - 1
+        if index in self.names or index >= left or len(self.names) >= left or not self._is_streaming:
+            return False
+        is_troubled = self._asked or stream.holes or self.given_up or self._vain_passes or self.resumed
+        return not (is_troubled or stream.is_awaited or self.done)
 
     def heed(self, now: float) -> None:
         """The head of the list has come: it was heard, and is not asked for again yet.

@@ -189,12 +189,12 @@ class Station:
             if isinstance(message, ParamSet):
                 self._receive_foreign_set(message, (frame.system, frame.component), now)
 
-    def tick(self, now: float, *, everyone: bool = True, is_behind: bool = False) -> None:
+    def tick(self, now: float, *, everyone: bool = True, most_lists: float = math.inf) -> None:
         """Do what is due: our heartbeat, and every component's time-outs.
 
         Without `everyone`, only components that were heard or touched, or whose deadline has come, are
-        looked at: a share of the link that has become larger meanwhile is then used a little later. With
-        `is_behind`, more has come than was given to `receive`, and no further list begins beside others.
+        looked at: a share of the link that has become larger meanwhile is then used a little later. No
+        list begins beside `most_lists` others.
         """
         if self._is_paused or self.is_log:
             return
@@ -212,7 +212,7 @@ class Station:
             if machine.next_deadline() <= now or machine.writes.is_held:  # for another component's word
                 machine.tick(now)
                 self._touched[machine] = None
-        if self._turns.tick(now, is_behind=is_behind):
+        if self._turns.tick(now, most=most_lists):
             self._touch_all(self.components.values())
         if self.traffic is not None:
             self.traffic.sent(self.bytes_sent, now)
@@ -302,6 +302,11 @@ class Station:
             self._skipped + sum(framer.skipped for framer in framers),
             self._damaged + sum(framer.damaged for framer in framers),
         )
+
+    @property
+    def bursts(self) -> int:
+        """Lists that come in bursts now: on a link that is faster than the program."""
+        return self._turns.bursts
 
     @property
     def is_waiting(self) -> bool:

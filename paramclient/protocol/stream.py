@@ -82,17 +82,24 @@ class ListStream:
             self._began = (index, now)
             self._came_before = self._advances
             self._together = 0
+            self._advances += 1
+            self.front = index
+            self.heard_at = self._front_at = now
         else:
-            self._longest *= 0.99
-            gap = now - self.heard_at
-            if gap > self._longest:
-                self._longest = gap
-            elif gap < AT_ONCE:
-                self._together += 1
+            self.goes_on(index, now)
+        return True
+
+    def goes_on(self, index: int, now: float) -> None:
+        """Go forward to an index that may be believed, not the first."""
+        self._longest *= 0.99
+        gap = now - self.heard_at
+        if gap > self._longest:
+            self._longest = gap
+        elif gap < AT_ONCE:
+            self._together += 1
         self._advances += 1
         self.front = index
-        self._front_at = now
-        return True
+        self.heard_at = self._front_at = now
 
     def pass_over(self, indices: Iterable[int]) -> None:
         """These in between have not come yet."""

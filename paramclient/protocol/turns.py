@@ -108,6 +108,7 @@ class Turns:
         self._idle_since = -math.inf
         self._begun_at = -math.inf  # when a turn was given last
         self._crowded_at = -math.inf  # when several lists came last
+        self._is_crowded = False  # whether other links have lists too
         self._lone: Stream | None = None  # the list that came alone last
         self._lone_at = -math.inf  # when that was
         self._waiting: deque[Stream] = deque()
@@ -121,6 +122,11 @@ class Turns:
     def is_free(self) -> bool:
         """Whether a list may begin at once."""
         return not self._waiting and self._active() < self._limit
+
+    @property
+    def bursts(self) -> int:
+        """How many lists come in bursts, or may do so."""
+        return sum(stream.is_awaited or stream.seen().is_bursty for stream in self._running)
 
     def ask(self, stream: Stream, now: float) -> None:
         """Want a turn; `Stream.begin` is called at once, or when it comes. Ended by `give_back`."""
@@ -161,23 +167,24 @@ class Turns:
             self._idle_since = self._now
 
     def is_beside_others(self, stream: Stream) -> bool:
-        """Whether lists of others come now."""
-        return any(each is not stream and not each.is_awaited for each in self._running)
+        """Whether lists of others come now, be it on other links that take the program's time."""
+        return self._is_crowded or any(each is not stream and not each.is_awaited for each in self._running)
 
     def beside_others_at(self, stream: Stream) -> float:
         """When a list of another one came last."""
         return max(self._crowded_at, -math.inf if self._lone is stream else self._lone_at)
 
-    def tick(self, now: float, *, is_behind: bool = False) -> bool:
+    def tick(self, now: float, *, most: float = math.inf) -> bool:
         """Let the next ones begin, if there is room; whether any has.
 
         Args:
             now: the time.
-            is_behind: whether more has come than the program has read: then nobody begins beside another.
+            most: so many may run beside each other, as the program has no time for more.
         """
         self._now = now
         coming = [stream for stream in self._running if not stream.is_awaited]
-        if len(coming) > 1:
+        self._is_crowded = most < math.inf
+        if len(coming) > 1 or self._is_crowded:
             self._crowded_at = now
         elif coming:
             if self._lone is not coming[0]:
@@ -189,8 +196,7 @@ class Turns:
         if self._newest:
             self._look(now)
         begins = min(self._room(), len(self._waiting))
-        if is_behind:
-            begins = min(begins, 1 - len(self._running))
+        begins = int(min(begins, most - len(self._running)))
         for _ in range(begins):
             self._begin(self._waiting.popleft(), now)
         return begins > 0
