@@ -108,13 +108,13 @@ class Carrier:
         self._sent = anyio.Event()  # set when anything is sent
         self._behind_since = math.inf  # since when more comes than is read at once
         self._read_at = -math.inf
-        self._most_lists = math.inf  # as many as other links let run here
         self._asked = True  # whether anything may have been asked of anybody
         self._standstill = Standstill()
 
     async def read(self) -> None:
         """Take what comes, until the link fails for good."""
         crowd = Crowd.of_this_loop()
+        crowd.joined(self)
         try:
             await self._read(crowd)
         finally:
@@ -141,7 +141,7 @@ class Carrier:
             self._behind_since = math.inf if len(chunks) < MANY else min(self._behind_since, now)
             self._read_at = math.inf
             rest = iter(chunks)
-            if len(chunks) >= SOME or self._most_lists < math.inf:
+            if len(chunks) >= SOME or (crowd.has_others and self._station.is_waiting):
                 is_news |= await self._take_turns(rest, crowd)
             is_news |= self._take(rest, math.inf)
             now = self._read_at = anyio.current_time()
@@ -189,8 +189,7 @@ class Carrier:
             self._standstill.expect(math.inf)  # a slow link may hold us up
             everyone = self._asked
             is_behind = self._is_behind(now)
-            most_lists = crowd.most_lists(self, station.bursts, now)
-            self._most_lists = most_lists = 1 if is_behind else most_lists
+            most_lists = 1 if is_behind else crowd.most_lists(self, station.bursts, now)
             if not is_behind or now >= self._behind_since + MOST_BEHIND:
                 self._asked = False
                 station.tick(now, everyone=everyone, most_lists=most_lists)

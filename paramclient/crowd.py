@@ -35,6 +35,7 @@ class Crowd:
 
     def __init__(self) -> None:
         self.turn = anyio.Lock(fast_acquire=True)
+        self._readers: set[object] = set()
         self._behind: dict[object, float] = {}  # by reader: until when there is more to be read
         self._bursts: dict[object, int] = {}  # by reader: its lists that come in bursts
 
@@ -46,6 +47,15 @@ class Crowd:
         except LookupError:
             _crowd.set(crowd := Crowd())
             return crowd
+
+    def joined(self, reader: object) -> None:
+        """A reader has begun."""
+        self._readers.add(reader)
+
+    @property
+    def has_others(self) -> bool:
+        """Whether there is more than one."""
+        return len(self._readers) > 1
 
     def came(self, reader: object, datagrams: int) -> None:
         """A reader has read so many at once, and will say when it has taken them."""
@@ -60,6 +70,7 @@ class Crowd:
 
     def left(self, reader: object) -> None:
         """A reader has ended."""
+        self._readers.discard(reader)
         self._behind.pop(reader, None)
         self._bursts.pop(reader, None)
 
