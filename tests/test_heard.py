@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from paramclient.cache import HeardParams, StoredParam
 from paramclient.cache.heard import FirstRows
-from paramclient.cache.packed import pack
+from paramclient.cache.packed import Packed, pack
 from paramclient.cache.rows import Damaged, Row, read_param, read_params
 from paramclient.params import Params
 from paramclient.values import Encoding, Param, ParamType, Trust, decode, from_bits, known_type
@@ -68,6 +68,10 @@ def test_a_table_gives_the_same_rows_in_every_way(
     assert list(names) == list(expected)
     assert [tuple(cells) for cells in zip(*columns, strict=True)] == [tuple(row) for row in expected.values()]
     assert pack(first) == pack(expected)
+    kept, left_out, heard_at = Packed(pack(first)).params()
+    assert kept == read_params(expected)
+    assert left_out == frozenset(name for name, row in expected.items() if row.volatile)
+    assert list(heard_at.items()) == [(name, AT) for name in kept]
     again = read_params(expected)
     one_by_one = {
         name: read_param(name, *row.value, row.param_index, row.default_bits)

@@ -21,6 +21,7 @@ from paramclient.links import Peer
 from paramclient.protocol import station as station_room
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import ComponentLost
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import MAV_AUTOPILOT_PX4, Heartbeat
@@ -99,6 +100,22 @@ def test_what_was_asked_of_one_goes_out_when_it_was_touched() -> None:
     station.touch(machine)
     assert station.next_deadline(everyone=False) == pytest.approx(machine.reads.pace.next_at())
     assert station.next_deadline(everyone=False) == station.next_deadline()
+
+
+def test_what_is_due_of_many_at_once_is_done_in_parts() -> None:
+    station = Station(link="x", is_stream=False)
+    for system in range(1, MANY + 1):
+        hear(station, system, 0.0)
+    station.events()
+    ticks = 0
+    now = 100.0  # all of them are lost by now
+    while station.next_deadline() <= now:
+        station.tick(now, everyone=not ticks)
+        ticks += 1
+        lost = [event for event in station.events() if isinstance(event, ComponentLost)]
+        assert len(lost) <= station_room.MOST_AT_ONCE
+    assert all(machine.presence.is_lost for machine in station.components.values())
+    assert ticks >= MANY / station_room.MOST_AT_ONCE
 
 
 def test_who_was_forgotten_leaves_no_deadline_to_whoever_comes_in_its_place(

@@ -20,13 +20,14 @@ import math
 import struct
 import zlib
 from collections.abc import Iterable, Mapping, Sequence
-from itertools import repeat
+from itertools import compress, repeat
 from operator import itemgetter, lt
 from typing import Any, Final, TypeVar
 
 from paramclient.cache.heard import FirstRows
-from paramclient.cache.rows import YEAR_10000, Damaged, Row
+from paramclient.cache.rows import YEAR_10000, Damaged, Row, read_cells
 from paramclient.errors import UsageError
+from paramclient.params import Params
 
 __all__ = ["Packed", "pack", "packed_row", "row_checksum", "unpack"]
 
@@ -152,6 +153,15 @@ class Packed:
             strict=True,
         )
         return self._by_name(map(_new, repeat(Row), rows))
+
+    def params(self) -> tuple[Params, frozenset[str], dict[str, float]]:
+        """All of it as `Session.params` gives it, without an object for each row."""
+        names = self._names()
+        volatile = compress(names, _flags(self._bytes(2)))
+        heard_at = self._by_name(_checked(self._times()))
+        numbers = self._bytes(0), self._numbers("q", self._wide), _flags(self._bytes(1))
+        params = read_cells(zip(names, *numbers, self._indices(), self._defaults(), strict=True))
+        return params, frozenset(volatile), heard_at
 
     def places(self) -> dict[str, int]:
         """Where each name stands."""

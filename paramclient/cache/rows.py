@@ -21,6 +21,7 @@ __all__ = [
     "cells",
     "checksum",
     "identity_cells",
+    "read_cells",
     "read_identity",
     "read_param",
     "read_params",
@@ -172,9 +173,14 @@ def read_param(
 
 def read_params(rows: Mapping[str, Row]) -> Params:
     """The parameters of a table, as it keeps them; their trust is CACHED."""
+    return read_cells((name, *row[:4], row.default_bits) for name, row in rows.items())
+
+
+def read_cells(cells_: Iterable[tuple[str, int, int, int, int | None, int | None]]) -> Params:
+    """The same of name, type, bits, is_raw, index and default of each."""
     params = Params()
     held, defaults = params.held, params.defaults
-    for name, (number, bits, is_raw, index, _, _, default_bits) in rows.items():
+    for name, number, bits, is_raw, index, default_bits in cells_:
         if not 0 <= number <= 255:
             raise Damaged(f"{number} is not a type")
         bits &= _MASK_64

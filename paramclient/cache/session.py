@@ -19,8 +19,10 @@ from paramclient.cache.rows import (
     identity_cells,
     read_identity,
     read_param,
+    read_params,
     time_cell,
 )
+from paramclient.params import Params
 
 __all__ = ["Line", "NumberedLine", "Session"]
 
@@ -166,6 +168,16 @@ class Session(ABC):
         Raises:
             Damaged: they are not what was written.
         """
+
+    def params(self, owner: int) -> tuple[Params, frozenset[str], dict[str, float]]:
+        """The same as parameters: those, the names of the volatile ones, and when each was heard.
+
+        Raises:
+            Damaged: they are not what was written.
+        """
+        rows = self.table(owner)
+        volatile = frozenset(name for name, row in rows.items() if row.volatile)
+        return read_params(rows), volatile, {name: row.heard_at for name, row in rows.items()}
 
     @abstractmethod
     def put_table(self, owner: int, before: Mapping[str, Row] | None, after: Mapping[str, Row]) -> None:

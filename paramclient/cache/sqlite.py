@@ -14,6 +14,7 @@ from paramclient.cache.packed import Packed, packed_row, row_checksum
 from paramclient.cache.records import CacheChange
 from paramclient.cache.rows import Damaged, Row, cells, checksum
 from paramclient.cache.session import Session
+from paramclient.params import Params
 
 __all__ = ["SqliteSession", "SqliteStore"]
 
@@ -90,6 +91,10 @@ class SqliteSession(Session):
     def table(self, owner: int) -> dict[str, Row]:
         packed = self._packed(owner)
         return {} if packed is None else packed.rows()
+
+    def params(self, owner: int) -> tuple[Params, frozenset[str], dict[str, float]]:
+        packed = self._packed(owner)
+        return (Params(), frozenset(), {}) if packed is None else packed.params()
 
     def put_table(self, owner: int, before: Mapping[str, Row] | None, after: Mapping[str, Row]) -> None:
         if not after:

@@ -22,7 +22,7 @@ from paramclient.cache.records import (
     TableState,
     TableUpdate,
 )
-from paramclient.cache.rows import Row, read_params, time_cell
+from paramclient.cache.rows import Row, time_cell
 from paramclient.cache.session import Line, Session
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
@@ -76,12 +76,12 @@ def component(
 ) -> CachedComponent | None:
     """One table with its parameters, or None."""
     for owner, summary in session.summaries(key, number):
-        rows = session.table(owner)
+        params, volatile, heard_at = session.params(owner)
         return CachedComponent(
             **{field.name: getattr(summary, field.name) for field in fields(summary)},
-            params=ParamMap(read_params(rows)),
-            volatile=frozenset(name for name, row in rows.items() if row.volatile),
-            heard_at=MappingProxyType({name: row.heard_at for name, row in rows.items()}),
+            params=ParamMap(params),
+            volatile=volatile,
+            heard_at=MappingProxyType(heard_at),
             _history=history,
         )
     return None

@@ -58,6 +58,8 @@ NOBODY: Final = (0, 0)
 MOST_COMPONENTS: Final = 1_000
 """Components followed on one link: more than 250 systems with a few each have. Further ones are heard
 when one that is lost and has told of no parameter can be forgotten for them."""
+MOST_AT_ONCE: Final = 64
+"""Components that do what is due in one `tick`, a few milliseconds. For more it is to be called again."""
 MOST_PAST: Final = 8
 """Deadlines of the past that are kept for each component before they are sorted out."""
 SEARCH_INTERVAL: Final = 0.5
@@ -190,7 +192,7 @@ class Station:
                 self._receive_foreign_set(message, (frame.system, frame.component), now)
 
     def tick(self, now: float, *, everyone: bool = True, most_lists: float = math.inf) -> None:
-        """Do what is due: our heartbeat, and every component's time-outs.
+        """Do what is due: our heartbeat, and time-outs of up to `MOST_AT_ONCE` components.
 
         Without `everyone`, only components that were heard or touched, or whose deadline has come, are
         looked at: a share of the link that has become larger meanwhile is then used a little later. No
@@ -208,10 +210,17 @@ class Station:
             while self._order and self._order[0][0] <= now:
                 _, system, component = heappop(self._order)
                 self._touched[self.components[system, component]] = None
+        done = 0
         for machine in list(self.components.values() if everyone else self._touched):
-            if machine.next_deadline() <= now or machine.writes.is_held:  # for another component's word
+            is_due = machine.next_deadline() <= now
+            if is_due and done == MOST_AT_ONCE:
+                self._deadlines[machine] = math.inf  # so it is noted anew, and is past
+            elif is_due or machine.writes.is_held:  # for another component's word
                 machine.tick(now)
-                self._touched[machine] = None
+                done += is_due
+            else:
+                continue
+            self._touched[machine] = None
         if self._turns.tick(now, most=most_lists):
             self._touch_all(self.components.values())
         if self.traffic is not None:
