@@ -1462,3 +1462,22 @@ def test_sim_on_a_byte_stream_joins_what_was_cut() -> None:
             receive(4)
     values = [each.param_id for each in messages if isinstance(each, wire.ParamValue)]
     assert values == ["MC_ROLL_P"]
+
+
+def test_the_garbage_collector_leaves_out_what_is_loaded_when_a_command_begins() -> None:
+    program = (
+        "import gc, paramclient.cli as cli\n"
+        "cli.run = lambda arguments: print(gc.get_freeze_count(), len(gc.get_objects())) or 0\n"
+        "from paramclient.__main__ import main\n"
+        "main()"
+    )
+    outcome = subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=PATIENCE,
+    )
+    frozen, rest = map(int, outcome.stdout.split())
+    assert frozen > 10 * rest

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -75,6 +76,7 @@ async def serve(
         raise UsageError(f"serving needs {' and '.join(missing)}: pip install 'paramclient[service]'")
     from paramclient import service  # only here: needs the extra
 
+    gc.freeze()  # as when the command begins: this stays loaded too
     if no_cache and cache is not None:
         raise UsageError("--cache and --no-cache exclude each other")
     if not links:

@@ -39,7 +39,7 @@ ENOUGH_NAMES: Final = 2_000
 """Names that every table may hold, whatever the others of its link do: more than autopilots have."""
 MOST_NAMES_OF_LINK: Final = 400_000
 """Names that all tables of one link may hold together before each is held to `ENOUGH_NAMES`: 250 vehicles
-with 1,600 parameters each. A name takes about half a kilobyte."""
+with 1,600 parameters each. A name takes about a quarter of a kilobyte."""
 MOST_OVERWRITTEN: Final = 1_024
 """What we wrote and was replaced before the cache was told: some tens fit between two writes to the disk."""
 MOST_GONE: Final = MOST_NAMES
