@@ -180,8 +180,14 @@ class Carrier:
 
     async def send(self) -> None:
         """Send what is to be sent, and do what is due, until the calls have failed for good."""
-        station = self._station
         crowd = Crowd.of_this_loop()
+        try:
+            await self._send(crowd)
+        finally:
+            crowd.left(self)
+
+    async def _send(self, crowd: Crowd) -> None:
+        station = self._station
         while self.ended is None:
             self._something_to_send = anyio.Event()
             now = anyio.current_time()
@@ -189,10 +195,12 @@ class Carrier:
             self._standstill.expect(math.inf)  # a slow link may hold us up
             everyone = self._asked
             is_behind = self._is_behind(now)
-            most_lists = 1 if is_behind else crowd.most_lists(self, station.bursts, now)
+            bursts, awaited = station.bursts(now)
+            most_lists = 1 if is_behind else crowd.most_lists(self, bursts, now, awaited=awaited)
             if not is_behind or now >= self._behind_since + MOST_BEHIND:
                 self._asked = False
-                station.tick(now, everyone=everyone, most_lists=most_lists)
+                is_crowded = crowd.is_busy_without(self)
+                station.tick(now, everyone=everyone, most_lists=most_lists, is_crowded=is_crowded)
             self._dispatch()
             to_send = station.data_to_send()
             if to_send:

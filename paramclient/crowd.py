@@ -38,6 +38,7 @@ class Crowd:
         self._readers: set[object] = set()
         self._behind: dict[object, float] = {}  # by reader: until when there is more to be read
         self._bursts: dict[object, int] = {}  # by reader: its lists that come in bursts
+        self._awaited: dict[object, int] = {}  # by reader: its lists that may do so soon
 
     @staticmethod
     def of_this_loop() -> Crowd:
@@ -73,8 +74,9 @@ class Crowd:
         self._readers.discard(reader)
         self._behind.pop(reader, None)
         self._bursts.pop(reader, None)
+        self._awaited.pop(reader, None)
 
-    def most_lists(self, reader: object, bursts: int, now: float) -> float:
+    def most_lists(self, reader: object, bursts: int, now: float, *, awaited: int = 0) -> float:
         """How many lists a link may have running beside each other: one in any case.
 
         No more, where more has come on any link than was read. A link that is alone has its own measure.
@@ -82,12 +84,18 @@ class Crowd:
         Args:
             reader: of the link.
             bursts: how many of its lists come in bursts now.
+            awaited: how many may do so soon.
         """
         self._bursts[reader] = bursts
-        others = sum(self._bursts.values()) - bursts
+        self._awaited[reader] = awaited
+        others = sum(self._bursts.values()) + sum(self._awaited.values()) - bursts - awaited
         if any(now < until for until in self._behind.values()):
             return 1
         return max(ENOUGH_LISTS - others, 1) if others else math.inf
+
+    def is_busy_without(self, reader: object) -> bool:
+        """Whether lists come in bursts on other links: one that is only awaited takes no time of anybody."""
+        return any(bursts for each, bursts in self._bursts.items() if each is not reader)
 
 
 _crowd: RunVar[Crowd] = RunVar("paramclient crowd")

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import gc
+import pickle
 
 import pytest
 from hypothesis import given
@@ -22,6 +24,7 @@ from paramclient.params import (
     to_hold,
     trusted,
 )
+from paramclient.protocol.change import Change
 from paramclient.values import Encoding, Param, ParamType, Trust, decode, known_type
 
 
@@ -142,3 +145,19 @@ def test_the_garbage_collector_goes_through_nothing_that_is_kept() -> None:
     for at in range(100):
         params[f"P{at}"] = Param(f"P{at}", 1.5, ParamType.REAL32, at, 0x3FC00000, default=2.5)
     assert not any(map(gc.is_tracked, (*params.held.values(), *params.defaults.values())))
+
+
+def test_a_change_is_the_same_by_what_has_changed_and_can_be_copied() -> None:
+    old = Param("A", 1, ParamType.INT8, 0, 1, default=3)
+    new = Param("A", 2, ParamType.INT8, 0, 2, Trust.CACHED, 4)
+    change = Change("A", old, new, "us")
+    same = Change("A", Param("A", 1, ParamType.INT8, 0, 1), new, "us")
+    assert change == same
+    assert not change != same  # noqa: SIM202 - what a tuple has of its own
+    assert hash(change) == hash(same)
+    assert change != Change("A", old, new, "vehicle")
+    for copied in (copy.copy(change), copy.deepcopy(change), pickle.loads(pickle.dumps(change))):
+        assert copied == change
+        assert copied.old is not None
+        assert copied.new is not None
+        assert (copied.old.default, copied.new.default) == (3, 4)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import inspect
 import math
 import time
@@ -270,7 +271,9 @@ class Watched(Station):
         self.on_receive()
         return True
 
-    def tick(self, now: float, *, everyone: bool = True, most_lists: float = math.inf) -> None:
+    def tick(
+        self, now: float, *, everyone: bool = True, most_lists: float = math.inf, is_crowded: bool = False
+    ) -> None:
         self.ticks.append(now)
         self.most_lists = most_lists
 
@@ -401,6 +404,19 @@ def test_a_link_has_no_more_lists_than_the_others_leave_it() -> None:
     assert readers.most_lists("a", 1, 2.0) == 1
     readers.left("b")
     assert readers.most_lists("a", 1, 2.0) == most - 9
+    assert readers.most_lists("c", 0, 2.0, awaited=4) == most - 10
+    assert readers.most_lists("a", 1, 2.0, awaited=1) == most - 13
+
+
+def test_a_list_that_is_only_awaited_takes_no_time_of_others() -> None:
+    readers = crowd.Crowd()
+    readers.most_lists("a", 0, 1.0, awaited=5)
+    assert not readers.is_busy_without("b")
+    readers.most_lists("a", 1, 1.0)
+    assert readers.is_busy_without("b")
+    assert not readers.is_busy_without("a")
+    readers.left("a")
+    assert not readers.is_busy_without("b")
 
 
 def test_no_link_has_lists_beside_each_other_while_more_has_come_on_one_than_was_read() -> None:
@@ -445,6 +461,24 @@ async def test_no_list_begins_while_another_link_brings_more_than_is_read() -> N
         await anyio.sleep(0.6)
         assert station.most_lists > 1, "that one was closed"
         tasks.cancel_scope.cancel()
+
+
+@swiftly
+async def test_a_link_that_was_closed_leaves_nothing_behind_whichever_of_its_tasks_ends_last() -> None:
+    station = Watched()
+    station.bursts = lambda now: (crowd.ENOUGH_LISTS, 0)  # type: ignore[method-assign]
+    for first in ("read", "send"):
+        tasks = {}
+        link = Carrier(Flood(), station, dispatch=lambda: None, end=lambda error: None)
+        for name in ("read", "send"):
+            tasks[name] = asyncio.create_task(getattr(link, name)())
+        await anyio.sleep(0.1)
+        readers = crowd.Crowd.of_this_loop()
+        assert readers.most_lists("another", 0, anyio.current_time()) == 1
+        for name in (first, *({*tasks} - {first})):
+            tasks[name].cancel()
+            await anyio.sleep(0.1)
+        assert readers.most_lists("another", 0, anyio.current_time()) == math.inf
 
 
 class Portions(ParamCache):

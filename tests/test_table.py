@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
+from paramclient.cache import HeardParams, StoredParam
 from paramclient.protocol import table as room
 from paramclient.protocol.change import Change
 from paramclient.protocol.table import Table
@@ -380,3 +383,52 @@ def test_another_place_leaves_value_and_default() -> None:
     assert (table.params["A"].index, table.params["A"].value, table.params["A"].default) == (3, 7, 5)
     table.forget_defaults()
     assert (table.params["A"].value, table.params["A"].default) == (7, None)
+
+
+HALF = 0x3F000000
+"""The bits of 0.5."""
+
+
+def rows_of(table: Table) -> dict[str, int | None]:
+    """The defaults that the cache makes of all that it is given of a table."""
+    overwritten = [StoredParam(param, 1.0, by=by) for param, by in table.overwritten]
+    heard = HeardParams(table.params.copy(), 1.0, volatile=None, by={}, overwritten=overwritten)
+    return {f"{name} {row.type}": row.default_bits for name, row, *_ in heard.rows()}
+
+
+def test_what_was_overwritten_keeps_the_default_of_its_own_type() -> None:
+    table = Table()
+    table.hear(param_value("A", 5, index=0, kind=ParamType.INT8), "us")
+    change = table.take("A", ParamType.REAL32, HALF, 0, HALF, is_older=False)
+    assert change is not None
+    assert change.old is not None
+    assert change.new is not None
+    assert (change.old.default, change.new.default) == (None, 0.5)
+    assert [(param.value, param.default) for param, _ in table.overwritten] == [(5, None)]
+    assert rows_of(table) == {"A 2": None, "A 9": HALF}
+    change = table.hear(param_value("A", 6, index=0, kind=ParamType.INT8), "us")
+    assert change is not None
+    assert change.old is not None
+    assert change.old.default == 0.5
+    table.overwritten = table.overwritten[1:]
+    assert rows_of(table) == {"A 9": HALF, "A 2": None}
+
+
+def test_an_older_file_tells_no_default_of_another_type() -> None:
+    table = Table()
+    table.hear(param_value("A", 5, index=0, kind=ParamType.INT8), "vehicle")
+    assert table.take("A", ParamType.REAL32, HALF, 3, HALF, is_older=True) is None
+    assert (table.params["A"].index, table.params["A"].default) == (3, None)
+    assert rows_of(table) == {"A 2": None}
+    table.take("A", ParamType.INT8, 6, 3, 7, is_older=True)
+    assert (table.params["A"].value, table.params["A"].default) == (5, 7)
+
+
+def test_what_another_station_has_heard_in_another_type_has_no_default() -> None:
+    table = Table()
+    table.fill({"A": replace(known("A", 5), default=7)})
+    [change] = table.renew({"A": known("A", 0.5)})
+    assert (table.params["A"].value, table.params["A"].default) == (0.5, None)
+    assert change.old is not None
+    assert change.old.default == 7
+    assert rows_of(table) == {"A 9": None}

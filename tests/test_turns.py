@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable
 from itertools import pairwise
 
+import anyio
 import pytest
 
 from paramclient import ParamClient
@@ -28,7 +29,7 @@ from paramclient.protocol.turns import (
 )
 from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
-from tests.shell import swiftly
+from tests.shell import Tap, swiftly
 from tests.simulation import Simulation
 
 TIMEOUT = 0.2
@@ -614,3 +615,33 @@ async def test_a_cancelled_fetch_makes_room_at_once() -> None:
         assert vehicles[1].requests["PARAM_REQUEST_LIST"] == 1
         assert (await waiting).complete
         assert asyncio.get_running_loop().time() - began < 6.0
+
+
+async def is_given_up(system: int) -> float:
+    """After how many seconds a vehicle that hears nothing is given up."""
+    vehicle = Tap(PX4Vehicle(system=system, table=table(10)))
+    vehicle.is_deaf = True
+    async with ParamClient(vehicle, cache=False) as client:
+        began = anyio.current_time()
+        component = await client.component()
+        with pytest.raises(NoReply):
+            await component.fetch_all()
+        return anyio.current_time() - began
+
+
+@swiftly
+async def test_those_who_keep_silent_on_two_links_do_not_wait_for_each_other() -> None:
+    alone = await is_given_up(1)
+    with anyio.fail_after(2 * alone):
+        both = await asyncio.gather(is_given_up(1), is_given_up(2))
+    assert both == pytest.approx([alone, alone], abs=0.01)
+
+
+def test_who_keeps_silent_is_in_nobodys_way_where_the_program_has_time_for_one() -> None:
+    road = Road(2)
+    road.now += TIMEOUT / 2
+    assert not road.turns.tick(road.now, most=1)
+    assert road.turns.awaited(road.now) == 1
+    road.now += TIMEOUT
+    assert road.turns.awaited(road.now) == 0
+    assert road.turns.tick(road.now, most=1)

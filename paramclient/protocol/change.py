@@ -10,7 +10,7 @@ __all__ = ["Change"]
 _new = tuple.__new__  # what the constructor of a tuple ends in, after several times the time
 
 
-class Change(tuple[str, Held | None, Held | None, str, Value | None]):
+class Change(tuple[str, Held | None, Held | None, str, Value | None, Value | None]):
     """One parameter that appeared, changed its value or went away.
 
     Each first value makes one, so the parameters in it are made when they are asked for.
@@ -27,8 +27,11 @@ class Change(tuple[str, Held | None, Held | None, str, Value | None]):
 
     def __new__(cls, name: str, old: Param | None, new: Param | None, by: str = "vehicle") -> Change:
         before, now = (None if each is None else held_of(each) for each in (old, new))
-        default = None if old is None else old.default
-        return _new(cls, (name, before, now, by, default if new is None else new.default))
+        defaults = (None if each is None else each.default for each in (new, old))
+        return _new(cls, (name, before, now, by, *defaults))
+
+    def __getnewargs__(self) -> tuple[str, Param | None, Param | None, str]:
+        return self.name, self.old, self.new, self.by
 
     @property
     def name(self) -> str:
@@ -38,7 +41,7 @@ class Change(tuple[str, Held | None, Held | None, str, Value | None]):
     @property
     def old(self) -> Param | None:
         """What was known before, or None when the parameter is new."""
-        return None if self[1] is None else param_of(self[0], self[1], self[4])
+        return None if self[1] is None else param_of(self[0], self[1], self[5])
 
     @property
     def new(self) -> Param | None:
@@ -52,6 +55,9 @@ class Change(tuple[str, Held | None, Held | None, str, Value | None]):
 
     def __eq__(self, other: object) -> bool:
         return tuple.__eq__(self[:4], other[:4]) if isinstance(other, Change) else NotImplemented
+
+    def __ne__(self, other: object) -> bool:
+        return not self == other
 
     def __hash__(self) -> int:
         return hash(self[:4])

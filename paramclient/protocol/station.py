@@ -191,12 +191,14 @@ class Station:
             if isinstance(message, ParamSet):
                 self._receive_foreign_set(message, (frame.system, frame.component), now)
 
-    def tick(self, now: float, *, everyone: bool = True, most_lists: float = math.inf) -> None:
+    def tick(
+        self, now: float, *, everyone: bool = True, most_lists: float = math.inf, is_crowded: bool = False
+    ) -> None:
         """Do what is due: our heartbeat, and time-outs of up to `MOST_AT_ONCE` components.
 
         Without `everyone`, only components that were heard or touched, or whose deadline has come, are
         looked at: a share of the link that has become larger meanwhile is then used a little later. No
-        list begins beside `most_lists` others.
+        list begins beside `most_lists` others. Where it `is_crowded`, lists of other links come as well.
         """
         if self._is_paused or self.is_log:
             return
@@ -221,7 +223,7 @@ class Station:
             else:
                 continue
             self._touched[machine] = None
-        if self._turns.tick(now, most=most_lists):
+        if self._turns.tick(now, most=most_lists, is_crowded=is_crowded):
             self._touch_all(self.components.values())
         if self.traffic is not None:
             self.traffic.sent(self.bytes_sent, now)
@@ -312,10 +314,9 @@ class Station:
             self._damaged + sum(framer.damaged for framer in framers),
         )
 
-    @property
-    def bursts(self) -> int:
-        """Lists that come in bursts now: on a link that is faster than the program."""
-        return self._turns.bursts
+    def bursts(self, now: float) -> tuple[int, int]:
+        """Lists that come in bursts, as on a link faster than the program, and that may do so soon."""
+        return self._turns.bursts, self._turns.awaited(now)
 
     @property
     def is_waiting(self) -> bool:

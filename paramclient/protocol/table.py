@@ -175,7 +175,7 @@ class Table:
             self.dirty[name] = by
             if self._hash is not None:
                 self._moved(name)
-            return _new(Change, (name, None, new, by, None))
+            return _new(Change, (name, None, new, by, None, None))
         return self._hear_again(name, old, message, by, is_exact=is_exact)
 
     def _hear_again(
@@ -198,18 +198,17 @@ class Table:
         else:
             bits, is_raw = bits_of_wire(raw, number, self._encoding)
             self._filed.discard(name)
-        if not is_same_type:
-            self._defaults.pop(name, None)
+        before = self._defaults.get(name) if is_same_type else self._defaults.pop(name, None)
         new = self._held[name] = to_hold(bits, number, is_raw, LIVE, place)
         self._wire[name] = raw
         if same_held(old, new):
             if placed(old, place) != old:
                 self.dirty.setdefault(name, by)
             return None
-        self._news(name, old, by)
+        self._news(name, old, by, before)
         if self._hash is not None:
             self._moved(name)
-        return _new(Change, (name, old, new, by, self._defaults.get(name)))
+        return _new(Change, (name, old, new, by, self._defaults.get(name), before))
 
     def take(
         self, name: str, number: int, bits: int, index: int, default: int | None, *, is_older: bool
@@ -232,26 +231,26 @@ class Table:
                 return None
             self._room.taken += 1
         raw = as_sent(bits, number, self._encoding)
-        is_default_news = initial != self._defaults.get(name)
-        if initial is None:
-            self._defaults.pop(name, None)
-        else:
-            self._defaults[name] = initial
-        if is_older and old is not None and (parts_of(old)[1] != number or self._wire.get(name) != raw):
+        before = self._defaults.get(name)
+        is_same_type = old is None or parts_of(old)[1] == number
+        if is_older and old is not None and not (is_same_type and self._wire.get(name) == raw):
+            if is_same_type:  # else it is the default of something else
+                self._set_default(name, initial)
             self._held[name] = placed(old, index)
             self.dirty.setdefault(name, "vehicle")
             return None
+        self._set_default(name, initial)
         is_raw = isinstance(from_bits(bits, number), bytes)
         new = self._held[name] = to_hold(bits, number, is_raw, LIVE, index)
         self._wire[name] = raw
         self._filed.add(name)
-        if old is None or placed(old, index) != old or is_default_news:
+        if old is None or placed(old, index) != old or initial != before:
             self.dirty.setdefault(name, "vehicle")
         if old is not None and same_held(old, new):
             return None
-        self._news(name, old, "vehicle")
+        self._news(name, old, "vehicle", before)
         self._moved(name)
-        return _new(Change, (name, old, new, "vehicle", initial))
+        return _new(Change, (name, old, new, "vehicle", initial, before))
 
     def use_encoding(self, encoding: Encoding) -> list[Change]:
         """Read everything that was heard in another encoding; give what looks different now."""
@@ -349,11 +348,14 @@ class Table:
             old = self._held.get(name)
             if old is None or trust_of(old) != CACHED or name in self.dirty or same_held(old, cached):
                 continue
-            new = self._held[name] = placed(trusted(cached, CACHED), parts_of(old)[4])
+            _, number, _, _, place = parts_of(old)
+            is_same_type = parts_of(cached)[1] == number
+            before = self._defaults.get(name) if is_same_type else self._defaults.pop(name, None)
+            new = self._held[name] = placed(trusted(cached, CACHED), place)
             self._wire.pop(name, None)  # should the vehicle say that again, it is a change
             if self._hash is not None:
                 self._moved(name)
-            changes.append(self._change(name, old, new))
+            changes.append(_new(Change, (name, old, new, "vehicle", self._defaults.get(name), before)))
         return changes
 
     def move(self, count: int) -> None:
@@ -490,19 +492,26 @@ class Table:
                 self.dirty[name] = "vehicle"
             if self._hash is not None:
                 self._moved(name)
-            changes.append(_new(Change, (name, held, None, "vehicle", default)))
+            changes.append(_new(Change, (name, held, None, "vehicle", None, default)))
         self._room.taken -= len(changes)
         return changes
 
-    def _change(self, name: str, old: Held | None, new: Held) -> Change:
-        return _new(Change, (name, old, new, "vehicle", self._defaults.get(name)))
+    def _set_default(self, name: str, default: Value | None) -> None:
+        if default is None:
+            self._defaults.pop(name, None)
+        else:
+            self._defaults[name] = default
 
-    def _news(self, name: str, old: Held | None, by: str) -> None:
+    def _change(self, name: str, old: Held | None, new: Held) -> Change:
+        default = self._defaults.get(name)
+        return _new(Change, (name, old, new, "vehicle", default, default))
+
+    def _news(self, name: str, old: Held | None, by: str, default: Value | None) -> None:
         """A value has changed. What was written for somebody is told of, however short it stood, and with
-        what it has replaced, however short that was known."""
+        what it has replaced, however short that was known; the default is that of what it was."""
         before = self.dirty.get(name)
         if old is not None and before is not None and (is_ours(before) or is_ours(by)):
-            self.overwritten.append((param_of(name, old, self._defaults.get(name)), before))
+            self.overwritten.append((param_of(name, old, default), before))
             del self.overwritten[:-MOST_OVERWRITTEN]
         self.dirty[name] = by
 

@@ -125,8 +125,12 @@ class Turns:
 
     @property
     def bursts(self) -> int:
-        """How many lists come in bursts, or may do so."""
-        return sum(stream.is_awaited or stream.seen().is_bursty for stream in self._running)
+        """How many lists come in bursts."""
+        return sum(not stream.is_awaited and stream.seen().is_bursty for stream in self._running)
+
+    def awaited(self, now: float) -> int:
+        """How many may do so soon: nothing has come of them, and their time-out is not over."""
+        return sum(stream.is_awaited and stream.silent_at > now for stream in self._running)
 
     def ask(self, stream: Stream, now: float) -> None:
         """Want a turn; `Stream.begin` is called at once, or when it comes. Ended by `give_back`."""
@@ -174,17 +178,18 @@ class Turns:
         """When a list of another one came last."""
         return max(self._crowded_at, -math.inf if self._lone is stream else self._lone_at)
 
-    def tick(self, now: float, *, most: float = math.inf) -> bool:
+    def tick(self, now: float, *, most: float = math.inf, is_crowded: bool = False) -> bool:
         """Let the next ones begin, if there is room; whether any has.
 
         Args:
             now: the time.
             most: so many may run beside each other, as the program has no time for more.
+            is_crowded: whether lists of other links take the program's time.
         """
         self._now = now
         coming = [stream for stream in self._running if not stream.is_awaited]
-        self._is_crowded = most < math.inf
-        if len(coming) > 1 or self._is_crowded:
+        self._is_crowded = is_crowded
+        if len(coming) > 1 or is_crowded:
             self._crowded_at = now
         elif coming:
             if self._lone is not coming[0]:
@@ -196,7 +201,7 @@ class Turns:
         if self._newest:
             self._look(now)
         begins = min(self._room(), len(self._waiting))
-        begins = int(min(begins, most - len(self._running)))
+        begins = int(min(begins, most - self._active()))
         for _ in range(begins):
             self._begin(self._waiting.popleft(), now)
         return begins > 0
