@@ -645,3 +645,13 @@ def test_who_keeps_silent_is_in_nobodys_way_where_the_program_has_time_for_one()
     road.now += TIMEOUT
     assert road.turns.awaited(road.now) == 0
     assert road.turns.tick(road.now, most=1)
+
+
+def test_only_lists_that_come_on_other_links_are_beside_it() -> None:
+    road = Road(1)
+    [lane] = road.lanes
+    road.turns.tick(road.now, most=1)
+    assert not road.turns.is_beside_others(lane), "those may be awaited for ever"
+    road.turns.tick(road.now, most=1, is_crowded=True)
+    assert road.turns.is_beside_others(lane)
+    assert road.turns.beside_others_at(lane) == road.now
