@@ -108,6 +108,7 @@ class Carrier:
         self._sent = anyio.Event()  # set when anything is sent
         self._behind_since = math.inf  # since when more comes than is read at once
         self._read_at = -math.inf
+        self._is_taking = False  # what was read, or waits for its turn to do so
         self._asked = True  # whether anything may have been asked of anybody
         self._standstill = Standstill()
 
@@ -142,7 +143,9 @@ class Carrier:
             self._read_at = math.inf
             rest = iter(chunks)
             if len(chunks) >= SOME or (crowd.has_others and self._station.is_waiting):
+                self._is_taking = True
                 is_news |= await self._take_turns(rest, crowd)
+                self._is_taking = False
             is_news |= self._take(rest, math.inf)
             now = self._read_at = anyio.current_time()
             crowd.taken(self, now)
@@ -253,7 +256,7 @@ class Carrier:
 
     def _is_behind(self, now: float) -> bool:
         """Whether more has come than was read, so that nothing can be said not to have been answered."""
-        return self._behind_since <= now < self._read_at + HELD_UP
+        return self._is_taking or self._behind_since <= now < self._read_at + HELD_UP
 
     async def _transmit(self, data: bytes, peer: Peer | None) -> None:
         for tap in self._taps:

@@ -356,6 +356,25 @@ async def test_time_outs_wait_for_nothing_that_does_not_come() -> None:
 
 
 @swiftly
+async def test_time_outs_wait_for_what_waits_for_its_turn() -> None:
+    """Few datagrams were read, among them perhaps the answers, and another link has the turn."""
+    link, station = Flood(), Watched()
+    link.size = crowd.SOME
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(carry, link, station, 3.0, lambda: None)
+        await anyio.sleep(0.5)
+        assert len(station.ticks) > 5
+        async with crowd.Crowd.of_this_loop().turn:
+            await anyio.sleep(2 * link.interval)
+            before = len(station.ticks)
+            await anyio.sleep(0.5)
+            assert len(station.ticks) == before
+        await anyio.sleep(0.1)
+        assert len(station.ticks) > before
+        tasks.cancel_scope.cancel()
+
+
+@swiftly
 async def test_what_comes_at_once_gives_way_to_other_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each datagram takes a millisecond; so do others that are told of what has happened by then."""
 
