@@ -14,9 +14,9 @@ LONGEST_TURN: Final = 0.003
 """Seconds of what came at once after which other tasks get their turn. With the last value of a list its hash
 is proven, which takes a millisecond more, and many lists may end at once."""
 SOME: Final = 16
-MANY: Final = 128
+MANY: Final = 64
 """Datagrams read at once for which a link waits for its turn, and that show that there are more: a link gives
-up to 256."""
+up to 128."""
 LASTING: Final = 0.02
 """Seconds for which that says something of a link when it has done with them: who has more, reads again."""
 ENOUGH_LISTS: Final = 24

@@ -39,7 +39,7 @@ __all__ = ["UdpIn", "UdpOut"]
 RECEIVE_BUFFER: Final = 4 * 1024 * 1024
 """Bytes asked for; Linux doubles it. Holds about 10,000 PARAM_VALUEs."""
 
-DATAGRAMS_PER_READ: Final = 256
+DATAGRAMS_PER_READ: Final = 128
 """Datagrams that one `receive` gives at most, so that other tasks get their turn during a burst."""
 
 PEERS: Final = 256
