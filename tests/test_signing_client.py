@@ -8,10 +8,12 @@ import os
 import pty
 import re
 import select
+import signal
 import subprocess
 import sys
 import traceback
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -689,6 +691,13 @@ class Terminal:
     def type(self, text: bytes) -> None:
         os.write(self.ours, text)
 
+    def interrupt(self) -> None:
+        """Ctrl-C until it is heeded: one between the prompt and the reading has to wait for a key."""
+        while self.process.poll() is None:
+            self.process.send_signal(signal.SIGINT)
+            with suppress(subprocess.TimeoutExpired):
+                self.process.wait(1.0)
+
     def close(self) -> int:
         try:
             while select.select([self.ours], [], [], PATIENCE)[0]:
@@ -738,5 +747,5 @@ def test_whoever_is_not_sure_sends_nothing(terminal: Callable[..., Terminal]) ->
     assert b"nothing was sent" in refused.seen
     ended = terminal("signing", "setup", "sim:px4", "--signing-passphrase")
     ended.until(b"Signing passphrase: ")
-    ended.process.send_signal(2)
+    ended.interrupt()
     assert ended.close() == 130
