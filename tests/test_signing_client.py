@@ -675,6 +675,8 @@ class Terminal:
             start_new_session=True,
             env={**os.environ, "TERM": "dumb", **environment},
             cwd=Path(__file__).parent.parent,
+            # whoever starts the tests in the background may have Ctrl-C ignored in all that they start
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
         os.close(theirs)
         self.seen = b""
@@ -693,10 +695,11 @@ class Terminal:
 
     def interrupt(self) -> None:
         """Ctrl-C until it is heeded: one between the prompt and the reading has to wait for a key."""
-        while self.process.poll() is None:
+        for _ in range(int(PATIENCE)):
             self.process.send_signal(signal.SIGINT)
             with suppress(subprocess.TimeoutExpired):
                 self.process.wait(1.0)
+                return
 
     def close(self) -> int:
         try:
