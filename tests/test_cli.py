@@ -1258,19 +1258,23 @@ def test_without_the_extra_it_says_what_to_install() -> None:
     )
 
 
-def test_rich_and_the_simulators_load_only_where_they_are_needed() -> None:
-    program = (
-        "import sys, paramclient.cli; print([n for n in ('rich', 'paramclient.sim') if n in sys.modules])"
-    )
-    outcome = subprocess.run(
+def printed_by(program: str) -> str:
+    """What a Python program of its own prints."""
+    return subprocess.run(
         [sys.executable, "-c", program],
         cwd=ROOT,
         capture_output=True,
         text=True,
         check=True,
         timeout=PATIENCE,
+    ).stdout
+
+
+def test_rich_and_the_simulators_load_only_where_they_are_needed() -> None:
+    program = (
+        "import sys, paramclient.cli; print([n for n in ('rich', 'paramclient.sim') if n in sys.modules])"
     )
-    assert outcome.stdout == "[]\n"
+    assert printed_by(program) == "[]\n"
 
 
 def test_the_module_is_the_command() -> None:
@@ -1471,13 +1475,5 @@ def test_the_garbage_collector_leaves_out_what_is_loaded_when_a_command_begins()
         "from paramclient.__main__ import main\n"
         "main()"
     )
-    outcome = subprocess.run(
-        [sys.executable, "-c", program],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-        timeout=PATIENCE,
-    )
-    frozen, rest = map(int, outcome.stdout.split())
+    frozen, rest = map(int, printed_by(program).split())
     assert frozen > 10 * rest

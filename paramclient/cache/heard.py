@@ -66,12 +66,9 @@ class HeardParams(Sequence[StoredParam]):
             param = item.param
             row = Row.of(param, param.index, bool(item.volatile), item.heard_at)
             yield param.name, row, item.volatile, item.by
-        author_of = self._by.get
-        is_volatile = None
         for name, row in self._rows().items():
-            if self._volatile is not None:
-                is_volatile = name in self._volatile
-            yield name, row, is_volatile, author_of(name, BY_VEHICLE)
+            is_volatile = None if self._volatile is None else bool(row.volatile)
+            yield name, row, is_volatile, self._by.get(name, BY_VEHICLE)
 
     def first_rows(self) -> FirstRows | None:
         """The rows of a table that had none before, or None where that cannot be told by name."""

@@ -188,9 +188,8 @@ class Table:
             place = NOWHERE if given >= count or count > MOST_PARAMETERS else given
         is_same_type = old_number == number
         if is_same_type and self._wire.get(name) == raw and not is_exact:
-            new = to_hold(old_bits, number, old_is_raw, LIVE, place)
             if placed(old, place) != old:
-                self._held[name] = new
+                self._held[name] = to_hold(old_bits, number, old_is_raw, LIVE, place)
                 self.dirty.setdefault(name, by)
             return None
         if is_same_type and not is_exact and self._rounds(old, raw):
