@@ -67,7 +67,6 @@ COMMAND = ("cli", "__main__")
 SERVICE = "service"
 SERVICE_LIBRARIES = {"fastapi", "starlette", "uvicorn", "websockets"}
 COMMAND_LIBRARIES = {"rich", "cyclopts"}
-LONGEST_ROOM = 550
 
 
 @dataclass(frozen=True)
@@ -258,12 +257,6 @@ def test_only_the_service_loads_its_libraries(module: str) -> None:
 @EVERY_MODULE
 def test_every_module_says_what_it_is(module: str) -> None:
     assert ast.get_docstring(source_of(module))
-
-
-@EVERY_MODULE
-def test_a_room_that_outgrows_itself_becomes_a_folder(module: str) -> None:
-    lines = len(MODULES[module].read_text(encoding="utf-8").splitlines())
-    assert lines <= LONGEST_ROOM, f"{module} has {lines} lines"
 
 
 @EVERY_MODULE
