@@ -29,7 +29,20 @@ EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 DIRECTIVE = re.compile(r"^\.\. (\w+):: ([\w.]+)(?:\(\))?$", re.MULTILINE)
-COMMANDS = ["fetch", "get", "set", "watch", "link", "ports", "show", "diff", "save", "history", "sim"]
+COMMANDS = [
+    "fetch",
+    "get",
+    "set",
+    "watch",
+    "link",
+    "check",
+    "ports",
+    "show",
+    "diff",
+    "save",
+    "history",
+    "sim",
+]
 COMMANDS += ["apply", "verify", "restore", "import", "serve", "token"]
 
 LINK = re.compile(r"\]\(([^)#\s]+)(#[^)\s]*)?\)")

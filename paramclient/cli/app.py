@@ -15,6 +15,7 @@ from typing import Final
 import anyio
 from cyclopts import App, CycloptsError, Parameter
 
+from paramclient.cli.check import check
 from paramclient.cli.diff import diff
 from paramclient.cli.fleet import fleet_diff
 from paramclient.cli.history import history
@@ -209,6 +210,14 @@ _app.command(
 )
 _app.command(
     link, help_epilogue=_examples("link udpin:0.0.0.0:14550", "link udpin:0.0.0.0:14550 --seconds 10 --json")
+)
+_app.command(
+    check,
+    help_epilogue=_examples(
+        "check udpin:0.0.0.0:14550",
+        "check serial:/dev/ttyUSB0:57600 --report check.md",
+        "check sim:px4 --json",
+    ),
 )
 _app.command(
     show,

@@ -25,7 +25,7 @@ from paramclient.protocol.wire import ComponentMetadata
 if TYPE_CHECKING:
     from paramclient.component import Component
 
-__all__ = ["metadata_of"]
+__all__ = ["announced_metadata", "metadata_of"]
 
 P = ParamSpec("P")
 Result = TypeVar("Result")
@@ -67,7 +67,7 @@ async def metadata_of(
     deadline = None if timeout is None else anyio.current_time() + timeout
     files = _Files(component, kept, deadline, progress)
     before = component.identity
-    announced = await _ask(component, files.left())
+    announced = await announced_metadata(component, files.left())
     if announced is None:
         return None
     general = await files.get(announced.uri, announced.file_crc or None)
@@ -157,8 +157,17 @@ class _Files:
         return Ftp(other), path
 
 
-async def _ask(component: Component, timeout: float | None) -> ComponentMetadata | None:
-    """What it announces; None where it refuses to."""
+async def announced_metadata(component: Component, timeout: float | None) -> ComponentMetadata | None:
+    """Return where a component says that its general metadata file is; None where it names none.
+
+    Args:
+        component: as `ParamClient.component` gives it.
+        timeout: seconds; None leaves it to the number of attempts.
+
+    Raises:
+        NoReply: it did not answer in time.
+        LinkError: the link failed, or the client was closed.
+    """
     component._client._check_open()
     what = f"COMPONENT_METADATA of {component.system}/{component.component}"
     machine, now = component._machine, anyio.current_time()

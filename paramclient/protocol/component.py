@@ -280,7 +280,13 @@ class ComponentMachine(Parts):
                 self.restart = None
 
     def begin_fetch(
-        self, now: float, *, refresh: bool = False, listed: bool = False, sampled: Sampled | None = None
+        self,
+        now: float,
+        *,
+        refresh: bool = False,
+        listed: bool = False,
+        by_list: bool = False,
+        sampled: Sampled | None = None,
     ) -> Fetch:
         """Begin a fetch, or join the one under way; give it back with `end_fetch`.
 
@@ -288,6 +294,7 @@ class ComponentMachine(Parts):
             now: the time.
             refresh: download even if the vehicle's hash would confirm the cached table.
             listed: the list has been asked for already, of all components at once.
+            by_list: download by list also where the vehicle serves the file.
             sampled: the sample that may settle it where there is no hash, or None.
 
         Raises:
@@ -295,7 +302,7 @@ class ComponentMachine(Parts):
         """
         if self.fetch is None and self._policy is not Policy.CACHE_ONLY:
             self.check_present(f"the parameters of {self.system}/{self.component}", now)
-        return self.fetches.begin(now, refresh=refresh, listed=listed, sampled=sampled)
+        return self.fetches.begin(now, refresh=refresh, listed=listed, by_list=by_list, sampled=sampled)
 
     def end_fetch(self, fetch: Fetch, now: float) -> None:
         """Wait for it no longer. The last one who waited cancels it."""

@@ -69,6 +69,7 @@ class Fetch(Operation[FetchResult]):
         announced: Announcement | None,
         refresh: bool,
         listed: bool,
+        by_list: bool = False,
         policy: Policy,
         may_use_file: Callable[[], bool | None],
         sampled: Sampled | None,
@@ -93,6 +94,7 @@ class Fetch(Operation[FetchResult]):
         self.first_value_at = math.inf
         self._held_before = 0.0  # by a download that was begun anew
         self._listed = listed
+        self._by_list = by_list
         self._policy = policy
         self._restarts = 0
         self.holders = 0
@@ -340,7 +342,7 @@ class Fetch(Operation[FetchResult]):
         self._has_begun = True
         self._present = present
         means.doubt(now)
-        may_use_file = not (self._listed or self._had_no_file) and self._may_use_file()
+        may_use_file = not (self._listed or self._by_list or self._had_no_file) and self._may_use_file()
         if may_use_file is None and now < self.begun_at + IDENTITY_PATIENCE:
             self._undecided_until = self.begun_at + IDENTITY_PATIENCE
             return

@@ -68,7 +68,13 @@ class Fetches:
         return self._file_took is not None and self._file_took <= CHEAP_SHARE * interval
 
     def begin(
-        self, now: float, *, refresh: bool = False, listed: bool = False, sampled: Sampled | None = None
+        self,
+        now: float,
+        *,
+        refresh: bool = False,
+        listed: bool = False,
+        by_list: bool = False,
+        sampled: Sampled | None = None,
     ) -> Fetch:
         """Begin one, or join the one under way; give it back with `end`.
 
@@ -76,6 +82,7 @@ class Fetches:
             now: the time.
             refresh: fetch even if the vehicle's hash would confirm the cached table.
             listed: the list has been asked for already, of all components at once.
+            by_list: download by list also where the vehicle serves the file.
             sampled: the sample that may settle it where there is no hash, or None.
         """
         fetch = self.current
@@ -97,6 +104,7 @@ class Fetches:
                 announced=self._sync.announced,
                 refresh=refresh,
                 listed=listed,
+                by_list=by_list,
                 policy=self._policy,
                 may_use_file=self.may_use_file,
                 sampled=sampled if may_sample else None,

@@ -1,0 +1,279 @@
+"""What in a diagnosis is slow or unusual, why, and what to do about it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from enum import StrEnum
+from statistics import median
+from typing import Final
+
+from paramclient.diagnosis.report import LinkReport, VehicleReport
+from paramclient.identity import SHARED_UIDS
+
+__all__ = ["Finding", "Severity", "findings_of"]
+
+NOTABLE_LOSS: Final = 0.005
+SEVERE_LOSS: Final = 0.1
+"""Shares of frames lost: with the first one, downloads repeat requests; with the second one, they take
+several times as long."""
+LONG_ROUND_TRIP: Final = 0.5
+"""Seconds: each repeat of a lost request costs at least one round trip."""
+SLOW_LIST: Final = 200.0
+"""Values per second. ArduPilot sends 1,680 and PX4 1,000 over UDP or USB (measured); a 57600 baud radio
+carries 40."""
+LONG_PAUSE: Final = 0.6
+"""Seconds. ArduPilot's list pauses for 0.2 to 0.4 s while it answers reads (measured)."""
+TYPICAL_ARDUPILOT_READS: Final = (35.0, 60.0)
+"""Reads per second of an ArduPilot on a clean link: five in each 100 ms (measured: 49)."""
+FULL_BUFFER: Final = 30
+"""Percent free of a radio's transmit buffer below which it holds frames back."""
+
+
+class Severity(StrEnum):
+    """How much a finding matters.
+
+    Attributes:
+        NOTE: explains what is seen; nothing is wrong.
+        SLOW: costs time.
+        PROBLEM: can give wrong or missing results, or stop the vehicle from answering.
+    """
+
+    NOTE = "note"
+    SLOW = "slow"
+    PROBLEM = "problem"
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that is slow or unusual.
+
+    Attributes:
+        severity: how much it matters.
+        text: what was measured, and the likely cause.
+        advice: what to do, or an empty text.
+    """
+
+    severity: Severity
+    text: str
+    advice: str = ""
+
+
+def findings_of(report: VehicleReport) -> list[Finding]:
+    """Return what is slow or unusual in a report: problems first, notes last."""
+    order = (Severity.PROBLEM, Severity.SLOW, Severity.NOTE)
+    found = [*_about_link(report.link), *_about_vehicle(report), *_about_services(report)]
+    return sorted(found, key=lambda each: order.index(each.severity))
+
+
+def _about_link(link: LinkReport) -> Iterator[Finding]:
+    if link.loss is not None and link.loss >= NOTABLE_LOSS:
+        is_severe = link.loss >= SEVERE_LOSS
+        yield Finding(
+            Severity.PROBLEM if is_severe else Severity.SLOW,
+            f"{link.loss:.1%} of the vehicle's frames were lost ({link.lost:,}).",
+            "Check antenna, distance and baud rate, or send less telemetry on this link.",
+        )
+    if link.damaged:
+        yield Finding(
+            Severity.PROBLEM,
+            f"{_count(link.damaged, 'frame')} had a wrong checksum: noise on a wire, a wrong baud rate, or "
+            "two programs that read one serial port.",
+            "Compare the baud rate with the vehicle's, and close other programs that use the port.",
+        )
+    if link.repeated:
+        yield Finding(
+            Severity.NOTE,
+            f"{_count(link.repeated, 'frame')} arrived twice: the vehicle is reached over two paths, such as "
+            "two radios or a router with a loop.",
+        )
+    if link.unknown:
+        yield Finding(
+            Severity.NOTE,
+            f"{_count(link.unknown, 'frame')} had message ids that the dialect does not have. They are "
+            "passed over.",
+        )
+    if link.mavlink == 1:
+        yield Finding(
+            Severity.NOTE,
+            "The vehicle speaks MAVLink 1: no signatures, and no message ids above 255.",
+            "Set the port to MAVLink 2 (ArduPilot: SERIALn_PROTOCOL 2; PX4: MAV_PROTO_VER 2).",
+        )
+    if link.round_trips and median(link.round_trips) >= LONG_ROUND_TRIP:
+        yield Finding(
+            Severity.SLOW,
+            f"The round trip is {median(link.round_trips):.2f} s. Each repeat of a lost request takes at "
+            "least as long.",
+        )
+    if not link.round_trips and link.unanswered:
+        yield Finding(
+            Severity.PROBLEM,
+            "No command was acknowledged: frames to the vehicle are lost, another station was first on a "
+            "port that answers only one (PX4 over UDP), or the vehicle expects signed frames.",
+            "Close other ground stations and restart the vehicle's link; with signing, give --signing-key.",
+        )
+    elif link.unanswered:
+        total = link.unanswered + len(link.round_trips)
+        yield Finding(
+            Severity.SLOW, f"{link.unanswered} of {total} commands had to be repeated or were not answered."
+        )
+    for station in link.stations:
+        where = f"{station.system}/{station.component}"
+        if station.has_our_address:
+            yield Finding(
+                Severity.PROBLEM,
+                f"Another ground station has this one's address, {where}: each takes the other's answers.",
+                "Give one of them another system id.",
+            )
+        else:
+            yield Finding(
+                Severity.NOTE,
+                f"Another ground station, {where}, is on this link. Its list requests and file sessions "
+                "delay downloads.",
+            )
+    if link.autopilots:
+        named = ", ".join(f"{system}/{component}" for system, component in link.autopilots)
+        yield Finding(
+            Severity.NOTE,
+            f"Other autopilots are on this link: {named}. They share its bandwidth.",
+            "Name the vehicle with --system in every command that writes.",
+        )
+    if link.radio_free is not None and link.radio_free < FULL_BUFFER:
+        yield Finding(
+            Severity.SLOW,
+            f"The radio's transmit buffer is {100 - link.radio_free} % full: it gets more than it can send.",
+            "Lower the vehicle's stream rates on this port.",
+        )
+
+
+def _about_vehicle(report: VehicleReport) -> Iterator[Finding]:
+    if not report.has_version:
+        yield Finding(
+            Severity.PROBLEM,
+            "The vehicle did not answer the request for AUTOPILOT_VERSION, so its hardware id and firmware "
+            "are unknown. Its cached table is kept by system id and link: another vehicle with that id would "
+            "be taken for this one.",
+        )
+    elif report.identity.uid is None or report.identity.uid in SHARED_UIDS:
+        is_shared = report.identity.uid is not None
+        what = "the hardware id that all simulated ones have" if is_shared else "no hardware id"
+        yield Finding(Severity.NOTE, f"The vehicle has {what}: its cached table is kept with its system id.")
+    if report.encoding_reason.startswith("the standard's"):
+        yield Finding(
+            Severity.PROBLEM,
+            f"Neither heartbeat nor capabilities tell how values are encoded; {report.encoding} is assumed.",
+            "Compare one integer parameter with its known value; if it is wrong, use --encoding c-cast.",
+        )
+    if report.is_armed:
+        yield Finding(Severity.NOTE, "The vehicle is armed: a download in flight delays its telemetry.")
+    if report.link.signed:
+        count = _count(report.link.signed, "frame")
+        yield Finding(
+            Severity.NOTE, f"The vehicle has signed {count}. Signatures are verified only with --signing-key."
+        )
+
+
+def _about_services(report: VehicleReport) -> Iterator[Finding]:
+    is_ardupilot = report.autopilot == "ardupilot"
+    reads, listed, files = report.reads, report.list, report.files
+    if reads is not None and reads.single is None:
+        yield Finding(
+            Severity.PROBLEM, "No PARAM_REQUEST_READ was answered.", "Is this component the autopilot?"
+        )
+    elif reads is not None and reads.answered < reads.in_flight:
+        missing = reads.in_flight - reads.answered
+        yield Finding(Severity.PROBLEM, f"{missing} of {reads.in_flight} reads stayed unanswered.")
+    elif reads is not None and reads.rate is not None and is_ardupilot:
+        low, high = TYPICAL_ARDUPILOT_READS
+        if low <= reads.rate <= high:
+            yield Finding(
+                Severity.NOTE,
+                f"{reads.rate:.0f} reads per second is what ArduPilot serves: at most five in each 100 ms.",
+            )
+    if listed is not None and listed.error is not None:
+        yield Finding(Severity.PROBLEM, f"The list could not be downloaded: {listed.error}.")
+    elif listed is not None and listed.is_cut_short:
+        left = ""
+        if listed.count is not None and listed.rate:
+            left = f" All of it takes {listed.count / listed.rate:.0f} s."
+        yield Finding(
+            Severity.SLOW, f"The list was cut short after {listed.elapsed:.0f} s by the time limit.{left}"
+        )
+    elif listed is not None and listed.missing:
+        yield Finding(
+            Severity.PROBLEM,
+            f"{_count(listed.missing, 'index', 'indices')} of {listed.count} never came: the vehicle counts "
+            "parameters that it does not send.",
+        )
+    if listed is not None and listed.rate is not None and listed.rate < SLOW_LIST:
+        yield Finding(
+            Severity.SLOW,
+            f"The list comes at {listed.rate:.0f} values per second: a slow port, a radio, or a "
+            "low-bandwidth mode.",
+            "Raise the port's baud rate or data rate (PX4: MAV_n_RATE, ArduPilot: SERIALn_BAUD).",
+        )
+    if listed is not None and not listed.lost and listed.longest_pause >= LONG_PAUSE:
+        yield Finding(
+            Severity.SLOW,
+            f"The list paused for {listed.longest_pause:.1f} s though nothing was lost: the vehicle is busy, "
+            "or another station is being served.",
+        )
+    yield from _about_files(report, is_ardupilot=is_ardupilot)
+    yield from _about_hash(report)
+    if files is not None and not files.defaults and report.descriptions is None:
+        yield Finding(
+            Severity.NOTE,
+            "The vehicle tells neither defaults nor descriptions of its parameters.",
+            "Give the firmware's own file with --metadata.",
+        )
+
+
+def _about_files(report: VehicleReport, *, is_ardupilot: bool) -> Iterator[Finding]:
+    files = report.files
+    if files is None or files.size is not None:
+        return
+    if files.is_announced and not files.is_serving:
+        yield Finding(
+            Severity.SLOW,
+            f"The vehicle announces MAVFTP and does not answer: {files.error}.",
+            "Another station's file session may be open; it ends after 3 s (ArduPilot) or 10 s (PX4).",
+        )
+    elif is_ardupilot:
+        yield Finding(
+            Severity.SLOW,
+            f"The packed parameter file cannot be read ({files.error}), so tables come by list and without "
+            "defaults.",
+            "Check that BRD_OPTIONS does not turn MAVFTP off (bit 1), and that the firmware is 4.1 or newer.",
+        )
+    elif report.autopilot == "px4":
+        yield Finding(
+            Severity.NOTE, f"This PX4 has no packed parameter file ({files.error}), so tables come by list."
+        )
+
+
+def _about_hash(report: VehicleReport) -> Iterator[Finding]:
+    found = report.hash
+    if found is None:
+        return
+    if found.before is None:
+        advice = "Set MAV_HASH_CHK_EN to 1." if report.autopilot == "px4" else ""
+        yield Finding(
+            Severity.SLOW if report.autopilot == "px4" else Severity.NOTE,
+            f"{found.error}: each session downloads the table anew.",
+            advice,
+        )
+    elif found.after is not None and found.after != found.before:
+        yield Finding(
+            Severity.NOTE,
+            f"The hash changed from {found.before:08x} to {found.after:08x} within {found.seconds:.1f} s: "
+            "parameters were written, or came into use, meanwhile.",
+        )
+    elif found.confirms_list is False:
+        yield Finding(
+            Severity.SLOW,
+            "The hash did not confirm the downloaded list, so the next session downloads again.",
+        )
+
+
+def _count(number: int, one: str, many: str | None = None) -> str:
+    return f"{number:,} {one if number == 1 else many or one + 's'}"

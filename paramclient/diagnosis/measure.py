@@ -1,0 +1,383 @@
+"""The measurements of a diagnosis: requests only, nothing that changes the vehicle."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from itertools import pairwise
+from statistics import median
+from typing import Final, TypeVar
+
+import anyio
+
+from paramclient.client import ParamClient
+from paramclient.component import Component
+from paramclient.diagnosis.report import (
+    FileService,
+    HashService,
+    LinkReport,
+    ListService,
+    ReadService,
+    Station,
+    VehicleReport,
+)
+from paramclient.errors import (
+    CommandRefused,
+    FileTransferError,
+    LinkError,
+    NoReply,
+    PackError,
+    ParamClientError,
+    VehicleError,
+)
+from paramclient.metadata.download import announced_metadata
+from paramclient.protocol import pack
+from paramclient.protocol.result import Progress
+from paramclient.protocol.traffic import ComponentTraffic
+from paramclient.protocol.wire import (
+    AUTOPILOT_VERSION_ID,
+    CAPABILITY_FTP,
+    HASH_CHECK,
+    MAV_AUTOPILOT_ARDUPILOTMEGA,
+    MAV_AUTOPILOT_INVALID,
+    MAV_CMD_REQUEST_MESSAGE,
+    MAV_TYPE_GCS,
+    enum_word,
+)
+
+__all__ = ["check_vehicle"]
+
+PARAMETER_FILE: Final = "@PARAM/param.pck?withdefaults=1"
+HEARING_TIME: Final = 2.2
+"""Seconds in which every component has been heard twice, as each sends a heartbeat once a second."""
+IDENTITY_TIME: Final = 3.0
+"""Seconds for AUTOPILOT_VERSION: four attempts at the initial timeout."""
+ANSWER_TIME: Final = 3.0
+"""Seconds for one small request. Longer than any measured round trip with repeats."""
+COMMANDS: Final = 10
+"""Round trips that are measured: enough for a median and a worst one."""
+SINGLE_READS: Final = 5
+READS_IN_FLIGHT: Final = 30
+"""Reads requested at once: ArduPilot serves five in 100 ms, so that its rate shows in 0.6 s."""
+STEADY_SHARE: Final = 0.9
+"""The share of the list after which its rate is taken: what follows are repeats of lost values."""
+
+Result = TypeVar("Result")
+
+
+async def check_vehicle(
+    client: ParamClient,
+    component: Component,
+    *,
+    timeout: float = 60.0,
+    tell: Callable[[str], None] | None = None,
+) -> VehicleReport:
+    """Measure what a vehicle serves, and how quickly.
+
+    Nothing is written: no PARAM_SET, no command but MAV_CMD_REQUEST_MESSAGE, no file. What the measurements
+    download fills the client's table, as any download does.
+
+    Args:
+        client: open, made with `traffic=True` and without a cache, so that nothing is known beforehand.
+        component: one of its components.
+        timeout: seconds for everything. A measurement that has no time left is None in the report, and a list
+            that takes longer is cut short.
+        tell: is called with what is measured next, in words.
+
+    Raises:
+        UsageError: the client counts no traffic, or sends nothing.
+        LinkError: the link failed, or the client was closed.
+    """
+    return await _Diagnosis(client, component, timeout, tell or _silent).run()
+
+
+class _Diagnosis:
+    """One diagnosis, step by step."""
+
+    def __init__(
+        self, client: ParamClient, component: Component, timeout: float, tell: Callable[[str], None]
+    ) -> None:
+        self._client = client
+        self._component = component
+        self._began = anyio.current_time()
+        self._ends = self._began + timeout
+        self._tell = tell
+        self._unanswered = 0
+
+    async def run(self) -> VehicleReport:
+        component = self._component
+        self._tell("listening")
+        self._client.traffic_report()
+        await anyio.sleep(max(0.0, HEARING_TIME - (anyio.current_time() - self._client._opened_at)))
+        self._tell("identification")
+        await self._identified()
+        self._tell("round trip")
+        round_trips = await self._round_trips()
+        self._tell("hash")
+        hash_began = anyio.current_time()
+        before = await self._within(self._hash)
+        self._tell("single reads")
+        reads = await self._within(self._reads)
+        self._tell("list download")
+        listed = await self._within(self._list)
+        self._tell("MAVFTP")
+        files = await self._within(self._files)
+        self._tell("descriptions")
+        descriptions = await self._within(self._descriptions)
+        self._tell("hash again")
+        after = await self._within(self._hash)
+        identity = component.identity
+        machine = component._machine
+        return VehicleReport(
+            system=component.system,
+            component=component.component,
+            autopilot=component.autopilot,
+            vehicle_type=_vehicle_type(machine.who.vehicle_type),
+            identity=identity,
+            has_version=machine.who.firmware is not None,
+            encoding=component.encoding,
+            encoding_reason=component.encoding_reason,
+            is_armed=component.is_armed,
+            descriptions=descriptions,
+            link=self._link(round_trips),
+            reads=reads,
+            list=listed,
+            files=files,
+            hash=None if before is None else self._hash_service(before, after, hash_began),
+            elapsed=anyio.current_time() - self._began,
+        )
+
+    def _left(self, at_most: float) -> float:
+        """Seconds for one request: not more than are left of all."""
+        return max(0.0, min(at_most, self._ends - anyio.current_time()))
+
+    async def _within(self, measure: Callable[[], Awaitable[Result]]) -> Result | None:
+        """What a measurement gives; None where there is no time for it."""
+        return await measure() if self._left(ANSWER_TIME) > 0 else None
+
+    async def _identified(self) -> None:
+        """Wait until AUTOPILOT_VERSION came, or was refused for good."""
+        with anyio.move_on_after(self._left(IDENTITY_TIME)):
+            while not self._component._machine.who.settled:
+                await self._client._carrier.news.wait()
+
+    async def _round_trips(self) -> tuple[float, ...]:
+        """Seconds from command to acknowledgement, of those that were sent once."""
+        component, machine = self._component, self._component._machine
+        taken: list[float] = []
+        for _ in range(COMMANDS):
+            left = self._left(ANSWER_TIME)
+            if not left:
+                break
+            began = anyio.current_time()
+            command = machine.commands.begin(MAV_CMD_REQUEST_MESSAGE, (float(AUTOPILOT_VERSION_ID),), began)
+            what = f"COMMAND_ACK of {component.system}/{component.component}"
+            try:
+                await component._wait(command, left, lambda what=what: (what, 0))  # type: ignore[misc]
+            except CommandRefused:
+                pass  # an answer too
+            except NoReply:
+                self._unanswered += 1
+                if not taken:
+                    break  # it acknowledges no commands
+                continue
+            finally:
+                machine.commands.cancel(command, anyio.current_time())
+            if command.attempts == 1:
+                taken.append(anyio.current_time() - began)
+            else:
+                self._unanswered += 1
+        return tuple(sorted(taken))
+
+    async def _hash(self) -> int | str:
+        """The vehicle's hash now, or why there is none."""
+        if self._component._machine.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+            return "ArduPilot has no parameter hash"
+        try:
+            param = await self._component.get(HASH_CHECK, timeout=self._left(ANSWER_TIME))
+        except (NoReply, VehicleError) as error:
+            return str(error)
+        return param.bits
+
+    async def _reads(self) -> ReadService:
+        component = self._component
+        single = []
+        for index in range(SINGLE_READS):
+            began = anyio.current_time()
+            if await self._is_answered(index):
+                single.append(anyio.current_time() - began)
+            elif not single:
+                return ReadService(None, None, 0, 0, 0)
+        count = component.count or 0
+        # spread over the table, and none of those that were just read
+        step = max((count - SINGLE_READS) // READS_IN_FLIGHT, 1)
+        wanted = range(SINGLE_READS, count, step)[:READS_IN_FLIGHT]
+        if not wanted:
+            return ReadService(median(single), None, 0, 0, 0)
+        reads = component._machine.reads
+        requests = reads.retries
+        began = anyio.current_time()
+        answers: list[float] = []
+
+        async def read(index: int) -> None:
+            if await self._is_answered(index):
+                answers.append(anyio.current_time())
+
+        async with anyio.create_task_group() as tasks:
+            for index in wanted:
+                tasks.start_soon(read, index)
+        rate = len(answers) / (max(answers) - began) if answers else None
+        requests = len(wanted) + reads.retries - requests
+        return ReadService(median(single), rate, len(wanted), len(answers), requests)
+
+    async def _is_answered(self, index: int) -> bool:
+        try:
+            await self._component.get(index, timeout=self._left(ANSWER_TIME))
+        except (NoReply, VehicleError):
+            return False
+        return True
+
+    async def _list(self) -> ListService:
+        """One download by PARAM_REQUEST_LIST, also where the file would be quicker."""
+        component, machine = self._component, self._component._machine
+        began = anyio.current_time()
+        arrivals: list[tuple[float, int]] = []
+
+        def progress(state: Progress) -> None:
+            if state.received and (not arrivals or state.received > arrivals[-1][1]):
+                arrivals.append((anyio.current_time(), state.received))
+
+        # the vehicle sends the list to its end whatever is measured behind it
+        deadline = max(began, self._ends - ANSWER_TIME)
+        try:
+            fetch = machine.begin_fetch(began, refresh=True, by_list=True)
+            try:
+                result = await component._wait_for_fetch(fetch, deadline, progress)
+            finally:
+                machine.end_fetch(fetch, anyio.current_time())
+                self._client._wake(machine)
+        except LinkError:
+            raise
+        except ParamClientError as error:
+            elapsed = anyio.current_time() - began
+            return ListService(None, 0, elapsed, None, None, 0.0, 0, 0, False, str(error))
+        now = anyio.current_time()
+        has_come = fetch.first_value_at <= now
+        return ListService(
+            count=result.count,
+            received=result.received,
+            elapsed=now - began,
+            first=fetch.first_value_at - began if has_come else None,
+            rate=_steady_rate(fetch.first_value_at, [*arrivals, (now, result.received)], result.received),
+            longest_pause=_longest_pause(fetch.first_value_at, arrivals) if has_come else 0.0,
+            lost=result.lost,
+            missing=len(result.missing),
+            is_cut_short=not fetch.done,
+            error=None,
+        )
+
+    async def _files(self) -> FileService:
+        machine = self._component._machine
+        capabilities = machine.who.capabilities
+        is_announced = None if capabilities is None else bool(capabilities & CAPABILITY_FTP)
+        ftp = self._client.ftp(self._component)
+        entries: int | None = None
+        size = parameters = defaults = None
+        elapsed: float | None = None
+        error: str | None = None
+        is_serving = False
+        try:
+            began = anyio.current_time()
+            data = await ftp.read(PARAMETER_FILE, timeout=self._left(float("inf")))
+            elapsed = anyio.current_time() - began
+            is_serving = True
+            size = len(data)
+            content = pack.decode(data)
+            parameters = len(content.entries)
+            defaults = parameters if content.with_defaults else 0
+        except FileTransferError as refusal:
+            is_serving = True
+            error = str(refusal)
+        except (NoReply, PackError) as failure:
+            error = str(failure)
+        if is_serving:
+            try:
+                entries = len(await ftp.list("/", timeout=self._left(ANSWER_TIME)))
+            except (NoReply, VehicleError):
+                entries = None
+        return FileService(is_announced, is_serving, entries, size, elapsed, parameters, defaults, error)
+
+    async def _descriptions(self) -> str | None:
+        try:
+            announced = await announced_metadata(self._component, self._left(ANSWER_TIME))
+        except (NoReply, VehicleError):
+            return None
+        return None if announced is None else announced.uri
+
+    def _hash_service(self, before: int | str, after: int | str | None, began: float) -> HashService:
+        seconds = anyio.current_time() - began
+        if isinstance(before, str):
+            return HashService(None, None, seconds, None, before)
+        last = self._component._machine.fetches.last
+        confirms = None if last is None or last.missing else last.hash is not None
+        return HashService(before, after if isinstance(after, int) else None, seconds, confirms, None)
+
+    def _link(self, round_trips: tuple[float, ...]) -> LinkReport:
+        client, component = self._client, self._component
+        report = client.traffic_report()
+        own = client._station.own
+        address = (component.system, component.component)
+        mine = next((each for each in report.components if (each.system, each.component) == address), None)
+        sent = 0 if mine is None else mine.frames - mine.repeated + mine.lost
+        return LinkReport(
+            name=client.link.name,
+            seconds=report.seconds,
+            round_trips=round_trips,
+            unanswered=self._unanswered,
+            loss=max(mine.lost, 0) / sent if mine is not None and sent > 0 else None,
+            lost=0 if mine is None else max(mine.lost, 0),
+            repeated=0 if mine is None else mine.repeated,
+            damaged=report.damaged,
+            unknown=report.unknown,
+            other_bytes=report.other_bytes,
+            bytes_received=report.bytes_received,
+            bytes_sent=report.bytes_sent,
+            mavlink=0 if mine is None else mine.version,
+            signed=0 if mine is None else mine.signed,
+            autopilots=tuple(
+                (each.system, each.component)
+                for each in report.components
+                if (each.system, each.component) != address and _is_autopilot(each)
+            ),
+            stations=tuple(
+                Station(each.system, each.component, (each.system, each.component) == own)
+                for each in report.components
+                if each.heartbeat is not None and each.heartbeat.type == MAV_TYPE_GCS
+            ),
+            radio_free=next((each.radio.free for each in report.components if each.radio is not None), None),
+        )
+
+
+def _is_autopilot(each: ComponentTraffic) -> bool:
+    beat = each.heartbeat
+    return beat is not None and beat.type != MAV_TYPE_GCS and beat.autopilot != MAV_AUTOPILOT_INVALID
+
+
+def _vehicle_type(number: int | None) -> str | None:
+    return None if number is None else enum_word("MAV_TYPE", number)
+
+
+def _steady_rate(first: float, arrivals: list[tuple[float, int]], received: int) -> float | None:
+    """Values per second up to the moment at which most of them had come."""
+    for at, number in arrivals:
+        if number >= STEADY_SHARE * received and at > first:
+            return number / (at - first)
+    return None
+
+
+def _longest_pause(first: float, arrivals: list[tuple[float, int]]) -> float:
+    moments = [first, *(at for at, _ in arrivals)]
+    return max((later - earlier for earlier, later in pairwise(moments)), default=0.0)
+
+
+def _silent(_: str) -> None:
+    """For a caller who wants to hear nothing."""
