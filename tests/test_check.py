@@ -321,7 +321,7 @@ def report(**changes: Any) -> VehicleReport:
         link=link,
         reads=ReadService(0.001, 500.0, 30, 30, 30),
         list=ListService(900, 900, 0.9, 0.02, 1_000.0, 0.1, 0, 0, False, None),
-        files=FileService(True, True, 3, 15_000, 0.4, 900, 900, None),
+        files=FileService(True, True, ("log/",), 15_000, 0.4, 900, 900, None),
         hash=HashService(0xCF579589, 0xCF579589, 2.0, True, None),
         elapsed=5.0,
     )

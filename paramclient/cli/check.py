@@ -36,6 +36,8 @@ __all__ = ["check"]
 
 CHECK_TIME: Final = 60.0
 """Seconds for everything, unless the user says otherwise: a list at 57600 baud takes 35."""
+MOST_ENTRIES: Final = 8
+"""Files and directories that are named to people."""
 _UNSIGNED: Final = SigningOptions()
 _COLOURS: Final = {Severity.PROBLEM: "red", Severity.SLOW: "yellow", Severity.NOTE: ""}
 
@@ -190,8 +192,10 @@ def _service_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
     if files is None:
         yield "MAVFTP", none
     else:
-        entries = "" if files.entries is None else f", {files.entries} entries in its root"
-        yield "MAVFTP", f"served{entries}" if files.is_serving else f"not served: {files.error}"
+        yield (
+            "MAVFTP",
+            f"served{_entries(files.entries or ())}" if files.is_serving else f"not served: {files.error}",
+        )
         if files.size is not None and files.elapsed is not None:
             yield (
                 "parameter file",
@@ -209,6 +213,14 @@ def _service_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
         after = "not answered" if found.after is None else f"{found.after:08x}"
         holds = f"the same after {found.seconds:.1f} s" if found.after == found.before else f"then {after}"
         yield "hash", f"{found.before:08x}, {holds}"
+
+
+def _entries(names: tuple[str, ...]) -> str:
+    """The root directory in a few words."""
+    if not names:
+        return ""
+    more = len(names) - MOST_ENTRIES
+    return f": {', '.join(names[:MOST_ENTRIES])}{f' and {more} more' if more > 0 else ''}"
 
 
 # for programs and issues

@@ -280,7 +280,7 @@ class _Diagnosis:
         capabilities = machine.who.capabilities
         is_announced = None if capabilities is None else bool(capabilities & CAPABILITY_FTP)
         ftp = self._client.ftp(self._component)
-        entries: int | None = None
+        entries: tuple[str, ...] | None = None
         size = parameters = defaults = None
         elapsed: float | None = None
         error: str | None = None
@@ -301,7 +301,8 @@ class _Diagnosis:
             error = str(failure)
         if is_serving:
             try:
-                entries = len(await ftp.list("/", timeout=self._left(ANSWER_TIME)))
+                listed = await ftp.list("/", timeout=self._left(ANSWER_TIME))
+                entries = tuple(sorted(each.name + "/" * each.is_directory for each in listed))
             except (NoReply, VehicleError):
                 entries = None
         return FileService(is_announced, is_serving, entries, size, elapsed, parameters, defaults, error)

@@ -130,7 +130,8 @@ class FileService:
     Attributes:
         is_announced: whether the capabilities in AUTOPILOT_VERSION include MAVFTP; None where unknown.
         is_serving: whether a request was answered with anything but silence.
-        entries: files and directories in the root, None where it could not be listed.
+        entries: names of the files and directories in the root, directories with a `/` at the end; None
+            where it could not be listed.
         size: bytes of `@PARAM/param.pck`; None where it could not be read.
         elapsed: seconds in which that was read.
         parameters: entries in it.
@@ -140,7 +141,7 @@ class FileService:
 
     is_announced: bool | None
     is_serving: bool
-    entries: int | None
+    entries: tuple[str, ...] | None
     size: int | None
     elapsed: float | None
     parameters: int | None

@@ -180,7 +180,7 @@ class CheckedFilesDoc(Document):
 
     is_announced: bool | None
     is_serving: bool
-    entries: int | None
+    entries: list[str] | None
     size: int | None
     elapsed_s: float | None
     parameters: int | None
@@ -193,7 +193,7 @@ class CheckedFilesDoc(Document):
         return cls(
             is_announced=files.is_announced,
             is_serving=files.is_serving,
-            entries=files.entries,
+            entries=None if files.entries is None else list(files.entries),
             size=files.size,
             elapsed_s=rounded(files.elapsed),
             parameters=files.parameters,
