@@ -302,7 +302,8 @@ class _Diagnosis:
         if is_serving:
             try:
                 listed = await ftp.list("/", timeout=self._left(ANSWER_TIME))
-                entries = tuple(sorted(each.name + "/" * each.is_directory for each in listed))
+                named = (each for each in listed if each.name not in (".", ".."))  # ArduPilot lists both
+                entries = tuple(sorted(each.name + "/" * each.is_directory for each in named))
             except (NoReply, VehicleError):
                 entries = None
         return FileService(is_announced, is_serving, entries, size, elapsed, parameters, defaults, error)
