@@ -252,7 +252,7 @@ class Carrier:
     def fail_for_good(self, error: LinkError) -> None:
         """No call can be answered any more."""
         self.ended = error
-        self._fail_calls(error)
+        self.fail_calls(error)
 
     def _is_behind(self, now: float) -> bool:
         """Whether more has come than was read, so that nothing can be said not to have been answered."""
@@ -297,7 +297,7 @@ class Carrier:
                 await self._link.open()
             except LinkError as again:
                 if anyio.current_time() >= patience_ends:
-                    self._fail_calls(again)
+                    self.fail_calls(again)
             else:
                 logger.info("%s: open again", self._link.name)
                 self.is_away = False
@@ -306,8 +306,11 @@ class Carrier:
                 self.wake()
                 return
 
-    def _fail_calls(self, error: LinkError) -> None:
-        """Whoever waits gets this error, and so does every new call until the link is back."""
+    def fail_calls(self, error: LinkError) -> None:
+        """Whoever waits gets this error, and so does every new call until the link is back.
+
+        The sessions of open files are closed on board nevertheless.
+        """
         self.broken = error
         self._station.fail_all(error, anyio.current_time())
         self.tell()

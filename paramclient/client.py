@@ -58,6 +58,9 @@ LISTENING_TIME: Final = 1.2
 """Seconds from opening in which every component has been heard: each sends a heartbeat once a second."""
 CLOSING_PATIENCE: Final = 0.5
 """Seconds that closing waits for the hash after a write, where the next session could not do without it."""
+SESSION_PATIENCE: Final = 2.0
+"""Seconds that a closing client waits at most for file sessions to be closed on board. The request is on its
+way by then: a burst that runs on a radio lets it wait, and it is obeyed after that."""
 
 logger = logging.getLogger(__name__)
 protocol_logger = logging.getLogger("paramclient.protocol")
@@ -264,8 +267,12 @@ class ParamClient:
             if kind is None and self._carrier.broken is None:
                 await self._let_hashes_settle()
         finally:
-            self._end(ClientClosed("the client was closed", link=self._link.name))
-            tasks.cancel_scope.cancel()
+            closed = ClientClosed("the client was closed", link=self._link.name)
+            try:
+                await self._close_files(closed)
+            finally:
+                self._end(closed)
+                tasks.cancel_scope.cancel()
             try:
                 # not told of the caller's exception: it would come out wrapped in a group
                 await tasks.__aexit__(None, None, None)
@@ -413,6 +420,7 @@ class ParamClient:
         return await together.run(
             self._check_open,
             self._wake,
+            self._files_closed,
             until=math.inf if timeout is None else began + timeout,
             hear_until=began + (HEARING_PATIENCE if timeout is None else timeout),
             listen_until=self._opened_at + LISTENING_TIME,
@@ -544,6 +552,34 @@ class ParamClient:
                 for machine in self._station.components.values()
             ):
                 await self._carrier.news.wait()
+
+    async def _close_files(self, error: LinkError) -> None:
+        """End what still waits, and have the sessions of open files closed on board, also when cancelled.
+
+        ArduPilot has one session for all links: what stays open keeps everyone from its files for 3 s.
+        """
+        if self._carrier.broken is None:
+            self._carrier.fail_calls(error)
+            with anyio.CancelScope(shield=True), anyio.move_on_after(SESSION_PATIENCE):
+                for machine in list(self._station.components.values()):
+                    await self._wait_until_closed(machine)
+
+    async def _files_closed(self, machine: ComponentMachine) -> None:
+        """Wait until the session of a file that nobody wants any more is closed on board: for one round trip.
+
+        While a burst comes the vehicle does not look at the request.
+        """
+        if machine.files.is_closing and self._carrier.broken is None:
+            with anyio.move_on_after(machine.round_trip.prompt_timeout):
+                await self._wait_until_closed(machine)
+
+    async def _wait_until_closed(self, machine: ComponentMachine) -> None:
+        carrier = self._carrier
+        while machine.files.is_closing and not (carrier.is_away or carrier.ended or machine.presence.is_lost):
+            closed = anyio.Event()
+            machine.files.on_closed.append(closed.set)
+            self._wake(machine)
+            await closed.wait()
 
     def _find(self, system: int | None, component: int | None) -> Component | None:
         found = self._station.find(system, component)

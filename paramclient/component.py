@@ -295,6 +295,7 @@ class Component:
         finally:
             machine.end_fetch(fetch, anyio.current_time())
             self._client._wake(machine)  # it may have been in the way of others
+            await self._client._files_closed(machine)
         return replace(result, elapsed=anyio.current_time() - began)
 
     async def refreshed(self, *, timeout: float | None = None) -> None:

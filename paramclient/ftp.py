@@ -121,3 +121,4 @@ class Ftp:
         finally:
             component._machine.files.release(job, anyio.current_time())
             component._client._wake(component._machine)
+            await component._client._files_closed(component._machine)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Final
@@ -72,6 +72,7 @@ class FetchTogether:
         self,
         check: Callable[[], None],
         wake: Callable[[], None],
+        closed: Callable[[ComponentMachine], Awaitable[None]],
         *,
         until: float,
         hear_until: float,
@@ -83,6 +84,7 @@ class FetchTogether:
         Args:
             check: raises what ends it; called at each turn.
             wake: is told that there may be something to send.
+            closed: waits until no file of a component is open on board that nobody wants any more.
             until: ends it, with what has come.
             hear_until, listen_until: as in `is_worth_waiting`.
             progress: called about ten times a second.
@@ -106,6 +108,8 @@ class FetchTogether:
         finally:
             self._end(anyio.current_time())
             wake()  # they may have been in the way of others
+            for address in self._fetches:
+                await closed(self._station.components[address])
 
     def join(self, now: float) -> bool:
         """Begin the fetches of components that have none yet, as soon as their cached table is there.

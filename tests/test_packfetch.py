@@ -431,11 +431,13 @@ def test_a_link_that_was_away_goes_on() -> None:
 
 
 def test_the_link_s_end_is_the_fetch_s() -> None:
-    session = Simulation(ArduPilotVehicle())
+    vehicle = ArduPilotVehicle()
+    session = Simulation(vehicle)
     fetch = in_the_middle(session)
     session.station.fail_all(LinkError("gone", link="sim:test"), session.now)
     assert isinstance(fetch.error, LinkError)
-    assert session.machine.files.is_idle
+    session.until(lambda: session.machine.files.is_idle)
+    assert not vehicle.open_files
     assert lists(session) == 0
 
 

@@ -13,7 +13,7 @@ from paramclient.protocol.operation import Operation
 from paramclient.protocol.timing import LONGEST_SILENCE, RoundTrip
 from paramclient.protocol.wire import FileTransfer, Message
 
-__all__ = ["Close", "Job", "Line", "path_bytes"]
+__all__ = ["Job", "Line", "path_bytes"]
 
 Result = TypeVar("Result")
 
@@ -27,6 +27,11 @@ ArduPilot gives one up that was idle for 3 s."""
 MOST_FAILURES: Final = 4
 """How often an open may fail without a reason. ArduPilot says no more when the session is open already, as
 after an open whose answer was lost; it is then closed and opened again at once."""
+CLOSE_ATTEMPTS: Final = 4
+"""Times that the closing of a session is asked for, or the answer to its open. A server that keeps silent for
+so long ends the session by its own timeout: ArduPilot after 3 s, PX4 after 10 s."""
+MOST_CLOSE_COPIES: Final = 4
+"""Requests to close that go out at once on a lossy link: each has 12 bytes of payload."""
 BUSY = frozenset((FileErrorCode.FAIL, FileErrorCode.INVALID_SESSION, FileErrorCode.NO_SESSIONS_AVAILABLE))
 """What servers say of an open while another file is open."""
 
@@ -90,8 +95,12 @@ class Line:
 class Job(Operation[Result]):
     """Something that is done with one file. Its owner gives it the answers and the time.
 
+    A job ends with its result or its error when its session is closed: the server has acknowledged that, or
+    has kept silent for `CLOSE_ATTEMPTS` timeouts. So whoever gets the result may open the next file at once.
+
     Attributes:
         path: of the file or directory.
+        is_over: whether the job needs the server no longer: nothing was begun, or its session is closed.
         is_of_caller: whether somebody waits for it who is to be told when the component is lost.
         session: the number of the session that is open for it, or None.
         asked_session: the one that was asked for when it is not known whether that is open, or None.
@@ -104,7 +113,9 @@ class Job(Operation[Result]):
         self.is_of_caller = False
         self.session: int | None = None
         self.asked_session: int | None = None
+        self.is_over = False
         self._path_data = path_bytes(path)
+        self._tell: Callable[[float], None] | None = None  # what ends it, once its session is closed
         self._request: Packet | None = None
         self._then: Callable[[Packet, float], None] | None = None
         self._attempts = 0
@@ -119,9 +130,77 @@ class Job(Operation[Result]):
         """How often the present request was sent."""
         return self._attempts
 
+    @property
+    def is_ended(self) -> bool:
+        """Whether the outcome is known; the session may still be open."""
+        return self._tell is not None
+
     @abstractmethod
     def begin(self, now: float) -> None:
         """The server is free: start."""
+
+    def finish(self, result: Result, now: float) -> None:
+        """End with a result as soon as the session is closed; later ends are ignored."""
+        self._close(lambda at: Operation.finish(self, result, at), now)
+
+    def fail(self, error: Exception, now: float) -> None:
+        """End with an error as soon as the session is closed; later ends are ignored.
+
+        After silence (`NoReply`) the closing is sent and nothing is awaited.
+        """
+        if isinstance(error, NoReply) and self._tell is None:
+            self._send_blind_close()
+            self.session = self.asked_session = None
+        self._close(lambda at: Operation.fail(self, error, at), now)
+
+    def stop(self, now: float, error: Exception | None = None) -> None:
+        """End without waiting for the session's closing, which goes on until `is_over`.
+
+        Args:
+            now: the time.
+            error: what to end with; None where nobody waits any more, and nobody is told.
+        """
+        if error is None:
+            self.on_done.clear()
+        else:
+            Operation.fail(self, error, now)
+        self._close(_nothing, now)
+
+    def _close(self, tell: Callable[[float], None], now: float) -> None:
+        """Close the session, then tell of the end."""
+        if self._tell is not None:
+            return
+        self._tell = tell
+        self._open_at = math.inf
+        if self.session is not None:
+            self._terminate(self.session, now)
+        elif self.asked_session is not None and self._request is not None:
+            # An open is on its way. Its answer says which session to close, as PX4 gives numbers of its own;
+            # ArduPilot keeps to ours, so this closes it even where nobody waits for that answer any more.
+            self._send_blind_close()
+            self._attempts = min(self._attempts, 1)
+        else:
+            self._closed(now)
+
+    def _terminate(self, session: int, now: float) -> None:
+        copies = self._line.round_trip.copies(COPY_RISK, MOST_CLOSE_COPIES)
+        self._ask(
+            Opcode.TERMINATE_SESSION, lambda _, now: self._closed(now), now, session=session, copies=copies
+        )
+
+    def _closed(self, now: float) -> None:
+        self._request = self._then = self.session = self.asked_session = None
+        self.is_over = True
+        assert self._tell is not None
+        self._tell(now)
+
+    def _send_blind_close(self) -> None:
+        """Ask for the session to be closed, and do not wait for it; twice, as one may get lost."""
+        session = self.asked_session if self.session is None else self.session
+        if session is not None:
+            packet = Packet(self._line.next_sequence(), session, Opcode.TERMINATE_SESSION)
+            self._line.send(packet)
+            self._line.send(packet)
 
     def take(self, packet: Packet, now: float) -> None:
         """Something came from the server."""
@@ -144,7 +223,10 @@ class Job(Operation[Result]):
             self._reopen(now)
         if self._request is not None and self._deadline() <= now:
             self._line.round_trip.timed_out(self._attempts)
-            if self._line.round_trip.is_hopeless(self._attempts, now):
+            if self.is_ended and self._attempts >= CLOSE_ATTEMPTS:
+                self._send_blind_close()
+                self._closed(now)
+            elif self._line.round_trip.is_hopeless(self._attempts, now):
                 self._request = None
                 self.fail(self._no_reply(self._attempts, now), now)
             else:
@@ -190,7 +272,12 @@ class Job(Operation[Result]):
             code = self._code(packet)
             if packet.opcode == Opcode.ACK:
                 self.session, self.asked_session = packet.session, None
-                then(packet, now)
+                if self.is_ended:
+                    self._terminate(packet.session, now)
+                else:
+                    then(packet, now)
+            elif self.is_ended:
+                self._closed(now)
             elif code not in BUSY or self._is_patience_over(code, now):
                 self.asked_session = None
                 self._refused(packet, "does not open", now)
@@ -244,7 +331,7 @@ class Job(Operation[Result]):
     def _transmit(self, request: Packet, now: float, *, copies: int = 1) -> None:
         self._attempts += 1
         self._sent_at = now
-        for _ in range(2 if self._line.round_trip.seen_loss >= COPY_RISK else copies):
+        for _ in range(max(copies, 2) if self._line.round_trip.seen_loss >= COPY_RISK else copies):
             self._line.send(request)
 
     def _deadline(self) -> float:
@@ -253,15 +340,5 @@ class Job(Operation[Result]):
         return since + self._line.round_trip.timeout
 
 
-class Close(Job[None]):
-    """Closes the session of another job, as well as can be: its end is never an error that matters."""
-
-    def __init__(self, line: Line, job: Job[Result], now: float) -> None:
-        super().__init__(line, job.path, now)
-        if job.session is not None:
-            self._opcode, self._number = Opcode.TERMINATE_SESSION, job.session
-        else:  # the server may have opened one, with a number that it did not get through to us
-            self._opcode, self._number = Opcode.RESET_SESSIONS, job.asked_session or 0
-
-    def begin(self, now: float) -> None:
-        self._ask(self._opcode, lambda _, now: self.finish(None, now), now, session=self._number)
+def _nothing(now: float) -> None:
+    """Whoever waited is told already."""

@@ -154,13 +154,15 @@ class FileRead(Job[bytes]):
 
     def take(self, packet: Packet, now: float) -> None:
         super().take(packet, now)
-        if not self.done and self.session is None and self._is_unheard(packet):
+        if self.is_ended:
+            return
+        if self.session is None and self._is_unheard(packet):
             # whether the file is ours nobody can tell any more: close it, and begin anew when the burst ends
             self._restarts += 1
             self._line.reset_sessions(packet.session)
             self._start_anew()
             self._begin_early(now)
-        if self.done or self.session is None or packet.session != self.session:
+        if self.is_ended or self.session is None or packet.session != self.session:
             return
         self._is_silent = False
         if packet.requested == Opcode.BURST_READ_FILE and self._is_of_a_burst(packet):
@@ -174,7 +176,7 @@ class FileRead(Job[bytes]):
 
     def tick(self, now: float) -> None:
         super().tick(now)
-        if self.done or self.session is None:
+        if self.is_ended or self.session is None:
             return
         if self._burst_runs and self._quiet_at() <= now:
             self._burst_is_silent(now)
@@ -187,7 +189,7 @@ class FileRead(Job[bytes]):
 
     def next_deadline(self) -> float:
         earliest = super().next_deadline()
-        if self.done or self.session is None:
+        if self.is_ended or self.session is None:
             return earliest
         if self._burst_runs:
             earliest = min(earliest, self._quiet_at())
@@ -199,7 +201,7 @@ class FileRead(Job[bytes]):
 
     def resume(self, now: float) -> None:
         super().resume(now)
-        if self.session is not None:
+        if self.session is not None and not self.is_ended:
             self._flights.clear()
             self._asked.clear()
             self._burst_attempts = 0
@@ -478,7 +480,7 @@ class FileRead(Job[bytes]):
 
     def _go_on(self, now: float) -> None:
         """Ask for what is wanted, as far as the pace allows; end when all is there."""
-        if self.done or self.session is None:
+        if self.is_ended or self.session is None:
             return
         if self._blocks.is_complete:
             self.finish(self._blocks.content, now)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeVar
 
 from paramclient.errors import FileErrorCode, NoReply, UsageError
-from paramclient.protocol.ftp.jobs import Close, Job, Line
+from paramclient.protocol.ftp.jobs import Job, Line
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
 from paramclient.protocol.ftp.reading import LARGEST_FILE, FileRead
 from paramclient.protocol.timing import RoundTrip
@@ -60,7 +60,7 @@ class FileWrite(Job[None]):
         session = self.session or 0
         piece = self._data[self.written : self.written + self._write_size]
         if not piece:
-            self._ask(Opcode.TERMINATE_SESSION, self._closed, now, session=session)
+            self._ask(Opcode.TERMINATE_SESSION, self._taken, now, session=session)
             return
 
         def answered(packet: Packet, now: float) -> None:
@@ -72,7 +72,7 @@ class FileWrite(Job[None]):
 
         self._ask(Opcode.WRITE_FILE, answered, now, data=piece, session=session, offset=self.written)
 
-    def _closed(self, packet: Packet, now: float) -> None:
+    def _taken(self, packet: Packet, now: float) -> None:
         was_closed_before = self._code(packet) == FileErrorCode.INVALID_SESSION and self._attempts > 1
         self.session = None
         if packet.opcode == Opcode.NAK and not was_closed_before:
@@ -140,6 +140,9 @@ class FileTransfers:
         own: ours; what the server sends to others is passed over.
         round_trip: the component's.
         send: takes what is to be sent.
+
+    Attributes:
+        on_closed: called once, in order, when the session of a job that has ended is closed.
     """
 
     def __init__(
@@ -156,11 +159,17 @@ class FileTransfers:
         self._line: Line | None = None
         self._job: Job[Any] | None = None
         self._waiting: deque[Job[Any]] = deque()
+        self.on_closed: list[Callable[[], None]] = []
 
     @property
     def is_idle(self) -> bool:
         """Whether nothing is under way, not even the closing of a session."""
         return self._job is None
+
+    @property
+    def is_closing(self) -> bool:
+        """Whether nobody waits for what is under way any more, and its session is still to be closed."""
+        return self._job is not None and self._job.is_ended
 
     def read(
         self, path: str, now: float, *, read_size: int = MOST_DATA, limit: int = LARGEST_FILE
@@ -207,11 +216,12 @@ class FileTransfers:
         return self._begin(FileChecksum(self._line_at(now), path, now), now)
 
     def release(self, job: Job[Any], now: float) -> None:
-        """Want it no longer: it does not end any more, and what it has open is closed."""
+        """Want it no longer: nobody is told of its end, and its session is closed."""
         if job in self._waiting:
             self._waiting.remove(job)
         elif job is self._job and not job.done:
-            self._end(job, now)
+            job.stop(now)
+            self._go_on(now)
 
     def heard(self, message: FileTransfer, now: float) -> None:
         """Every FILE_TRANSFER_PROTOCOL of the component passes here."""
@@ -249,16 +259,18 @@ class FileTransfers:
                 error = NoReply(what, attempts=job.attempts, waited=now - job.begun_at)
                 if job is not self._job:
                     self._waiting.remove(job)
-                job.fail(error, now)
+                job.stop(now, error)
         self._go_on(now)
 
     def fail_all(self, error: Exception, now: float) -> None:
-        """Nothing can be answered any more. What is asked for from now on stands."""
+        """Nothing is awaited any more. The closing of an open session goes on; what is asked for from now on
+        stands.
+        """
         jobs = [*([] if self._job is None else [self._job]), *self._waiting]
-        self._job = None
         self._waiting.clear()
         for job in jobs:
-            job.fail(error, now)
+            job.stop(now, error)
+        self._go_on(now)
 
     def _line_at(self, now: float) -> Line:
         if self._line is None:
@@ -272,19 +284,13 @@ class FileTransfers:
         return job
 
     def _go_on(self, now: float) -> None:
-        """Close what has ended, and begin the next."""
-        if self._job is not None and self._job.done:
-            self._end(self._job, now)
-
-    def _end(self, job: Job[Any], now: float) -> None:
-        is_open = job.session is not None or job.asked_session is not None
-        if is_open and not isinstance(job, Close):
-            self._job = Close(self._line_at(now), job, now)
-            self._job.begin(now)
-        if not is_open or isinstance(job, Close) or isinstance(job.error, NoReply):
-            # of one who has fallen silent nothing more is awaited
+        """Begin the next when what was under way has ended and its session is closed."""
+        if self._job is not None and self._job.is_over:
             self._job = None
             self._next(now)
+            callbacks, self.on_closed = self.on_closed, []
+            for callback in callbacks:
+                callback()
 
     def _next(self, now: float) -> None:
         while self._job is None and self._waiting:
