@@ -18,6 +18,7 @@ from paramclient.cache import (
 from paramclient.client import FetchedAll, ParamClient
 from paramclient.component import Component
 from paramclient.errors import (
+    AmbiguousVehicle,
     AnotherVehicle,
     CacheError,
     ClientClosed,
@@ -36,6 +37,7 @@ from paramclient.errors import (
     Refused,
     TypeMismatch,
     UnknownParameter,
+    UnknownVehicle,
     UsageError,
     ValueNotApplied,
     VehicleArmed,
@@ -61,6 +63,7 @@ from paramclient.values import Encoding, Param, ParamType, Trust
 from paramclient.version import __version__
 
 __all__ = [
+    "AmbiguousVehicle",
     "AnotherVehicle",
     "CacheError",
     "CachedComponent",
@@ -130,6 +133,7 @@ __all__ = [
     "Trust",
     "TypeMismatch",
     "UnknownParameter",
+    "UnknownVehicle",
     "UsageError",
     "ValueNotApplied",
     "VehicleArmed",

@@ -6,7 +6,9 @@ The tree says who is to blame::
     ├── UsageError(ValueError)        the caller: a name, value, link name or argument that cannot be right
     │   ├── FileError                 a parameter file that cannot be read or written
     │   ├── InvalidParameters         values that are to be set, and cannot be right
-    │   └── MetadataError             a description of parameters that is none
+    │   ├── MetadataError             a description of parameters that is none
+    │   ├── UnknownVehicle            no vehicle in the cache has the name that was given
+    │   └── AmbiguousVehicle          several vehicles fit, on the link or in the cache, and one must be named
     ├── VehicleError                  the vehicle answered, and the answer is no
     │   ├── UnknownParameter          it has no parameter of that name or index
     │   ├── Refused                   it gave a reason: PARAM_ERROR, or ArduPilot's text
@@ -27,10 +29,11 @@ Each carries what is known as attributes, so that a program need not read its te
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from enum import IntEnum
 
 __all__ = [
+    "AmbiguousVehicle",
     "AnotherVehicle",
     "CacheError",
     "ClientClosed",
@@ -49,6 +52,7 @@ __all__ = [
     "Refused",
     "TypeMismatch",
     "UnknownParameter",
+    "UnknownVehicle",
     "UsageError",
     "ValueNotApplied",
     "VehicleArmed",
@@ -187,6 +191,30 @@ class MetadataError(UsageError):
     def __init__(self, message: str, *, source: str) -> None:
         super().__init__(message)
         self.source = source
+
+
+class UnknownVehicle(UsageError):
+    """No vehicle in the cache has the name, system id or component that was given. Nothing was done.
+
+    Attributes:
+        vehicles: the vehicles that the cache holds, in words.
+    """
+
+    def __init__(self, message: str, *, vehicles: Sequence[str]) -> None:
+        super().__init__(message)
+        self.vehicles = tuple(vehicles)
+
+
+class AmbiguousVehicle(UsageError):
+    """Several vehicles fit, on the link or in the cache, and none of them was chosen. Nothing was done.
+
+    Attributes:
+        vehicles: the vehicles that fit, in words.
+    """
+
+    def __init__(self, message: str, *, vehicles: Sequence[str]) -> None:
+        super().__init__(message)
+        self.vehicles = tuple(vehicles)
 
 
 class VehicleError(ParamClientError):

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
-from paramclient.errors import CacheError, NoReply, UsageError, VehicleError
+from paramclient.errors import CacheError, NoReply, UnknownVehicle, UsageError, VehicleError
 from paramclient.paramset import ParamSet
 from paramclient.provision.applying import BEFORE_APPLY
 from paramclient.values import Param, Trust
@@ -169,7 +169,10 @@ def before_last_apply(cache: ParamCache, key: str, component: int) -> ParamSet:
     Raises:
         CacheError: nothing is known of that.
     """
-    kept = [each for each in cache.snapshots(key, component) if each.reason == BEFORE_APPLY]
+    try:
+        kept = [each for each in cache.snapshots(key, component) if each.reason == BEFORE_APPLY]
+    except UnknownVehicle:
+        kept = []
     if not kept:
         raise CacheError(f"the cache knows of no apply to {key}; name the moment whose state is to come back")
     return cache.state_at(key, component, kept[-1].id)

@@ -28,7 +28,7 @@ from paramclient.cache import (
     tables,
 )
 from paramclient.cache.session import Session
-from paramclient.errors import CacheError, UsageError
+from paramclient.errors import AmbiguousVehicle, CacheError, UnknownVehicle, UsageError
 from paramclient.identity import Identity
 from paramclient.values import Param, ParamType, Trust, same_bits
 from tests.caches import CACHE_ALONE, NOW, PX4, set_aside, start, stored, update, values, whole_table
@@ -341,19 +341,22 @@ def test_vehicles_and_components_are_listed_the_last_seen_first(three: ParamCach
             "<CachedSummary 1/1 px4 2 params synced 2026-11-18 11:06Z>",
         ]
         assert [summary.component for summary in cache.components(PX4.key)] == [1, 154]
-        assert [summary.size for summary in cache.components("0003")] == [2]
+        assert [summary.size for summary in cache.components("uid:0003AB")] == [2]
 
 
 @pytest.mark.parametrize(
     ("wanted", "found"),
     [
         ({"vehicle": PX4.key}, PX4.key),
-        ({"vehicle": "0002"}, PX4.key),
+        ({"vehicle": "uid:000200"}, PX4.key),
+        ({"vehicle": PX4.key.removeprefix("uid:").upper()}, PX4.key),
+        ({"vehicle": "2"}, "system:2@udpin:0.0.0.0:14550"),
+        ({"vehicle": "1", "component": 154}, PX4.key),
         ({"vehicle": "uid:0003AB"}, "uid:0003ab"),
         ({"system": 2}, "system:2@udpin:0.0.0.0:14550"),
         ({"vehicle": "system:2@udpin:0.0.0.0:14550"}, "system:2@udpin:0.0.0.0:14550"),
         ({"component": 154}, PX4.key),
-        ({"vehicle": "0003", "system": 1}, "uid:0003ab"),
+        ({"vehicle": "0003ab", "system": 1}, "uid:0003ab"),
     ],
 )
 def test_a_table_is_found_by_key_hardware_id_or_system(
@@ -367,11 +370,12 @@ def test_a_table_is_found_by_key_hardware_id_or_system(
 
 def test_an_exact_key_is_preferred_to_the_beginning_of_another(path: Path) -> None:
     with ParamCache(path) as cache:
-        for uid in ("ab", "abcd"):
+        for uid in ("abcdef01", "abcdef0123"):
             cache.save(update(identity=replace(PX4, uid=uid)))
-        assert cache.component("uid:ab").key == "uid:ab"
-        with pytest.raises(CacheError, match="more than one"):
-            cache.component("ab")
+        assert cache.component("uid:abcdef01").key == "uid:abcdef01"
+        assert cache.component("ABCDEF01").key == "uid:abcdef01"
+        with pytest.raises(AmbiguousVehicle, match="vehicle uid:abcdef, component 1 fits 2 vehicles"):
+            cache.component("uid:abcdef")
 
 
 @pytest.mark.parametrize(
@@ -379,16 +383,16 @@ def test_an_exact_key_is_preferred_to_the_beginning_of_another(path: Path) -> No
     [
         (
             {},
-            r"component 1 fits more than one .*: uid:0002.*; system:2@.*; uid:0003ab \(.*, components 1\)",
+            r"component 1 fits 3 vehicles .*:\n  uid:0002.*\n  system:2@.*\n  uid:0003ab \(.*components 1\)",
         ),
         (
             {"system": 1},
-            r"system 1, component 1 fits more than one .*: uid:0002[^;]*components 1, 154\); uid:0003",
+            r"system 1, component 1 fits 2 vehicles .*:\n  uid:0002.*components 1, 154\)\n  uid:0003",
         ),
-        ({"vehicle": "000"}, "vehicle 000, component 1 fits more than one"),
+        ({"vehicle": "1"}, "vehicle 1, component 1 fits 2 vehicles"),
         (
             {"vehicle": "beef"},
-            r"vehicle beef, component 1 is not in the cache .*, which holds uid:0002.*; system:2",
+            r"vehicle beef, component 1 is not in the cache .* holds 3 vehicles:\n  uid:0002.*\n  system:2",
         ),
         ({"system": 9}, "system 9, component 1 is not in the cache"),
         ({"component": 7}, "component 7 is not in the cache"),
@@ -397,14 +401,18 @@ def test_an_exact_key_is_preferred_to_the_beginning_of_another(path: Path) -> No
 def test_what_is_not_there_or_not_clear_is_an_error_that_says_what_there_is(
     three: ParamCache, wanted: dict[str, Any], text: str
 ) -> None:
-    with three as cache, pytest.raises(CacheError, match=text):
+    with three as cache, pytest.raises((UnknownVehicle, AmbiguousVehicle), match=text) as caught:
         cache.component(**wanted)
+    error = caught.value
+    assert isinstance(error, UnknownVehicle | AmbiguousVehicle)
+    assert all(each in str(error) for each in error.vehicles)
+    assert len(error.vehicles) == (2 if "fits 2" in text else 3)
 
 
 def test_lists_of_a_vehicle_that_is_not_there_are_errors_too(three: ParamCache) -> None:
     with three as cache:
         for ask in (cache.components, cache.history, cache.remove):
-            with pytest.raises(CacheError, match="vehicle beef is not in the cache"):
+            with pytest.raises(UnknownVehicle, match="vehicle beef is not in the cache"):
                 ask("beef")
 
 
@@ -414,7 +422,7 @@ def test_tables_and_vehicles_are_removed_with_their_history(three: ParamCache) -
         table = cache.component(component=154)
         assert len(table.history()) == 1
         assert cache.remove(PX4.key, 99) == 0
-        assert cache.remove("0002", 154) == 1
+        assert cache.remove("uid:000200", 154) == 1
         assert table.history() == []
         assert (cache.load(PX4.key, 154), cache.history(PX4.key)) == (None, [])
         assert len(values(cache)) == 3
@@ -438,9 +446,9 @@ def test_reprs_tell_the_state(path: Path) -> None:
 def test_without_a_file_there_is_nothing_and_to_look_creates_nothing(path: Path) -> None:
     with ParamCache(path) as cache:
         assert (cache.vehicles(), cache.components(), cache.load(PX4.key, 1)) == ([], [], None)
-        with pytest.raises(CacheError, match=r"component 1 is not in the cache .*, which holds nothing"):
+        with pytest.raises(UnknownVehicle, match=r"component 1 is not in the cache .* holds no vehicle\."):
             cache.component()
-        with pytest.raises(CacheError, match="holds nothing"):
+        with pytest.raises(UnknownVehicle, match="holds no vehicle"):
             cache.remove(PX4.key)
     assert not path.parent.exists()
 

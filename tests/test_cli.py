@@ -923,7 +923,7 @@ def test_show_lists_several_vehicles_and_finds_one(command: Command, warm: Path)
     assert "paramclient show VEHICLE" in listed.err
     assert len(command("show", "--json", "--cache", warm).json["components"]) == 2
     key = key_of(warm)
-    for name in ("2", key, key.removeprefix("uid:")[:6], key.removeprefix("uid:").upper()):
+    for name in ("2", key, key[: len("uid:") + 6], key.removeprefix("uid:").upper()):
         [component] = command("show", name, "--json", "--cache", warm).json["components"]
         assert (component["system"], component["synced_at"]) == (2, None)
         assert list(component["params"]) == ["RTL_ALT"]
@@ -937,7 +937,7 @@ def test_show_says_when_there_is_nothing(command: Command, warm: Path, tmp_path:
     assert (empty.code, empty.out, empty.err) == (0, "", f"the cache {nowhere} is empty\n")
     for arguments in (["show", "9"], ["show", "--component", "9"], ["show", "1", "--component", "9"]):
         missing = command(*arguments, "--cache", warm)
-        assert (missing.code, missing.out) == (5, "")
+        assert (missing.code, missing.out) == (2, "")
         assert missing.err.startswith("paramclient: ")
     assert not nowhere.exists()
 
@@ -946,8 +946,9 @@ def test_a_name_that_fits_two_vehicles_chooses_none(command: Command, warm: Path
     assert command("get", "sim:ardupilot", "RTL_ALT", "--cache", warm).code == 0
     for arguments in (["show", "1"], ["cache", "history", "1"], ["cache", "remove", "1"]):
         outcome = command(*arguments, "--cache", warm)
-        assert (outcome.code, outcome.out) == (5, "")
-        assert "more than one vehicle" in outcome.err
+        assert (outcome.code, outcome.out) == (2, "")
+        assert "vehicle 1 fits 2 vehicles" in outcome.err
+        assert all(f"\n  {each}\n" in outcome.err for each in ParamCache(warm).vehicles())
     assert len(ParamCache(warm).vehicles()) == 2
 
 
@@ -979,11 +980,11 @@ def test_the_cache_can_be_looked_into(command: Command, warm: Path) -> None:
 
 def test_a_vehicle_can_be_forgotten(command: Command, warm: Path) -> None:
     key = key_of(warm)
-    assert command("cache", "remove", "1", "--component", 9, "--cache", warm).code == 5
+    assert command("cache", "remove", "1", "--component", 9, "--cache", warm).code == 2
     removed = command("cache", "remove", "1", "--json", "--cache", warm)
     assert (removed.code, removed.json) == (0, {"key": key, "removed": 1})
     assert command("cache", "list", "--json", "--cache", warm).json["components"] == []
-    assert command("cache", "remove", "1", "--cache", warm).code == 5
+    assert command("cache", "remove", "1", "--cache", warm).code == 2
 
 
 # how it ends

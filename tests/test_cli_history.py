@@ -152,7 +152,7 @@ def test_changes_are_told_as_in_the_cache_and_since_a_moment(command: Command) -
 @pytest.mark.usefixtures("known")
 def test_snapshots_are_listed_with_their_numbers(command: Command) -> None:
     first, second = (time_text(HOUR_AGO + after) for after in (1500, 1900))
-    found = command("history", "0002", "--snapshots", "--json").json["snapshots"]
+    found = command("history", "uid:000200", "--snapshots", "--json").json["snapshots"]
     assert found == [
         {
             "id": 1, "time": first, "component": 1, "size": 2, "complete": True,
@@ -182,7 +182,7 @@ def test_snapshots_are_listed_with_their_numbers(command: Command) -> None:
         (["1", "A", "--snapshots"], 2, "it takes no parameter's name"),
         (["1", "A_NAME_THAT_IS_TOO_LONG"], 2, "a param_id holds 16"),
         (["1", "--limit", "0"], 2, "limit"),
-        (["9"], 5, "vehicle 9 is not in the cache"),
+        (["9"], 2, "vehicle 9 is not in the cache"),
     ],
 )
 def test_what_cannot_be_told_is_an_error(

@@ -385,10 +385,21 @@ def test_restore_takes_a_moment_or_a_snapshot(
     assert command("restore", put(vehicle), 99).code == 5
 
 
-def test_restore_needs_something_to_go_back_to(command: Command, put: Callable[[Endpoint], str]) -> None:
-    outcome = command("restore", put(copter()))
+@pytest.mark.parametrize(
+    ("when", "text"),
+    [
+        ([], "the cache knows of no apply to uid:"),
+        (["2h ago"], "no earlier state of uid:"),
+        (["4"], "no earlier state of uid:"),
+    ],
+)
+def test_restore_needs_something_to_go_back_to(
+    command: Command, put: Callable[[Endpoint], str], when: list[str], text: str
+) -> None:
+    outcome = command("restore", put(copter()), *when)
     assert outcome.code == 5
-    assert command("restore", put(copter()), "--no-cache").code == 2
+    assert text in outcome.err
+    assert command("restore", put(copter()), *when, "--no-cache").code == 2
 
 
 # verify

@@ -18,7 +18,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from paramclient.cache import ParamCache, SnapshotSummary, StoredParam, TableState, earlier, tables
-from paramclient.errors import CacheError, UsageError
+from paramclient.errors import CacheError, UnknownVehicle, UsageError
 from paramclient.identity import Identity
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.values import Param, ParamType
@@ -51,12 +51,12 @@ def test_a_snapshot_is_the_table_as_it_stood_whatever_becomes_of_it(path: Path) 
         cache.save(
             update(*(StoredParam(each, NOW) for each in kept), table=TableState(0xABC, 2, complete=True))
         )
-        made = cache.snapshot("0002", 1, reason="before apply plane.parm", at=NOW + 1.23456)
+        made = cache.snapshot("uid:000200", 1, reason="before apply plane.parm", at=NOW + 1.23456)
         cache.save(update(stored("INT", 7), removed=["FLOAT", "RAW"], at=NOW + 2))
     with ParamCache(path) as cache:
         state = cache.state_at(PX4.key, 1, made.id)
         summary = SnapshotSummary(1, PX4.key, 1, NOW + 1.235, "before apply plane.parm", 3, 0xABC, True)
-        assert cache.snapshots("0002") == [summary]
+        assert cache.snapshots("uid:000200") == [summary]
         assert cache.state_at(PX4.key, 1, NOW + 1.235) == state == made.params
         assert numbers(cache.state_at(PX4.key, 1, NOW + 2)) == {"INT": 7}
     assert state.params == {
@@ -181,7 +181,7 @@ def test_what_is_not_there_is_an_error_that_creates_nothing(path: Path) -> None:
             lambda: cache.state_at(PX4.key, 1, NOW),
             lambda: cache.snapshots(PX4.key),
         ):
-            with pytest.raises(CacheError, match="holds nothing"):
+            with pytest.raises(UnknownVehicle, match="holds no vehicle"):
                 ask()
         assert not path.exists()
         with pytest.raises(UsageError, match="unix seconds"):

@@ -14,6 +14,7 @@ from paramclient.cache import earlier, fleet, tables
 from paramclient.cache.address import Address, is_address
 from paramclient.cache.fleet import FleetDiff
 from paramclient.cache.interface import Store
+from paramclient.cache.lookup import find_vehicle
 from paramclient.cache.operations import Merge, Remove, Save, SetDown
 from paramclient.cache.records import (
     CacheChange,
@@ -171,10 +172,12 @@ class ParamCache:
         """Every table, without its parameters, ordered as `vehicles()`, then by component id.
 
         Args:
-            vehicle: of this one only: its key, or the beginning of its hardware id.
+            vehicle: only this one: its system id (`"4"`), `uid:` with at least 6 digits of its hardware id,
+                its hardware id in full, or its key.
 
         Raises:
-            CacheError: there is no such vehicle, or more than one.
+            UnknownVehicle: no vehicle in the cache has this name.
+            AmbiguousVehicle: several vehicles have it.
         """
 
         def work(session: Session) -> list[CachedSummary]:
@@ -189,12 +192,13 @@ class ParamCache:
         """The one table that fits.
 
         Args:
-            vehicle: its key, or the beginning of its hardware id.
+            vehicle: as for `components`.
             system: its system id.
             component: component id; the autopilot's is 1.
 
         Raises:
-            CacheError: none fits, or more than one; the text says what there is.
+            UnknownVehicle: no table fits. `vehicles` and the text say what there is.
+            AmbiguousVehicle: tables of several vehicles fit. `vehicles` and the text list them.
         """
 
         def work(session: Session) -> CachedComponent:
@@ -216,14 +220,15 @@ class ParamCache:
         """The changes of a vehicle's values, newest last. Of each table the newest `HISTORY_LINES` are kept.
 
         Args:
-            vehicle: its key, or the beginning of its hardware id.
+            vehicle: as for `components`.
             component: of this component only.
             name: of this parameter only.
             limit: the newest so many.
             since: those from this time on only, in unix seconds.
 
         Raises:
-            CacheError: there is no such vehicle, or more than one.
+            UnknownVehicle: no vehicle in the cache has this name.
+            AmbiguousVehicle: several vehicles have it.
         """
 
         return self._store.read(
@@ -236,13 +241,14 @@ class ParamCache:
         Of each table the newest `SNAPSHOTS` are kept.
 
         Args:
-            vehicle: its key, or the beginning of its hardware id.
+            vehicle: as for `components`.
             component: component id.
             reason: what for, in words.
             at: unix seconds; None for now.
 
         Raises:
-            CacheError: there is no such table, or more than one.
+            UnknownVehicle: there is no such table.
+            AmbiguousVehicle: several vehicles have this name.
         """
 
         moment = time.time() if at is None else at
@@ -265,8 +271,8 @@ class ParamCache:
         The table that is kept does not change. Of each table the newest `SNAPSHOTS` are kept.
 
         Args:
-            vehicle: who it is; one that the cache does not know yet is written down. Or the key of one that
-                it knows, or the beginning of its hardware id.
+            vehicle: who it is; one that the cache does not know yet is written down. Or the name of one that
+                it knows, as for `components`.
             component: component id.
             params: names, values, types and defaults are kept, comments and lines are not.
             reason: what for, in words.
@@ -275,7 +281,8 @@ class ParamCache:
             complete: these are all the parameters that the vehicle has.
 
         Raises:
-            CacheError: a key was given, and there is no such table, or more than one.
+            UnknownVehicle: a name was given, and there is no such table.
+            AmbiguousVehicle: several vehicles have this name.
         """
         moment = time.time() if at is None else at
         who = vehicle
@@ -287,11 +294,12 @@ class ParamCache:
         """The snapshots of a vehicle's tables, newest last.
 
         Args:
-            vehicle: its key, or the beginning of its hardware id.
+            vehicle: as for `components`.
             component: of this component only.
 
         Raises:
-            CacheError: there is no such vehicle, or more than one.
+            UnknownVehicle: no vehicle in the cache has this name.
+            AmbiguousVehicle: several vehicles have it.
         """
         return self._store.read(lambda session: session.snapshots(self._choose(session, vehicle), component))
 
@@ -305,15 +313,17 @@ class ParamCache:
         not in it. Defaults and the firmware of the vehicle are only known of snapshots.
 
         Args:
-            vehicle: its key, or the beginning of its hardware id.
+            vehicle: as for `components`.
             component: component id.
             when: a float is a time, in unix seconds; an int is the id of a snapshot.
 
         Raises:
             UsageError: a time that is not in unix seconds.
-            CacheError: there is no such table, or more than one; there is no such snapshot of it, or it is
-                damaged; history does not reach back so far (the text says how far, and which snapshots are
-                next to it), or the clock of this computer went through that moment twice.
+            UnknownVehicle: there is no such table.
+            AmbiguousVehicle: several vehicles have this name.
+            CacheError: there is no such snapshot of it, or it is damaged; history does not reach back so far
+                (the text says how far, and which snapshots are next to it), or the clock of this computer
+                went through that moment twice.
         """
 
         def work(session: Session) -> ParamSet:
@@ -397,11 +407,12 @@ class ParamCache:
         """Forget a vehicle's tables with their history and snapshots; give the number of tables.
 
         Args:
-            vehicle: its key, or the beginning of its hardware id.
+            vehicle: as for `components`.
             component: this component's only.
 
         Raises:
-            CacheError: there is no such vehicle, or more than one.
+            UnknownVehicle: no vehicle in the cache has this name.
+            AmbiguousVehicle: several vehicles have it.
         """
 
         def work(session: Session) -> tuple[str, int]:
@@ -432,25 +443,7 @@ class ParamCache:
         system: int | None = None,
         component: int | None = None,
     ) -> str:
-        """The key of the one vehicle that fits; an exact key is preferred to the beginning of another id."""
-        kept = session.vehicles()
-        fits = [
-            known
-            for known in kept
-            if (system is None or known.identity.system == system)
-            and (component is None or component in known.components)
-        ]
-        if vehicle is not None:
-            start = vehicle.removeprefix("uid:").lower()
-            fits = [known for known in fits if known.key == vehicle] or [
-                known for known in fits if known.identity.uid and known.identity.uid.startswith(start)
-            ]
-        if len(fits) == 1:
-            return fits[0].key
-        wanted = {"vehicle": vehicle, "system": system, "component": component}
-        named = ", ".join(f"{what} {value}" for what, value in wanted.items() if value is not None)
-        if fits:
-            raise CacheError(f"{named} fits more than one vehicle in the cache: {'; '.join(map(str, fits))}")
-        raise CacheError(
-            f"{named} is not in the cache {self.place}, which holds {'; '.join(map(str, kept)) or 'nothing'}"
-        )
+        """Return the key of the only vehicle that fits; see `paramclient.cache.lookup`."""
+        return find_vehicle(
+            session.vehicles(), vehicle, place=self.place, system=system, component=component
+        ).key

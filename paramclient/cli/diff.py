@@ -46,8 +46,8 @@ async def diff(
     Exit code 0 says that both have the same names with the same values, 1 that they have not.
 
     Args:
-        left: A parameter file; a vehicle in the cache, by its system id, the beginning of its hardware id, or
-            as cache:VEHICLE; or a link.
+        left: A parameter file; a vehicle in the cache, by its system id, its hardware id in full, uid: and at
+            least 6 digits of it, its key, or as cache:VEHICLE; or a link.
         right: The same.
         base: A third one, or "defaults" for the firmware's, to see which of the two has moved away from it.
         only: A name or a pattern such as "MC_*"; all others are left out. It may be given again.

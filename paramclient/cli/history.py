@@ -13,7 +13,7 @@ from paramclient.cache import HistoryEntry, ParamCache, SnapshotSummary
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import print_document, print_table
-from paramclient.cli.sources import vehicle_key
+from paramclient.cli.sources import tables_in
 from paramclient.cli.when import parse_time
 from paramclient.errors import UsageError
 from paramclient.notation import hash_text, time_text
@@ -40,7 +40,7 @@ def history(
     With --snapshots, print what was set down of its tables instead, each with its number.
 
     Args:
-        vehicle: Its system id, the beginning of its hardware id, or its key in the cache.
+        vehicle: Its system id, its hardware id in full, uid: and at least 6 digits of it, or its key.
         name: This parameter only.
         component: This component only.
         since: From this time on only: 2h ago, yesterday, '2026-11-20 14:00'.
@@ -53,7 +53,7 @@ def history(
     if name is not None:
         check_name(name)
     with ParamCache(options.cache) as cache:
-        key = vehicle_key(cache, vehicle)
+        key = tables_in(cache, vehicle, None)[0].key
         if snapshots:
             kept = [each for each in cache.snapshots(key, component) if begin is None or each.at >= begin]
             _print_snapshots(kept[-limit:] if limit else kept, options)

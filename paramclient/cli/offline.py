@@ -31,7 +31,7 @@ from paramclient.cli.output import (
     report,
     say,
 )
-from paramclient.cli.sources import is_file, open_file, vehicle_key
+from paramclient.cli.sources import is_file, open_file, tables_in
 from paramclient.cli.written import show_file
 from paramclient.errors import CacheError, UsageError
 from paramclient.identity import autopilot_name
@@ -62,8 +62,9 @@ def show(
     With --changed, exit code 1 says that the firmware's defaults are not known.
 
     Args:
-        vehicle: A parameter file; else a vehicle's system id, the beginning of its hardware id, its key in
-            the cache, or cache: and one of these; or replay:FILE, a telemetry log.
+        vehicle: A parameter file; else a vehicle in the cache: its system id, its hardware id in full, uid:
+            and at least 6 digits of it, or its key, also with cache: before it; or replay:FILE, a telemetry
+            log.
         component: This component only.
         changed: Only what differs from the firmware's defaults.
         names: These parameters of a vehicle only, with what is known of them.
@@ -77,7 +78,7 @@ def show(
     described = from_file(metadata, offline=True)
     is_log = vehicle is not None and vehicle.lower().startswith("replay:")
     with _open(options) if not is_log or vehicle is None else cache_of_log(vehicle) as cache:
-        summaries = _choose(cache, None if is_log else vehicle, component)
+        summaries = tables_in(cache, None if is_log else vehicle, component)
         is_list = vehicle is None and len(summaries) > 1 and not options.json
         tables = [] if is_list else _load(cache, summaries)
     views = [_View.of(table, wanted, described, cache, changed=changed) for table in tables]
@@ -89,7 +90,7 @@ def show(
         print_document(CachedTablesDoc(components=[view.document() for view in views]))
     elif is_list:
         _print_summaries(summaries)
-        say("paramclient show VEHICLE shows one of them: by its system id, or the beginning of its key")
+        say("paramclient show VEHICLE shows one of them: by its system id or its key")
     elif not summaries:
         say(f"the cache {printable(cache.place)} is empty")
     for view in [] if options.json else views:
@@ -133,12 +134,11 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
     """Forget a vehicle: its tables and their history.
 
     Args:
-        vehicle: Its system id, the beginning of its hardware id, or its key in the cache.
+        vehicle: Its system id, its hardware id in full, uid: and at least 6 digits of it, or its key.
         component: This component's table only.
     """
     with _open(options) as cache:
-        _choose(cache, vehicle, component)
-        key = vehicle_key(cache, vehicle)
+        key = tables_in(cache, vehicle, component)[0].key
         removed = cache.remove(key, component)
     if options.json:
         from paramclient.documents.cached import RemovedDoc  # only here: loads pydantic
@@ -187,28 +187,15 @@ def tables_of(options: CacheOptions, vehicle: str, component: int | None) -> lis
     """The cached tables of a vehicle, or that of one of its components.
 
     Raises:
-        CacheError: there is none, more than one vehicle fits, or the cache cannot be read.
+        UnknownVehicle, AmbiguousVehicle: as `tables_in`.
+        CacheError: the cache cannot be read.
     """
     with _open(options) as cache:
-        return _load(cache, _choose(cache, vehicle, component))
+        return _load(cache, tables_in(cache, vehicle, component))
 
 
 def _open(options: CacheOptions) -> ParamCache:
     return ParamCache(options.cache)
-
-
-def _choose(cache: ParamCache, vehicle: str | None, component: int | None) -> list[CachedSummary]:
-    """The tables that the user means.
-
-    Raises:
-        CacheError: a vehicle was named and there is none such, or more than one; or it has no such component.
-    """
-    summaries = cache.components(None if vehicle is None else vehicle_key(cache, vehicle))
-    chosen = [each for each in summaries if component in (None, each.component)]
-    if not chosen and (summaries or vehicle is not None):
-        known = ", ".join(f"{each.system}/{each.component}" for each in summaries)
-        raise CacheError(f"component {component} is not in the cache {cache.place}, which holds {known}")
-    return chosen
 
 
 def _load(cache: ParamCache, summaries: Sequence[CachedSummary]) -> list[CachedComponent]:

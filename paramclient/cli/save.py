@@ -48,7 +48,7 @@ async def save(
 
     Args:
         where: The link, such as udpin:0.0.0.0:14550 or sim:px4; or with no link a vehicle in the cache: its
-            system id, the beginning of its hardware id, or its key.
+            system id, its hardware id in full, uid: and at least 6 digits of it, or its key.
         file: The file. Its ending names the form: .params, .parm, .param, .pck, .json, .yaml.
         form: The form, where the ending does not name it.
         changed: Only what differs from the firmware's defaults.

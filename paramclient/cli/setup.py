@@ -48,7 +48,7 @@ from paramclient.cli.targets import (
 from paramclient.cli.when import parse_when
 from paramclient.cli.written import described
 from paramclient.component import Component
-from paramclient.errors import NoReply, ParamClientError, UsageError
+from paramclient.errors import CacheError, NoReply, ParamClientError, UnknownVehicle, UsageError
 from paramclient.metadata import Metadata
 from paramclient.paramset import ParamSet
 from paramclient.protocol.result import Progress
@@ -283,7 +283,11 @@ async def _state(found: Targets, vehicle: Component, when: str | None, options: 
 def _kept(cache: ParamCache, key: str, component: int, moment: float | None) -> ParamSet:
     if moment is None:
         return before_last_apply(cache, key, component)
-    return cache.state_at(key, component, moment)
+    try:
+        return cache.state_at(key, component, moment)
+    except UnknownVehicle:  # the user named no vehicle of the cache: this one was heard on the link
+        what = f"the cache {cache.place} has no earlier state of {key}, component {component}"
+        raise CacheError(what) from None
 
 
 async def _described(

@@ -3,8 +3,8 @@
 The form of a text alone says which of them it is, and whether there is a file of that name:
 
 1. a file that exists, whatever its name looks like;
-2. `cache:VEHICLE`, a key of the cache (`uid:…`, `system:…`), a system id (`1`), or hexadecimal digits (the
-   beginning of a hardware id, or one with a system id behind it): a vehicle in the cache;
+2. `cache:VEHICLE`, or what can only be the name of a vehicle in the cache (see `paramclient.cache.lookup`):
+   a number is a system id, `uid:` and at least six digits are the beginning of a hardware id;
 3. anything else: a link.
 
 So `./1` is the file and `cache:1` the vehicle, if ever there are both.
@@ -12,7 +12,6 @@ So `./1` is the file and `cache:1` the vehicle, if ever there are both.
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from contextlib import nullcontext, suppress
 from pathlib import Path
@@ -21,11 +20,12 @@ from typing import Final
 import anyio
 
 from paramclient.cache import CachedSummary, ParamCache
+from paramclient.cache.lookup import is_vehicle_name
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import progress_bar, report
 from paramclient.cli.session import Deadline, connect
 from paramclient.component import Component
-from paramclient.errors import CacheError, UsageError
+from paramclient.errors import UnknownVehicle, UsageError
 from paramclient.files import ParamFile, read_file
 from paramclient.files.model import AUTOPILOT
 from paramclient.links import FORMS, parse_link
@@ -43,17 +43,16 @@ __all__ = [
     "open_file",
     "resolve",
     "resolve_all",
-    "vehicle_key",
+    "tables_in",
 ]
 
 SOURCES: Final = f"""\
   FILE                a parameter file that exists
-  cache:VEHICLE       last known of a vehicle: its system id, the beginning of its hardware id, or its key;
-                      without cache: where it can be nothing else, as 1, 0002000000, uid:0002000000
+  cache:VEHICLE       last known of a vehicle: its system id, its hardware id in full, uid: and at least 6
+                      digits of it, or its key; without cache: where it can be nothing else, as 1, uid:000200
 {FORMS}"""
 
 _CACHED: Final = "cache:"
-_VEHICLE: Final = re.compile(rf"{_CACHED}.*|uid:.*|system:.*|[0-9]+|[0-9a-fA-F]{{4,}}(/[0-9]*)?")
 
 
 async def resolve(text: str, options: LinkOptions) -> ParamSet:
@@ -69,7 +68,9 @@ async def resolve(text: str, options: LinkOptions) -> ParamSet:
     Raises:
         UsageError: it is none of the three; a file that cannot be read (FileError); options that exclude
             each other.
-        CacheError: the cache has no such vehicle or component, more than one, or not its whole table.
+        UnknownVehicle: the cache has no such vehicle or component.
+        AmbiguousVehicle: several vehicles in the cache have this name.
+        CacheError: the cache does not have its whole table.
         VehicleError: some parameters did not come; the text names them.
         NoReply: nobody was heard, or answered.
         LinkError: the link cannot be opened, or failed.
@@ -120,7 +121,7 @@ def is_file(text: str) -> bool:
 
 def names_vehicle(text: str) -> bool:
     """Whether a word of the user names a vehicle in the cache. It need not be there."""
-    return _VEHICLE.fullmatch(text) is not None
+    return text.startswith(_CACHED) or is_vehicle_name(text)
 
 
 def check_link(text: str) -> None:
@@ -172,26 +173,31 @@ def choose(file: ParamFile, component: int | None, system: int | None) -> ParamS
     return file.choose(component, system=system if is_of_several else None)
 
 
-def vehicle_key(cache: ParamCache, vehicle: str) -> str:
-    """The key of the vehicle that the user means: by its system id, the beginning of its hardware id, or key.
+def tables_in(cache: ParamCache, vehicle: str | None, component: int | None) -> list[CachedSummary]:
+    """Return the tables in the cache that the user means. All commands find cached vehicles by this function.
 
-    `cache:` may stand before each of them.
+    Args:
+        cache: the cache.
+        vehicle: the vehicle as the user names it, also with `cache:` before it; None for all vehicles.
+        component: the table of this component only.
 
     Raises:
-        UsageError: nothing is named, as by an empty variable of a script; every id begins with nothing.
-        CacheError: none fits, or more than one.
+        UsageError: the name is empty, as an unset variable of a script is.
+        UnknownVehicle: no vehicle in the cache has this name, or none of its tables is of this component.
+        AmbiguousVehicle: several vehicles have this name.
     """
-    vehicle = vehicle.removeprefix(_CACHED)
-    if not vehicle:
+    name = None if vehicle is None else vehicle.removeprefix(_CACHED)
+    if name == "":
         raise UsageError("a vehicle in the cache needs a name: its system id, its hardware id, or its key")
-    if vehicle.isdecimal():
-        fits = [known for known in cache.vehicles() if str(known.identity.system) == vehicle]
-        if len(fits) > 1:
-            listed = "; ".join(map(str, fits))
-            raise CacheError(f"system {vehicle} fits more than one vehicle in the cache: {listed}")
-        if fits:
-            return fits[0].key
-    return cache.components(vehicle)[0].key
+    known = cache.components(name)
+    chosen = [each for each in known if component in (None, each.component)]
+    if not chosen and (known or vehicle is not None):
+        held = [f"{each.system}/{each.component} ({each.key})" for each in known]
+        raise UnknownVehicle(
+            f"component {component} is not in the cache {cache.place}, which holds {', '.join(held)}",
+            vehicles=held,
+        )
+    return chosen
 
 
 def _from_file(path: str, options: LinkOptions) -> ParamSet:
@@ -202,21 +208,12 @@ def _from_cache(vehicle: str, options: LinkOptions) -> ParamSet:
     if options.place is False:
         raise UsageError(f"{vehicle!r} is a vehicle in the cache, and --no-cache excludes that")
     with ParamCache(options.cache) as cache:
-        key = vehicle_key(cache, vehicle)
-        return cached_set(cache, key, _component(cache.components(key), options.component))
-
-
-def _component(summaries: Sequence[CachedSummary], component: int | None) -> int:
-    """The component that the user means, of those of one vehicle."""
-    by_id = {each.component: each for each in summaries}
-    if component is None:
-        component = AUTOPILOT if AUTOPILOT in by_id or len(by_id) > 1 else next(iter(by_id))
-    if component not in by_id:
-        raise CacheError(
-            f"component {component} of {summaries[0].key} is not in the cache, which holds "
-            f"{', '.join(map(str, sorted(by_id)))}"
-        )
-    return component
+        tables = tables_in(cache, vehicle, options.component)
+        table = next((each for each in tables if each.component == AUTOPILOT), tables[0])
+        if options.component is None and len(tables) > 1 and table.component != AUTOPILOT:
+            known = ", ".join(f"{each.system}/{each.component}" for each in tables)
+            raise UsageError(f"no autopilot is among {known}; choose with --component")
+        return cached_set(cache, table.key, table.component)
 
 
 async def _from_link(url: str, options: LinkOptions, *, is_alone: bool) -> ParamSet:

@@ -6,6 +6,7 @@ from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 from paramclient.errors import (
+    AmbiguousVehicle,
     AnotherVehicle,
     CacheError,
     CommandRefused,
@@ -17,6 +18,7 @@ from paramclient.errors import (
     Refused,
     TypeMismatch,
     UnknownParameter,
+    UnknownVehicle,
     UsageError,
     ValueNotApplied,
     VehicleArmed,
@@ -69,6 +71,10 @@ def _whom(problem: Problem) -> dict[str, Any]:
     }
 
 
+def _vehicles(problem: Problem) -> tuple[str, ...]:
+    return tuple(map(str, problem["vehicles"]))
+
+
 def _no_reply(detail: str, problem: Problem) -> NoReply:
     return NoReply(
         str(problem["awaited"]), attempts=int(problem["attempts"]), waited=float(problem["waited"])
@@ -102,6 +108,8 @@ _MAKERS: Final[dict[str, Callable[[str, Problem], ParamClientError]]] = {
     "UsageError": lambda detail, problem: UsageError(detail),
     "FileError": lambda detail, problem: FileError(detail),
     "InvalidParameters": lambda detail, problem: InvalidParameters(dict(problem["problems"])),
+    "UnknownVehicle": lambda detail, problem: UnknownVehicle(detail, vehicles=_vehicles(problem)),
+    "AmbiguousVehicle": lambda detail, problem: AmbiguousVehicle(detail, vehicles=_vehicles(problem)),
     "UnknownParameter": lambda detail, problem: UnknownParameter(detail, **_whom(problem)),
     "TypeMismatch": lambda detail, problem: TypeMismatch(detail, **_whom(problem)),
     "VehicleArmed": lambda detail, problem: VehicleArmed(detail, **_whom(problem)),

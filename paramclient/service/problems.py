@@ -19,6 +19,7 @@ from starlette.routing import Match
 
 from paramclient.documents.problem import Problem
 from paramclient.errors import (
+    AmbiguousVehicle,
     CacheError,
     ClientClosed,
     FileError,
@@ -30,6 +31,7 @@ from paramclient.errors import (
     PackError,
     ParamClientError,
     UnknownParameter,
+    UnknownVehicle,
     UsageError,
     VehicleError,
 )
@@ -212,6 +214,8 @@ _KINDS: Final[dict[type[ParamClientError], tuple[int, str | None]]] = {
     InvalidParameters: (422, None),
     MetadataError: (422, None),
     PackError: (422, None),
+    UnknownVehicle: (404, None),
+    AmbiguousVehicle: (409, None),
     UsageError: (422, "usage"),
     ParamClientError: (500, None),
 }

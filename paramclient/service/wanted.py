@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeVar
 from pydantic import BeforeValidator, Field, model_validator
 
 from paramclient.documents.base import Body
-from paramclient.errors import CacheError, UsageError
+from paramclient.errors import CacheError, UnknownVehicle, UsageError
 from paramclient.files import FileForm, ParamFile, loads
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.provision.looking import identified
@@ -265,7 +265,7 @@ async def known_to(hub: Hub, look: Callable[[], Result]) -> Result:
     """What the cache knows. That it does not is no failure of the disk: that was read just now."""
     try:
         return await hub.aside(look)
-    except CacheError as error:
+    except (CacheError, UnknownVehicle) as error:  # the latter where another program has just removed it
         raise ServiceError(404, "unknown-state", str(error), error=type(error).__name__) from error
 
 

@@ -1,0 +1,121 @@
+"""Vehicles in the cache by name: system id, hardware id or key.
+
+The only place that decides which vehicle a name means. In this order:
+
+1. A key, as `Identity.key` has it.
+2. One to three decimal digits: a system id, and nothing else.
+3. `uid:` and at least six hexadecimal digits: the beginning of a hardware id. `/` and a system id may follow
+   for a hardware id that many vehicles share.
+4. Four or more hexadecimal digits: a hardware id in full, also when all of its digits are decimal.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from typing import Final
+
+from paramclient.cache.records import CachedVehicle
+from paramclient.errors import AmbiguousVehicle, UnknownVehicle
+
+__all__ = ["find_vehicle", "is_vehicle_name"]
+
+PREFIX_DIGITS_MIN: Final = 6
+"""Hexadecimal digits that the beginning of a hardware id has at least: fewer fit by accident, as those of a
+system id do."""
+LISTED_MAX: Final = 50
+"""Vehicles that an error message lists. A station with more has `paramclient cache list`."""
+
+_SYSTEM_ID: Final = re.compile(r"[0-9]{1,3}")
+_UID: Final = re.compile(r"(?P<prefix>uid:)?(?P<digits>[0-9a-f]+)(/(?P<system>[0-9]{1,3}))?", re.IGNORECASE)
+_NAME: Final = re.compile(r"uid:.*|system:.*|[0-9]+|[0-9a-f]{4,}(/[0-9]*)?", re.IGNORECASE)
+
+
+def is_vehicle_name(text: str) -> bool:
+    """Return whether a text can only be the name of a vehicle. The cache need not have that vehicle."""
+    return _NAME.fullmatch(text) is not None
+
+
+def find_vehicle(
+    kept: Sequence[CachedVehicle],
+    name: str | None,
+    *,
+    place: str,
+    system: int | None = None,
+    component: int | None = None,
+) -> CachedVehicle:
+    """Return the only vehicle of the cache that fits.
+
+    Args:
+        kept: the vehicles in the cache.
+        name: a system id, a hardware id or a key, see above; None for any.
+        place: the cache, for messages.
+        system: only a vehicle with this system id.
+        component: only a vehicle of which the table of this component is kept.
+
+    Raises:
+        UnknownVehicle: none fits, or the name can be no vehicle's.
+        AmbiguousVehicle: several fit.
+    """
+    named, problem = (kept, None) if name is None else _named(kept, name)
+    fits = [
+        known
+        for known in named
+        if system in (None, known.identity.system) and (component is None or component in known.components)
+    ]
+    if len(fits) == 1:
+        return fits[0]
+    conditions = {"vehicle": name, "system": system, "component": component}
+    wanted = ", ".join(f"{what} {value}" for what, value in conditions.items() if value is not None)
+    if fits:
+        raise AmbiguousVehicle(
+            f"{wanted or 'no name'} fits {len(fits)} vehicles in the cache {place}:{_listed(fits)}\n"
+            "Choose one by its key.",
+            vehicles=tuple(map(str, fits)),
+        )
+    reason = "" if problem is None else f": {problem}"
+    raise UnknownVehicle(
+        f"{wanted} is not in the cache {place}{reason}. The cache holds "
+        + (f"{_number(kept)}:{_listed(kept)}" if kept else "no vehicle."),
+        vehicles=tuple(map(str, kept)),
+    )
+
+
+def _named(kept: Sequence[CachedVehicle], name: str) -> tuple[Sequence[CachedVehicle], str | None]:
+    """Return the vehicles that a name fits, and why it fits none where the name itself is the reason."""
+    if same := [known for known in kept if known.key == name]:
+        return same, None
+    if _SYSTEM_ID.fullmatch(name):
+        is_valid = 1 <= int(name) <= 255
+        problem = f"no vehicle has system id {int(name)}" if is_valid else "system ids are 1 to 255"
+        return [known for known in kept if known.identity.system == int(name)], problem
+    uid = _UID.fullmatch(name)
+    if uid is None:
+        if name.lower().startswith("uid:"):
+            return [], "a hardware id has hexadecimal digits"
+        return [], None
+    digits = uid["digits"].lower()
+    candidates = [
+        known
+        for known in kept
+        if known.identity.uid is not None
+        and (uid["system"] is None or known.key == f"uid:{known.identity.uid}/{int(uid['system'])}")
+    ]
+    if same := [known for known in candidates if known.identity.uid == digits]:
+        return same, None
+    if uid["prefix"] is None:
+        return [], f"{name} is neither a system id nor a hardware id in full; uid: goes before a part of one"
+    if len(digits) < PREFIX_DIGITS_MIN:
+        return [], f"uid: takes at least {PREFIX_DIGITS_MIN} digits of a hardware id"
+    return [known for known in candidates if (known.identity.uid or "").startswith(digits)], None
+
+
+def _number(vehicles: Sequence[CachedVehicle]) -> str:
+    return f"{len(vehicles)} vehicle{'' if len(vehicles) == 1 else 's'}"
+
+
+def _listed(vehicles: Sequence[CachedVehicle]) -> str:
+    """Return a line for each vehicle."""
+    lines = [f"\n  {known}" for known in vehicles[:LISTED_MAX]]
+    more = len(vehicles) - len(lines)
+    return "".join(lines) + (f"\n  and {more} more; `paramclient cache list` shows all" if more else "")
