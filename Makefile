@@ -8,6 +8,7 @@
 #   make scale      250 systems on one link        make fuzz       each target of fuzz/ for a while
 #   make soak       10,000 sessions at random      make clean      remove all that was made
 #   make screenshots  what the page looks like, into docs/images
+#   make live LINK=udpin:127.0.0.1:14550   checks on a real vehicle, which must be disarmed
 
 PYTHON ?= $(shell for python in python3 python3.14 python3.13 python3.12 python3.11; do \
 	"$$python" -c $(IS_NEW_ENOUGH) 2>/dev/null && echo "$$python" && break; done)
@@ -20,12 +21,19 @@ TESTS ?=
 SESSIONS ?= 10000
 TARGETS ?= cache component files framer metadata pack signing tlog
 SECONDS ?= 1800
+LINK ?=
+KIND ?=
+SYSTEM ?=
+ONLY ?=
+LINK2 ?=
+READ_ONLY ?=
+REBOOT ?=
 
 MEASURED = 'protocol/*' 'sim/*' 'cache/*' 'files/*' values.py errors.py identity.py params.py paramset.py
 # they start programs of their own, which are not measured, are about rooms that are not, or go where others have been
 UNMEASURED = $(addprefix --ignore=tests/test_,bench.py cli.py docs.py examples.py links.py machine.py packaging.py)
 
-.PHONY: demo test coverage soak fuzz lint docs screenshots bench cost scale peers dist clean
+.PHONY: demo test coverage soak live fuzz lint docs screenshots bench cost scale peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -43,6 +51,12 @@ coverage: $(VENV)/with-test
 
 soak: $(VENV)/with-test
 	$(BIN)/python -m tests.soak --sessions $(SESSIONS)
+
+# without LINK it says how to call it; see docs/testing.md
+live: $(VENV)/with-test
+	@$(BIN)/python -m tests.live $(LINK) $(if $(KIND),--kind $(KIND)) $(if $(SYSTEM),--system $(SYSTEM)) \
+		$(if $(ONLY),--only '$(ONLY)') $(if $(LINK2),--second-link $(LINK2)) \
+		$(if $(filter yes,$(READ_ONLY)),--read-only) $(if $(filter yes,$(REBOOT)),--reboot)
 
 # one after the other; what reaches something new is put into fuzz/corpus, what breaks something into fuzz/findings;
 # `python -m fuzz.keep TARGET` leaves of a corpus what is needed

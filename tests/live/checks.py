@@ -1,0 +1,561 @@
+"""The checks, in the order in which they are made."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import statistics
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
+from contextlib import asynccontextmanager
+from functools import partial
+from typing import Final
+
+import anyio
+
+from paramclient import Component, FetchResult, Ftp, ParamClient
+from paramclient.errors import (
+    FileTransferError,
+    NoReply,
+    ParamClientError,
+    Refused,
+    UnknownParameter,
+    UsageError,
+    ValueNotApplied,
+)
+from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, message_name
+from paramclient.values import ParamType, type_name
+from tests.live.choice import another_value
+from tests.live.relay import FILE_TRANSFER_ID, LIST_REQUEST_ID, Conditions
+from tests.live.session import Check, CheckFailed, Measured, Session, Skip
+
+__all__ = ["checks"]
+
+NO_SUCH_NAME: Final = "NO_SUCH_PARAM"
+READS: Final = 10
+"""Single reads of which the median counts."""
+FRACTION: Final = 0.1
+"""What is added to a float32 parameter so that its value has to be rounded."""
+SEEN_TIMEOUT: Final = 3.0
+"""Seconds in which another session has to learn of a change."""
+PARAMETER_FILE: Final = "@PARAM/param.pck"
+RADIO_RATE: Final = 5760.0
+"""Bytes per second at 57600 baud."""
+SLOWEST_FETCH: Final = 240.0
+"""Seconds after which a fetch over a bad link is given up."""
+KILLED_WITHIN: Final = 20.0
+"""Seconds for another program to open the parameter file and to be killed."""
+
+CLEAN_FETCH: Final[Mapping[str, float]] = {"ardupilot": 0.6, "px4": 1.0}
+"""Seconds that a fetch takes at most on a clean link, by autopilot."""
+LOSSY_FETCH: Final[Mapping[tuple[str, float], float]] = {
+    ("ardupilot", 0.05): 1.3,
+    ("ardupilot", 0.20): 2.0,
+    ("px4", 0.05): 1.5,
+    ("px4", 0.20): 2.0,
+}
+"""Seconds that a fetch takes at most with a round trip of 100 ms, by autopilot and share lost."""
+LOSSY_LIST: Final[Mapping[float, float]] = {0.05: 3.5, 0.20: 6.0}
+"""The same by list, of ArduPilot."""
+
+spawn = multiprocessing.get_context("spawn")
+
+
+def checks(*, reboots: bool) -> Iterator[Check]:
+    """Give every check in order.
+
+    Args:
+        reboots: whether the vehicle is restarted too.
+    """
+    yield Check("fetch, nothing known", fetch_cold, "every value right", CLEAN_FETCH)
+    yield Check("fetch again at once", fetch_again, "as quick as the first", CLEAN_FETCH)
+    yield Check(
+        "fetch in a new session, cached",
+        fetch_warm,
+        "PX4: confirmed by its hash, nothing downloaded",
+        {"px4": 0.3, "ardupilot": 0.6},
+    )
+    yield Check("fetch, refreshed", fetch_refreshed, "downloaded whatever is cached", CLEAN_FETCH)
+    yield Check("get by name", partial(get_some, by_name=True), "the value in the table")
+    yield Check("get by index", partial(get_some, by_name=False), "the value in the table")
+    yield Check("get of an unknown name", get_unknown, "UnknownParameter")
+    for number in (ParamType.INT8, ParamType.INT16, ParamType.INT32, ParamType.REAL32):
+        yield Check(
+            f"set, {type_name(number)}",
+            partial(set_one, number=number),
+            "accepted, and read back",
+            writes=True,
+        )
+    yield Check("set, rounded to float32", set_rounded, "accepted as the nearest float32", writes=True)
+    yield Check(
+        "set, a fraction for an integer",
+        set_fraction,
+        "ArduPilot: adjusted; PX4: UsageError, nothing sent",
+        writes=True,
+        kinds=("ardupilot", "px4"),
+    )
+    yield Check("set, refused", set_refused, "Refused with the reason", writes=True, kinds=("ardupilot",))
+    yield Check("set of an unknown name", set_unknown, "UnknownParameter")
+    yield Check(
+        "30 sets at once",
+        set_many,
+        "each accepted, and read back",
+        {"ardupilot": 1.0, "px4": 1.0},
+        writes=True,
+    )
+    yield Check(
+        "a group shown and hidden",
+        show_group,
+        "its members come and go with the switch",
+        writes=True,
+        kinds=("ardupilot",),
+    )
+    yield Check("MAVFTP, list of the root", list_root, "its entries")
+    yield Check(
+        "MAVFTP, parameter file three times", read_file, "one time like the other", kinds=("ardupilot",)
+    )
+    yield Check("MAVFTP, a file that is not there", read_missing, "FileTransferError, and is_not_found")
+    yield Check(
+        "fetch after a program was killed in a transfer",
+        fetch_after_kill,
+        "by list at once, or by file when the session has ended",
+        {"ardupilot": 4.0},
+        kinds=("ardupilot",),
+    )
+    yield Check("two sessions, fetch at the same time", fetch_in_two, "every value right in both")
+    yield Check(
+        "two sessions, a change in one",
+        see_change,
+        "the other is told of it",
+        {"ardupilot": 1.0, "px4": 1.0},
+        writes=True,
+    )
+    yield from lossy_checks()
+    if reboots:
+        yield Check("reboot", reboot, "the same vehicle is back, with the value that was set", writes=True)
+
+
+def lossy_checks() -> Iterator[Check]:
+    """Give the checks behind a bad link."""
+    for loss in (0.0, 0.05, 0.20):
+        for trip in (0.02, 0.1):
+            conditions = Conditions(loss=loss, round_trip=trip, seed=1)
+            name = f"fetch, {loss:.0%} loss, {trip * 1000:.0f} ms"
+            seconds = {
+                kind: limit for (kind, share), limit in LOSSY_FETCH.items() if share == loss and trip == 0.1
+            }
+            yield Check(name, partial(fetch_under, conditions=conditions), "every value right", seconds)
+    for loss in (0.05, 0.20):
+        conditions = Conditions(loss=loss, round_trip=0.1, seed=1, refuses_files=True)
+        yield Check(
+            f"fetch by list, {loss:.0%} loss, 100 ms",
+            partial(fetch_under, conditions=conditions),
+            "every value right",
+            {"ardupilot": LOSSY_LIST[loss]},
+            kinds=("ardupilot",),
+        )
+    for number, kinds in (
+        (AUTOPILOT_VERSION_ID, None),
+        (FILE_TRANSFER_ID, ("ardupilot",)),
+        (LIST_REQUEST_ID, ("px4",)),
+    ):
+        conditions = Conditions(round_trip=0.1, loses_first=frozenset({number}))
+        yield Check(
+            f"fetch, first {message_name(number)} lost, 100 ms",
+            partial(fetch_under, conditions=conditions),
+            "one round trip more, and the same way",
+            {"ardupilot": 1.3, "px4": 1.5},
+            kinds=kinds,
+        )
+    radio = Conditions(rate=RADIO_RATE, drops_telemetry=True)
+    yield Check("fetch, 57600 baud", partial(fetch_under, conditions=radio), "every value right")
+    worst = Conditions(loss=0.20, round_trip=0.1, seed=2)
+    yield Check(
+        "10 sets, 20% loss, 100 ms",
+        partial(set_under, conditions=worst),
+        "each accepted, and read back",
+        writes=True,
+    )
+
+
+# Fetching
+
+
+async def fetch_cold(session: Session) -> Measured:
+    async with session.client() as vehicle:
+        return await fetch(session, vehicle)
+
+
+async def fetch_again(session: Session) -> Measured:
+    async with session.client() as vehicle:
+        await fetch(session, vehicle)
+        return await fetch(session, vehicle)
+
+
+async def fetch_warm(session: Session) -> Measured:
+    cache = session.folder / "warm.sqlite3"
+    async with session.client(cache=cache) as vehicle:
+        await fetch(session, vehicle)
+    async with session.client(cache=cache) as vehicle:
+        return await fetch(session, vehicle)
+
+
+async def fetch_refreshed(session: Session) -> Measured:
+    cache = session.folder / "refreshed.sqlite3"
+    async with session.client(cache=cache) as vehicle:
+        await fetch(session, vehicle)
+        measured = await fetch(session, vehicle, refresh=True)
+    if "cache" in measured.text:
+        raise CheckFailed("nothing was downloaded")
+    return measured
+
+
+async def fetch(session: Session, vehicle: Component, *, refresh: bool = False) -> Measured:
+    """Fetch everything, and compare it with the state before."""
+    result = await vehicle.fetch_all(refresh=refresh, timeout=SLOWEST_FETCH)
+    await vehicle.refreshed(timeout=SLOWEST_FETCH)
+    await session.check_fetched(vehicle, result)
+    return told(result)
+
+
+def told(result: FetchResult) -> Measured:
+    way = {"ftp": "by file", "stream": "by list", "cache": "from the cache"}[result.source]
+    return Measured(f"{result.received} in {result.elapsed:.2f} s {way}", result.elapsed)
+
+
+async def fetch_under(session: Session, *, conditions: Conditions) -> Measured:
+    async with session.under(conditions), session.client() as vehicle:
+        return await fetch(session, vehicle)
+
+
+async def fetch_after_kill(session: Session) -> Measured:
+    process = spawn.Process(target=_open_file_and_die, args=(session.relay.link, session.system))
+    process.start()
+    with anyio.move_on_after(KILLED_WITHIN):
+        while process.is_alive():  # noqa: ASYNC110 - a process tells nobody of its end
+            await anyio.sleep(0.02)
+    has_opened = process.exitcode == 0
+    process.kill()
+    process.join()
+    if not has_opened:
+        raise Skip("the vehicle serves no parameter file")
+    async with session.client() as vehicle:
+        return await fetch(session, vehicle)
+
+
+def _open_file_and_die(link: str, system: int) -> None:
+    """Begin to read the parameter file, and end without a word while it comes. Exit code 0 when it came."""
+
+    def die(received: int, size: int | None) -> None:
+        if received:
+            os._exit(0)
+
+    async def read() -> None:
+        async with ParamClient(link, cache=False, component=192) as client:
+            vehicle = await client.component(system)
+            await client.ftp(vehicle).read(PARAMETER_FILE, progress=die)
+
+    try:
+        anyio.run(read)
+    finally:
+        os._exit(1)
+
+
+# Single reads
+
+
+async def get_some(session: Session, *, by_name: bool) -> Measured:
+    listed = [param for param in session.journal.before.values() if param.index is not None]
+    chosen = listed[:: max(1, len(listed) // READS)][:READS]
+    seconds: list[float] = []
+    async with session.client() as vehicle:
+        for param in chosen:
+            assert param.index is not None
+            began = time.monotonic()
+            held = await vehicle.get(param.name if by_name else param.index)
+            seconds.append(time.monotonic() - began)
+            if held.name != param.name or not (
+                held.same_value(param) or session.journal.moves_by_itself(param.name)
+            ):
+                raise CheckFailed(f"{param} came as {held}")
+    middle = statistics.median(seconds)
+    return Measured(f"{middle * 1000:.0f} ms, slowest of {len(seconds)} {max(seconds) * 1000:.0f} ms")
+
+
+async def get_unknown(session: Session) -> Measured:
+    async with session.client() as vehicle:
+        await vehicle.get(0)  # what follows is not about who the vehicle is
+        return await expect(UnknownParameter, lambda: vehicle.get(NO_SUCH_NAME))
+
+
+async def expect(error: type[ParamClientError], call: Callable[[], Awaitable[object]]) -> Measured:
+    """Call, and see that it ends with this error."""
+    began = time.monotonic()
+    try:
+        made = await call()
+    except error as raised:
+        seconds = time.monotonic() - began
+        return Measured(f"{type(raised).__name__} after {seconds:.2f} s")
+    raise CheckFailed(f"no error, but {made}")
+
+
+# Single writes
+
+
+async def set_one(session: Session, *, number: ParamType) -> Measured:
+    name = session.choice.by_type.get(number)
+    if name is None:
+        raise Skip(f"no harmless parameter of type {type_name(number)}")
+    async with session.client() as vehicle:
+        param = await vehicle.get(name)
+        value = another_value(param)
+        began = time.monotonic()
+        done = await session.journal.set(vehicle, name, value)
+        seconds = time.monotonic() - began
+        held = await vehicle.get(name)
+        await put_back(session, vehicle)
+    if done.adjusted or held.value != value:
+        raise CheckFailed(f"{name} set to {value} is {held.value!r}, {done.status}")
+    return Measured(f"{name} {param.value!r} to {value} in {seconds * 1000:.0f} ms")
+
+
+async def set_rounded(session: Session) -> Measured:
+    name = session.choice.by_type.get(ParamType.REAL32)
+    if name is None:
+        raise Skip("no harmless parameter of type REAL32")
+    async with session.client() as vehicle:
+        param = await vehicle.get(name)
+        assert isinstance(param.value, float)
+        done = await session.journal.set(vehicle, name, param.value + FRACTION)
+        held = await vehicle.get(name)
+        await put_back(session, vehicle)
+    if done.adjusted or not held.same_value(done.param):
+        raise CheckFailed(f"{name} set to {done.requested!r} is {held.value!r}, {done.status}")
+    return Measured(f"{name} to {done.requested!r} is {held.value!r}")
+
+
+async def set_fraction(session: Session) -> Measured:
+    types = (ParamType.INT16, ParamType.INT32)
+    name = next((session.choice.by_type[each] for each in types if each in session.choice.by_type), None)
+    if name is None:
+        raise Skip("no harmless integer parameter")
+    async with session.client() as vehicle:
+        param = await vehicle.get(name)
+        assert isinstance(param.value, int)
+        wanted = another_value(param) + 0.7
+        try:
+            done = await session.journal.set(vehicle, name, wanted)
+        except UsageError as error:
+            if session.kind != "px4":
+                raise CheckFailed(f"{name} to {wanted}: {error}") from error
+            held = await vehicle.get(name)
+            if not held.same_value(param):
+                raise CheckFailed(f"refused before it was sent, and yet {name} is {held.value!r}") from error
+            return Measured(f"{name} to {wanted}: UsageError")
+        finally:
+            await put_back(session, vehicle)
+    if session.kind == "px4" or not done.adjusted or done.actual != int(wanted):
+        raise CheckFailed(f"{name} set to {wanted} is {done.actual!r}, {done.status}")
+    return Measured(f"{name} to {wanted} is adjusted to {done.actual!r}")
+
+
+async def set_refused(session: Session) -> Measured:
+    name = session.choice.read_only
+    if name is None:
+        raise Skip("no parameter is known that the vehicle would refuse to change")
+    async with session.client() as vehicle:
+        param = await vehicle.get(name)
+        began = time.monotonic()
+        try:
+            await session.journal.set(vehicle, name, another_value(param))
+        except Refused as error:
+            return Measured(f"{name}: {error.reason} after {time.monotonic() - began:.2f} s")
+        except ValueNotApplied as error:
+            raise CheckFailed(f"{name}: {error}") from error
+        finally:
+            await put_back(session, vehicle)
+    raise Skip(f"this firmware lets {name} be changed")
+
+
+async def set_unknown(session: Session) -> Measured:
+    async with session.client() as vehicle:
+        await vehicle.get(0)
+        return await expect(UnknownParameter, lambda: vehicle.set(NO_SUCH_NAME, 1))
+
+
+# Many writes
+
+
+async def set_many(session: Session) -> Measured:
+    async with session.client() as vehicle:
+        await vehicle.fetch_all(timeout=SLOWEST_FETCH)
+        return await set_all(session, vehicle, session.choice.many)
+
+
+async def set_under(session: Session, *, conditions: Conditions) -> Measured:
+    async with session.under(conditions), session.client() as vehicle:
+        return await set_all(session, vehicle, session.choice.many[:10])
+
+
+async def set_all(session: Session, vehicle: Component, names: tuple[str, ...]) -> Measured:
+    """Set parameters side by side, read them back, and put them back."""
+    if not names:
+        raise Skip("no harmless parameters")
+    wanted = {name: another_value(session.journal.before[name]) for name in names}
+    began = time.monotonic()
+    async with anyio.create_task_group() as tasks:
+        for name, value in wanted.items():
+            tasks.start_soon(session.journal.set, vehicle, name, value)
+    seconds = time.monotonic() - began
+    wrong = [str(held) for name in names if (held := await vehicle.get(name)).value != wanted[name]]
+    await put_back(session, vehicle)
+    if wrong:
+        raise CheckFailed(f"{len(wrong)} of {len(names)} have another value: {', '.join(wrong[:5])}")
+    return Measured(f"{len(names)} in {seconds:.2f} s", seconds)
+
+
+async def show_group(session: Session) -> Measured:
+    tried: list[str] = []
+    async with session.client() as vehicle:
+        whole = await vehicle.fetch_all(timeout=SLOWEST_FETCH)
+        for switch in session.choice.groups:
+            await session.journal.set(vehicle, switch, 1)
+            shown = await vehicle.fetch_all(refresh=True, timeout=SLOWEST_FETCH)
+            await put_back(session, vehicle)
+            members = shown.params.keys() - whole.params.keys()
+            if not members:
+                tried.append(switch)
+                continue
+            hidden = await vehicle.fetch_all(refresh=True, timeout=SLOWEST_FETCH)
+            if not (whole.count + len(members) == shown.count and hidden.count == whole.count):
+                counts = f"{whole.count}, {shown.count}, {hidden.count}"
+                raise CheckFailed(f"{switch} shows {len(members)}, and the vehicle counts {counts}")
+            await session.check_fetched(vehicle, hidden)
+            return Measured(f"{switch}: {whole.count}, {shown.count}, {hidden.count} parameters")
+    raise Skip(f"none of these shows a group: {', '.join(tried)}" if tried else "no switch of a group is off")
+
+
+async def put_back(session: Session, vehicle: Component) -> None:
+    """Put back what this check has changed. What fails here is tried again at the end of the suite."""
+    if problems := await session.journal.put_back(vehicle):
+        raise CheckFailed("; ".join(problems))
+
+
+# Files
+
+
+async def list_root(session: Session) -> Measured:
+    async with session.client() as vehicle:
+        await vehicle.get(0)
+        try:
+            began = time.monotonic()
+            entries = await Ftp(vehicle).list("/")
+        except FileTransferError as error:
+            raise Skip(f"the vehicle does not list it: {error.reason}") from error
+        except NoReply as error:
+            raise Skip("the vehicle does not answer MAVFTP") from error
+    return Measured(f"{len(entries)} entries in {time.monotonic() - began:.2f} s")
+
+
+async def read_file(session: Session) -> Measured:
+    seconds: list[float] = []
+    sizes: set[int] = set()
+    async with session.client() as vehicle:
+        await vehicle.get(0)
+        for _ in range(3):
+            began = time.monotonic()
+            try:
+                sizes.add(len(await Ftp(vehicle).read(PARAMETER_FILE)))
+            except (FileTransferError, NoReply) as error:
+                if seconds:
+                    raise
+                raise Skip(f"the vehicle serves no parameter file: {error}") from error
+            seconds.append(time.monotonic() - began)
+    told = ", ".join(f"{each:.2f}" for each in seconds)
+    if max(seconds) > 2 * min(seconds) + 0.2:
+        raise CheckFailed(f"{told} s: it does not take the same time again")
+    return Measured(f"{max(sizes)} bytes in {told} s")
+
+
+async def read_missing(session: Session) -> Measured:
+    async with session.client() as vehicle:
+        await vehicle.get(0)
+        try:
+            await Ftp(vehicle).read("/no-such-file")
+        except FileTransferError as error:
+            if not error.is_not_found:
+                raise CheckFailed(f"{error.reason} (errno {error.errno})") from error
+            return Measured(error.reason)
+        except NoReply as error:
+            raise Skip("the vehicle does not answer MAVFTP") from error
+    raise CheckFailed("the file was read")
+
+
+# Two sessions
+
+
+async def fetch_in_two(session: Session) -> Measured:
+    results: list[Measured] = []
+
+    async def fetch_in(vehicle: Component) -> None:
+        results.append(await fetch(session, vehicle))
+
+    async with (
+        session.client() as first,
+        second_client(session) as second,
+        anyio.create_task_group() as tasks,
+    ):
+        tasks.start_soon(fetch_in, first)
+        tasks.start_soon(fetch_in, second)
+    return Measured(" and ".join(result.text for result in results))
+
+
+async def see_change(session: Session) -> Measured:
+    name = next(iter(session.choice.by_type.values()), None)
+    if name is None:
+        raise Skip("no harmless parameter")
+    async with session.client() as first, second_client(session) as second:
+        known = await first.get(name)
+        await second.get(name)
+        changes = second.changes()
+        value = another_value(known)
+        began = time.monotonic()
+        await session.journal.set(first, name, value)
+        seen = False
+        with anyio.move_on_after(SEEN_TIMEOUT):
+            async for change in changes:
+                if change.name == name and change.new is not None and change.new.value == value:
+                    seen = True
+                    break
+        seconds = time.monotonic() - began
+        await put_back(session, first)
+    if not seen:
+        raise CheckFailed(f"the other session has not heard of {name} in {SEEN_TIMEOUT:.0f} s")
+    return Measured(f"after {seconds * 1000:.0f} ms", seconds)
+
+
+@asynccontextmanager
+async def second_client(session: Session) -> AsyncIterator[Component]:
+    """Open another session: on the second link where there is one, else behind the same relay."""
+    async with session.client(link=session.second_link or "", component=191) as vehicle:
+        yield vehicle
+
+
+# A restart
+
+
+async def reboot(session: Session) -> Measured:
+    name = next(iter(session.choice.by_type.values()), None)
+    if name is None:
+        raise Skip("no harmless parameter")
+    async with session.client() as vehicle:
+        value = another_value(await vehicle.get(name))
+        await session.journal.set(vehicle, name, value)
+        began = time.monotonic()
+        vehicle = await vehicle.reboot()
+        seconds = time.monotonic() - began
+        held = await vehicle.get(name)
+        await put_back(session, vehicle)
+    if held.value != value:
+        raise CheckFailed(f"{name} was set to {value} before the restart, and is {held.value!r}")
+    return Measured(f"back after {seconds:.1f} s, {name} is {value}")
