@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from paramclient.protocol.pacing import (
+    BATCHED_RATE,
     FIRST_RATE,
     LARGEST_RATE,
     QUEUEING,
@@ -81,6 +82,22 @@ def test_it_stays_near_what_is_served() -> None:
     assert FIRST_RATE <= pace.rate < 400.0
     # and a request waits for the others that are before it, not for ever
     assert pace.next_at() < end + 1.0
+
+
+@pytest.mark.parametrize("silent", [0, 64])
+def test_one_that_serves_batches_is_never_asked_faster_than_it_serves(silent: int) -> None:
+    round_trip = RoundTrip()
+    for number in range(100):
+        if number < silent:
+            round_trip.timed_out(1)
+        else:
+            round_trip.answered(0.0, 0.02, 1)
+    pace = Pace(round_trip)
+    pace.is_batched = True
+    serve(pace, 3.0, 0.02)
+    assert pace.rate == pytest.approx(BATCHED_RATE / (1.0 - round_trip.seen_loss) ** 0.5)
+    assert pace.prospect == pace.rate
+    assert (pace.rate > BATCHED_RATE) is (silent > 0)
 
 
 def test_answers_that_queue_up_slow_it_down() -> None:

@@ -18,7 +18,8 @@ from paramclient.protocol.pacing import FIRST_RATE, SMALLEST_BURST
 from paramclient.protocol.reads import CONTROL, ENOUGH_CONTROLS, MOST_COPIES, Key, Read, Reads
 from paramclient.protocol.timing import FEWEST_TRIES, INITIAL_TIMEOUT, LONGEST_SILENCE, MOST_TRIES, RoundTrip
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
-from tests.simulation import param_value
+from paramclient.sim import Air, ArduPilotVehicle
+from tests.simulation import Simulation, param_value
 
 BURST = int(SMALLEST_BURST)
 
@@ -597,3 +598,29 @@ def test_a_read_that_ends_may_take_others_with_it_while_time_passes() -> None:
     assert isinstance(reads[0].error, NoReply)
     assert not reads[1].done
     assert len(desk.reads) == 0
+
+
+@pytest.mark.parametrize("delay", [0.0, 0.01, 0.05, 0.3], ids=lambda delay: f"{2 * delay:g}s")
+def test_ardupilot_is_asked_once_for_each_of_many_parameters_on_a_clean_link(delay: float) -> None:
+    vehicle = ArduPilotVehicle()
+    session = Simulation(vehicle, air=Air.symmetric([vehicle], delay=delay))
+    machine = session.meet()
+    session.run(1.0)
+    session.sent.clear()
+    began = session.now
+    reads = [machine.read(10 * number, session.now) for number in range(120)]
+    session.until(lambda: all(read.done for read in reads))
+    assert len(session.sent_of(ParamRequestRead)) == 120
+    assert all(read.error is None for read in reads)
+    assert session.now - began < 2.5 + 2 * delay  # 5 in each 100 ms
+
+
+def test_the_timeout_of_a_read_covers_the_batches_ahead_of_it() -> None:
+    desk = Desk()
+    desk.measure(0.005)  # of what is answered at once
+    desk.reads.pace.is_batched = True
+    reads = [desk.ask(index) for index in range(BURST)]
+    desk.pass_time(0.19)
+    assert [read.attempts for read in reads] == [1] * BURST
+    desk.pass_time(0.02)
+    assert [read.attempts for read in reads] == [2] * 5 + [1] * 5  # the others are behind the first batch

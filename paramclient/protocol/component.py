@@ -493,6 +493,7 @@ class ComponentMachine(Parts):
     def _follow_identity(self, now: float) -> None:
         """What the identification has come to know takes effect."""
         self._report(self.table.use_encoding(self.who.encoding))
+        self.reads.pace.is_batched = self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
         if self.fetch is not None:
             self.fetch.identified(now)
         if self.who.settled and self._known_as != self.identity.key:

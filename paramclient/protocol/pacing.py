@@ -12,6 +12,9 @@ __all__ = ["Pace", "Share"]
 FIRST_RATE: Final = 50.0
 """Requests a second before anything is known: what ArduPilot serves, the slowest autopilot there is."""
 LARGEST_RATE: Final = 2000.0
+BATCHED_RATE: Final = 49.0
+"""Requests a second that ArduPilot serves, however many are sent (measured). What is sent faster fills its
+queue of 20, and is then dropped without a word."""
 SMALLEST_RATE: Final = 4.0
 SMALLEST_BURST: Final = 10.0
 """Requests that may go out at once: half of what ArduPilot queues."""
@@ -115,6 +118,8 @@ class Pace:
 
     Attributes:
         gap: seconds between two values of its list, as far as it was measured; 0 before.
+        is_batched: whether it is known to serve reads as ArduPilot does, in batches and no faster than
+            `BATCHED_RATE`. Then no higher rate is tried.
     """
 
     __slots__ = (
@@ -133,12 +138,14 @@ class Pace:
         "_tokens_at",
         "_was_short",
         "gap",
+        "is_batched",
     )
 
     def __init__(self, round_trip: RoundTrip, share: Share | None = None) -> None:
         self._round_trip = round_trip
         self._share = Share() if share is None else share
         self.gap = 0.0
+        self.is_batched = False
         self._likely_loss = 1.0  # of exchanges, by what the list has lost
         self._rate = FIRST_RATE
         self._tokens = SMALLEST_BURST
@@ -155,12 +162,26 @@ class Pace:
     @property
     def rate(self) -> float:
         """Requests a second."""
-        return min(self._rate, self._share.each)
+        return min(self._rate, self._share.each, self._served)
+
+    @property
+    def _served(self) -> float:
+        """Requests a second that it is known to serve, and those that are lost on the way to it."""
+        if not self.is_batched:
+            return math.inf
+        return BATCHED_RATE / math.sqrt(1.0 - min(self._round_trip.seen_loss, 0.9))
+
+    @property
+    def quickest(self) -> float:
+        """Seconds that the quickest answer has taken; 0 before the first one."""
+        return self._quickest if self._quickest < math.inf else 0.0
 
     @property
     def prospect(self) -> float:
         """Requests a second that the next look may allow: what is served is not found yet."""
-        return self.rate if self._is_found else min(self.rate * self._growth, self._share.each)
+        if self._is_found or self.is_batched:
+            return self.rate
+        return min(self.rate * self._growth, self._share.each)
 
     @property
     def _growth(self) -> float:

@@ -37,6 +37,9 @@ BAD_LUCK: Final = 1e-6
 by the controls that were answered. Where much is silent, nothing else tells of the link."""
 ENOUGH_CONTROLS: Final = 4
 """Answered controls, at the least, after which a silence is the component's and not the link's."""
+READS_PER_BATCH: Final = 5
+BATCH_INTERVAL: Final = 0.1
+"""Reads that ArduPilot answers at once, and seconds from one such batch to the next (measured)."""
 
 
 class Read(Operation[ParamValue]):
@@ -49,12 +52,18 @@ class Read(Operation[ParamValue]):
         copies: requests sent on top of the last one, before it had timed out.
         is_of_caller: whether somebody waits for it, and not only a fetch.
         controls: reads of something that exists which were answered while this one stayed silent.
+        sent_at: when the last request was sent; infinity while none is awaited.
+        serving_time: seconds that the vehicle needs for the requests ahead of it; its timeout is no shorter.
+        ask_again_at: when the request is sent again, because the answer may be older than a set; else
+            infinity.
     """
 
     def __init__(self, key: Key, begun_at: float) -> None:
         super().__init__(begun_at)
         self.key = key
         self.sent_at = math.inf
+        self.serving_time = 0.0
+        self.ask_again_at = math.inf
         self.attempts = 0
         self.copies = 0
         self.holders = 0
@@ -80,6 +89,7 @@ class Reads:
         list_until: until when a list may still come that nobody follows any more.
         control: the index that is asked for to learn whether the component answers at all: one that is known
             to be there.
+        sent_at: when a request was sent last.
     """
 
     def __init__(
@@ -103,7 +113,7 @@ class Reads:
         self._again: deque[Read] = deque()
         self._urgent: deque[Read] = deque()
         self._patient: deque[Read] = deque()
-        self.answered_at = -math.inf
+        self.answered_at = self.sent_at = -math.inf
         self.list_runs_again = False
         self.is_idle = True
         self._silences = 0  # time-outs since anything was answered
@@ -179,6 +189,15 @@ class Reads:
                 for read in self._flying.values():
                     read.controls += read.attempts > 1
 
+    def defer(self, message: ParamValue, until: float, now: float) -> None:
+        """Take an answer whose value may be older than a set: it ends no read; ask again at `until`."""
+        for key in (message.param_id, message.param_index):
+            read = self._flying.get(key)
+            if read is not None and read.sent_at < math.inf:
+                self._count_answer(read, now)
+                read.sent_at = math.inf
+                read.ask_again_at = until
+
     def refused(self, message: ParamError, now: float) -> None:
         """A PARAM_ERROR that may be about a read."""
         key: Key = message.param_id if message.param_index < 0 else message.param_index
@@ -223,9 +242,13 @@ class Reads:
     def tick(self, now: float) -> None:
         """Ask again what stayed unanswered, give up what stayed so too often."""
         timeout = self._round_trip.timeout
-        for read in [read for read in self._flying.values() if read.sent_at + timeout <= now]:
+        for read in [read for read in self._flying.values() if self._due_at(read) <= now]:
             if self._flying.get(read.key) is not read:
                 continue  # what the end of another one brought about
+            if read.ask_again_at < math.inf:
+                read.ask_again_at = math.inf
+                self._again.append(read)
+                continue
             self._silences += 1
             if not (self.list_runs_again and isinstance(read.key, int)):
                 self._round_trip.timed_out(read.attempts)
@@ -255,7 +278,7 @@ class Reads:
         """When `tick` has something to do, or infinity."""
         earliest = math.inf
         if self._flying:
-            earliest = min(read.sent_at for read in self._flying.values()) + self._round_trip.timeout
+            earliest = min(map(self._due_at, self._flying.values()))
         if self._again or self._urgent or self._patient:
             return min(earliest, self.pace.next_at())
         if self._copy_wanted() is not None:
@@ -268,7 +291,7 @@ class Reads:
         self._again.clear()
         for read in self._flying.values():
             read.attempts -= 1
-            read.sent_at = math.inf
+            read.sent_at = read.ask_again_at = math.inf
             self._again.append(read)
         self._send_waiting(now)
 
@@ -286,6 +309,21 @@ class Reads:
             if self._open.get(read.key) is read:
                 self._drop(read)
                 read.fail(error, now)
+
+    def _due_at(self, read: Read) -> float:
+        """When a read in flight times out, or is sent again."""
+        timeout = max(self._round_trip.timeout, read.serving_time)
+        return min(read.sent_at + timeout, read.ask_again_at)
+
+    def _time_to_serve(self) -> float:
+        """Seconds until the request that is sent now is answered, by the requests that are in flight.
+
+        The requests that reach the vehicle wait for each other: 12 in flight are served within three batches,
+        and the first batch may be a whole interval away.
+        """
+        in_flight = sum(1 + read.copies for read in self._flying.values() if read.sent_at < math.inf)
+        batches = math.ceil(in_flight / READS_PER_BATCH)
+        return (batches + 1) * BATCH_INTERVAL + self.pace.quickest
 
     def _is_hopeless(self, read: Read, now: float) -> bool:
         silent_for = now - self._silent_since
@@ -350,13 +388,15 @@ class Reads:
         self.retries += read.attempts > 1
         read.copies = 0
         read.sent_at = now
+        read.serving_time = self._time_to_serve() if self.pace.is_batched else 0.0
         self._silent_since = min(self._silent_since, now)
         self.pace.sent(now)
-        self._request(read)
+        self._request(read, now)
         if read.key != self.control and read.attempts > (2 if self._is_known(read.key) else 1):
             self._send_control(now)
 
-    def _request(self, read: Read) -> None:
+    def _request(self, read: Read, now: float) -> None:
+        self.sent_at = now
         if isinstance(read.key, int):
             self._send(ParamRequestRead(*self._target, "", read.key))
         else:
@@ -395,7 +435,7 @@ class Reads:
         while (read_again := self._copy_wanted()) is not None and self.pace.may_send(now, COPY_RESERVE):
             read_again.copies += 1
             self.pace.sent(now)
-            self._request(read_again)
+            self._request(read_again, now)
 
     def _copy_wanted(self) -> Read | None:
         """A read that is worth asking for once more while its answer may be on the way."""
