@@ -23,6 +23,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentIdentified, Event, Fetched, ParamChanged, ParamsMoved
 from paramclient.protocol.station import Station
 from paramclient.protocol.sync import Upkeep
+from paramclient.protocol.value_check import DISTRUST_TIME
 from paramclient.protocol.wire import (
     CAPABILITY_PARAM_ENCODE_BYTEWISE,
     HASH_CHECK,
@@ -243,7 +244,7 @@ def test_what_changes_twice_in_a_short_while_is_asked_for_once_more() -> None:
     desk.hear("A", 1.0)
     desk.now += 2 * DOUBT
     desk.hear("A", 2.0)
-    desk.now += 0.1
+    desk.now += DISTRUST_TIME
     desk.hear("A", 1.0)  # an answer from before the change, it may be
     desk.hear("B", 1.0)
     assert desk.reads() == []

@@ -9,6 +9,7 @@ from typing import Final
 
 from paramclient.errors import LinkError, NoReply, UsageError
 from paramclient.identity import autopilot_name
+from paramclient.params import parts_of
 from paramclient.protocol import events
 from paramclient.protocol.change import Change
 from paramclient.protocol.events import ParamChanged
@@ -20,6 +21,7 @@ from paramclient.protocol.result import FetchResult, Policy, Sampled
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
+    MAV_AUTOPILOT_PX4,
     MOST_PARAMETERS,
     AutopilotVersion,
     CommandAck,
@@ -34,12 +36,14 @@ from paramclient.protocol.wire import (
     SystemTime,
 )
 from paramclient.protocol.writes import Write
-from paramclient.values import Param, Trust, Value, encode
+from paramclient.values import Param, Trust, Value, as_sent, encode
 
 __all__ = ["ComponentMachine"]
 
 MOST_DOUBTED: Final = 256
 """Reads that may be open for a value to be asked for that changed twice: each takes its share of the link."""
+CHECK_PAUSE: Final = 0.1
+"""Seconds until a value is read again for which there is no room among the reads."""
 FRESH_IDENTITY: Final = 1.0
 """Seconds for which an AUTOPILOT_VERSION needs no other."""
 
@@ -94,6 +98,7 @@ class ComponentMachine(Parts):
             if self.presence.heartbeat(message, now):
                 self._rebooted(now)
             self._authors.forget(now)
+            self._checks.forget(now)
         elif isinstance(message, AutopilotVersion):
             before = self.who.firmware
             if self.who.version(message, now):
@@ -153,9 +158,16 @@ class ComponentMachine(Parts):
         is_ours = by is not None
         if by is None:
             by = authors.of(name, now) if authors.foreign_sets else "vehicle"
-        change = table.hear(message, by, is_exact=is_ours and writes.wants(message))
+        is_wanted = is_ours and writes.wants(message)
+        if self._checks:
+            until = self._checks.ambiguous_until(message, now, is_wanted=is_wanted)
+            if until > now:
+                self._receive_ambiguous(message, until, now)
+                return
+        change = table.hear(message, by, is_exact=is_wanted)
         if change is not None:
             authors.changed(name, now, is_ours)
+            self._note_replaced(change, message, now)
             self.sync.changed(name, by)
             self._tell(change)
         elif name not in table.params:
@@ -168,6 +180,28 @@ class ComponentMachine(Parts):
         if writes.queues:
             writes.heard(message, now)
         self._value_heard(message, now)
+
+    def _note_replaced(self, change: Change, message: ParamValue, now: float) -> None:
+        """Remember the value before a change. PX4 has none on the way: it answers with the value of now."""
+        old = change[1]
+        if old is not None and self.who.autopilot != MAV_AUTOPILOT_PX4:
+            bits, number, *_ = parts_of(old)
+            raw = as_sent(bits, number, self.table.encoding)
+            self._checks.replaced(change.name, number, raw, message, now, self.reads.sent_at)
+
+    def _receive_ambiguous(self, message: ParamValue, until: float, now: float) -> None:
+        """Take a PARAM_VALUE whose value may be older than the last change: only its index counts."""
+        self.table.hear_index(message)
+        self._checks.ask(message.param_id, until)
+        fetch = self.fetches.current
+        if fetch is not None:
+            fetch.heard(message, now)
+        elif not self.reads.awaits(message):
+            self.following.heard(message, now)
+        self.writes.defer(message, until)
+        if self.fetches.overheard is not None:
+            self.fetches.overheard.heard(message, now)
+        self.reads.defer(message, until, now)
 
     def foreign_set(self, name: str, station: str, now: float) -> None:
         """Another station was heard setting a parameter of this component."""
@@ -348,6 +382,8 @@ class ComponentMachine(Parts):
         for name in self._authors.doubted(now):
             if self._policy is Policy.AUTO and len(self.reads) < MOST_DOUBTED:
                 self.reads.ask(name, now, urgent=False)
+        if self._checks.next_deadline() <= now:
+            self._check_values(now)
 
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity. Asked often: what is idle is not asked in turn."""
@@ -370,6 +406,7 @@ class ComponentMachine(Parts):
             self.descriptions.next_deadline(),
             self.sync.next_deadline(),
             self._authors.next_deadline(),
+            self._checks.next_deadline(),
         )
 
     def resume(self, now: float) -> None:
@@ -404,6 +441,7 @@ class ComponentMachine(Parts):
         self.reads.fail_all(error, now)
         self.sync.stop()
         self._authors.clear()
+        self._checks.clear()
 
     def become_another(self, now: float) -> None:
         """Another vehicle has taken this system id: nothing that is known is about it."""
@@ -411,6 +449,7 @@ class ComponentMachine(Parts):
         self.sync.forget()
         self.fetches.forget()
         self.following.forget()
+        self._checks.clear()
         self._known_as = None
         if self.restart is not None:
             self.restart.another(now)
@@ -461,6 +500,16 @@ class ComponentMachine(Parts):
         self.who.lose()
         self._doubt()
 
+    def _check_values(self, now: float) -> None:
+        """Read again what is due."""
+        for name in self._checks.due(now):
+            if self._policy is not Policy.AUTO:
+                self.table.doubt_value(name)
+            elif len(self.reads) < MOST_DOUBTED:
+                self.reads.ask(name, now, urgent=False)
+            else:
+                self._checks.ask(name, now + CHECK_PAUSE)
+
     def _was_silent(self, silence: float, now: float) -> None:
         """It is heard again. After a while, who it is and its hash are asked for before anything counts."""
         presence = self.presence
@@ -483,6 +532,7 @@ class ComponentMachine(Parts):
         self._doubt()
         self.following.forget()
         self._authors.clear()
+        self._checks.clear()
         self.sync.check(now)
         self.who.doubt(now)
         if self.restart is not None:

@@ -357,9 +357,10 @@ class Fetch(Operation[FetchResult]):
             file.on_done.append(partial(self._file_ended, file))
             return
         count, following = self._table.count, means.following
-        if not (present or self._listed) and following.is_running(now):
+        if not self._listed and following.is_running(now):
             # another station has asked for it: to ask again would begin it anew for both
-            present, count = following.hand_over(means.reads)
+            followed, of = following.hand_over(means.reads)
+            present, count = {**(present or {}), **followed} if of == count else followed, of
         download = self.download = Download(
             means.target,
             means.round_trip,

@@ -27,6 +27,7 @@ from paramclient.protocol.table import Room, Table
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.trace import Trace, silent
 from paramclient.protocol.turns import Turns
+from paramclient.protocol.value_check import ValueChecks
 from paramclient.protocol.wire import MAV_AUTOPILOT_PX4, Message
 from paramclient.protocol.writes import Writes
 from paramclient.values import Encoding
@@ -134,6 +135,7 @@ class Parts(ABC):
         self._known_as: str | None = None  # the key of the identity that was reported
         self._saved_at = -math.inf  # when all that we have written will have been saved
         self._authors = Authors()
+        self._checks = ValueChecks()
         self.tells_changes = True
         self.has_moved = False
         self.writes.left_open = self._authors.foreign_set

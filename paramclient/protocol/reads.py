@@ -176,6 +176,20 @@ class Reads:
             self._drop(read)
             read.finish(message, now)
             self._send_waiting(now)
+        self._hear_control(index, count, now)
+
+    def defer(self, message: ParamValue, until: float, now: float) -> None:
+        """Take an answer whose value may be older than a set: it ends no read; ask again at `until`."""
+        for key in (message.param_id, message.param_index):
+            read = self._flying.get(key)
+            if read is not None and read.sent_at < math.inf:
+                self._count_answer(read, now)
+                read.sent_at = math.inf
+                read.ask_again_at = until
+        self._hear_control(message.param_index, message.param_count, now)
+
+    def _hear_control(self, index: int, count: int, now: float) -> None:
+        """Take an index that was answered: it exists, and may be the one asked for to learn of the link."""
         if index < count <= MOST_PARAMETERS:
             self.control = index  # it exists, and is answered
         if index == self._control_index and self._control_at < math.inf:
@@ -188,15 +202,6 @@ class Reads:
                 self._controls_answered += 1
                 for read in self._flying.values():
                     read.controls += read.attempts > 1
-
-    def defer(self, message: ParamValue, until: float, now: float) -> None:
-        """Take an answer whose value may be older than a set: it ends no read; ask again at `until`."""
-        for key in (message.param_id, message.param_index):
-            read = self._flying.get(key)
-            if read is not None and read.sent_at < math.inf:
-                self._count_answer(read, now)
-                read.sent_at = math.inf
-                read.ask_again_at = until
 
     def refused(self, message: ParamError, now: float) -> None:
         """A PARAM_ERROR that may be about a read."""

@@ -178,6 +178,15 @@ class Table:
             return _new(Change, (name, None, new, by, None, None))
         return self._hear_again(name, old, message, by, is_exact=is_exact)
 
+    def hear_index(self, message: ParamValue) -> None:
+        """Take the index of a PARAM_VALUE of a known parameter, and leave the value as it is."""
+        name, _, _, count, given = message
+        held = self._held[name]
+        is_index = given < count <= MOST_PARAMETERS and given not in self.passed_over.get(name, ())
+        if is_index and placed(held, given) != held:
+            self._held[name] = placed(held, given)
+            self.dirty.setdefault(name, "vehicle")
+
     def _hear_again(
         self, name: str, old: Held, message: ParamValue, by: str, *, is_exact: bool
     ) -> Change | None:
@@ -425,6 +434,13 @@ class Table:
             if trust_of(held) in doubted:
                 self._wire.pop(name, None)  # the next value counts, also if it is the same
                 self._held[name] = trusted(held, CACHED)
+
+    def doubt_value(self, name: str) -> None:
+        """One value may have changed unheard: it is no more than *cached*."""
+        held = self._held.get(name)
+        if held is not None:
+            self._wire.pop(name, None)  # the next value counts, also if it is the same
+            self._held[name] = trusted(held, CACHED)
 
     def remove(self, condition: Callable[[Param], bool]) -> list[Change]:
         """Take out the parameters that meet a condition."""

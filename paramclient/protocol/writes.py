@@ -194,6 +194,16 @@ class Writes:
                 write.is_answered = True
                 write.verify_at = min(write.verify_at, now + self._grace)
 
+    def defer(self, message: ParamValue, until: float) -> None:
+        """Take a PARAM_VALUE that may be older than the last change: it proves nothing.
+
+        Where it has the wanted value, the parameter is read at `until` to decide.
+        """
+        write = self._active(message.param_id)
+        if write is not None and write.read is None and self.wants(message):
+            write.is_answered = True
+            write.verify_at = min(write.verify_at, until)
+
     def refused(self, message: ParamError, now: float) -> bool:
         """A PARAM_ERROR: true when it ended a write."""
         write = self._active(message.param_id) if message.param_index < 0 or message.param_id else None

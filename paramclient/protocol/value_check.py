@@ -1,0 +1,111 @@
+"""Values that were just replaced and may still come, and values that are to be read again."""
+
+from __future__ import annotations
+
+import math
+from typing import Final
+
+from paramclient.protocol.wire import ParamValue
+
+__all__ = ["LATER_CHANGE_TIME", "ValueChecks"]
+
+DISTRUST_TIME: Final = 0.3
+"""Seconds after a change in which a PARAM_VALUE with the value before it is no observation: ArduPilot takes
+the value of a read when it queues the answer, and sends it up to 100 ms later. Jitter comes on top."""
+LATER_CHANGE_TIME: Final = 1.2
+"""Seconds after its acknowledgement until a value is read again on PX4, whose modules clamp values 25 to
+815 ms after it, and set others up to 1 s after it (measured)."""
+LATE_ANSWER_TIME: Final = 1.0
+"""Seconds after a request was sent in which its answer may still come."""
+REPLACED_MAX: Final = 4_096
+"""Names whose replaced values are remembered, more than an autopilot has; the oldest is dropped first."""
+
+
+class ValueChecks:
+    """What one component's values were shortly before, and which of them are to be read again, and when.
+
+    The rule: what may be older than a change is no observation of the present. Within `DISTRUST_TIME` of a
+    change only the value before it is ambiguous. It may have been taken before the change, or be another
+    change back. It is not believed, and the parameter is read again when that time is over. Every other value
+    is news.
+
+    It goes for the answers to reads and for lists. In a file that was being read, what was heard meanwhile
+    counts anyway.
+    """
+
+    __slots__ = ("_ask_at", "_replaced")
+
+    def __init__(self) -> None:
+        self._replaced: dict[str, dict[tuple[int, bytes], tuple[float, bool]]] = {}
+        self._ask_at: dict[str, float] = {}
+
+    def __bool__(self) -> bool:
+        """Whether any replaced value is remembered."""
+        return bool(self._replaced)
+
+    def replaced(
+        self, name: str, number: int, old: bytes, new: ParamValue, now: float, sent_at: float
+    ) -> None:
+        """Note that a value has changed.
+
+        Args:
+            name: param_id.
+            number: the type of the value before.
+            old: its 4 bytes, as a message has them.
+            new: the message with the present value.
+            now: the time.
+            sent_at: when the last read of any parameter was sent: without one, no answer of ours can be late.
+        """
+        values = self._replaced.pop(name, {})
+        values.pop((new.param_type, new.raw), None)
+        values[number, old] = (now + DISTRUST_TIME, now - sent_at < LATE_ANSWER_TIME)
+        self._replaced[name] = values
+        if len(self._replaced) > REPLACED_MAX:
+            del self._replaced[next(iter(self._replaced))]
+
+    def ambiguous_until(self, message: ParamValue, now: float, *, is_wanted: bool) -> float:
+        """Return until when the value of a message may be older than the last change.
+
+        Args:
+            message: what came.
+            now: the time.
+            is_wanted: whether it has the value of a PARAM_SET under way. Then it is believed, unless it may
+                be the answer to an earlier read.
+
+        Returns:
+            A time after `now`, or -infinity where the value is news.
+        """
+        values = self._replaced.get(message.param_id)
+        until, was_read = -math.inf, True
+        if values is not None:
+            until, was_read = values.get((message.param_type, message.raw), (until, was_read))
+        return until if until > now and (was_read or not is_wanted) else -math.inf
+
+    def ask(self, name: str, at: float) -> None:
+        """Read a value again at a time, or at the later one that is noted already."""
+        self._ask_at[name] = max(at, self._ask_at.get(name, at))
+
+    def due(self, now: float) -> list[str]:
+        """Take the names whose values are to be read now."""
+        names = [name for name, at in self._ask_at.items() if at <= now]
+        for name in names:
+            del self._ask_at[name]
+        return names
+
+    def next_deadline(self) -> float:
+        """When `due` has something to give, or infinity."""
+        return min(self._ask_at.values(), default=math.inf)
+
+    def forget(self, now: float) -> None:
+        """Drop what is too old to matter; once a second is enough."""
+        if self._replaced:
+            self._replaced = {
+                name: values
+                for name, values in self._replaced.items()
+                if any(until > now for until, _ in values.values())
+            }
+
+    def clear(self) -> None:
+        """Drop everything: the vehicle has started again, or is another one."""
+        self._replaced.clear()
+        self._ask_at.clear()
