@@ -1,11 +1,15 @@
 """Download every parameter with this library and with the programs that people use today, side by side.
 
-    python bench/peers.py [--repeat N] [--limit SECONDS] [--only TEXT ...]
+    python bench/peers.py [--repeat N] [--limit SECONDS] [--only TEXT ...] [--live LINK]
 
 Simulated PX4 and ArduPilot vehicles speak over real UDP on loopback, each in a process of its own, behind a
 link that loses datagrams in both directions. Every client starts with nothing known and hears the vehicle
 first; then its time runs from asking until it has every value. What it got is compared with what the vehicle
 holds. An ArduPilot "by file" serves its table over MAVFTP too, and whoever can fetch it as one file does.
+
+With `--live`, the vehicle is the one on this link, real or in its firmware's own simulation; the relay of
+`tests/live/relay.py` loses the datagrams and, but for the rows "by file", refuses MAVFTP. Nothing is changed
+on the vehicle.
 
 Prints a Markdown table of the median seconds, each with its ratio to this library, and below it the date, the
 machine and its load, to be pasted as it is; what goes on meanwhile goes to the standard error. A whole run
@@ -31,7 +35,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from multiprocessing.connection import Connection
@@ -40,11 +44,14 @@ from typing import Any
 
 import anyio
 
-from paramclient import ParamClient
+from paramclient import Identity, ParamClient
+from paramclient.identity import autopilot_name
 from paramclient.links import create_link, serve_endpoint
 from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.version import __version__
+from tests.live.journal import Journal
+from tests.live.relay import Conditions, Relay
 
 REPEAT = 3
 LIMIT = 120.0
@@ -59,6 +66,10 @@ MISSING_AT_ONCE = 10
 """How the usual loop over pymavlink goes on: so many missing indices after so long a silence."""
 TOLERANCE = 1e-6
 """Within which values count as equal: the file that MAVProxy writes has six decimals."""
+
+SESSION_PAUSE = 3.5
+"""Seconds before each download of a real vehicle: ArduPilot keeps a file that was not closed open for 3 s."""
+TITLES = {"px4": "PX4", "ardupilot": "ArduPilot"}
 
 Values = Mapping[str, float]
 spawn = multiprocessing.get_context("spawn")
@@ -101,6 +112,15 @@ class Case:
     def link(self) -> str:
         return f"{self.loss:.0%}" if self.loss else "clean"
 
+    @property
+    def truth(self) -> Mapping[str, float]:
+        """What the vehicle holds, by name."""
+        return {name: float(v) for name, v in self.vehicle().values.items() if not isinstance(v, bytes)}
+
+    def is_settled(self, name: str) -> bool:
+        """Whether the value stays the same as long as nobody sets it."""
+        return True
+
     def vehicle(self) -> Vehicle:
         return PX4Vehicle() if self.kind == "PX4" else ArduPilotVehicle(live_period=0.0, ftp=self.by_file)
 
@@ -108,6 +128,105 @@ class Case:
         return Air.symmetric(
             [self.vehicle()], loss=self.loss, delay=ROUND_TRIP / 2 if self.loss else 0.0, seed=seed
         )
+
+    @contextmanager
+    def flying(self, seed: int) -> Iterator[tuple[int, Any]]:
+        """Run the vehicle in a process of its own.
+
+        Gives the port that it speaks to, and a shared number: when it was first asked for its list or file.
+        """
+        port = free_port()
+        asked_at = spawn.Value("d", math.inf)
+        process = spawn.Process(target=fly, args=(self, seed, port, asked_at))
+        process.start()
+        try:
+            yield port, asked_at
+        finally:
+            process.kill()
+            process.join()
+
+
+@dataclass(frozen=True)
+class LiveCase(Case):
+    """A real vehicle behind one link.
+
+    Attributes:
+        field: the relay to it, and what it holds.
+    """
+
+    field: LiveField | None = None
+
+    @property
+    def truth(self) -> Mapping[str, float]:
+        """See `Case.truth`."""
+        return self._field.values
+
+    def is_settled(self, name: str) -> bool:
+        """See `Case.is_settled`."""
+        return not self._field.journal.moves_by_itself(name)
+
+    @contextmanager
+    def flying(self, seed: int) -> Iterator[tuple[int, Any]]:
+        """See `Case.flying`; the vehicle is there already, and hears a new partner behind another link."""
+        time.sleep(SESSION_PAUSE)
+        conditions = Conditions(
+            loss=self.loss,
+            round_trip=ROUND_TRIP if self.loss else 0.0,
+            seed=seed,
+            refuses_files=not self.by_file,
+        )
+        self._field.relay.change(conditions)
+        yield self._field.port, self._field
+
+    @property
+    def _field(self) -> LiveField:
+        assert self.field is not None
+        return self.field
+
+
+class LiveField:
+    """A real vehicle and the relay to it.
+
+    Attributes:
+        relay: loses what is to be lost.
+        port: where every client listens.
+        journal: what the vehicle held at the beginning, and which of it moves by itself.
+        values: the numbers of that.
+        kind: of autopilot, as the table names it.
+        vehicle: what it is, in words.
+    """
+
+    def __init__(self, relay: Relay, port: int, folder: Path) -> None:
+        self.relay = relay
+        self.port = port
+        self.journal = Journal(folder)
+        self.values: dict[str, float] = {}
+        self.kind = ""
+        self.vehicle = ""
+        anyio.run(self._look)
+
+    @property
+    def value(self) -> float:
+        """When the vehicle was first asked for its list or file; infinite before."""
+        asked_at = self.relay.counts().first_request_at
+        return math.inf if asked_at is None else asked_at
+
+    def cases(self) -> list[Case]:
+        """Give the rows for this vehicle."""
+        ways = (False, True) if self.kind == "real ArduPilot" else (False,)
+        return [LiveCase(self.kind, loss, by_file, self) for by_file in ways for loss in LOSSES]
+
+    async def _look(self) -> None:
+        async with ParamClient(self.relay.link, cache=False) as client:
+            component = await client.component(timeout=START_PATIENCE)
+            result = await component.fetch_all(timeout=LIMIT)
+            listed = {name: param for name, param in result.params.items() if param.index is not None}
+            self.journal.begin(component, listed)
+            self.kind = f"real {TITLES.get(component.autopilot, component.autopilot)}"
+            self.vehicle = firmware(component.identity)
+        self.values = {
+            name: float(param.value) for name, param in listed.items() if not isinstance(param.value, bytes)
+        }
 
 
 def main() -> None:
@@ -121,9 +240,26 @@ def main() -> None:
         metavar="TEXT",
         help="clients and cases whose names hold one of these",
     )
+    parser.add_argument(
+        "--live", metavar="LINK", help="the link to a real vehicle, in place of simulated ones"
+    )
     arguments = parser.parse_args()
-    kinds = (("PX4", False), ("ArduPilot", False), ("ArduPilot", True))
-    cases = [Case(kind, loss, by_file) for kind, by_file in kinds for loss in LOSSES]
+    with ExitStack() as stack:
+        field: LiveField | None = None
+        if arguments.live is None:
+            kinds = (("PX4", False), ("ArduPilot", False), ("ArduPilot", True))
+            cases = [Case(kind, loss, by_file) for kind, by_file in kinds for loss in LOSSES]
+        else:
+            port = free_port()
+            relay = stack.enter_context(Relay(arguments.live, listeners=[port]))
+            folder = stack.enter_context(tempfile.TemporaryDirectory())
+            field = LiveField(relay, port, Path(folder))
+            cases = field.cases()
+        compare(cases, arguments, "" if field is None else f" {field.vehicle}.")
+
+
+def compare(cases: list[Case], arguments: argparse.Namespace, vehicle: str) -> None:
+    """Let every client download every case, and print the table; `vehicle` stands at its end."""
     clients = choose(list(CLIENTS), arguments.only)
     chosen = [case for case in cases if case.name in choose([case.name for case in cases], arguments.only)]
     results: dict[tuple[str, Case], list[Outcome]] = {}
@@ -144,7 +280,7 @@ def main() -> None:
         f"\nMedian of {arguments.repeat}, in seconds; in brackets the ratio to paramclient. Datagrams are "
         f"lost in both directions, and where they are, the round trip is {ROUND_TRIP * 1000:.0f} ms. "
         f"{time.strftime('%Y-%m-%d')}, {machine()}, load {min(loads):.1f} to {max(loads):.1f}, "
-        f"{(time.monotonic() - began) / 60:.0f} minutes. {versions()}."
+        f"{(time.monotonic() - began) / 60:.0f} minutes. {versions()}.{vehicle}"
     )
 
 
@@ -171,7 +307,7 @@ def print_table(
                 cells.append("has no way by file")
             else:
                 cells.append(cell(outcomes, ours) + "".join(mark(notes, note) for note in remarks(outcomes)))
-        count = len(case.vehicle().params)
+        count = len(case.truth)
         print(
             f"| {case.kind}{' by file' if case.by_file else ''}, {count}, {case.link} | {' | '.join(cells)} |"
         )
@@ -221,6 +357,17 @@ def versions() -> str:
     )
 
 
+def firmware(identity: Identity) -> str:
+    """Return what a vehicle's heartbeat and AUTOPILOT_VERSION say of it, in words."""
+    major, minor, patch, stage = identity.firmware.to_bytes(4, "big")
+    release = {0: "-dev", 64: "-alpha", 128: "-beta", 192: "-rc", 255: ""}.get(stage, f"-{stage}")
+    commit = f" ({identity.git_hash[:8]})" if identity.git_hash else ""
+    autopilot = autopilot_name(identity.autopilot)
+    kinds = {1: "plane", 2: "quadrotor", 10: "rover", 11: "boat", 12: "submarine"}
+    kind = kinds.get(identity.vehicle_type, f"vehicle type {identity.vehicle_type}")
+    return f"{TITLES.get(autopilot, autopilot)} {kind} {major}.{minor}.{patch}{release}{commit}"
+
+
 def installed(package: str) -> str:
     if package == "paramclient":
         return __version__  # also where it is run without being installed
@@ -233,23 +380,12 @@ def installed(package: str) -> str:
 # the vehicle's side
 
 
-@contextmanager
-def flying(case: Case, seed: int) -> Iterator[tuple[int, Any]]:
-    """A vehicle in a process of its own.
-
-    Gives the port that it speaks to, and a shared number: when it was first asked for its list or file.
-    """
+def free_port() -> int:
+    """Return a port on loopback that nobody has."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port: int = probe.getsockname()[1]
-    asked_at = spawn.Value("d", math.inf)
-    process = spawn.Process(target=fly, args=(case, seed, port, asked_at))
-    process.start()
-    try:
-        yield port, asked_at
-    finally:
-        process.kill()
-        process.join()
+    return port
 
 
 def fly(case: Case, seed: int, port: int, asked_at: Any) -> None:
@@ -301,7 +437,7 @@ class PythonClient:
         if installed(self._package) == "not installed":
             return Outcome(math.inf, "not installed")
         receiver, sender = spawn.Pipe(duplex=False)
-        with flying(case, seed) as (port, _):
+        with case.flying(seed) as (port, _):
             process = spawn.Process(target=call, args=(self._fetch, port, limit, sender))
             process.start()
             sender.close()
@@ -330,16 +466,16 @@ def call(
 
 def judge(case: Case, seconds: float, values: Values, limit: float) -> Outcome:
     """Compare what was got with what the vehicle holds."""
-    truth = case.vehicle().values
+    truth = case.truth
     got = truth.keys() & values.keys()
     if len(got) < len(truth):
         return Outcome(math.inf, f"incomplete ({len(got)} of {len(truth)})")
     if seconds > limit:
         return Outcome(math.inf, f"> {limit:.0f}")
     wrong = sum(
-        not math.isclose(values[name], float(value), rel_tol=TOLERANCE, abs_tol=TOLERANCE)
+        not math.isclose(values[name], value, rel_tol=TOLERANCE, abs_tol=TOLERANCE)
         for name, value in truth.items()
-        if not isinstance(value, bytes)
+        if case.is_settled(name)
     )
     return Outcome(seconds, wrong=wrong)
 
@@ -421,7 +557,7 @@ class MavProxy:
     def run(self, case: Case, seed: int, limit: float) -> Outcome:
         if installed("MAVProxy") == "not installed":
             return Outcome(math.inf, "not installed")
-        with tempfile.TemporaryDirectory() as folder, flying(case, seed) as (port, asked_at):
+        with tempfile.TemporaryDirectory() as folder, case.flying(seed) as (port, asked_at):
             # with its module for MAVFTP it always tries the file first, without it downloads by list
             modules = "ftp,param" if case.by_file else "param"
             command = [sys.executable, "-m", "MAVProxy.mavproxy", f"--master=udpin:127.0.0.1:{port}"]

@@ -11,13 +11,15 @@ from pathlib import Path
 
 import pytest
 
-from paramclient.sim import ArduPilotVehicle
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle
+from paramclient.values import ParamType
+from tests.flying import flying
 
 ROOT = Path(__file__).parent.parent
 
 
-def bench(name: str, *arguments: str) -> str:
-    """What a benchmark prints."""
+def bench(name: str, *arguments: str, code: int = 0) -> str:
+    """What a benchmark prints; it must end with this exit code."""
     run = subprocess.run(
         [sys.executable, f"bench/{name}.py", *arguments],
         cwd=ROOT,
@@ -26,7 +28,7 @@ def bench(name: str, *arguments: str) -> str:
         text=True,
         timeout=120,
     )
-    assert run.returncode == 0, run.stderr
+    assert run.returncode == code, run.stderr
     return run.stdout
 
 
@@ -87,3 +89,53 @@ def test_peers_prints_a_table_of_who_got_everything() -> None:
     assert re.fullmatch(rf"\| ArduPilot, 1382, clean \| {seconds} \| {seconds} \|", rows[1]), text
     assert re.fullmatch(rf"\| ArduPilot by file, 1382, clean \| {seconds} \| has no .* \|", rows[2]), text
     assert re.search(r"\d{4}-\d\d-\d\d, \d+ cores, .*Python \S+, load [\d.]+ to [\d.]+", text), text
+
+
+def test_peers_prints_a_table_of_a_real_vehicle() -> None:
+    with flying(PX4Vehicle(table={"MC_ROLL_P": 6.5, "MC_PITCH_P": 6.5})) as link:
+        text = bench("peers", "--repeat", "1", "--only", "paramclient", "clean", "5%", "--live", link)
+    _, _, *rows = text.splitlines()[:4]
+    assert [row.split(" | ")[0] for row in rows] == ["| real PX4, 2, clean", "| real PX4, 2, 5%"]
+    assert all(re.search(r" \| \d+\.\d\d \(1\.0\) \|$", row) for row in rows), text
+    assert re.search(r"PX4 quadrotor \d+\.\d+\.\d+", text), text
+
+
+def test_live_prints_the_rows_of_a_vehicle_and_what_is_promised() -> None:
+    with flying(PX4Vehicle(table={"MC_ROLL_P": 6.5, "MC_AIRMODE": 3})) as link:
+        text = bench("live", link, "--kind", "px4", "--seeds", "2", "--row", "clean", "--row", "command")
+    head, _, *rows = text.splitlines()[:4]
+    assert head == "| real autopilot | median | worst | promised |"
+    figures = r"\d+\.\d\d \| \d+\.\d\d \|"
+    assert re.fullmatch(rf"\| PX4, clean \| {figures} 0\.95 / 1 \|", rows[0]), text
+    assert re.fullmatch(rf"\| PX4, command: .* \| {figures} 0\.6 / 0\.9(?: missed)? \|", rows[1]), text
+    assert re.search(r"\d{4}-\d\d-\d\d, \d+ cores, .* load .* PX4 quadrotor", text), text
+
+
+def test_live_fails_with_check_where_a_value_is_wrong() -> None:
+    """The vehicle answers the fetch at the beginning with another value than those after it."""
+    vehicle = PX4Vehicle(table={"MC_ROLL_P": 6.5, "MC_AIRMODE": 3})
+    vehicle.when_listed(2, lambda: vehicle.set_param("MC_AIRMODE", 2))
+    with flying(vehicle) as link:
+        arguments = ["live", link, "--kind", "px4", "--seeds", "1", "--row", "clean", "--check"]
+        text = bench(*arguments, code=1)
+    assert "PX4, clean, run 0: 1 differ: MC_AIRMODE was 3, is 2" in text
+    assert " missed |" in text
+
+
+def test_live_applies_values_in_groups_and_puts_everything_back() -> None:
+    switches = ("FENCE_ENABLE", "GRIP_ENABLE", "SCR_ENABLE", "FOLL_ENABLE")
+    vehicle = ArduPilotVehicle(
+        table=dict.fromkeys(switches, (ParamType.INT8, 0)),
+        groups={
+            switch: {f"{switch[:4]}_LIMIT{number}": (ParamType.REAL32, 5.0) for number in range(7)}
+            for switch in switches
+        },
+    )
+    before = vehicle.values
+    with flying(vehicle) as link:
+        text = bench("live", link, "--kind", "ardupilot", "--seeds", "2", "--row", "apply")
+    row = text.splitlines()[2]
+    assert re.match(r"\| ArduPilot, apply 30 values in 4 groups \| \d+\.\d\d \| \d+\.\d\d \|", row), text
+    assert vehicle.values == before
+    vehicle.set_param("GRIP_ENABLE", 1)
+    assert vehicle.values["GRIP_LIMIT0"] == 5.0  # what is hidden too

@@ -3,23 +3,19 @@
 from __future__ import annotations
 
 import signal
-import threading
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from queue import Queue
 
 import anyio
 import anyio.from_thread
 import anyio.lowlevel
 import pytest
 
-from paramclient.links import create_link, serve_endpoint
-from paramclient.links.udp import UdpIn
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
-from paramclient.sim import Air, ArduPilotVehicle, Endpoint, FaultyLink, PX4Vehicle, Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
 from paramclient.values import ParamType, Value
+from tests.flying import flying
 from tests.live import __main__ as suite
 from tests.live.checks import checks
 from tests.live.choice import choose
@@ -51,33 +47,6 @@ def px4(*, armed: bool = False) -> PX4Vehicle:
 
 def ardupilot() -> ArduPilotVehicle:
     return ArduPilotVehicle(table=ARDUPILOT_TABLE, groups=GROUP)
-
-
-@contextmanager
-def flying(endpoint: Endpoint) -> Iterator[str]:
-    """Run a simulated vehicle in a thread; the name of the link to it."""
-    started: Queue[tuple[int, Callable[[], None]]] = Queue()
-
-    async def fly() -> None:
-        async with anyio.create_task_group() as tasks:
-            link = await tasks.start(serve_endpoint, endpoint, create_link("udpin:127.0.0.1:0"))
-            assert isinstance(link, UdpIn)
-            assert link.address is not None
-            token = anyio.lowlevel.current_token()
-
-            def stop() -> None:
-                anyio.from_thread.run_sync(tasks.cancel_scope.cancel, token=token)
-
-            started.put((link.address[1], stop))
-
-    thread = threading.Thread(target=anyio.run, args=(fly,))
-    thread.start()
-    port, stop = started.get(timeout=30)
-    try:
-        yield f"udpout:127.0.0.1:{port}"
-    finally:
-        stop()
-        thread.join()
 
 
 def having(monkeypatch: pytest.MonkeyPatch, *chosen: Check | str) -> None:

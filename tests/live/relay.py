@@ -266,6 +266,13 @@ class Relay:
 
         What is on its way at that moment still arrives in its time.
         """
+        return self._ask(conditions)
+
+    def counts(self) -> Counts:
+        """Return the counts of the present conditions."""
+        return self._ask(None)
+
+    def _ask(self, conditions: Conditions | None) -> Counts:
         assert self._control is not None
         try:
             self._control.send(conditions)
@@ -337,18 +344,21 @@ class _Traffic:
         await self._near.close()
         await self._far.close()
 
-    def _change(self, conditions: Conditions) -> Counts:
+    def _change(self, conditions: Conditions | None) -> Counts:
+        """Put other conditions into force, unless there are none; the counts of those before."""
         old = self._air
-        self._leaving += [(old.uplink, self._vehicle.outgoing.append), (old.downlink, self._arrived.append)]
         counts = Counts(
             old.uplink.sent,
             old.downlink.sent,
             old.uplink.lost + old.downlink.lost,
             self._vehicle.first_request_at,
         )
-        self._vehicle.change(conditions)
-        self._air = _air_of(self._vehicle, conditions)
-        self._wake.set()
+        if conditions is not None:
+            self._leaving.append((old.uplink, self._vehicle.outgoing.append))
+            self._leaving.append((old.downlink, self._arrived.append))
+            self._vehicle.change(conditions)
+            self._air = _air_of(self._vehicle, conditions)
+            self._wake.set()
         return counts
 
     async def _read_far(self) -> None:

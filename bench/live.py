@@ -1,0 +1,413 @@
+"""Time the main jobs on real autopilots, through a link that loses datagrams.
+
+    python bench/live.py LINK --kind ardupilot|px4 [--seeds N] [--row TEXT ...] [--check] [--json]
+
+LINK is the link to one vehicle, real or in the firmware's own simulation, such as `udpin:127.0.0.1:14550`. It
+must be disarmed. Everything goes through the relay of `tests/live/relay.py`, which has one port towards the
+vehicle for the whole run. Each run of a row is a new client with a new cache, which knows nothing of the
+vehicle. Every table that comes is compared with one that was fetched at the beginning.
+
+The row with `apply` changes parameters, and puts them back after each run: it turns on four groups that are
+off, and changes members of them.
+
+Prints a Markdown table, and below it the date, the machine, its load and the firmware, to be pasted as it is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from itertools import zip_longest
+from pathlib import Path
+from typing import Final
+
+import anyio
+from peers import TITLES, firmware, machine
+
+from paramclient import Component, FetchResult, ParamClient, ParamSet, WrittenParam
+from paramclient.errors import LinkError, NoReply, ParamClientError, UsageError, VehicleArmed
+from paramclient.provision import apply
+from paramclient.values import Param
+from paramclient.version import __version__
+from tests.live.choice import another_value
+from tests.live.journal import Journal, check_disarmed
+from tests.live.relay import CLEAN, Conditions, Relay
+
+SEEDS: Final = 10
+ROUND_TRIP: Final = 0.1
+"""Seconds, where datagrams are lost."""
+FETCH_TIMEOUT: Final = 120.0
+"""Seconds after which one run is given up."""
+HEARING_TIMEOUT: Final = 20.0
+"""Seconds to wait for the vehicle's heartbeat."""
+SESSION_PAUSE: Final = 3.5
+"""Seconds before each run but those of the row without a pause: ArduPilot keeps a MAVFTP session that was not
+closed for 3 s, and a run must not pay for the one before it."""
+SWITCHES: Final = (
+    *(
+        "FENCE_ENABLE",
+        "GRIP_ENABLE",
+        "SCR_ENABLE",
+        "FOLL_ENABLE",
+        "BTN_ENABLE",
+        "SPRAY_ENABLE",
+        "PLND_ENABLED",
+    ),
+    *("DID_ENABLE", "VTX_ENABLE", "CHUTE_ENABLED", "CUST_ROT_ENABLE", "SOAR_ENABLE", "RALLY_ENABLE"),
+)
+"""Switches of ArduPilot that show a group; the first `GROUPS` that are off and show enough are taken."""
+GROUPS: Final = 4
+VALUES: Final = 30
+"""Values that are applied, the switches among them."""
+NO_LIMITS: Final = (
+    "_TYPE",
+    "_ACTION",
+    "_ENABLE",
+    "ENABLE",
+    "_OPTIONS",
+    "_OPTS",
+    "_SYSID",
+    "_ID",
+    "_CAN_ID",
+    "_RETRACT",
+    "_PIN",
+)
+"""Ends of names of members that choose something, instead of limiting it."""
+COMMAND_TIMEOUT: Final = 30.0
+"""Seconds for one call of the command."""
+
+
+class WrongResult(Exception):
+    """A run did not bring what the vehicle has."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One line of the table.
+
+    Attributes:
+        name: what is timed.
+        kind: the autopilot that it is about.
+        measure: does one run, with this seed, and returns its seconds.
+        median, worst: the seconds that are good enough.
+        pause: seconds before each run.
+    """
+
+    name: str
+    kind: str
+    measure: Callable[[Vehicle, int], Awaitable[float]]
+    median: float
+    worst: float
+    pause: float = SESSION_PAUSE
+
+
+@dataclass(frozen=True)
+class Timing:
+    """What came of a row.
+
+    Attributes:
+        row: its name.
+        seconds: of each run.
+        problems: of runs that did not bring what the vehicle has, in words.
+        median, worst: of the runs.
+        promised_median, promised_worst: the seconds that are good enough.
+    """
+
+    row: str
+    seconds: tuple[float, ...]
+    problems: tuple[str, ...]
+    median: float
+    worst: float
+    promised_median: float
+    promised_worst: float
+
+    @property
+    def is_met(self) -> bool:
+        """Whether every run was right, and median and worst are good enough."""
+        return not self.problems and self.median <= self.promised_median and self.worst <= self.promised_worst
+
+
+@dataclass
+class Vehicle:
+    """The vehicle of the run.
+
+    Attributes:
+        relay: the way to it.
+        system: its system id.
+        journal: its state before, and what was changed.
+        folder: for caches.
+        wanted: the values to apply, switches first; None until they are chosen.
+        members: what the switches and their members are before, for putting back.
+        caches: how many were made.
+    """
+
+    relay: Relay
+    system: int
+    journal: Journal
+    folder: Path
+    wanted: ParamSet | None = None
+    members: dict[str, Param] = field(default_factory=dict)
+    caches: int = 0
+
+    def new_cache(self) -> Path:
+        """Return a path where no cache is."""
+        self.caches += 1
+        return self.folder / f"{self.caches}.sqlite3"
+
+    def check(self, result: FetchResult) -> None:
+        """Raise WrongResult unless the result has every value of the state before."""
+        if not result.complete:
+            raise WrongResult(f"{len(result.missing)} parameters are missing")
+        listed = {name: param for name, param in result.params.items() if param.index is not None}
+        wrong, _ = self.journal.differences(listed)
+        if wrong:
+            raise WrongResult(f"{len(wrong)} differ: {', '.join(wrong[:3])}")
+
+
+def rows() -> Iterator[Row]:
+    """Give every row, in the order in which they are printed."""
+    clean = partial(time_fetch, conditions=CLEAN)
+    yield Row("ArduPilot, clean, one right after the other", "ardupilot", clean, 0.45, 0.6, pause=0.0)
+    for refuses, way, bounds in (
+        (False, "file", {0.05: (0.8, 1.3), 0.20: (1.1, 2.0)}),
+        (True, "list", {0.05: (2.3, 3.5), 0.20: (3.8, 6.0)}),
+    ):
+        for loss, (median, worst) in bounds.items():
+            conditions = Conditions(loss=loss, round_trip=ROUND_TRIP, refuses_files=refuses)
+            name = f"ArduPilot by {way}, {loss:.0%} lost"
+            yield Row(name, "ardupilot", partial(time_fetch, conditions=conditions), median, worst)
+    yield Row(f"ArduPilot, apply {VALUES} values in {GROUPS} groups", "ardupilot", time_apply, 2.5, 3.5)
+    yield Row("PX4, clean", "px4", clean, 0.95, 1.0, pause=0.0)
+    for loss, median, worst in ((0.05, 1.2, 1.5), (0.20, 1.4, 2.0)):
+        conditions = Conditions(loss=loss, round_trip=ROUND_TRIP)
+        yield Row(
+            f"PX4, {loss:.0%} lost", "px4", partial(time_fetch, conditions=conditions), median, worst, 0.0
+        )
+    for kind, title in (("ardupilot", "ArduPilot"), ("px4", "PX4")):
+        yield Row(f"{title}, command: start to the value of one get", kind, time_command, 0.6, 0.9, 0.0)
+
+
+async def time_fetch(vehicle: Vehicle, seed: int, *, conditions: Conditions) -> float:
+    """Fetch everything once; the seconds from the call to the result, with the vehicle heard before."""
+    vehicle.relay.change(replace(conditions, seed=seed))
+    async with ParamClient(vehicle.relay.link, cache=vehicle.new_cache()) as client:
+        component = await client.component(vehicle.system, timeout=HEARING_TIMEOUT)
+        began = time.monotonic()
+        result = await component.fetch_all(timeout=FETCH_TIMEOUT)
+        seconds = time.monotonic() - began
+    vehicle.check(result)
+    return seconds
+
+
+async def time_command(vehicle: Vehicle, seed: int) -> float:
+    """Call `paramclient get` once; the seconds from the start of its process to the printed value."""
+    vehicle.relay.change(CLEAN)
+    names = sorted(name for name, param in vehicle.journal.before.items() if isinstance(param.value, int))
+    name = names[seed % len(names)]
+    command = [sys.executable, "-m", "paramclient", "get", vehicle.relay.link, name]
+    command += ["--cache", str(vehicle.new_cache())]
+    began = time.monotonic()
+    with anyio.fail_after(COMMAND_TIMEOUT):
+        async with await anyio.open_process(command, stderr=subprocess.DEVNULL) as process:
+            assert process.stdout is not None
+            printed = b""
+            while name.encode() not in printed or b"\n" not in printed:
+                printed += await process.stdout.receive()
+            seconds = time.monotonic() - began
+    if str(vehicle.journal.before[name].value) not in printed.decode():
+        raise WrongResult(f"{name}: printed {printed.decode().strip()!r}")
+    return seconds
+
+
+async def time_apply(vehicle: Vehicle, seed: int) -> float:
+    """Apply the chosen values once, and put the vehicle back; the seconds of the call of `apply`."""
+    vehicle.relay.change(CLEAN)
+    if vehicle.wanted is None:
+        async with ParamClient(vehicle.relay.link, cache=False) as client:
+            vehicle.wanted = await choose_values(vehicle, await client.component(vehicle.system))
+        await anyio.sleep(SESSION_PAUSE)
+    async with ParamClient(vehicle.relay.link, cache=vehicle.new_cache()) as client:
+        component = await client.component(vehicle.system, timeout=HEARING_TIMEOUT)
+        vehicle.journal.note(vehicle.members)
+        began = time.monotonic()
+        result = await apply(component, vehicle.wanted)
+        seconds = time.monotonic() - began
+        await put_back(vehicle, component)
+    others = [str(row) for row in result.rows.values() if row.status != "set"]
+    if not result.complete or others:
+        raise WrongResult(f"{len(others)} are not set: {'; '.join(others[:3])}")
+    return seconds
+
+
+async def choose_values(vehicle: Vehicle, component: Component) -> ParamSet:
+    """Look into the groups that are off, one after another, and choose what to apply.
+
+    Raises:
+        UsageError: the vehicle has too few groups that are off, or they have too few members.
+    """
+    await check_disarmed(component)
+    journal = vehicle.journal
+    groups: dict[str, list[Param]] = {}
+    for switch in SWITCHES:
+        held = journal.before.get(switch)
+        if held is None or held.value != 0 or len(groups) == GROUPS:
+            continue
+        await journal.set(component, switch, 1)
+        shown = (await component.fetch_all(refresh=True, timeout=FETCH_TIMEOUT)).params
+        await put_back(vehicle, component)
+        await component.fetch_all(refresh=True, timeout=FETCH_TIMEOUT)
+        members = [param for name, param in shown.items() if name not in journal.before and is_plain(param)]
+        if members:
+            groups[switch] = sorted(members, key=lambda param: not isinstance(param.value, float))
+    wanted = [WrittenParam(switch, 1) for switch in groups]
+    members = [param for group in zip_longest(*groups.values()) for param in group if param is not None]
+    if len(groups) < GROUPS or len(groups) + len(members) < VALUES:
+        raise UsageError(f"{len(groups)} groups that are off, with {len(members)} members: too few")
+    chosen = members[: VALUES - len(groups)]
+    vehicle.members = {switch: journal.before[switch] for switch in groups}
+    vehicle.members |= {param.name: param for param in chosen}
+    wanted += [WrittenParam(param.name, another_value(param)) for param in chosen]
+    return ParamSet({each.name: each for each in wanted}, source=f"{', '.join(groups)}")
+
+
+def is_plain(param: Param) -> bool:
+    """Whether a member of a group may be changed by one: a limit, not a choice or an address."""
+    return not param.is_raw and not param.name.endswith(NO_LIMITS)
+
+
+async def put_back(vehicle: Vehicle, component: Component) -> None:
+    """Put back what was changed.
+
+    Raises:
+        WrongResult: something could not be put back.
+    """
+    if problems := await vehicle.journal.put_back(component):
+        raise WrongResult(f"NOT AS BEFORE: {'; '.join(problems)}")
+
+
+async def time_row(row: Row, vehicle: Vehicle, seeds: int) -> Timing:
+    """Do every run of a row."""
+    seconds: list[float] = []
+    problems: list[str] = []
+    for seed in range(seeds):
+        await anyio.sleep(row.pause)
+        try:
+            seconds.append(await row.measure(vehicle, seed))
+        except (WrongResult, ParamClientError, TimeoutError) as error:
+            problems.append(f"run {seed}: {error or type(error).__name__}")
+            seconds.append(math.inf)
+        print(
+            f"{row.name}, run {seed}: {problems[-1] if seconds[-1] == math.inf else f'{seconds[-1]:.2f} s'}",
+            file=sys.stderr,
+        )
+    return Timing(
+        row.name,
+        tuple(seconds),
+        tuple(problems),
+        statistics.median(seconds),
+        max(seconds),
+        row.median,
+        row.worst,
+    )
+
+
+async def time_rows(
+    chosen: Sequence[Row], relay: Relay, folder: Path, options: argparse.Namespace
+) -> tuple[str, list[Timing]]:
+    """Look at the vehicle, do every row, and see that the vehicle is as before; its name and the timings."""
+    async with ParamClient(relay.link, cache=False) as client:
+        component = await client.component(options.system, timeout=HEARING_TIMEOUT)
+        if component.autopilot != options.kind:
+            raise UsageError(f"the vehicle is {component.autopilot}, not {options.kind}")
+        result = await component.fetch_all(timeout=FETCH_TIMEOUT)
+        journal = Journal(folder)
+        journal.begin(
+            component, {name: param for name, param in result.params.items() if param.index is not None}
+        )
+        vehicle = Vehicle(relay, component.system, journal, folder)
+        name = f"{firmware(component.identity)}, {len(journal.before)} parameters"
+    try:
+        return name, [await time_row(row, vehicle, options.seeds) for row in chosen]
+    finally:
+        with anyio.CancelScope(shield=True):
+            relay.change(CLEAN)
+            if journal.changed:
+                async with ParamClient(relay.link, cache=False) as client:
+                    await put_back(vehicle, await client.component(vehicle.system, timeout=HEARING_TIMEOUT))
+
+
+def table(timings: Sequence[Timing]) -> Iterator[str]:
+    """Give the lines of the Markdown table, and of what did not go right."""
+    yield "| real autopilot | median | worst | promised |"
+    yield "|---|---|---|---|"
+    for each in timings:
+        promise = f"{each.promised_median:g} / {each.promised_worst:g}{'' if each.is_met else ' missed'}"
+        yield f"| {each.row} | {each.median:.2f} | {each.worst:.2f} | {promise} |"
+    for each in timings:
+        for problem in each.problems:
+            yield f"{each.row}, {problem}"
+
+
+def main() -> int:
+    """Print the table; the exit code is 1 with `--check` when a promise is missed."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("link", help="the link to the vehicle")
+    parser.add_argument("--kind", choices=list(TITLES), required=True)
+    parser.add_argument("--system", type=int, help="its system id, where several vehicles are on the link")
+    parser.add_argument("--seeds", type=int, default=SEEDS, help="runs of each row")
+    parser.add_argument(
+        "--row",
+        action="append",
+        default=[],
+        metavar="TEXT",
+        help="rows whose name holds this; may be given again",
+    )
+    parser.add_argument("--check", action="store_true", help="exit with 1 when a promise is missed")
+    parser.add_argument("--json", action="store_true", help="print every figure as JSON")
+    options = parser.parse_args()
+    chosen = [
+        row
+        for row in rows()
+        if row.kind == options.kind and (not options.row or any(text in row.name for text in options.row))
+    ]
+    if not chosen:
+        parser.error(f"no row of {options.kind} holds {' or '.join(options.row)}")
+    loads = [os.getloadavg()[0]]
+    try:
+        with tempfile.TemporaryDirectory() as folder, Relay(options.link) as relay:
+            name, timings = anyio.run(time_rows, chosen, relay, Path(folder), options)
+    except (UsageError, LinkError, NoReply, VehicleArmed) as error:
+        parser.exit(2, f"{error}\n")
+    loads.append(os.getloadavg()[0])
+    footing = {
+        "date": time.strftime("%Y-%m-%d"),
+        "machine": machine(),
+        "load": [min(loads), max(loads)],
+        "vehicle": name,
+        "paramclient": __version__,
+    }
+    if options.json:
+        print(json.dumps({**footing, "rows": [asdict(each) for each in timings]}))
+    else:
+        for line in table(timings):
+            print(line)
+        print(
+            f"\nMedian and worst of {options.seeds}, in seconds. Datagrams are lost in both directions, "
+            f"and where they are, the round trip is {ROUND_TRIP * 1000:.0f} ms. {footing['date']}, "
+            f"{machine()}, load {min(loads):.1f} to {max(loads):.1f}. {name}; paramclient {__version__}."
+        )
+    return 1 if options.check and not all(each.is_met for each in timings) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
