@@ -221,6 +221,62 @@ def test_ardupilot_answers_in_the_spelling_that_was_asked_for() -> None:
     assert write.done
 
 
+def types_of(desk: Desk) -> dict[str, ParamType | int]:
+    return {name: param.type for name, param in desk.machine.table.params.items()}
+
+
+def test_ardupilots_answer_to_a_set_does_not_change_an_integers_type() -> None:
+    """It says REAL32 if the set changes nothing and the value was never stored."""
+    desk = Desk(ARDUPILOT)
+    desk.hear("A", 3, ParamType.INT8, index=0)
+    desk.hear("B", 7, ParamType.INT32, index=1)
+    write = desk.machine.write("A", 3, desk.now)
+    desk.take()
+    before = len(desk.changes)
+    desk.hear("A", 3.0)
+    assert write.result is not None
+    assert (write.result.param.value, write.result.param.type) == (3, ParamType.INT8)
+    desk.hear("B", 7.0)  # another station's set
+    assert types_of(desk) == {"A": ParamType.INT8, "B": ParamType.INT32}
+    assert len(desk.changes) == before
+    desk.hear("B", 8.0)
+    assert [change.new for change in desk.changes[before:]] == [known("B", 8, index=1).with_trust(Trust.LIVE)]
+
+
+def test_a_type_of_the_cache_gives_way() -> None:
+    """A write reads first, so it never depends on that."""
+    desk = Desk(ARDUPILOT)
+    desk.cached(known("A", 3, index=0, kind=ParamType.INT8))
+    write = desk.machine.write("A", 3, desk.now)
+    assert desk.reads() == ["A"]
+    desk.hear("A", 3.0)
+    assert types_of(desk) == {"A": ParamType.REAL32}
+    desk.hear("A", 3.0)
+    assert write.done
+
+
+@pytest.mark.parametrize("value", [3.5, 128.0, -129.0, math.nan, math.inf])
+def test_a_value_that_the_known_type_cannot_have_brings_its_own(value: float) -> None:
+    desk = Desk(ARDUPILOT)
+    desk.hear("A", 3, ParamType.INT8, index=0)
+    desk.hear("A", value)
+    assert types_of(desk) == {"A": ParamType.REAL32}
+
+
+def test_a_list_says_what_type_it_is() -> None:
+    desk = Desk(ARDUPILOT)
+    desk.hear("A", 3, ParamType.INT8, index=0)
+    desk.hear("A", 3.0, index=0)
+    assert types_of(desk) == {"A": ParamType.REAL32}
+
+
+def test_other_autopilots_mean_the_type_that_they_say() -> None:
+    desk = Desk(SOMETHING)
+    desk.hear("A", 3, ParamType.INT8, index=0)
+    desk.hear("A", 3.0)
+    assert types_of(desk) == {"A": ParamType.REAL32}
+
+
 def test_other_autopilots_mind_the_case() -> None:
     desk = Desk()
     desk.machine.read("a", desk.now)

@@ -23,6 +23,7 @@ from paramclient.protocol.wire import (
     MAV_AUTOPILOT_ARDUPILOTMEGA,
     MAV_AUTOPILOT_PX4,
     MOST_PARAMETERS,
+    NO_INDEX,
     AutopilotVersion,
     CommandAck,
     ComponentMetadata,
@@ -36,7 +37,7 @@ from paramclient.protocol.wire import (
     SystemTime,
 )
 from paramclient.protocol.writes import Write
-from paramclient.values import Param, Trust, Value, as_sent, encode
+from paramclient.values import Param, ParamType, Trust, Value, as_sent, encode
 
 __all__ = ["ComponentMachine"]
 
@@ -135,7 +136,7 @@ class ComponentMachine(Parts):
         self._heard(now, version)
         who = self.who
         who.heard(now)
-        name, _, _, count, _ = message
+        name, _, number, count, index = message
         if not name:
             return
         if name == HASH_CHECK:
@@ -146,10 +147,13 @@ class ComponentMachine(Parts):
                 self.fetches.overheard.announced(announced, now)
             self.reads.heard(message, now)
             return
-        if who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not name.isupper():
-            name = _in_capitals(name)
-            message = message._replace(param_id=name)
         table = self.table
+        if who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+            if not name.isupper():
+                name = _in_capitals(name)
+                message = message._replace(param_id=name)
+            if number == ParamType.REAL32 and index == NO_INDEX:
+                message = table.with_known_type(message)
         if count != table.count and count <= MOST_PARAMETERS:
             self._count_moved(count, now)
         authors = self._authors

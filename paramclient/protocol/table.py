@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Mapping
+from struct import unpack
 from typing import Final
 
 from paramclient.params import (
@@ -27,7 +28,17 @@ from paramclient.protocol.authors import is_ours
 from paramclient.protocol.change import Change
 from paramclient.protocol.hashing import hash_of
 from paramclient.protocol.wire import MOST_PARAMETERS, NO_INDEX, ParamValue
-from paramclient.values import Encoding, Param, Trust, Value, as_sent, bits_of_wire, from_bits
+from paramclient.values import (
+    Encoding,
+    Param,
+    ParamType,
+    Trust,
+    Value,
+    as_sent,
+    bits_of_wire,
+    from_bits,
+    known_type,
+)
 
 __all__ = ["MOST_NAMES", "Room", "Table"]
 
@@ -177,6 +188,28 @@ class Table:
                 self._moved(name)
             return _new(Change, (name, None, new, by, None, None))
         return self._hear_again(name, old, message, by, is_exact=is_exact)
+
+    def with_known_type(self, message: ParamValue) -> ParamValue:
+        """Return a PARAM_VALUE of the type REAL32 with the integer type that is known of the parameter.
+
+        ArduPilot answers a PARAM_SET with REAL32, whatever the parameter's type is, if the value is the
+        default and was never stored (measured on 4.6-dev). A cached type that nothing has confirmed does not
+        count. Without a type, or if the number is not whole or out of its range, the message is returned
+        unchanged.
+        """
+        name = message.param_id
+        held = self._held.get(name)
+        if held is None:
+            return message
+        _, number, _, trust, _ = parts_of(held)
+        if trust == CACHED and name not in self._wire:
+            return message
+        known = known_type(number)
+        (value,) = unpack("<f", message.raw)
+        if not isinstance(known, ParamType) or not known.is_integer or not value.is_integer():
+            return message
+        low, high = known.bounds
+        return message._replace(param_type=known) if low <= value <= high else message
 
     def hear_index(self, message: ParamValue) -> None:
         """Take the index of a PARAM_VALUE of a known parameter, and leave the value as it is."""
