@@ -421,8 +421,16 @@ async def test_a_component_is_waited_for() -> None:
 
 
 @swiftly
-async def test_a_component_that_is_heard_before_its_heartbeat() -> None:
+async def test_a_component_that_is_heard_before_its_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a firmware that does not send its heartbeat on request; others are known at once."""
     vehicle = small_px4()
+    answer = vehicle._on_command
+
+    def without_heartbeat(request: wire.CommandLong, sender: wire.Frame) -> None:
+        if request.params[0] != wire.HEARTBEAT_ID:
+            answer(request, sender)
+
+    monkeypatch.setattr(vehicle, "_on_command", without_heartbeat)
     vehicle.tick(1000.0)
     vehicle.data_to_send()
     vehicle.set_param("PARAM_01", 5)

@@ -13,6 +13,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentHeard, ComponentIdentified
 from paramclient.protocol.result import FetchResult
 from paramclient.protocol.station import Station
+from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.wire import (
     MAV_AUTOPILOT_INVALID,
     MAV_AUTOPILOT_PX4,
@@ -120,6 +121,74 @@ def test_a_component_is_met_by_its_heartbeat_or_a_value() -> None:
     assert events == [ComponentHeard(machine) for machine in station.components.values()]
     assert station.events() == []
     assert station.components[3, 4].table.params["A"].value == 0.0
+
+
+ATTITUDE = 30
+
+
+def telemetry(system: int = 1, component: int = 1, *, version: int = 2) -> bytes:
+    payload = bytes(range(1, 29))
+    return wire.build_frame(
+        ATTITUDE, payload, system=system, component=component, sequence=0, version=version
+    )
+
+
+def heartbeat_requests(station: Station) -> list[tuple[int, int, object]]:
+    """Of whom the heartbeat was requested, and to which peer that went."""
+    return [
+        (message.target_system, message.target_component, peer)
+        for message, _, peer in sent(station)
+        if isinstance(message, CommandLong)
+        and (message.command, message.params[0]) == (wire.MAV_CMD_REQUEST_MESSAGE, wire.HEARTBEAT_ID)
+    ]
+
+
+@pytest.mark.parametrize("is_stream", [False, True])
+def test_a_vehicle_that_sends_telemetry_is_asked_for_its_heartbeat(is_stream: bool) -> None:
+    station = a_station(is_stream=is_stream)
+    assert station.receive(telemetry(4), "there", 0.0)
+    assert heartbeat_requests(station) == [(4, 1, "there")]
+    assert not station.components  # telemetry alone makes no component
+    station.receive(telemetry(4), "there", 0.2)
+    assert heartbeat_requests(station) == []
+    station.receive(telemetry(4), "there", 0.25)
+    assert heartbeat_requests(station) == [(4, 1, "there")]
+    hear(station, PX4, 4, now=0.3)
+    sent(station)
+    station.receive(telemetry(4), "there", 1.0)
+    station.receive(telemetry(5), "there", 2.0)
+    assert heartbeat_requests(station) == []
+
+
+def test_a_ground_station_does_not_stand_in_the_way_of_that() -> None:
+    station = a_station()
+    hear(station, GCS, 254, 190)
+    hear(station, CAMERA, 1, 100)
+    sent(station)
+    station.receive(telemetry(), "there", 0.1)
+    assert heartbeat_requests(station) == [(1, 1, "there")]
+
+
+@pytest.mark.parametrize(("system", "component"), [(1, 100), (0, 1), (255, 190)])
+def test_only_an_autopilot_is_asked_for_its_heartbeat(system: int, component: int) -> None:
+    station = a_station()
+    assert not station.receive(telemetry(system, component), "there", 0.0)
+    assert heartbeat_requests(station) == []
+
+
+def test_who_only_listens_asks_for_no_heartbeat() -> None:
+    station = Station(link="x", is_stream=False, upkeep=Upkeep(listens_only=True))
+    station.receive(telemetry(), "there", 0.0)
+    assert sent(station) == []
+
+
+@pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
+def test_a_vehicle_in_mid_second_is_found_at_once(make: type[PX4Vehicle] | type[ArduPilotVehicle]) -> None:
+    """Both autopilots answer the request within some milliseconds (measured)."""
+    simulation = Simulation(make(telemetry=50.0))
+    simulation.run(0.3)
+    simulation.next_session()
+    simulation.until(lambda: bool(simulation.station.components), limit=0.1)
 
 
 def test_our_own_frames_and_those_of_nobody_are_passed_over() -> None:

@@ -22,10 +22,13 @@ from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import (
     AUTOPILOT_COMPONENT,
     COMP_ID_ALL,
+    HEARTBEAT_ID,
     MAV_AUTOPILOT_INVALID,
+    MAV_CMD_REQUEST_MESSAGE,
     MAV_STATE_ACTIVE,
     MAV_TYPE_GCS,
     PARAM_VALUE_ID,
+    CommandLong,
     Frame,
     Framer,
     Heartbeat,
@@ -64,6 +67,8 @@ MOST_PAST: Final = 8
 """Deadlines of the past that are kept for each component before they are sorted out."""
 SEARCH_INTERVAL: Final = 0.5
 """Seconds between two searches for one that can be forgotten, where there was none: each looks at all."""
+HEARTBEAT_REQUEST_INTERVAL: Final = 0.25
+"""Seconds between two requests for the heartbeat of a vehicle that speaks and has not sent one yet."""
 MOST_PEERS: Final = 256
 """Stream peers whose unfinished frames are kept."""
 HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
@@ -145,6 +150,8 @@ class Station:
         self._order: list[tuple[float, int, int]] = []  # a heap of these, with some that are of the past
         self._room = Room()
         self._full_until = -math.inf
+        self._awaits_autopilot = not self.listens_only  # none was heard yet
+        self._heartbeat_requested_at = -math.inf
 
     def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
         """From now on sign what is sent and take what the verifier accepts; before anything has come."""
@@ -177,6 +184,8 @@ class Station:
                 self._receive_other(frame, peer, now)
         if self._is_stream and not data:
             self._peers = {system: each for system, each in self._peers.items() if each != peer}
+        if self._awaits_autopilot and self._request_heartbeat(data, peer, now):
+            return True
         return bool(frames)
 
     def touch(self, machine: ComponentMachine) -> None:
@@ -425,6 +434,26 @@ class Station:
         self._retire(peer)
         return frames
 
+    def _request_heartbeat(self, data: bytes, peer: Peer, now: float) -> bool:
+        """Request the heartbeat of an autopilot that sends other messages; return whether one was found.
+
+        A heartbeat comes once a second; MAV_CMD_REQUEST_MESSAGE brings it in one round trip (measured on PX4
+        and ArduPilot). That is done until the first autopilot is heard: others are heard by the heartbeats
+        that they send.
+        """
+        if self._is_paused or now < self._heartbeat_requested_at + HEARTBEAT_REQUEST_INTERVAL:
+            return False
+        for frame in Framer(stream=False).receive(data):
+            is_autopilot = frame.component == AUTOPILOT_COMPONENT and frame.system != 0
+            if is_autopilot and (frame.system, frame.component) != self.own:
+                self._heartbeat_requested_at = now
+                self._peers[frame.system] = peer
+                request = (float(HEARTBEAT_ID), *[0.0] * 6)
+                command = CommandLong(frame.system, frame.component, MAV_CMD_REQUEST_MESSAGE, request)
+                self._send(command, frame.system, frame.version)
+                return True
+        return False
+
     def _retire(self, peer: Peer) -> None:
         """Part with the framer of a peer, and keep what it has counted."""
         framer = self._framers.pop(peer)
@@ -475,6 +504,8 @@ class Station:
             room=self._room,
             trace=self._trace,
         )
+        if isinstance(message, Heartbeat | HighLatency2) and message.autopilot != MAV_AUTOPILOT_INVALID:
+            self._awaits_autopilot = False
         self.components[sender] = machine
         self._of_system.setdefault(system, []).append(machine)
         self._events.append(ComponentHeard(machine))

@@ -10,7 +10,7 @@ from typing import Final
 
 from paramclient.protocol.sequence import SequenceCheck
 from paramclient.protocol.sniff import Seen, Sniffer
-from paramclient.protocol.wire import Frame, Heartbeat, decode, message_name
+from paramclient.protocol.wire import HEARTBEAT_ID, Frame, Heartbeat, decode, message_name
 
 __all__ = ["ComponentTraffic", "MessageTraffic", "RadioStatus", "Traffic", "TrafficReport"]
 
@@ -26,7 +26,6 @@ MOST_MESSAGES: Final = 500
 """Message ids counted one by one for a component; the dialect has fewer than that."""
 MOST_PEERS: Final = 256
 """Peers whose unfinished frames, and peers of one component whose numbers, are followed."""
-HEARTBEAT_ID: Final = 0
 RADIO_STATUS_IDS: Final = frozenset({109, 166})
 """RADIO_STATUS, and RADIO as older firmware of SiK radios sends it; they have the same layout."""
 

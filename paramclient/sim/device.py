@@ -240,20 +240,25 @@ class Device(ABC):
         self._framer.guard = None if self._verifier is None else self._verifier.accepts
 
     def _send_signs_of_life(self, now: float) -> None:
-        beat = self._heartbeat
         if self._high_latency:
-            self._send(wire.HighLatency2(beat.type, beat.autopilot))
+            self._send(wire.HighLatency2(self._heartbeat.type, self._heartbeat.autopilot))
             return
-        if now < self._on_at + self._boot_time:
-            beat = replace(beat, system_status=wire.MAV_STATE_BOOT)
-        if self.armed:
-            beat = replace(beat, base_mode=beat.base_mode | wire.MAV_MODE_FLAG_SAFETY_ARMED)
-        self._send(beat)
+        self._send(self._beat)
         self._send(wire.SystemTime(0, self._time_boot_ms(now)))
 
     def _time_boot_ms(self, now: float) -> int:
         """Since it was switched on, as it is sent: in 32 bits."""
         return int((now - self._on_at) * 1000.0) & 0xFFFFFFFF
+
+    @property
+    def _beat(self) -> wire.Heartbeat:
+        """The heartbeat as it is sent now."""
+        beat = self._heartbeat
+        if self._now < self._on_at + self._boot_time:
+            beat = replace(beat, system_status=wire.MAV_STATE_BOOT)
+        if self.armed:
+            beat = replace(beat, base_mode=beat.base_mode | wire.MAV_MODE_FLAG_SAFETY_ARMED)
+        return beat
 
     def _send_attitude(self, now: float) -> None:
         self._queue(
@@ -306,12 +311,18 @@ class Device(ABC):
         if request.command == wire.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN:
             self._on_restart_command(int(request.params[0]), sender)
             return
-        wanted = request.command == wire.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES or (
-            request.command == wire.MAV_CMD_REQUEST_MESSAGE and request.params[0] == _AUTOPILOT_VERSION
-        )
-        result = wire.MAV_RESULT_ACCEPTED if wanted else wire.MAV_RESULT_UNSUPPORTED
+        wanted: wire.Message | None = None
+        if request.command == wire.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES:
+            wanted = self._version
+        elif request.command == wire.MAV_CMD_REQUEST_MESSAGE:
+            known: dict[float, wire.Message] = {
+                wire.AUTOPILOT_VERSION_ID: self._version,
+                wire.HEARTBEAT_ID: self._beat,
+            }
+            wanted = known.get(request.params[0])  # a float, and perhaps no number
+        result = wire.MAV_RESULT_UNSUPPORTED if wanted is None else wire.MAV_RESULT_ACCEPTED
         ack = wire.CommandAck(request.command, result, sender.system, sender.component)
-        answers: list[wire.Message] = [ack, self._version] if wanted else [ack]
+        answers: list[wire.Message] = [ack] if wanted is None else [ack, wanted]
         for answer in answers if self._ack_first else reversed(answers):
             self._send(answer)
 
@@ -334,7 +345,6 @@ _NAMES = {
     wire.SetupSigning: "SETUP_SIGNING",
 }
 _REBOOT = 1  # of the autopilot; others shut down, or stay in the bootloader
-_AUTOPILOT_VERSION = 148
 _ATTITUDE = 30
 _LEVEL_FLIGHT = struct.pack("<6f", 0.0, 0.0, 0.5, 0.0, 0.0, 0.01)
 _HIGH_LATENCY_PAUSE = 5.0

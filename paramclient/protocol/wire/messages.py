@@ -21,6 +21,7 @@ __all__ = [
     "ComponentMetadata",
     "FileTransfer",
     "HASH_CHECK",
+    "HEARTBEAT_ID",
     "Heartbeat",
     "HighLatency2",
     "MAV_AUTOPILOT_ARDUPILOTMEGA",
@@ -71,6 +72,7 @@ MAV_AUTOPILOT_PX4: Final = 12
 MAV_MODE_FLAG_SAFETY_ARMED: Final = 128
 MAV_STATE_BOOT: Final = 1
 MAV_STATE_ACTIVE: Final = 4
+HEARTBEAT_ID: Final = 0
 PARAM_VALUE_ID: Final = 22
 AUTOPILOT_VERSION_ID: Final = 148
 COMPONENT_METADATA_ID: Final = 397
