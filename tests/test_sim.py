@@ -526,12 +526,40 @@ class TestPX4:
 
     def test_a_set_is_acknowledged_and_pushed_once(self) -> None:
         vehicle = PX4Vehicle()
-        station = Station(vehicle).wait(0.3).send(write("MPC_XY_VEL_MAX", 9.5, ParamType.REAL32)).wait(2.0)
+        station = Station(vehicle).wait(0.3).send(write("MPC_XY_VEL_MAX", 11.5, ParamType.REAL32)).wait(2.0)
         assert [time - 0.3 for time in station.times()] == pytest.approx([0.0, 0.020])
         first, second = station.values()
         assert first == second
         assert first.param_index == vehicle.param("MPC_XY_VEL_MAX").index
-        assert vehicle.values["MPC_XY_VEL_MAX"] == 9.5
+        assert vehicle.values["MPC_XY_VEL_MAX"] == 11.5
+
+    @pytest.mark.parametrize(
+        ("name", "value", "changed"),
+        [
+            ("MPC_TILTMAX_LND", 80.0, {"MPC_TILTMAX_LND": 45.0}),
+            ("MPC_TILTMAX_AIR", 95.0, {"MPC_TILTMAX_AIR": 89.0}),
+            ("MPC_XY_VEL_MAX", 3.0, {"MPC_VEL_MANUAL": 3.0, "MPC_XY_CRUISE": 3.0}),
+            ("MPC_VEL_MAN_SIDE", 20.0, {"MPC_VEL_MAN_SIDE": 10.0}),
+            ("MPC_THR_HOVER", 0.125, {}),
+            ("MPC_THR_HOVER", 0.0625, {"MPC_THR_HOVER": 0.12}),
+        ],
+    )
+    def test_its_position_controller_keeps_values_within_limits(
+        self, name: str, value: float, changed: dict[str, float]
+    ) -> None:
+        vehicle = PX4Vehicle()
+        station = Station(vehicle).wait(0.3).send(write(name, value, ParamType.REAL32))
+        station.wait(0.39)
+        assert vehicle.values[name] == value
+        station.wait(2.0)
+        expected = {name: value, **changed}
+        assert {each: vehicle.values[each] for each in expected} == pytest.approx(expected)
+        assert {each.param_id for each in station.values()} == expected.keys()
+        still = PX4Vehicle(clamp_delay=None)
+        Station(still).wait(0.3).send(write(name, value, ParamType.REAL32)).wait(2.0)
+        assert still.values[name] == value
+        with pytest.raises(UsageError, match="clamp_delay"):
+            PX4Vehicle(clamp_delay=-1.0)
 
     def test_an_unchanged_value_is_only_acknowledged(self) -> None:
         vehicle = PX4Vehicle(unsaved=["SYS_AUTOSTART"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Iterable, Mapping
 from typing import Final, Unpack
 
@@ -13,9 +14,25 @@ from paramclient.sim.generic import BytewiseVehicle
 from paramclient.sim.metadata import GENERAL_FILE, metadata_files
 from paramclient.sim.table import Entry, SimParam, Table, as_table, px4_table, with_system_id
 from paramclient.sim.vehicle import VehicleOptions
-from paramclient.values import Encoding, ParamType, crc32_px4, px4_hash
+from paramclient.values import Encoding, ParamType, bits_of, crc32_px4, px4_hash
 
 __all__ = ["PX4Vehicle"]
+
+UPPER_LIMITS: Final[tuple[tuple[str, str | float], ...]] = (
+    ("MPC_TILTMAX_AIR", 89.0),
+    ("MPC_TILTMAX_LND", "MPC_TILTMAX_AIR"),
+    ("MPC_XY_CRUISE", "MPC_XY_VEL_MAX"),
+    ("MPC_VEL_MANUAL", "MPC_XY_VEL_MAX"),
+    ("MPC_VEL_MAN_BACK", "MPC_VEL_MANUAL"),
+    ("MPC_VEL_MAN_SIDE", "MPC_VEL_MANUAL"),
+    ("MPC_Z_V_AUTO_UP", "MPC_Z_VEL_MAX_UP"),
+    ("MPC_Z_V_AUTO_DN", "MPC_Z_VEL_MAX_DN"),
+    ("MPC_THR_HOVER", "MPC_THR_MAX"),
+)
+"""What the position controller of PX4 sets to a limit, a value or that of another parameter, when it is above
+it (measured with 1.17)."""
+LOWER_LIMITS: Final = (("MPC_THR_HOVER", "MPC_THR_MIN"),)
+"""The same below it."""
 
 RESET_KEEPS: Final = (
     *("SYS_AUTOSTART", "SYS_PARAM_VER", "RC", "CAL_", "COM_FLTMODE", "LND_FLIGHT", "TC_", "COM_FLIGHT"),
@@ -33,6 +50,9 @@ class PX4Vehicle(BytewiseVehicle):
     - A set with exactly the right type is acknowledged at once, whatever the value. If it changed the
       value, 20 ms later that value is sent again, and with it every other one that is not yet saved; both
       wait for the end of a list.
+    - Its position controller looks at its own parameters 0.4 s after one of them has changed, and sets those
+      to their limit that are beyond it (see `UPPER_LIMITS`); a real one takes 10 ms to 1.1 s. These changes
+      are sent as any other.
     - A wrong type, an unknown name and an unknown index are met with silence.
     - A parameter that is not in use can be read and set by name (index 65535) and is neither in the list
       nor in the hash.
@@ -57,6 +77,8 @@ class PX4Vehicle(BytewiseVehicle):
             CAL_MAG2_*; with another table, nothing.
         unsaved: names that the firmware itself has changed while it booted and not saved.
         autosave: seconds from a change until all that was unsaved is saved.
+        clamp_delay: seconds from a change until the position controller sets values to their limits; None for
+            never.
         burst, period: by default UDP and USB. A serial port has a burst of 3, the low-bandwidth mode 1
             every 0.125 s.
         ftp: whether there is a param.pck, as after 1.17; otherwise it is said not to be found.
@@ -72,6 +94,7 @@ class PX4Vehicle(BytewiseVehicle):
     _restart_delay = 0.4
     _push_at: float
     _save_at: float
+    _clamp_at: float
 
     def __init__(
         self,
@@ -85,6 +108,7 @@ class PX4Vehicle(BytewiseVehicle):
         late_use: Mapping[str, Iterable[str]] | None = None,
         unsaved: Iterable[str] = (),
         autosave: float = 0.3,
+        clamp_delay: float | None = 0.4,
         burst: int = 20,
         period: float = 0.020,
         ftp: bool = False,
@@ -105,6 +129,9 @@ class PX4Vehicle(BytewiseVehicle):
             raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
         if not autosave >= 0.0:
             raise UsageError(f"autosave is a number of seconds from 0 up, not {autosave}")
+        if clamp_delay is not None and not clamp_delay >= 0.0:
+            raise UsageError(f"clamp_delay is a number of seconds from 0 up, not {clamp_delay}")
+        self._clamp_delay = clamp_delay
         self._ftp = FileServer(
             self._packed_params if ftp else lambda: None,
             self._apply_packed,
@@ -166,7 +193,7 @@ class PX4Vehicle(BytewiseVehicle):
         return entry.name not in self._unused
 
     def _timers(self) -> tuple[float, ...]:
-        return self._push_at, self._save_at
+        return self._push_at, self._save_at, self._clamp_at
 
     def _on_list(self) -> None:
         self._hash_next = self._position is None and self.announced_hash() is not None
@@ -206,6 +233,8 @@ class PX4Vehicle(BytewiseVehicle):
         self._hash = None
         self._unsaved.add(entry.name)
         self._waking |= self._late_use.get(entry.name, frozenset())
+        if entry.name in _LIMITED and self._clamp_delay is not None:
+            self._clamp_at = min(self._clamp_at, self._now + self._clamp_delay)
         self._push_at = min(self._push_at, self._now + _PUSH_DELAY)
         self._save_at = min(self._save_at, self._now + self._autosave)
 
@@ -237,10 +266,25 @@ class PX4Vehicle(BytewiseVehicle):
         self._hash_next = False
         self._push_from: int | None = None
         self._push_at = math.inf
-        self._save_at = math.inf
+        self._save_at = self._clamp_at = math.inf
         super()._switch_on(at)
 
+    def _clamp(self) -> None:
+        """Set what is beyond its limit to that."""
+        for limits, is_beyond in ((UPPER_LIMITS, operator.gt), (LOWER_LIMITS, operator.lt)):
+            for name, limit in limits:
+                entry = self._find(name)
+                other = self._find(limit) if isinstance(limit, str) else None
+                most = limit if other is None else other.value
+                if entry is None or not isinstance(most, float) or not isinstance(entry.value, float):
+                    continue
+                if is_beyond(entry.value, most):
+                    self._write(entry, bits_of(most, entry.type))
+
     def _work(self, now: float) -> None:
+        if self._clamp_at <= now:
+            self._clamp_at = math.inf
+            self._clamp()
         if self._push_at <= now:
             self._push_at = math.inf
             if self._waking & self._unused:
@@ -279,6 +323,9 @@ class PX4Vehicle(BytewiseVehicle):
             )
 
 
+_LIMITED = frozenset(
+    name for pair in (*UPPER_LIMITS, *LOWER_LIMITS) for name in pair if isinstance(name, str)
+)
 _SYSTEM_ID = "MAV_SYS_ID"
 _QUADROTOR = 2
 _RELEASE = 17891392  # 1.17.0
