@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 from paramclient.errors import UsageError
 from paramclient.protocol.wire import MOST_PARAMETERS
 from paramclient.values import check_name
 
-__all__ = ["check_accepted", "check_asked"]
+__all__ = ["SETTLE_MAX", "check_accepted", "check_asked", "check_settle"]
+
+SETTLE_MAX: Final = 60.0
+"""Seconds for which a written value can be watched, at the most: a write to the same name waits meanwhile."""
 
 
 def check_asked(name: str | int) -> None:
@@ -31,3 +36,14 @@ def check_accepted(accept: str, sample: int) -> None:
         raise UsageError(f'accept is "verified" or "sampled", not {accept!r}')
     if sample < 1:
         raise UsageError(f"a sample has at least one parameter, not {sample}")
+
+
+def check_settle(settle: float) -> float:
+    """See that a value can be watched for so many seconds after it was written.
+
+    Raises:
+        UsageError: it cannot.
+    """
+    if not 0.0 <= settle <= SETTLE_MAX:
+        raise UsageError(f"settle is a number of seconds from 0 to {SETTLE_MAX:g}, not {settle}")
+    return float(settle)

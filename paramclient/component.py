@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, SupportsFloat, SupportsIndex, TypeVar
 
 import anyio
 
-from paramclient.asked import check_accepted, check_asked
+from paramclient.asked import check_accepted, check_asked, check_settle
 from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.events import Changes
 from paramclient.identity import Identity, autopilot_name
@@ -194,6 +194,8 @@ class Component:
         value: SupportsIndex | SupportsFloat | bytes,
         *,
         timeout: float | None = None,
+        settle: float = 0.0,
+        force: bool = False,
         asker: str | None = None,
     ) -> SetResult:
         """Write one parameter and prove by its value that the vehicle has taken it.
@@ -205,6 +207,12 @@ class Component:
             name: param_id.
             value: a number; or the 4 bytes of the message for what cannot be said as a number.
             timeout: as in `get`.
+            settle: seconds, up to 60, for which the value is watched after its acknowledgement; then it is
+                read once more, and the result tells what has become of it. 1.2 is enough for PX4, whose
+                modules clamp values within a second. Without it such a change only comes as one of
+                `changes`.
+            force: send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot,
+                which ignores them.
             asker: for whom it is done, in printable ASCII: the change, and its line of history, are then by
                 "us for ASKER".
 
@@ -212,8 +220,8 @@ class Component:
             Accepted, or adjusted: the vehicle made another value of it.
 
         Raises:
-            UsageError: the name, the value or the asker cannot be right, or the client only listens. Nothing
-                was written.
+            UsageError: the name, the value or another argument cannot be right, the value is NaN or infinite
+                and the autopilot cannot store that, or the client only listens. Nothing was written.
             UnknownParameter: the vehicle does not have it.
             Refused: it gave a reason.
             TypeMismatch: it holds the parameter in another type.
@@ -225,7 +233,14 @@ class Component:
             raise UsageError(f"{HASH_CHECK} is no parameter: it can be read, and not written")
         machine = self._machine
         self._client._check_open()
-        write = machine.write(name, check_value(value), anyio.current_time(), check_asker(asker))
+        write = machine.write(
+            name,
+            check_value(value),
+            anyio.current_time(),
+            check_asker(asker),
+            settle=check_settle(settle),
+            force=force,
+        )
         try:
             what = f"PARAM_SET {name} to {self.system}/{self.component}"
             return await self._wait(write, timeout, lambda: (what, write.attempts))

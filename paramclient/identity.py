@@ -5,12 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["Identity", "autopilot_name"]
+__all__ = ["Identity", "autopilot_name", "reason_against_non_finite"]
 
 SHARED_UIDS: Final = frozenset({"4954414c44494e4f"})
 """Hardware ids that name no single vehicle: every simulated PX4 reports this one (measured). Their system ids
 tell them apart, as PX4 numbers the simulated vehicles on one machine."""
 
+_AGAINST_NON_FINITE = {
+    "px4": "PX4 cannot save NaN and infinity: its parameter file becomes invalid, it saves nothing any more, "
+    "and it may stop, also after each restart, until the file is deleted",
+    "ardupilot": "ArduPilot ignores NaN and infinity, and does not answer",
+}
 _AUTOPILOTS = {0: "generic", 3: "ardupilot", 8: "no autopilot", 12: "px4"}
 _HEX_DIGITS = frozenset(b"0123456789abcdefABCDEF")
 
@@ -126,3 +131,8 @@ class Identity:
 def autopilot_name(number: int) -> str:
     """A MAV_AUTOPILOT in a word: px4, ardupilot, generic, …; others by their number."""
     return _AUTOPILOTS.get(number, f"autopilot {number}")
+
+
+def reason_against_non_finite(autopilot: str) -> str:
+    """Return why an autopilot, by its name, must not be sent NaN and infinity; "" where it may be."""
+    return _AGAINST_NON_FINITE.get(autopilot, "")

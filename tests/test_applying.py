@@ -42,7 +42,7 @@ from paramclient.provision import (
     verify,
     verify_all,
 )
-from paramclient.provision.run import Run
+from paramclient.provision.run import LASTING_TIME, Run
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, PX4Vehicle, SimParam
 from paramclient.sim.table import Entry
 from paramclient.values import ParamType, Value, bits_of, from_bits
@@ -104,6 +104,16 @@ class Meddling(PX4Vehicle):
             super()._write(self._entry("TUNE_01"), bits_of(0.25, ParamType.REAL32))
         if entry.name == "TUNE_01" and self.quarrels:
             super()._write(self._entry("TUNE_19"), bits_of(4.75, ParamType.REAL32))
+
+
+CLAMPED: dict[str, Value | tuple[ParamType, Value]] = {
+    "MPC_TILTMAX_AIR": 45.0,
+    "MPC_TILTMAX_LND": 12.0,
+    "MPC_XY_VEL_MAX": 12.0,
+    "MPC_XY_CRUISE": 5.0,
+    "MPC_VEL_MANUAL": 10.0,
+}
+"""What PX4's position controller sets to limits."""
 
 
 def ardupilot(kind: type[ArduPilotVehicle] = ArduPilotVehicle, **options: Any) -> ArduPilotVehicle:
@@ -243,7 +253,7 @@ async def test_what_no_hash_covers_is_read_again_for_the_proof() -> None:
         await component.fetch_all()
         result = await apply(component, wanted, include="calibration", progress=learn)
     assert result.before["CAL_ACC0_XOFF"].value == 0.75
-    assert statuses(result) == {"TUNE_01": "set", "CAL_ACC0_XOFF": "failed"}
+    assert statuses(result) == {"TUNE_01": "set", "CAL_ACC0_XOFF": "adjusted"}
     assert result.rows["CAL_ACC0_XOFF"].actual == 0.75
 
 
@@ -1092,3 +1102,89 @@ async def test_a_file_of_another_autopilot_is_refused_before_the_vehicle_is_aske
     assert not {wire.ParamSet, wire.ParamRequestRead, wire.ParamRequestList} & {
         type(message) for _, _, message in tap.heard
     }
+
+
+# what the vehicle changes after it has acknowledged it
+
+
+@pytest.mark.parametrize("delay", [0.02, 0.8, 1.1])
+@swiftly
+async def test_what_modules_clamp_within_a_second_is_adjusted(delay: float) -> None:
+    vehicle = PX4Vehicle(table=SETTINGS | CLAMPED, clamp_delay=delay)
+    wanted = {"MPC_TILTMAX_LND": 80.0, "TUNE_01": 9.5, "MPC_XY_CRUISE": 6.0}
+    async with a_client(vehicle) as client:
+        result = await apply(await client.component(), written(wanted))
+    assert statuses(result) == {"MPC_TILTMAX_LND": "adjusted", "TUNE_01": "set", "MPC_XY_CRUISE": "set"}
+    row = result.rows["MPC_TILTMAX_LND"]
+    assert (row.before, row.actual) == (12.0, 45.0)
+    assert "changed it afterwards" in row.reason
+    assert not result.complete
+    assert vehicle.requests["PARAM_SET"] == 4  # once more, as another one that was set may have changed it
+
+
+@swiftly
+async def test_a_clamp_back_to_the_old_value_is_no_failure_but_an_adjustment() -> None:
+    vehicle = PX4Vehicle(table=SETTINGS | CLAMPED | {"MPC_TILTMAX_LND": 45.0}, clamp_delay=0.5)
+    async with a_client(vehicle) as client:
+        result = await apply(await client.component(), written({"MPC_TILTMAX_LND": 80.0}))
+    assert statuses(result) == {"MPC_TILTMAX_LND": "adjusted"}
+    assert result.rows["MPC_TILTMAX_LND"].actual == 45.0
+
+
+@swiftly
+async def test_what_is_clamped_by_another_wanted_value_arrives_with_the_second_try() -> None:
+    vehicle = PX4Vehicle(table=SETTINGS | CLAMPED, clamp_delay=0.0)
+    async with a_client(vehicle) as client:
+        wanted = {"MPC_XY_CRUISE": 18.0, "MPC_XY_VEL_MAX": 19.0}
+        assert (await apply(await client.component(), written(wanted))).complete
+
+
+@swiftly
+async def test_what_was_as_wanted_and_is_changed_by_another_one_is_seen() -> None:
+    vehicle = PX4Vehicle(table=SETTINGS | CLAMPED, clamp_delay=1.0)
+    async with a_client(vehicle) as client:
+        wanted = {"MPC_XY_VEL_MAX": 8.0, "MPC_VEL_MANUAL": 10.0}
+        result = await apply(await client.component(), written(wanted))
+    assert statuses(result) == {"MPC_XY_VEL_MAX": "set", "MPC_VEL_MANUAL": "adjusted"}
+
+
+@swiftly
+async def test_the_proof_begins_long_enough_after_the_last_write() -> None:
+    tap = Tap(px4())
+    async with a_client(tap) as client:
+        assert (await apply(await client.component(), written(another()))).complete
+    sets = [at for at, _, message in tap.heard if isinstance(message, wire.ParamSet)]
+    hashes = [
+        at
+        for at, _, message in tap.heard
+        if isinstance(message, wire.ParamRequestRead) and message.param_id == wire.HASH_CHECK
+    ]
+    assert hashes[-1] - sets[-1] >= LASTING_TIME
+
+
+@swiftly
+async def test_where_nothing_is_to_be_written_nothing_is_waited_for() -> None:
+    async with a_client(px4()) as client:
+        result = await apply(await client.component(), written({"TUNE_01": 0.25}))
+    assert result.complete
+    assert result.elapsed < LASTING_TIME
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("-inf")])
+@swiftly
+async def test_what_px4_cannot_save_is_only_set_when_forced(value: float) -> None:
+    vehicle = px4()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        with pytest.raises(InvalidParameters, match="cannot save NaN"):
+            await apply(component, written({"TUNE_01": value}), include="out-of-range")
+        assert vehicle.requests["PARAM_SET"] == 0
+        state = (await apply(component, written({"TUNE_02": 0.75}))).before
+        forced = await apply(component, written({"TUNE_01": value}), force=True)
+        assert statuses(forced) == {"TUNE_01": "set"}
+        await apply(component, written({"TUNE_01": 0.25}))
+        state = ParamSet({**state.params, **written({"TUNE_01": value}).params}, identity=state.identity)
+        result = await restore(component, state)
+        assert statuses(result)["TUNE_01"] == "skipped"
+        assert "cannot save NaN" in result.rows["TUNE_01"].reason
+        assert statuses(await restore(component, state, force=True))["TUNE_01"] == "set"

@@ -349,12 +349,30 @@ def test_set_tells_what_the_vehicle_made_of_it(command: Command) -> None:
     assert table.err.startswith("1 of 1 set on 1/1 ardupilot in ")
 
 
-def test_nan_can_be_set(command: Command) -> None:
-    done = command("set", "sim:px4", "MC_ROLL_P", "nan", "MC_PITCH_P", "-inf", "--json", "--no-cache")
+def test_nan_can_be_forced(command: Command) -> None:
+    wanted = ("MC_ROLL_P", "nan", "MC_PITCH_P", "-inf")
+    refused = command("set", "sim:px4", *wanted, "MC_YAW_P", 3, "--json", "--no-cache")
+    assert refused.code == 2
+    assert [each["status"] for each in refused.json["results"]] == ["invalid", "invalid", "accepted"]
+    assert "PX4 cannot save NaN and infinity" in refused.err
+    done = command("set", "sim:px4", *wanted, "--force", "--json", "--no-cache")
     assert done.json["results"] == [
         {"name": "MC_ROLL_P", "requested": "NaN", "actual": "NaN", "status": "accepted"},
         {"name": "MC_PITCH_P", "requested": "-Infinity", "actual": "-Infinity", "status": "accepted"},
     ]
+
+
+def test_settle_tells_what_modules_of_px4_make_of_a_value_within_a_second(command: Command) -> None:
+    wanted = ("MPC_TILTMAX_LND", 80, "MC_ROLL_P", 6.25)
+    at_once = command("set", "sim:px4", *wanted, "--json", "--no-cache")
+    assert [each["status"] for each in at_once.json["results"]] == ["accepted", "accepted"]
+    done = command("set", "sim:px4", *wanted, "--settle", 1.2, "--json", "--no-cache")
+    assert done.code == 0
+    assert done.json["results"] == [
+        {"name": "MPC_TILTMAX_LND", "requested": 80, "actual": 45.0, "status": "adjusted"},
+        {"name": "MC_ROLL_P", "requested": 6.25, "actual": 6.25, "status": "accepted"},
+    ]
+    assert command("set", "sim:px4", *wanted, "--settle", -1, "--no-cache").code == 2
 
 
 class Stubborn(GenericVehicle):
@@ -601,7 +619,7 @@ def test_watch_prints_lines_of_json_as_values_change(command: Command, tmp_path:
     ):
         assert line_of(watching.stderr) == "watching MC_ROLL_P of 1/1 px4\n"
         before = datetime.now(UTC)
-        assert command("set", url, "MC_PITCH_P", 7, "MC_ROLL_P", "nan", "--no-cache").code == 0
+        assert command("set", url, "MC_PITCH_P", 7, "MC_ROLL_P", "nan", "--force", "--no-cache").code == 0
         change = strict(line_of(watching.stdout))
         assert list(change) == ["time", "name", "old", "new", "by"]
         at = datetime.fromisoformat(change.pop("time"))

@@ -217,7 +217,7 @@ def test_what_can_be_included_is_a_category_or_a_glob(include: str | list[str]) 
         (ParamType.INT8, 1.5, Encoding.C_CAST, "1.5 is not a whole number, and the parameter is INT8"),
         (ParamType.REAL32, 1e39, Encoding.BYTEWISE, "beyond the range of a float32"),
         (ParamType.INT32, 16777217, Encoding.C_CAST, "the nearest is 16777216"),
-        (ParamType.REAL32, math.nan, Encoding.C_CAST, "nan is no number that this vehicle takes"),
+        (ParamType.REAL32, math.nan, Encoding.C_CAST, "ArduPilot ignores NaN"),
     ],
 )
 def test_what_the_type_cannot_take_is_found_beforehand(
@@ -255,9 +255,22 @@ def test_the_range_counts_where_metadata_is_there() -> None:
 
 def test_what_is_no_number_has_to_be_asked_for() -> None:
     for value in (math.nan, math.inf):
-        made = plan(held(P=1.0), written(P=value), autopilot="px4")
+        made = plan(held(P=1.0), written(P=value))
         assert only_row(made)[:2] == (PlanStatus.INVALID, OUT_OF_RANGE)
-        assert plan(held(P=1.0), written(P=value), autopilot="px4", include=OUT_OF_RANGE).steps
+        assert plan(held(P=1.0), written(P=value), include=OUT_OF_RANGE).steps
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(("autopilot", "says"), [("px4", "may stop"), ("ardupilot", "does not answer")])
+def test_what_an_autopilot_cannot_store_has_to_be_forced(value: float, autopilot: str, says: str) -> None:
+    table, wanted = held(P=1.0), written(P=value)
+    made = plan(table, wanted, autopilot=autopilot, include=OUT_OF_RANGE)
+    status, category, reason = only_row(made)
+    assert (status, category) == (PlanStatus.INVALID, WRONG)
+    assert says in reason
+    forced = plan(table, wanted, autopilot=autopilot, force=True)
+    assert forced.force
+    assert [step.name for step in forced.steps] == ["P"]
     assert plan(held(P=math.nan), written(P=math.nan), autopilot="px4").is_met
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
+import math
 import os
 import random
 from collections import deque
@@ -224,6 +225,19 @@ async def test_a_program_that_leaves_ends_the_download_of_nobody_else() -> None:
         leaving.cancel()
         assert (await staying).complete
         assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
+
+
+@swiftly
+async def test_a_write_is_watched_and_forced_over_a_service() -> None:
+    async with a_service(PX4Vehicle()) as network, a_program(network) as client:
+        component = await client.component()
+        done = await component.set("MPC_TILTMAX_LND", 80.0, settle=1.2)
+        assert (done.status, done.actual) == ("adjusted", 45.0)
+        with pytest.raises(UsageError, match="cannot save NaN"):
+            await component.set("MC_ROLL_P", math.nan)
+        assert (await component.set("MC_ROLL_P", math.nan, force=True)).status == "accepted"
+        with pytest.raises(UsageError, match="settle"):
+            await component.set("MC_ROLL_P", 1.0, settle=math.nan)
 
 
 @swiftly

@@ -16,7 +16,7 @@ from paramclient.documents.job import JobDoc
 from paramclient.documents.param import ParamDoc
 from paramclient.links import SimLink
 from paramclient.service import Hub, create_app, following
-from paramclient.sim import Air, ArduPilotVehicle, SimParam
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.values import ParamType
 from tests.asgi import a_browser
 from tests.recordings import DATA
@@ -252,6 +252,26 @@ async def test_of_many_values_each_is_tried_and_told_of() -> None:
         assert results["PARAM_04"]["problem"]["error"] == "UsageError"
         assert hub.followed[0].component.params["PARAM_01"].value == 11
         problem(await browser.patch(f"{C}/params", json={"values": {}}), 422, "invalid-request")
+
+
+@swiftly
+async def test_a_write_may_be_watched_or_forced() -> None:
+    async with service(SimLink(PX4Vehicle())) as (_, browser):
+        await met(browser)
+        body = {"value": 80, "settle_s": 1.2}
+        done = (await browser.put(f"{C}/params/MPC_TILTMAX_LND", json=body)).json()
+        assert (done["status"], done["actual"]) == ("adjusted", 45.0)
+        values = {"MPC_XY_CRUISE": 18, "MC_ROLL_P": "NaN"}
+        answer = await browser.patch(f"{C}/params", json={"values": values, "settle_s": 1.2})
+        many = answer.json()["results"]
+        assert many["MPC_XY_CRUISE"]["status"] == "adjusted"
+        assert many["MC_ROLL_P"]["problem"]["error"] == "UsageError"
+        assert "cannot save NaN" in many["MC_ROLL_P"]["problem"]["detail"]
+        forced = await browser.put(f"{C}/params/MC_ROLL_P", json={"value": "NaN", "force": True})
+        assert forced.json()["status"] == "accepted"
+        for settle in (-1, 61, "x"):
+            wrong = {"value": 1, "settle_s": settle}
+            problem(await browser.put(f"{C}/params/MC_ROLL_P", json=wrong), 422, "invalid-request")
 
 
 @swiftly

@@ -11,6 +11,7 @@ from paramclient.protocol.change import Change
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import Event, ParamChanged
 from paramclient.protocol.reads import BATCH_INTERVAL, Read
+from paramclient.protocol.station import Station
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.value_check import DISTRUST_TIME, REPLACED_MAX, ValueChecks
 from paramclient.protocol.wire import (
@@ -23,7 +24,7 @@ from paramclient.protocol.wire import (
     ParamSet,
 )
 from paramclient.protocol.writes import Write
-from paramclient.sim import Air, ArduPilotVehicle
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from paramclient.values import ParamType, Trust
 from tests.simulation import Simulation, is_so, param_value
 
@@ -301,3 +302,51 @@ def test_a_simulated_ardupilot_takes_the_value_of_a_read_when_it_is_queued() -> 
     assert len(heard) == 1
     assert 0.0 < heard[0][0] - at <= BATCH_INTERVAL
     assert first != acknowledged.actual
+
+
+# what PX4's modules change afterwards
+
+
+@pytest.mark.parametrize("fetched", [True, False], ids=["whole", "unfetched"])
+def test_a_change_after_the_acknowledgement_is_found_although_nothing_tells_of_it(fetched: bool) -> None:
+    vehicle = PX4Vehicle()
+    upkeep = Upkeep.chosen(None, "auto")
+    station = Station(link="sim:test", is_stream=False, upkeep=upkeep)
+    session = Simulation(vehicle, station=station)
+    session.meet()
+    if fetched:
+        session.fetch()
+    session.run(3.0)
+    name = "MPC_XY_CRUISE"
+    assert session.set(name, 18.0).status == "accepted"
+    session.run(0.1)
+    session.events.clear()
+    session.sent.clear()
+    vehicle._send_value = lambda entry, **more: None  # type: ignore[method-assign]  # its push is lost
+    session.run(0.5)
+    del vehicle._send_value
+    assert session.machine.table.params[name].value == 18.0
+    assert vehicle.params[name].value == 12.0
+    session.run(2.5)
+    assert session.machine.table.params[name].value == 12.0
+    assert [(each.new and each.new.value, each.by) for each in changed_in(session.events, name)] == [
+        (12.0, "vehicle")
+    ]
+
+
+def test_after_many_writes_the_hash_alone_proves_that_they_have_lasted() -> None:
+    vehicle = PX4Vehicle()
+    station = Station(link="sim:test", is_stream=False, upkeep=Upkeep.chosen(None, "auto"))
+    session = Simulation(vehicle, station=station)
+    machine = session.meet()
+    session.fetch()
+    session.run(3.0)
+    names = [name for name, param in machine.table.params.items() if param.type is ParamType.REAL32]
+    names = [name for name in names if name not in machine.table.volatile and not name.startswith("MPC_")]
+    writes = [machine.write(name, 0.75, session.now) for name in names[:40]]
+    session.until(partial(are_done, writes))
+    session.run(0.5)
+    session.sent.clear()
+    session.run(2.0)
+    assert [each.param_id for each in session.sent_of(ParamRequestRead)] == ["_HASH_CHECK"]
+    assert machine.sync.synced

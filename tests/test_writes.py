@@ -24,7 +24,7 @@ from paramclient.protocol.timing import FEWEST_TRIES, INITIAL_TIMEOUT, RoundTrip
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamSet, ParamValue
 from paramclient.protocol.writes import Write, Writes
 from paramclient.values import Encoding, ParamType, Trust, Value, decode
-from tests.simulation import known, param_value
+from tests.simulation import is_so, known, param_value
 
 INT32 = ParamType.INT32
 NAN = struct.unpack("<f", b"\x01\x00\xc0\x7f")[0]
@@ -729,3 +729,128 @@ def test_a_write_that_ends_may_take_others_with_it_while_time_passes() -> None:
     desk.pass_time()
     assert sorted([first.done, second.done]) == [False, True]
     assert len(desk.writes) == len(desk.reads) == 0
+
+
+# watched after the acknowledgement
+
+
+def test_a_watched_value_is_read_once_more_and_then_the_write_ends() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.writes.set("A", 80.0, desk.now, settle=1.2)
+    desk.take()
+    desk.hear("A", 80.0, at=0.1)
+    assert not is_so(write.done)
+    assert desk.writes.author("A") is None  # what changes now is not ours
+    desk.pass_time(1.1)
+    assert desk.take() == []
+    desk.pass_time(0.2)
+    assert desk.take() == ["read A"]
+    desk.hear("A", 80.0)
+    assert write.result is not None
+    assert (write.result.status, write.result.actual, write.result.attempts) == ("accepted", 80.0, 1)
+    assert len(desk.writes) == len(desk.reads) == 0
+
+
+def test_what_the_vehicle_makes_of_a_watched_value_is_an_adjustment() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.writes.set("A", 80.0, desk.now, settle=1.2)
+    desk.hear("A", 80.0, at=0.1)
+    desk.hear("A", 45.0, at=0.9)
+    assert not write.done
+    desk.pass_time(0.5)
+    desk.hear("A", 45.0)
+    assert write.result is not None
+    assert write.result.adjusted
+    assert (write.result.requested, write.result.actual, write.result.param.value) == (80.0, 45.0, 45.0)
+
+
+def test_a_watched_adjustment_stays_one() -> None:
+    desk = Desk(Encoding.C_CAST)
+    desk.knows("A", 1, INT32)
+    write = desk.writes.set("A", 5.7, desk.now, settle=1.0)
+    desk.hear("A", 5, INT32)
+    desk.pass_time(1.1)
+    desk.hear("A", 5, INT32)
+    assert write.result is not None
+    assert write.result.adjusted
+    assert write.result.actual == 5
+
+
+def test_the_next_write_to_a_name_waits_for_the_watch_and_others_do_not() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    desk.knows("B", 1.0)
+    first = desk.writes.set("A", 2.0, desk.now, settle=1.0)
+    second = desk.set("A", 3.0)
+    other = desk.set("B", 3.0)
+    desk.hear("A", 2.0)
+    desk.hear("B", 3.0)
+    assert [first.done, second.done, other.done] == [False, False, True]
+    desk.take()
+    desk.pass_time(1.1)
+    desk.hear("A", 2.0)
+    assert first.done
+    assert desk.take() == ["read A", "set A 3.0 REAL32"]
+
+
+def test_a_watch_survives_an_absence_of_the_link() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.writes.set("A", 2.0, desk.now, settle=1.0)
+    desk.hear("A", 2.0)
+    desk.take()
+    desk.writes.resume(desk.now)
+    assert desk.take() == []  # it is acknowledged: nothing is sent again
+    desk.pass_time(1.1)
+    desk.hear("A", 2.0)
+    assert write.result is not None
+
+
+def test_a_watch_that_cannot_be_ended_says_that_the_value_was_acknowledged() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    left: list[str] = []
+    desk.writes.left_open = lambda name, by, now: left.append(name)
+    lost = desk.writes.set("A", 2.0, desk.now, settle=1.0)
+    desk.hear("A", 2.0)
+    desk.writes.lose(desk.now)
+    assert isinstance(lost.error, NoReply)
+    assert "acknowledged" in str(lost.error)
+    cancelled = desk.writes.set("A", 3.0, desk.now, settle=1.0)
+    desk.hear("A", 3.0)
+    desk.writes.cancel(cancelled, desk.now)
+    assert len(desk.writes) == 0
+    unanswered = desk.writes.set("A", 4.0, desk.now, settle=1.0)
+    desk.hear("A", 4.0)
+    desk.pass_time()
+    assert isinstance(unanswered.error, NoReply)
+    assert "acknowledged" in str(unanswered.error)
+    assert left == []  # nobody has to guess who changes the value now
+
+
+# NaN and infinity
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, struct.pack("<f", math.inf)])
+def test_what_the_vehicle_cannot_store_is_not_sent(value: Value) -> None:
+    desk = Desk()
+    desk.writes.against_non_finite = "it stops"
+    write = desk.set("A", value)  # the type is not known yet
+    desk.hear("A", 1.0)
+    assert isinstance(write.error, UsageError)
+    assert "it stops" in str(write.error)
+    assert desk.take() == ["read A"]
+    assert len(desk.writes) == 0
+    forced = desk.writes.set("A", value, desk.now, force=True)
+    assert [each[:5] for each in desk.take()] == ["set A"]
+    assert not forced.done
+
+
+def test_the_bits_of_an_infinity_are_an_integer_as_any_other() -> None:
+    desk = Desk()
+    desk.writes.against_non_finite = "it stops"
+    desk.knows("A", 1, INT32)
+    desk.set("A", struct.pack("<f", math.inf))
+    assert desk.take() == ["set A 2139095040 INT32"]

@@ -85,6 +85,7 @@ async def apply(
     reboot: bool = False,
     allow_armed: bool = False,
     skip_invalid: bool = False,
+    force: bool = False,
     backup: str | None = None,
     over: Annotated[str | None, Parameter(name="--overlay")] = None,
     everybody: Everybody = False,
@@ -109,6 +110,7 @@ async def apply(
         reboot: Start the vehicle again where values count only from then on.
         allow_armed: Go on although it is armed.
         skip_invalid: Set the others although some values cannot be right.
+        force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
         backup: A new file for what the vehicle has before; its ending tells the form. {uid} and {system} in
             it stand for the vehicle's own.
         over: A file that lies over the other, with {uid} or {system} in its name for the vehicle's own.
@@ -132,7 +134,8 @@ async def apply(
         show = _Show(found, as_json=options.json, is_fleet=everybody, full=full)
 
         async def plans() -> tuple[dict[Vehicle, Plan], dict[Vehicle, ParamClientError]]:
-            fleet = await _within(found, verify_all(found.vehicles, wanted, include=include, info=info))
+            compared = verify_all(found.vehicles, wanted, include=include, info=info, force=force)
+            fleet = await _within(found, compared)
             return show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors)
 
         if dry_run:
@@ -151,6 +154,7 @@ async def apply(
                 reboot=reboot,
                 allow_armed=allow_armed,
                 skip_invalid=skip_invalid,
+                force=force,
                 backup=None if backup is None else lambda each: backups[each.system, each.component],
                 timeout=found.deadline.left(),
                 progress=tell,
@@ -207,6 +211,7 @@ async def restore(
     include: Include = (),
     reboot: bool = False,
     allow_armed: bool = False,
+    force: bool = False,
     backup: str | None = None,
     dry_run: bool = False,
     full: bool = False,
@@ -225,6 +230,7 @@ async def restore(
         include: A category of what is left out, or a name or pattern, as with apply.
         reboot: Start the vehicle again where values count only from then on.
         allow_armed: Go on although it is armed.
+        force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
         backup: A new file for what the vehicle has now.
         dry_run: Print what would be sent, and send none of it.
         full: Print also what is as it should be, or left out.
@@ -241,7 +247,7 @@ async def restore(
 
         async def plans() -> tuple[dict[Vehicle, Plan], dict[Vehicle, ParamClientError]]:
             whole = (*await restored(vehicle, state), *include)
-            fleet = await _within(found, verify_all([vehicle], state, include=whole, info=info))
+            fleet = await _within(found, verify_all([vehicle], state, include=whole, info=info, force=force))
             return show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors)
 
         if dry_run:
@@ -257,6 +263,7 @@ async def restore(
                 info=info(vehicle),
                 reboot=reboot,
                 allow_armed=allow_armed,
+                force=force,
                 backup=backups.get(address),
                 timeout=found.deadline.left(),
                 progress=lambda how_far: tell(vehicle, how_far),

@@ -12,6 +12,7 @@ import anyio
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from paramclient.asked import SETTLE_MAX
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
     MetadataChoice,
@@ -158,6 +159,8 @@ async def set_(
     url: str,
     /,
     *pairs: Annotated[str, Parameter(name="NAME VALUE", allow_leading_hyphen=True)],
+    settle: Annotated[float, Parameter(validator=Number(gte=0, lte=SETTLE_MAX))] = 0.0,
+    force: bool = False,
     metadata: MetadataChoice = None,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
@@ -170,6 +173,9 @@ async def set_(
     Args:
         url: The link.
         pairs: A parameter and its value, as often as wanted; NAME=VALUE is one too.
+        settle: Seconds after the last of them until all are read once more. 1.2 shows what PX4's modules
+            clamp.
+        force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
         metadata: A file that describes parameters; or vehicle, to ask the vehicle for what it says of them.
     """
     wanted = parse_pairs(pairs)
@@ -184,7 +190,10 @@ async def set_(
         for problem in problems(writes, described):
             report(problem)
         began = anyio.current_time()
-        outcomes = [await _write(session, name, value) for name, value in writes]
+        outcomes = [await _write(session, name, value, force=force) for name, value in writes]
+        if settle:
+            await anyio.sleep(settle)
+            outcomes = [await _read_again(session, outcome) for outcome in outcomes]
         client = session.client
         summary = (
             f"{sum(not outcome.reason for outcome in outcomes)} of {len(outcomes)} set on {session.who} in "
@@ -391,7 +400,7 @@ def _report_all(errors: Iterable[ParamClientError]) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Written:
-    """What became of one set; `reason` is empty where it was done."""
+    """What became of one set; `reason` is empty where it was done, and `param` is what was acknowledged."""
 
     name: str
     type: ParamType | int
@@ -400,6 +409,7 @@ class _Written:
     status: str
     reason: str = ""
     code: ExitCode = ExitCode.DONE
+    param: Param | None = None
 
     def document(self, metadata: Metadata | None) -> SetDoneDoc:
         """The same for programs."""
@@ -420,9 +430,10 @@ class _Written:
         return self.name, format_value(self.requested, ParamType.REAL64), actual, self.status
 
 
-async def _write(session: Session, name: str, value: int | float) -> _Written:
+async def _write(session: Session, name: str, value: int | float, *, force: bool) -> _Written:
+    left = session.deadline.left()
     try:
-        done = await session.component.set(name, value, timeout=session.deadline.left())
+        done = await session.component.set(name, value, timeout=left, force=force)
     except ParamClientError as error:
         known = session.component.params.get(name)
         return _Written(
@@ -434,7 +445,23 @@ async def _write(session: Session, name: str, value: int | float) -> _Written:
             reason=str(error),
             code=code_of(error),
         )
-    return _Written(name, done.param.type, requested=value, actual=done.actual, status=done.status)
+    return _Written(
+        name, done.param.type, requested=value, actual=done.actual, status=done.status, param=done.param
+    )
+
+
+async def _read_again(session: Session, written: _Written) -> _Written:
+    """What has become of a value since it was acknowledged."""
+    if written.param is None:
+        return written
+    try:
+        param = await session.component.get(written.name, timeout=session.deadline.left())
+    except ParamClientError as error:
+        reason = f"acknowledged, and not read once more: {error}"
+        return replace(written, actual=None, status=status_of(error), reason=reason, code=code_of(error))
+    if param.same_value(written.param):
+        return written
+    return replace(written, actual=param.value, status="adjusted")
 
 
 # watch

@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from paramclient.errors import LinkError, NoReply, UsageError
-from paramclient.identity import autopilot_name
+from paramclient.identity import autopilot_name, reason_against_non_finite
 from paramclient.params import parts_of
 from paramclient.protocol import events
 from paramclient.protocol.change import Change
@@ -18,6 +18,7 @@ from paramclient.protocol.parts import Parts
 from paramclient.protocol.reads import Key, Read
 from paramclient.protocol.restart import SAVING_TIME, Restart
 from paramclient.protocol.result import FetchResult, Policy, Sampled
+from paramclient.protocol.value_check import LATER_CHANGE_TIME
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -267,11 +268,27 @@ class ComponentMachine(Parts):
         read.is_of_caller = True
         return read
 
-    def write(self, name: str, value: Value, now: float, asker: str | None = None) -> Write:
+    def write(
+        self,
+        name: str,
+        value: Value,
+        now: float,
+        asker: str | None = None,
+        *,
+        settle: float = 0.0,
+        force: bool = False,
+    ) -> Write:
         """Write one parameter, for somebody.
 
+        Args:
+            name, value, asker: as in `Component.set`.
+            now: the time.
+            settle: seconds from the acknowledgement until the value is read once more.
+            force: send NaN and infinity also to an autopilot that cannot store them.
+
         Raises:
-            UsageError: the type is known and the value does not fit it. Nothing was sent.
+            UsageError: the type is known and the value does not fit it, or the autopilot cannot store it.
+                Nothing was sent.
             NoReply: the component is lost. Nothing was sent.
         """
         self.check_present(f"PARAM_SET {name} to {self.system}/{self.component}", now)
@@ -279,8 +296,9 @@ class ComponentMachine(Parts):
         known = self.table.params.get(name)
         if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
             encode(value, known.type, self.table.encoding)
-        write = self.writes.set(name, value, now, asker)
-        write.on_done.append(lambda: self._write_ended(write.ended_at))
+        self.writes.check_finite(name, value, force=force)
+        write = self.writes.set(name, value, now, asker, settle=settle, force=force)
+        write.on_done.append(lambda: self._write_ended(write))
         return write
 
     def begin_restart(self, now: float, *, returns: bool = True) -> Restart:
@@ -505,8 +523,12 @@ class ComponentMachine(Parts):
         self._doubt()
 
     def _check_values(self, now: float) -> None:
-        """Read again what is due."""
-        for name in self._checks.due(now):
+        """Read again what is due; by the vehicle's hash alone, as far as that proves it."""
+        names = self._checks.due(now)
+        if self.who.autopilot == MAV_AUTOPILOT_PX4 and self.sync.may_resync and self.table.is_provable:
+            names = [name for name in names if not self.table.is_hashed(name)]
+            self.sync.ask(now)
+        for name in names:
             if self._policy is not Policy.AUTO:
                 self.table.doubt_value(name)
             elif len(self.reads) < MOST_DOUBTED:
@@ -547,7 +569,10 @@ class ComponentMachine(Parts):
     def _follow_identity(self, now: float) -> None:
         """What the identification has come to know takes effect."""
         self._report(self.table.use_encoding(self.who.encoding))
-        self.reads.pace.is_batched = self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
+        autopilot = self.who.autopilot
+        self.reads.pace.is_batched = autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
+        name = "" if autopilot is None else autopilot_name(autopilot)
+        self.writes.against_non_finite = reason_against_non_finite(name)
         if self.fetch is not None:
             self.fetch.identified(now)
         if self.who.settled and self._known_as != self.identity.key:
@@ -567,9 +592,13 @@ class ComponentMachine(Parts):
             self.sync.changed(change.name, change.by)
         self._report(changes)
 
-    def _write_ended(self, now: float) -> None:
+    def _write_ended(self, write: Write) -> None:
+        now = write.ended_at
         self._saved_at = now + SAVING_TIME
         self.sync.write_ended(now)
+        is_px4 = self.who.autopilot == MAV_AUTOPILOT_PX4
+        if is_px4 and write.result is not None and self._policy is Policy.AUTO and not write.settle:
+            self._checks.ask(write.name, now + LATER_CHANGE_TIME)
 
     def _resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
         self._emit(events.TableResynced(self, changed, confirmed))

@@ -216,11 +216,15 @@ class Sync:
         if name not in self._table.volatile:
             if not is_ours(by):
                 self._moved_by_us_alone = False
-            announced = self.announced
-            if announced is not None and announced.at != _PAST:
-                self.announced = replace(announced, at=_PAST)
+            self.expire_hash()
         if (self._has_fallen or self._resync is not None) and len(self._moved) < MOST_NAMES:
             self._moved[name] = None
+
+    def expire_hash(self) -> None:
+        """The hash that was announced last is of the past: it is asked for again before it counts."""
+        announced = self.announced
+        if announced is not None and announced.at != _PAST:
+            self.announced = replace(announced, at=_PAST)
 
     def count_moved(self, now: float) -> None:
         """Another number of parameters was heard: the table is not what it was."""
@@ -245,8 +249,7 @@ class Sync:
         """The component is lost, or has started again: the table counts once its hash has confirmed it."""
         self._fall()
         self.stop()
-        if self.announced is not None:
-            self.announced = replace(self.announced, at=_PAST)
+        self.expire_hash()
 
     def check(self, now: float) -> None:
         """It is there again: see whether the table still holds, as soon as the link is idle."""
@@ -322,6 +325,11 @@ class Sync:
         """Ask for nothing any more, unless there is a new reason to."""
         self._settle_at = self._check_at = math.inf
         self._is_checking = False
+
+    @property
+    def may_resync(self) -> bool:
+        """Whether a hash that is not the table's leads to a new fetch."""
+        return self._is_kept_up and not self._is_spared()
 
     # private
 

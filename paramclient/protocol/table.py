@@ -493,6 +493,16 @@ class Table:
         """They were those of another firmware."""
         self._defaults.clear()
 
+    @property
+    def is_provable(self) -> bool:
+        """Whether the vehicle's hash can prove the present values of all that it covers."""
+        return self.complete and self.volatile_known and self.hash is not None
+
+    def is_hashed(self, name: str) -> bool:
+        """Whether the vehicle's hash covers a parameter, while that is known."""
+        held = self._held.get(name)
+        return held is not None and is_listed(held) and name not in self.volatile
+
     def listed_bits(self) -> dict[str, int]:
         """The bits of those that have an index, which the count and the hash are about, by name."""
         return {name: parts_of(held)[0] for name, held in self._held.items() if is_listed(held)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import deque
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from paramclient.errors import NoReply, ParamErrorCode, TypeMismatch, UsageError, ValueNotApplied
 from paramclient.protocol.authors import by_us
@@ -36,7 +36,8 @@ class SetResult:
     Attributes:
         name: param_id.
         status: "accepted" (the vehicle holds what was asked for, as far as its type can), or "adjusted" (it
-            took the value and made another of it, as ArduPilot makes 1234 of 1234.7 for an integer).
+            took the value and made another of it, as ArduPilot makes 1234 of 1234.7 for an integer; or it
+            changed it while it was watched, as modules of PX4 clamp values within a second).
         requested: the value that was asked for.
         actual: the value that the vehicle reports.
         param: the parameter as it is now.
@@ -62,13 +63,31 @@ class SetResult:
 
 
 class Write(Operation[SetResult]):
-    """One PARAM_SET until its value is proven; see `Writes`."""
+    """One PARAM_SET until its value is proven; see `Writes`.
 
-    def __init__(self, name: str, value: Value, begun_at: float, asker: str | None = None) -> None:
+    Attributes:
+        settle: seconds from the acknowledgement until the value is read once more.
+        is_forced: whether a value that the vehicle cannot store is sent all the same.
+        acknowledged: the result so far, while the value is watched for that time.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        value: Value,
+        begun_at: float,
+        asker: str | None = None,
+        *,
+        settle: float = 0.0,
+        is_forced: bool = False,
+    ) -> None:
         super().__init__(begun_at)
         self.name = name
         self.value = value
         self.by = by_us(asker)
+        self.settle = settle
+        self.is_forced = is_forced
+        self.acknowledged: SetResult | None = None
         self.attempts = 0
         self.sent_at = math.inf
         self.number = 0  # the type that was sent
@@ -91,6 +110,10 @@ class Writes:
     PARAM_SET is sent again, and if the same comes of it, it is the adjustment. The old one means that nothing
     was applied, and the PARAM_SET is sent again, as it may have been lost, until that is no longer likely.
 
+    Where the caller asks for it, the value is watched for a while after that, and then read once more: what
+    the vehicle has made of it meanwhile is its adjustment. All that time the write is acknowledged, so that
+    changes of the value are not ours, but the next write to the name waits.
+
     Nothing is sent before it is certain how the component writes values: an integer in the wrong encoding
     would be taken as another number.
 
@@ -98,6 +121,7 @@ class Writes:
         queues: by name, those that are open, the one under way first; no name has an empty one.
         is_held: whether one waits for that.
         asked, retries: writes so far, and PARAM_SETs that were sent for another time.
+        against_non_finite: why the vehicle must not be sent NaN and infinity; "" where it may be.
         left_open: is told the name and the author of a write of which nobody learns any more whether the
             vehicle takes it.
     """
@@ -123,6 +147,7 @@ class Writes:
         self._trace = trace
         self.asked = self.retries = 0
         self.is_held = False
+        self.against_non_finite = ""
         self.queues: dict[str, deque[Write]] = {}
         self.left_open: Callable[[str, str, float], None] = _nobody
 
@@ -134,15 +159,36 @@ class Writes:
         write = self._active(name)
         return None if write is None else write.by
 
-    def set(self, name: str, value: Value, now: float, asker: str | None = None) -> Write:
+    def set(
+        self,
+        name: str,
+        value: Value,
+        now: float,
+        asker: str | None = None,
+        *,
+        settle: float = 0.0,
+        force: bool = False,
+    ) -> Write:
         """Begin a write, behind those to the same name that are open."""
-        write = Write(name, value, now, asker)
+        write = Write(name, value, now, asker, settle=settle, is_forced=force)
         self.asked += 1
         queue = self.queues.setdefault(name, deque())
         queue.append(write)
         if len(queue) == 1:
             self._start(write, now)
         return write
+
+    def check_finite(self, name: str, value: Value, *, force: bool) -> None:
+        """See that a value may be sent as far as it is a finite number.
+
+        Raises:
+            UsageError: it is NaN or infinite, and the vehicle must not be sent that.
+        """
+        if isinstance(value, float) and not math.isfinite(value) and self.against_non_finite and not force:
+            raise UsageError(
+                f"{name} = {value} was not sent to {self._target[0]}/{self._target[1]}: "
+                f"{self.against_non_finite}. Force it to send it all the same."
+            )
 
     def cancel(self, write: Write, now: float) -> None:
         """Forget a write. What was sent cannot be taken back: the vehicle may have applied it."""
@@ -172,10 +218,9 @@ class Writes:
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here after it went into the table."""
-        queue = self.queues.get(message.param_id)
-        if queue is None or not queue[0].attempts:
+        write = self._active(message.param_id)
+        if write is None:
             return
-        write = queue[0]
         value, bits = decode(message.raw, message.param_type, self._encoding())
         heard = Param(write.name, value, message.param_type, None, bits)
         if message.param_type != write.number:
@@ -228,15 +273,10 @@ class Writes:
             if not queue:
                 continue
             write = queue[0]
-            if write.verify_at <= now:
+            if write.verify_at <= now:  # also where it is watched, and that time is over
                 write.verify_at = math.inf
                 self._read(write, now)
-            elif (
-                write.attempts
-                and write.read is None
-                and not write.is_answered
-                and write.sent_at + timeout <= now
-            ):
+            elif self._awaits_answer(write) and not write.is_answered and write.sent_at + timeout <= now:
                 self._round_trip.timed_out(write.attempts)
                 if self._round_trip.is_hopeless(write.attempts, now):
                     # reads in between have shown that nothing came of it
@@ -256,14 +296,14 @@ class Writes:
         for queue in self.queues.values():
             write = queue[0]
             earliest = min(earliest, write.verify_at)
-            if write.attempts and write.read is None and not write.is_answered:
+            if self._awaits_answer(write) and not write.is_answered:
                 earliest = min(earliest, write.sent_at + timeout)
         return earliest
 
     def resume(self, now: float) -> None:
         """The link is back: what was under way goes on at once."""
         for queue in list(self.queues.values()):
-            if queue and queue[0].attempts and queue[0].read is None:
+            if queue and self._awaits_answer(queue[0]):
                 if self._is_certain():
                     queue[0].attempts -= 1
                 self._transmit(queue[0], now)
@@ -291,8 +331,13 @@ class Writes:
         return max(self._round_trip.timeout / 2, 0.05)
 
     def _active(self, name: str) -> Write | None:
+        """The write whose PARAM_SET to this name is under way and not acknowledged."""
         queue = self.queues.get(name)
-        return queue[0] if queue and queue[0].attempts else None
+        return queue[0] if queue and queue[0].attempts and queue[0].acknowledged is None else None
+
+    @staticmethod
+    def _awaits_answer(write: Write) -> bool:
+        return write.attempts > 0 and write.acknowledged is None and write.read is None
 
     def _start(self, write: Write, now: float) -> None:
         known = self._params.get(write.name)
@@ -325,6 +370,11 @@ class Writes:
             self._fail(write, self._type_mismatch(write, str(error)) if write.was_retyped else error, now)
             return
         value, bits = decode(raw, write.number, encoding)
+        try:
+            self.check_finite(write.name, value, force=write.is_forced)
+        except UsageError as error:
+            self._fail(write, error, now)
+            return
         write.wanted = Param(write.name, value, write.number, None, bits)
         write.attempts += 1
         self.retries += write.attempts > 1
@@ -345,6 +395,8 @@ class Writes:
                 self._fail(write, self._no_reply(write, read.ended_at), read.ended_at)
             elif read.error is not None:
                 self._fail(write, read.error, read.ended_at)
+            elif write.acknowledged is not None:
+                self._end_watch(write, write.acknowledged, read.ended_at)
             elif write.attempts:
                 self._decide(write, self._params[write.name], read.ended_at)
             else:
@@ -372,9 +424,24 @@ class Writes:
             exact = actual.value == write.value
         status = "accepted" if exact else "adjusted"
         result = SetResult(write.name, status, write.value, actual.value, actual, write.attempts)
-        self._leave(write, now)
         self._trace("%s/%s %s: %s after try %s", *self._target, write.name, status, write.attempts)
+        if write.settle > 0.0:
+            if write.read is not None:
+                self._reads.release(write.read)
+                write.read = None
+            write.acknowledged = result
+            write.verify_at = now + write.settle
+            return
+        self._leave(write, now)
         write.finish(result, now)
+
+    def _end_watch(self, write: Write, result: SetResult, now: float) -> None:
+        """The value was read once more: what has become of it since the acknowledgement?"""
+        actual = self._params[write.name]
+        if not result.param.same_value(actual):
+            result = replace(result, status="adjusted", actual=actual.value)
+        self._leave(write, now)
+        write.finish(replace(result, param=actual), now)
 
     def _fail(self, write: Write, error: Exception, now: float) -> None:
         if isinstance(error, NoReply):
@@ -384,7 +451,7 @@ class Writes:
         write.fail(error, now)
 
     def _leave_open(self, write: Write, now: float) -> None:
-        if write.attempts:
+        if write.attempts and write.acknowledged is None:
             self.left_open(write.name, write.by, now)
 
     def _leave(self, write: Write, now: float) -> None:
@@ -400,6 +467,8 @@ class Writes:
 
     def _no_reply(self, write: Write, now: float, why: str = "") -> Exception:
         what = f"PARAM_SET {write.name} to {self._target[0]}/{self._target[1]}{why}"
+        if write.acknowledged is not None:
+            what += ": it was acknowledged, and could not be read once more"
         return NoReply(what, attempts=write.attempts, waited=now - write.begun_at)
 
     def _not_applied(self, write: Write, actual: Param) -> Exception:

@@ -36,6 +36,7 @@ async def apply(
     reboot: bool = False,
     allow_armed: bool = False,
     skip_invalid: bool = False,
+    force: bool = False,
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
     asker: str | None = None,
@@ -64,6 +65,7 @@ async def apply(
         reboot: start the vehicle again where values count only from then on.
         allow_armed: go on although it is armed.
         skip_invalid: set the others although some values cannot be right.
+        force: as in `plan`.
         backup: a file for the state before; its form follows from its name, see `paramclient.files`.
         timeout: seconds, after which the result says how far it came.
         asker: for whom it is done, as in `Component.set`.
@@ -86,6 +88,7 @@ async def apply(
         reboot=reboot,
         allow_armed=allow_armed,
         skip_invalid=skip_invalid,
+        force=force,
         backup=backup,
         asker=asker,
         progress=progress,
@@ -102,6 +105,7 @@ async def restore(
     info: Mapping[str, ParamInfo] | None = None,
     reboot: bool = False,
     allow_armed: bool = False,
+    force: bool = False,
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
     asker: str | None = None,
@@ -115,7 +119,7 @@ async def restore(
         component: the vehicle.
         state: what it had, such as a snapshot, or the file of a backup. If it does not say that it is this
             vehicle's own, identity and calibration are left out.
-        include, info, reboot, allow_armed, backup, timeout, asker, progress: as in `apply`.
+        include, info, reboot, allow_armed, force, backup, timeout, asker, progress: as in `apply`.
 
     Raises:
         UsageError: it is the state of another vehicle.
@@ -130,6 +134,7 @@ async def restore(
         reboot=reboot,
         allow_armed=allow_armed,
         skip_invalid=True,
+        force=force,
         backup=backup,
         asker=asker,
         progress=progress,

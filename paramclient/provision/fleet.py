@@ -33,6 +33,7 @@ async def apply_all(
     reboot: bool = False,
     allow_armed: bool = False,
     skip_invalid: bool = False,
+    force: bool = False,
     backup: Callable[[Component], str | os.PathLike[str]] | None = None,
     timeout: float | None = None,
     asker: str | None = None,
@@ -44,7 +45,7 @@ async def apply_all(
         components: the vehicles.
         wanted: what they shall have: all the same; or each its own, by (system, component) or by a call.
             `overlay` puts what is one vehicle's own over what all share.
-        include, reboot, allow_armed, skip_invalid, timeout, asker: as in `apply`.
+        include, reboot, allow_armed, skip_invalid, force, timeout, asker: as in `apply`.
         info: gives the metadata for a vehicle.
         backup: gives the name of the file for the state before of a vehicle.
         progress: as in `apply`, with the vehicle.
@@ -67,6 +68,7 @@ async def apply_all(
             reboot=reboot,
             allow_armed=allow_armed,
             skip_invalid=skip_invalid,
+            force=force,
             backup=None if backup is None else backup(component),
             timeout=timeout,
             asker=asker,
@@ -82,6 +84,7 @@ async def verify_all(
     *,
     include: str | Iterable[str] = (),
     info: Callable[[Component], Mapping[str, ParamInfo] | None] | None = None,
+    force: bool = False,
 ) -> FleetVerified:
     """`verify` several vehicles side by side.
 
@@ -91,7 +94,7 @@ async def verify_all(
 
     async def one(component: Component, own: ParamSet) -> Plan:
         described = None if info is None else info(component)
-        return await verify(component, own, include=given, info=described)
+        return await verify(component, own, include=given, info=described, force=force)
 
     return FleetVerified(*await _side_by_side(components, wanted, one))
 

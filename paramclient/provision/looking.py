@@ -65,6 +65,7 @@ async def look(
         NoReply: it did not answer.
         LinkError: the link failed, or the client was closed.
     """
+    component._machine.sync.expire_hash()  # what was announced before may have moved
     heard = {name for name, param in component.params.items() if param.trust is Trust.LIVE}
     fetched = await component.fetch_all()
     await component.refreshed()
@@ -106,12 +107,13 @@ async def prepare(
     *,
     include: str | Iterable[str] = (),
     info: Mapping[str, ParamInfo] | None = None,
+    force: bool = False,
 ) -> Plan:
     """Work out what `apply` would send to a vehicle, and in which order. Only reads.
 
     Args:
         component: the vehicle.
-        wanted, include, info: as in `plan`.
+        wanted, include, info, force: as in `plan`.
 
     Raises:
         UsageError: as from `plan`.
@@ -124,7 +126,7 @@ async def prepare(
     plan({}, wanted, include=given, autopilot=component.autopilot)
     await identified(component)
     seen = await look(component, wanted)
-    return plan_for(component, seen.table, wanted, given, info)
+    return plan_for(component, seen.table, wanted, given, info, force=force)
 
 
 async def verify(
@@ -133,6 +135,7 @@ async def verify(
     *,
     include: str | Iterable[str] = (),
     info: Mapping[str, ParamInfo] | None = None,
+    force: bool = False,
 ) -> Plan:
     """Compare a vehicle with what is wanted. Only reads.
 
@@ -141,7 +144,7 @@ async def verify(
 
     Args and errors as in `prepare`.
     """
-    return await prepare(component, wanted, include=include, info=info)
+    return await prepare(component, wanted, include=include, info=info, force=force)
 
 
 def plan_for(
@@ -150,6 +153,8 @@ def plan_for(
     wanted: ParamSet,
     include: tuple[str, ...],
     info: Mapping[str, ParamInfo] | None,
+    *,
+    force: bool,
 ) -> Plan:
     """The plan for a vehicle that has this table."""
     return plan(
@@ -159,6 +164,7 @@ def plan_for(
         info=info,
         autopilot=component.autopilot,
         encoding=component.encoding,
+        force=force,
     )
 
 

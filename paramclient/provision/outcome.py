@@ -23,7 +23,7 @@ class ApplyStatus(StrEnum):
     UNCHANGED = "unchanged"
     """The vehicle had the value already."""
     ADJUSTED = "adjusted"
-    """It was written, and the vehicle made another value of it."""
+    """It was written, and the vehicle made another value of it, at once or within a second afterwards."""
     REFUSED = "refused"
     SKIPPED = "skipped"
     """It was not written: left out, not on this vehicle, or invalid."""

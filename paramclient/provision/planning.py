@@ -11,7 +11,7 @@ from enum import StrEnum
 from typing import Final, Protocol
 
 from paramclient.errors import UsageError
-from paramclient.identity import Identity, autopilot_name
+from paramclient.identity import Identity, autopilot_name, reason_against_non_finite
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.provision.cautions import OUT_OF_RANGE, READ_ONLY, Cautions, Choice, cautions_for
 from paramclient.provision.nearest import nearest_names
@@ -198,6 +198,7 @@ class Plan:
         extra: names that the vehicle has and `wanted` does not; they stay as they are.
         include: what was asked for although the list leaves it out.
         identity: whose plan it is, where `current` said so.
+        force: whether values that the autopilot cannot store are sent all the same.
         unstarted: switches that are on already, and whose group is not there: as they count from the next
             start of the vehicle on, it may not have started since they were set.
     """
@@ -209,6 +210,7 @@ class Plan:
     include: tuple[str, ...] = ()
     identity: Identity | None = None
     unstarted: tuple[str, ...] = ()
+    force: bool = False
 
     @property
     def steps(self) -> list[Step]:
@@ -247,6 +249,7 @@ def plan(
     info: Mapping[str, ParamInfo] | None = None,
     autopilot: str | None = None,
     encoding: Encoding | None = None,
+    force: bool = False,
 ) -> Plan:
     """Work out what has to be set on a vehicle so that it has the wanted values. Nothing is sent.
 
@@ -256,7 +259,8 @@ def plan(
     A value is invalid that the parameter's own type cannot take, or that cannot be sent exactly: a fraction
     for an integer, and, where integers are sent as float32 (ArduPilot), one beyond 24 bits. So is one
     outside of the range in the metadata, or not finite, unless "out-of-range" is included: many vehicles
-    take such values without a word.
+    take such values without a word. Of PX4 and ArduPilot, only `force` lets NaN and infinity through: PX4
+    cannot save them, nor anything else from then on, and may stop.
 
     Args:
         current: what the vehicle has: a table, such as `component.params`, or a snapshot.
@@ -266,6 +270,7 @@ def plan(
         info: metadata by name, where there is some.
         autopilot: "px4" or "ardupilot"; None where `current` says it, or for the lists of both.
         encoding: how values are sent; None: as the autopilot does.
+        force: let NaN and infinity be set, whatever the autopilot makes of them.
 
     Raises:
         UsageError: `include` names no category and is no glob, or the two are of different components or
@@ -281,13 +286,14 @@ def plan(
     given = (include,) if isinstance(include, str) else tuple(include)
     if encoding is None:
         encoding = Encoding.C_CAST if autopilot == "ardupilot" else Encoding.BYTEWISE
-    planner = _Planner(current, cautions_for(autopilot or ""), Choice(given), info or {}, encoding)
+    cautions = cautions_for(autopilot or "")
+    planner = _Planner(current, cautions, Choice(given), info or {}, encoding, autopilot or "", force=force)
     rows = {name: planner.row(each) for name, each in wanted.items()}
     stages = planner.stages(rows)
     unstarted = planner.unstarted(rows)
     rows = planner.settle_missing(rows, stages)
     extra = tuple(name for name in current if name not in wanted)
-    return Plan(wanted, rows, stages, extra, given, identity, unstarted)
+    return Plan(wanted, rows, stages, extra, given, identity, unstarted, force)
 
 
 def overlay(base: ParamSet, over: ParamSet) -> ParamSet:
@@ -344,12 +350,19 @@ class _Planner:
         choice: Choice,
         info: Mapping[str, ParamInfo],
         encoding: Encoding,
+        autopilot: str,
+        *,
+        force: bool,
     ) -> None:
         self._current = current
         self._cautions = cautions
         self._choice = choice
         self._info = info
         self._encoding = encoding
+        self._force = force
+        # nothing but ArduPilot sends integers as float32
+        usual = "ardupilot" if encoding is Encoding.C_CAST else ""
+        self._against_non_finite = reason_against_non_finite(autopilot or usual)
 
     def row(self, wanted: WrittenParam) -> PlanRow:
         """What is to be done with one parameter; what is missing is settled later."""
@@ -452,8 +465,10 @@ class _Planner:
         if isinstance(value, bytes):
             return None
         if not math.isfinite(value):
-            if self._encoding is Encoding.C_CAST:
-                return WRONG, f"{value} is no number that this vehicle takes"
+            if self._force:
+                return None
+            if self._against_non_finite:
+                return WRONG, self._against_non_finite
             return OUT_OF_RANGE, f"{value} is no number to fly with"
         if info is not None:
             sent = _float32(value) if kind == ParamType.REAL32 else value

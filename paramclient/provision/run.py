@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
@@ -52,6 +53,9 @@ MOST_SILENT: Final = 3
 """Writes without an answer, and none with one between them, after which no further is begun."""
 RESET_SYSTEM: Final = 1
 """The system id that a PX4 has after SYS_AUTOCONFIG: MAV_SYS_ID is not among what its start script keeps."""
+LASTING_TIME: Final = 1.2
+"""Seconds after the last write before the vehicle is looked at for proof: modules of PX4 clamp values up to
+815 ms after the acknowledgement, and set others up to 1 s after it (measured)."""
 HEARTBEAT_PATIENCE: Final = 3.0
 """Seconds for a heartbeat to say whether the vehicle is armed; there is one a second, and some are lost."""
 FOLLOW_PATIENCE: Final = 10.0
@@ -83,6 +87,7 @@ class Run:
         reboot: bool,
         allow_armed: bool,
         skip_invalid: bool,
+        force: bool,
         backup: str | os.PathLike[str] | None,
         asker: str | None,
         progress: Callable[[ApplyProgress], None] | None,
@@ -93,6 +98,7 @@ class Run:
         if isinstance(wanted, Plan):
             self._planned_for = wanted.identity
             include = (*wanted.include, *include)
+            force = force or wanted.force
             wanted = wanted.wanted
         self._wanted = wanted
         self._include = include
@@ -100,6 +106,7 @@ class Run:
         self._reboot = reboot
         self._allow_armed = allow_armed
         self._skip_invalid = skip_invalid
+        self._force = force
         self._backup = backup
         self._asker = check_asker(asker)
         self._progress = progress
@@ -112,6 +119,8 @@ class Run:
         self._first: Seen | None = None
         self._first_plan: Plan | None = None
         self._is_proven = True  # nothing was written since it was looked at
+        self._written_at = -math.inf  # when the last write ended
+        self._looked_at = -math.inf  # when the vehicle began to be looked at
         self._reboot_for: dict[str, None] = {}
         self._reboots = 0
         self._new_system: int | None = None  # its id from the next start on
@@ -147,8 +156,10 @@ class Run:
                     await self._write_stage(stage)
                 if self._has_to_start(stages):
                     await self._restart()
-                elif not stages:
+                elif not stages and self._looked_at >= self._written_at + LASTING_TIME:
                     return
+                elif not self._may_reveal(stages):
+                    await anyio.sleep_until(self._written_at + LASTING_TIME)
                 await self._look()
         except ParamClientError as error:
             if not self.sent:
@@ -195,6 +206,10 @@ class Run:
                     break
         return stages
 
+    def _may_reveal(self, done: list[Stage]) -> bool:
+        """Whether more is to be written as soon as the vehicle has been looked at, now that this is done."""
+        return bool(done) and done[-1].reveals and bool(self.plan.of(PlanStatus.LATER))
+
     def _has_to_start(self, done: list[Stage]) -> bool:
         """Whether the vehicle has to start again, now that these stages are done."""
         if not self._reboot:
@@ -228,9 +243,12 @@ class Run:
     async def _look(self) -> None:
         self._tell("reading")
         absent = self.seen.absent if self._first is not None else frozenset[str]()
+        self._looked_at = anyio.current_time()
         self.seen = await look(self._component, self._wanted, absent, whole=self._first is None)
         self._check_it_is_the_same()
-        self.plan = plan_for(self._component, self.seen.table, self._wanted, self._include, self._info)
+        self.plan = plan_for(
+            self._component, self.seen.table, self._wanted, self._include, self._info, force=self._force
+        )
         self._is_proven = True
 
     async def _write_stage(self, stage: Stage) -> None:
@@ -262,7 +280,7 @@ class Run:
         self._is_proven = False
         self.sent.add(step.name)
         try:
-            done = await self._component.set(step.name, step.value, asker=self._asker)
+            done = await self._component.set(step.name, step.value, force=self._force, asker=self._asker)
         except (VehicleError, UsageError) as error:
             self._silent = 0
             self._settle(step, ApplyStatus.REFUSED, step.before, str(error))
@@ -276,6 +294,8 @@ class Run:
         except LinkError as error:
             self._settle(step, ApplyStatus.FAILED, None, str(error))
             raise
+        finally:
+            self._written_at = anyio.current_time()
         self._silent = 0
         self._note_written(step)
         if self._is_action(step.name) and self._cautions.resets(step.name):
@@ -308,6 +328,7 @@ class Run:
             except ParamClientError as error:  # raised in here, it would come out in a group
                 failure = error
             sending.cancel_scope.cancel()
+        self._written_at = anyio.current_time()
         if failure is None:
             self._note_written(step)
             self._tell("writing", self._row_of(step, ApplyStatus.SET, step.value))
@@ -461,4 +482,4 @@ class Run:
             return row(ApplyStatus.UNPROVEN, f"{answered}, and not read back")
         if self._is_action(name):
             return row(ApplyStatus.SET, "done by the vehicle")
-        return row(ApplyStatus.FAILED, "it was acknowledged, and the vehicle has another value at the end")
+        return row(ApplyStatus.ADJUSTED, "the vehicle acknowledged it, and changed it afterwards")

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn, SupportsFloat, SupportsI
 
 import anyio
 
-from paramclient.asked import check_accepted, check_asked
+from paramclient.asked import check_accepted, check_asked, check_settle
 from paramclient.component import Component
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.events import Changes, Event, Found, Heard, Lost
@@ -185,6 +185,8 @@ class RemoteComponent(Component):
         value: SupportsIndex | SupportsFloat | bytes,
         *,
         timeout: float | None = None,
+        settle: float = 0.0,
+        force: bool = False,
         asker: str | None = None,
     ) -> SetResult:
         """See `Component.set`.
@@ -193,9 +195,14 @@ class RemoteComponent(Component):
         write is not sent again: LinkError then says that it is not known whether it was done.
         """
         requested = check_value(value)
+        body: dict[str, Any] = {"values": {check_name(name): value_as_sent(requested)}}
+        if check_settle(settle):
+            body["settle_s"] = settle
+        if force:
+            body["force"] = True
         answer = await self._ask(
             "params",
-            {"values": {check_name(name): value_as_sent(requested)}},
+            body,
             timeout,
             f"PARAM_SET {name} to {self.system}/{self.component}",
             method="PATCH",

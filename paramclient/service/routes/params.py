@@ -14,6 +14,7 @@ import anyio
 from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import Field
 
+from paramclient.asked import SETTLE_MAX
 from paramclient.documents.base import Body, Document
 from paramclient.documents.call import NotSetDoc, SetManyDoc, SetResultDoc
 from paramclient.documents.param import ParamDoc
@@ -72,10 +73,23 @@ class Read(Body):
     timeout_s: Seconds = None
 
 
+Settle = Annotated[
+    float,
+    Field(
+        ge=0, le=SETTLE_MAX, description="Seconds for which the value is watched; then it is read once more."
+    ),
+]
+Force = Annotated[
+    bool, Field(description="Whether NaN and infinity are sent to autopilots that cannot store them.")
+]
+
+
 class Write(Body):
     """One value."""
 
     value: ValueGiven
+    settle_s: Settle = 0.0
+    force: Force = False
     timeout_s: Seconds = None
 
 
@@ -83,6 +97,8 @@ class WriteMany(Body):
     """Several values, by name."""
 
     values: Annotated[dict[Name, ValueGiven], Field(min_length=1, max_length=MOST_VALUES)]
+    settle_s: Settle = 0.0
+    force: Force = False
     timeout_s: Seconds = None
 
 
@@ -143,7 +159,7 @@ async def read_by_path(request: Request, target: Target, name: str, body: Asked)
 async def write(request: Request, target: Target, name: str, body: Write) -> SetResultDoc:
     """Write one parameter, and prove by its value that the vehicle has taken it."""
     asker = asker_of(request)
-    return await answered(request, lambda: _write(target, name, body.value, body.timeout_s, asker), target)
+    return await answered(request, lambda: _write(target, name, body.value, body, asker), target)
 
 
 @router.patch("/params", dependencies=[Depends(may_write)])
@@ -154,7 +170,7 @@ async def write_many(request: Request, target: Target, body: WriteMany) -> SetMa
 
     async def write_one(name: str) -> None:
         try:
-            results[name] = await _write(target, name, body.values[name], body.timeout_s, asker)
+            results[name] = await _write(target, name, body.values[name], body, asker)
         except ParamClientError as error:
             results[name] = NotSetDoc(problem=problem_of(error))
 
@@ -174,10 +190,12 @@ async def _read(request: Request, target: Followed, key: str | int, timeout: flo
 
 
 async def _write(
-    target: Followed, name: str, given: ValueGiven, timeout: float | None, asker: str
+    target: Followed, name: str, given: ValueGiven, body: Write | WriteMany, asker: str
 ) -> SetResultDoc:
     value = await value_of(target, name, given)
-    result = await target.component.set(name, value, timeout=timeout, asker=asker)
+    result = await target.component.set(
+        name, value, timeout=body.timeout_s, settle=body.settle_s, force=body.force, asker=asker
+    )
     target.was_heard(result.param.name)
     return SetResultDoc.of(result)
 

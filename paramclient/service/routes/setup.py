@@ -62,6 +62,7 @@ class Wanted(Body):
     over: Source | None = None
     only: Patterns = ()
     include: Patterns = ()
+    force: bool = False
     full: bool = False
     timeout_s: Seconds = None
 
@@ -84,6 +85,7 @@ class Restored(Body):
     include: Patterns = ()
     reboot: bool = False
     allow_armed: bool = False
+    force: bool = False
     dry_run: bool = False
     full: bool = False
     wait: bool = True
@@ -147,6 +149,7 @@ async def apply_(request: Request, hub: TheHub, target: Target, body: Applied) -
             reboot=body.reboot,
             allow_armed=body.allow_armed,
             skip_invalid=body.skip_invalid,
+            force=body.force,
             timeout=body.timeout_s,
             asker=asker,
             progress=tell,
@@ -178,6 +181,7 @@ async def restore_(request: Request, hub: TheHub, target: Target, body: Restored
             info=target.metadata,
             reboot=body.reboot,
             allow_armed=body.allow_armed,
+            force=body.force,
             timeout=body.timeout_s,
             asker=asker,
             progress=tell,
@@ -235,7 +239,8 @@ async def _plan(hub: Hub, target: Followed, body: Wanted) -> Plan:
     wanted = await _wanted(hub, target, body)
 
     async def work() -> Plan:
-        return await prepare(target.component, wanted, include=body.include, info=target.metadata)
+        include, info = body.include, target.metadata
+        return await prepare(target.component, wanted, include=include, info=info, force=body.force)
 
     return await _within(target, body.timeout_s, work)
 
@@ -245,7 +250,8 @@ async def _plan_back(hub: Hub, target: Followed, body: Restored) -> Plan:
 
     async def work() -> Plan:
         include = (*await restored(target.component, earlier), *body.include)
-        return await prepare(target.component, earlier, include=include, info=target.metadata)
+        info = target.metadata
+        return await prepare(target.component, earlier, include=include, info=info, force=body.force)
 
     return await _within(target, body.timeout_s, work)
 
