@@ -1496,3 +1496,26 @@ def test_the_garbage_collector_leaves_out_what_is_loaded_when_a_command_begins()
     )
     frozen, rest = map(int, printed_by(program).split())
     assert frozen > 10 * rest
+
+
+def test_a_command_loads_its_own_modules_only() -> None:
+    """To start is a part of the time that each call takes."""
+    program = (
+        "import sys; from paramclient.cli import run; run(['ports', '--json']); "
+        "print([name for name in sys.modules if name.startswith('paramclient.cli.')])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, env=PLAIN, capture_output=True, text=True, timeout=PATIENCE
+    )
+    loaded = set(strict(done.stdout.splitlines()[-1].replace("'", '"')))
+    assert "paramclient.cli.ports" in loaded
+    assert not loaded & {f"paramclient.cli.{name}" for name in ("diff", "setup", "serve", "vehicle", "fleet")}
+
+
+@pytest.mark.parametrize("words", [(), ("--help",), ("cache",), ("fleet", "--help")])
+def test_a_page_of_help_says_what_each_command_does(words: tuple[str, ...], command: Command) -> None:
+    out = command(*words).out
+    rows = re.findall(r"^│ ([a-z]+) +(\S.*)│$", out, re.MULTILINE)
+    assert rows
+    assert all(text.strip() for _, text in rows)
+    assert len(re.findall(r"^│ [a-z]+ ", out, re.MULTILINE)) == len(rows)

@@ -63,9 +63,9 @@ async def link(
         verbose: Tell on stderr what is done, step by step.
     """
     is_live = sys.stdout.isatty() and not json
-    deadline = Deadline(seconds if is_live or seconds is not None else LISTENING_TIME)
+    limit = seconds if is_live or seconds is not None else LISTENING_TIME
     async with listen(url, options.signing, listen_only=listen_only, tlog=tlog) as client:
-        report = await _while_measuring(client, _show if is_live else _listen, deadline)
+        report = await _while_measuring(client, _show if is_live else _listen, limit)
     if not report.frames:
         noise = f" (but {report.bytes_received:,} other bytes)" if report.bytes_received else ""
         raise NoReply(f"anything on {client.link.name}{noise}", attempts=0, waited=report.seconds)
@@ -82,13 +82,15 @@ async def link(
 
 
 async def _while_measuring(
-    client: ParamClient, look: Callable[[ParamClient, Deadline], Awaitable[TrafficReport]], deadline: Deadline
+    client: ParamClient,
+    look: Callable[[ParamClient, float | None], Awaitable[TrafficReport]],
+    seconds: float | None,
 ) -> TrafficReport:
     outcome: TrafficReport | Exception
     async with anyio.create_task_group() as tasks:
         tasks.start_soon(_measure, client)
         try:
-            outcome = await look(client, deadline)
+            outcome = await look(client, seconds)
         except Exception as error:  # out of the group it would come wrapped
             outcome = error
         tasks.cancel_scope.cancel()
@@ -97,15 +99,17 @@ async def _while_measuring(
     return outcome
 
 
-async def _listen(client: ParamClient, deadline: Deadline) -> TrafficReport:
+async def _listen(client: ParamClient, seconds: float | None) -> TrafficReport:
+    deadline = Deadline(seconds)
     while left := deadline.left(REFRESH_INTERVAL):
         client.traffic_report()  # a link that fails ends it
         await anyio.sleep(left)
     return client.traffic_report()
 
 
-async def _show(client: ParamClient, deadline: Deadline) -> TrafficReport:
+async def _show(client: ParamClient, seconds: float | None) -> TrafficReport:
     with live_view() as draw:
+        deadline = Deadline(seconds)  # from now on: what draws is loaded
         while True:
             report = client.traffic_report()
             if report.frames:

@@ -47,7 +47,6 @@ from paramclient.notation import hash_text, time_text
 from paramclient.protocol.change import Change
 from paramclient.protocol.result import FetchResult, Policy
 from paramclient.protocol.sampling import SAMPLE_SIZE, Sample
-from paramclient.taken import NO_DEFAULTS
 from paramclient.values import Param, ParamType, Trust, Value, check_name, format_value, type_name
 
 if TYPE_CHECKING:
@@ -113,6 +112,8 @@ async def fetch(
             print_table([*_COLUMNS, "trust", "default"], rows, right="value index default")
         say(printable(fetched.summary))
     if changed and not has_defaults:
+        from paramclient.taken import NO_DEFAULTS  # only here: brings set-up along
+
         report(NO_DEFAULTS)
         return ExitCode.INCOMPLETE
     if fetched.missing:
