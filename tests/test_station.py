@@ -160,6 +160,22 @@ def test_a_vehicle_that_sends_telemetry_is_asked_for_its_heartbeat(is_stream: bo
     assert heartbeat_requests(station) == []
 
 
+def test_a_heartbeat_ends_that_also_of_a_component_that_is_known_by_a_value() -> None:
+    station = a_station()
+    hear(station, param_value("A"), 4)
+    hear(station, PX4, 4)
+    sent(station)
+    station.receive(telemetry(4), "there", 1.0)
+    assert heartbeat_requests(station) == []
+
+
+def test_a_vehicle_that_never_sends_a_heartbeat_is_not_asked_for_ever() -> None:
+    station = a_station()
+    for step in range(1000):
+        station.receive(telemetry(4), "there", 0.1 * step)
+    assert len(heartbeat_requests(station)) == room.HEARTBEAT_REQUESTS_MAX
+
+
 def test_a_ground_station_does_not_stand_in_the_way_of_that() -> None:
     station = a_station()
     hear(station, GCS, 254, 190)

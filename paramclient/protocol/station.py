@@ -69,6 +69,8 @@ SEARCH_INTERVAL: Final = 0.5
 """Seconds between two searches for one that can be forgotten, where there was none: each looks at all."""
 HEARTBEAT_REQUEST_INTERVAL: Final = 0.25
 """Seconds between two requests for the heartbeat of a vehicle that speaks and has not sent one yet."""
+HEARTBEAT_REQUESTS_MAX: Final = 8
+"""Such requests on one link: in the 2 s that they take, two heartbeats are due."""
 MOST_PEERS: Final = 256
 """Stream peers whose unfinished frames are kept."""
 HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
@@ -152,6 +154,7 @@ class Station:
         self._full_until = -math.inf
         self._awaits_autopilot = not self.listens_only  # none was heard yet
         self._heartbeat_requested_at = -math.inf
+        self._heartbeat_requests = 0
 
     def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
         """From now on sign what is sent and take what the verifier accepts; before anything has come."""
@@ -447,6 +450,8 @@ class Station:
             is_autopilot = frame.component == AUTOPILOT_COMPONENT and frame.system != 0
             if is_autopilot and (frame.system, frame.component) != self.own:
                 self._heartbeat_requested_at = now
+                self._heartbeat_requests += 1
+                self._awaits_autopilot = self._heartbeat_requests < HEARTBEAT_REQUESTS_MAX
                 self._peers[frame.system] = peer
                 request = (float(HEARTBEAT_ID), *[0.0] * 6)
                 command = CommandLong(frame.system, frame.component, MAV_CMD_REQUEST_MESSAGE, request)
@@ -467,6 +472,8 @@ class Station:
         if sender == self.own or frame.system == 0 or (message := decode(frame)) is None:
             return
         self._peers[frame.system] = peer
+        if isinstance(message, Heartbeat | HighLatency2) and message.autopilot != MAV_AUTOPILOT_INVALID:
+            self._awaits_autopilot = False
         if isinstance(message, ParamSet):
             self._receive_foreign_set(message, sender, now)
             return
@@ -504,8 +511,6 @@ class Station:
             room=self._room,
             trace=self._trace,
         )
-        if isinstance(message, Heartbeat | HighLatency2) and message.autopilot != MAV_AUTOPILOT_INVALID:
-            self._awaits_autopilot = False
         self.components[sender] = machine
         self._of_system.setdefault(system, []).append(machine)
         self._events.append(ComponentHeard(machine))
