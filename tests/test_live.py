@@ -14,11 +14,12 @@ import pytest
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
-from paramclient.values import ParamType, Value
+from paramclient.values import Param, ParamType, Value
 from tests.flying import flying
 from tests.live import __main__ as suite
 from tests.live.checks import checks
 from tests.live.choice import choose
+from tests.live.journal import Journal
 from tests.live.relay import Conditions, RealVehicle
 from tests.live.session import Check, Measured, Session
 
@@ -223,6 +224,29 @@ def test_only_what_nothing_uses_is_chosen() -> None:
         assert not used  # mapped or with an option, and those of pilots
     assert choose("generic", px4().params).names == ()
     assert choose("ardupilot", {}).names == ()
+
+
+def test_what_a_vehicle_changes_by_itself_is_no_difference(tmp_path: Path) -> None:
+    def param(name: str, value: int) -> Param:
+        return Param(name, value, ParamType.INT32, 0, value)
+
+    journal = Journal(tmp_path)
+    journal.kind = "px4"
+    journal.before = {
+        "CAL_BARO1_ID": param("CAL_BARO1_ID", 0),
+        "LND_FLIGHT_T_LO": param("LND_FLIGHT_T_LO", 1),
+        "MAV_TYPE": param("MAV_TYPE", 2),
+        "SYS_HITL": param("SYS_HITL", 0),
+    }
+    after = {
+        "LND_FLIGHT_T_LO": param("LND_FLIGHT_T_LO", 5),
+        "MAV_TYPE": param("MAV_TYPE", 1),
+    }
+    wrong, moved = journal.differences(after)
+    assert wrong == ["MAV_TYPE was 2, is 1", "SYS_HITL was 0, is absent"]
+    assert moved == ["CAL_BARO1_ID", "LND_FLIGHT_T_LO"]
+    journal.kind = "ardupilot"
+    assert not journal.comes_and_goes("CAL_BARO1_ID")
 
 
 # The relay's end towards the vehicle

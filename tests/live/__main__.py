@@ -71,6 +71,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except (UsageError, LinkError, NoReply, VehicleArmed) as error:
             print(f"{error}. Nothing was changed.", file=sys.stderr)
             return 2
+        except KeyboardInterrupt:
+            print("Stopped.", file=sys.stderr)
+            return 1
 
 
 @contextmanager

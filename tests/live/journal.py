@@ -119,11 +119,14 @@ class Journal:
         for name in sorted(self.before.keys() | params.keys()):
             old, new = self.before.get(name), params.get(name)
             if old is not None and new is not None:
-                if old.same_value(new):
-                    continue
-                if self.moves_by_itself(name):
-                    moved.append(name)
-                    continue
+                is_same, may_differ = old.same_value(new), self.moves_by_itself(name)
+            else:
+                is_same, may_differ = False, self.comes_and_goes(name)
+            if is_same:
+                continue
+            if may_differ:
+                moved.append(name)
+                continue
             was = "absent" if old is None else format_value(old.value, old.type)
             now = "absent" if new is None else format_value(new.value, new.type)
             wrong.append(f"{name} was {was}, is {now}")
@@ -134,8 +137,19 @@ class Journal:
 
         Counters and calibration do, by the list that the set-up of vehicles uses.
         """
+        return self._category(name) in ("counter", "calibration")
+
+    def comes_and_goes(self, name: str) -> bool:
+        """Whether a vehicle of this kind may list the parameter or not, without being asked.
+
+        PX4 lists what its firmware has used since the start: the ids of sensors that are not there are listed
+        after some starts, and not after others (measured).
+        """
+        return self.kind == "px4" and self._category(name) in ("counter", "calibration", "hardware")
+
+    def _category(self, name: str) -> str:
         caution = cautions_for(self.kind).left_out(name)
-        return caution is not None and caution.category in ("counter", "calibration")
+        return "" if caution is None else caution.category
 
     async def _set_back(self, vehicle: Component, param: Param, problems: list[str]) -> None:
         """Set one parameter until a read proves it."""

@@ -125,11 +125,12 @@ class Session:
 
     async def _check_values(self, vehicle: Component, listed: Mapping[str, Param]) -> None:
         before = self.journal.before
-        if unknown := sorted(listed.keys() ^ before.keys()):
+        unknown = sorted(listed.keys() ^ before.keys())
+        if unknown := [name for name in unknown if not self.journal.comes_and_goes(name)]:
             raise CheckFailed(f"{len(unknown)} names came or went: {', '.join(unknown[:NAMES_SHOWN])}")
         wrong: list[str] = []
         for name, param in listed.items():
-            if not before[name].same_value(param):
+            if name in before and not before[name].same_value(param):
                 held = await vehicle.get(name)
                 if held.same_value(param):
                     before[name] = param
