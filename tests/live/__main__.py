@@ -190,20 +190,24 @@ class _Run:
         keep = self._folder / "keep"
         if not self._options.read_only:
             keep.touch()
+        problems: list[str] = []
+        moved: list[str] = []
         try:
             with anyio.fail_after(PUT_BACK_TIMEOUT):
                 self._relay.change(CLEAN)
                 async with session.client() as vehicle:
-                    problems = await session.journal.put_back(vehicle)
+                    problems += await session.journal.put_back(vehicle)
                     result = await vehicle.fetch_all(refresh=True)
-            wrong, moved = session.journal.differences(
-                {name: param for name, param in result.params.items() if param.index is not None}
-            )
+                    if not result.complete:
+                        problems.append(f"{len(result.missing)} parameters did not come; asked for once more")
+                        result = await vehicle.fetch_all(refresh=True)
+            listed = {name: param for name, param in result.params.items() if param.index is not None}
+            wrong, moved = session.journal.differences(listed)
+            problems += wrong
         except (ParamClientError, TimeoutError) as error:
-            problems, wrong, moved = [f"{type(error).__name__}: {error}"], [], []
-        if problems or wrong:
-            text = "; ".join([*problems, *wrong])
-            self._report.add(Row("state after", FAILED, text, promise))
+            problems.append(f"{type(error).__name__}: {error}")
+        if problems:
+            self._report.add(Row("state after", FAILED, "; ".join(problems), promise))
             if not self._options.read_only:
                 _tell(f"To bring it back: paramclient restore {self._options.link} {session.journal.file}")
             return

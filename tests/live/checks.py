@@ -43,6 +43,8 @@ RADIO_RATE: Final = 5760.0
 """Bytes per second at 57600 baud."""
 SLOWEST_FETCH: Final = 240.0
 """Seconds after which a fetch over a bad link is given up."""
+CANCELLED_AFTER: Final = 0.2
+"""Seconds after which a fetch is cancelled together with its client: ArduPilot's file takes 0.4 s."""
 KILLED_WITHIN: Final = 20.0
 """Seconds for another program to open the parameter file and to be killed."""
 
@@ -120,6 +122,13 @@ def checks(*, reboots: bool) -> Iterator[Check]:
         fetch_after_kill,
         "by list at once, or by file when the session has ended",
         {"ardupilot": 4.0},
+        kinds=("ardupilot",),
+    )
+    yield Check(
+        "fetch after a session was cancelled in a transfer",
+        fetch_after_cancellation,
+        "as quick as the first, the file was closed",
+        {"ardupilot": 0.6},
         kinds=("ardupilot",),
     )
     yield Check("two sessions, fetch at the same time", fetch_in_two, "every value right in both")
@@ -239,6 +248,17 @@ async def fetch_after_kill(session: Session) -> Measured:
     process.join()
     if not has_opened:
         raise Skip("the vehicle serves no parameter file")
+    async with session.client() as vehicle:
+        return await fetch(session, vehicle)
+
+
+async def fetch_after_cancellation(session: Session) -> Measured:
+    with anyio.CancelScope() as scope:
+        async with session.client() as vehicle:
+            scope.deadline = anyio.current_time() + CANCELLED_AFTER
+            await vehicle.fetch_all(refresh=True)
+    if not scope.cancelled_caught:
+        raise Skip(f"the fetch takes less than {CANCELLED_AFTER} s")
     async with session.client() as vehicle:
         return await fetch(session, vehicle)
 
