@@ -160,6 +160,7 @@ class FileError(UsageError):
         source: the file's name as it was given; "" for bytes without one.
         line: the first bad line, from 1; None where it is not about a line.
         expected: what should have stood there, in words; None where it is not about a line.
+        reason: the first of its lines, without the place.
     """
 
     def __init__(
@@ -179,6 +180,13 @@ class FileError(UsageError):
         self.source = source
         self.line = line
         self.expected = expected
+        self.reason = message
+        self._more = more
+
+    def with_more(self, text: str) -> FileError:
+        """The same with another line of text."""
+        more = (*self._more, text)
+        return FileError(self.reason, source=self.source, line=self.line, expected=self.expected, more=more)
 
 
 class MetadataError(UsageError):

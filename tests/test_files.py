@@ -24,7 +24,8 @@ from paramclient import (
     write_file,
 )
 from paramclient.errors import UsageError
-from paramclient.files import LARGEST_FILE, loads
+from paramclient.files import LARGEST_FILE, dumps, loads
+from paramclient.files.includes import DEPTH_MAX, FILES_MAX
 from paramclient.files.model import ENDINGS
 
 ROOT = Path(__file__).parent.parent
@@ -305,3 +306,108 @@ def test_a_file_of_bytes_has_no_name() -> None:
     assert repr(file) == "<ParamFile unnamed parm ?/?: 1>"
     with pytest.raises(FileError, match=r"^line 1: expected NAME VALUE, found 'x'$"):
         loads(b"x")
+
+
+# files that include others
+
+
+def tree(folder: Path, **files: str) -> Path:
+    """Files in folders, `__` in a key for a slash and `_parm` for the ending; the path of the first one."""
+    paths = []
+    for key, text in files.items():
+        path = folder / key.replace("__", "/").replace("_parm", ".parm")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        paths.append(path)
+    return paths[0]
+
+
+def values(path: Path) -> dict[str, object]:
+    return {name: param.value for name, param in read_file(path).sets[0].items()}
+
+
+def test_an_included_file_stands_in_the_place_of_its_line(tmp_path: Path) -> None:
+    first = tree(
+        tmp_path,
+        board__new__defaults_parm="A 1\n@include ../base/defaults.parm  # as on the other board\nB 20\n",
+        board__base__defaults_parm="# of the base\nA 10 # ten\nB 11\n@include more.parm\n",
+        board__base__more_parm="C 12\n",
+    )
+    file = read_file(first)
+    params = file.sets[0]
+    assert values(first) == {"A": 10, "B": 20, "C": 12}
+    assert (params["A"].comment, params["A"].line, params["B"].line) == ("ten", None, 3)
+    base = f"{first.parent}/../base/defaults.parm"
+    assert file.notes == (
+        f"A stands twice: 10 in {base}:2 counts, not 1 in line 1.",
+        f"B stands twice: 20 in line 3 counts, not 11 in {base}:3.",
+    )
+    assert loads(dumps(file)).sets[0] == ParamSet(params.params)
+
+
+def test_a_file_may_do_nothing_but_include_another_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = tree(tmp_path, here__a_parm="@include ../there/b.parm\n", there__b_parm="A 1\n")
+    assert values(first) == {"A": 1}
+    monkeypatch.chdir(first.parent)
+    assert values(Path("a.parm")) == {"A": 1}
+
+
+def test_two_lines_may_include_one_file(tmp_path: Path) -> None:
+    first = tree(tmp_path, a_parm="@include b.parm\nA 2\n@include b.parm\n", b_parm="A 1\n")
+    assert values(first) == {"A": 1}
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        ("@include gone.parm", "x/y/gone.parm cannot be read: No such file or directory"),
+        ("@include ../y", "x/y/../y cannot be read: it is no regular file"),
+        ("@include ../../outside.parm", "lies outside of"),
+        ("@include ../z/../../outside.parm", "lies outside of"),
+        ("@include /etc/hostname", "an absolute path is not followed"),
+        ("@include link.parm", "lies outside of"),
+        ("@include first.parm", "in a circle"),
+        ("@include round.parm", "in a circle"),
+    ],
+)
+def test_what_cannot_be_included_says_so_with_its_line(line: str, problem: str, tmp_path: Path) -> None:
+    first = tree(
+        tmp_path,
+        x__y__first_parm=f"A 1\n{line}\nbad\n",
+        x__y__round_parm="@include first.parm\n",
+        x__z__other_parm="B 1\n",
+        outside_parm="SECRET 1\n",
+    )
+    (first.parent / "link.parm").symlink_to(tmp_path / "outside.parm")
+    error = refused(lambda: read_file(first))
+    told = str(error)
+    assert problem in told
+    assert f"{first}:2: " in told
+    assert "SECRET" not in told
+
+
+def test_an_error_in_an_included_file_names_both_lines(tmp_path: Path) -> None:
+    first = tree(tmp_path, a_parm="A 1\n@include b.parm\n", b_parm="B 1\nbad\n")
+    error = refused(lambda: read_file(first))
+    assert str(error).splitlines() == [
+        f"{tmp_path}/b.parm:2: expected NAME VALUE, found 'bad'",
+        f"{first}:2: includes that file",
+    ]
+    assert (error.source, error.line) == (f"{tmp_path}/b.parm", 2)
+    (tmp_path / "b.parm").write_bytes(b"B 1\n\xff\n")
+    assert "includes that file" in str(refused(lambda: read_file(first)))
+
+
+def test_how_much_is_included_is_limited(tmp_path: Path) -> None:
+    chain = {f"f{number}_parm": f"@include f{number + 1}.parm\n" for number in range(DEPTH_MAX)}
+    assert values(tree(tmp_path, **chain, **{f"f{DEPTH_MAX}_parm": "A 1\n"})) == {"A": 1}
+    (tmp_path / f"f{DEPTH_MAX}.parm").write_text(f"@include f{DEPTH_MAX + 1}.parm\n")
+    assert "in a row" in str(refused(lambda: read_file(tmp_path / "f0.parm")))
+    wide = {f"g{number}_parm": f"@include g{number + 1}.parm\n" * 4 for number in range(DEPTH_MAX)}
+    first = tree(tmp_path, **wide, **{f"g{DEPTH_MAX}_parm": "A 1\n"})
+    assert f"more than {FILES_MAX} files" in str(refused(lambda: read_file(first)))
+    (tmp_path / "large.parm").write_text("# " + "x" * (LARGEST_FILE // 2) + "\nA 1\n")
+    (tmp_path / "twice.parm").write_text("@include large.parm\n@include large.parm\n")
+    assert "too large" in str(refused(lambda: read_file(tmp_path / "twice.parm")))

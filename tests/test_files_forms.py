@@ -407,6 +407,23 @@ def test_a_script_is_read_for_what_it_sets_in_any_case() -> None:
 
 
 @pytest.mark.parametrize(
+    ("lines", "value", "line"),
+    [
+        ("param set A 1\nparam set A 2", 2, 2),
+        ("param set-default A 1\nparam set-default A 2", 2, 2),
+        ("param set-default A 1\nparam set A 2", 2, 2),
+        ("param set A 1\nparam set-default A 2", 1, 1),  # a default replaces no value
+        ("param set A 1\nparam set-default A 2\nparam set A 3", 3, 3),
+    ],
+)
+def test_of_a_name_that_a_script_sets_twice_the_last_value_counts(lines: str, value: int, line: int) -> None:
+    file = loads(lines.encode())
+    param = file.sets[0]["A"]
+    assert (param.value, param.line) == (value, line)
+    assert any(f"{value} in line {line} counts, not" in note for note in file.notes)
+
+
+@pytest.mark.parametrize(
     ("lines", "line", "problem"),
     [
         ("if [ $X ]\nthen\nparam set A 1\nfi", 3, "inside of a condition, loop or function"),
@@ -459,10 +476,39 @@ def test_look_alikes_of_a_list_are_read_as_meant(data: bytes) -> None:
 
 
 def test_a_name_that_comes_twice_with_one_value_is_told() -> None:
-    assert loads(b"A 1\nB 2\nA 1\n").notes == ("A stands with one value in lines 1 and 3.",)
+    assert loads(b"A 1\nB 2\nA 1\n").notes == ("A stands with one value in line 1 and line 3.",)
     assert loads(b"A nan\nA nan\n").notes != ()
     many = loads(b"A 1\n" * 1000).notes
-    assert (len(many), many[-1]) == (21, "So do parameters in 979 more lines.")
+    assert (len(many), many[-1]) == (21, "979 more lines repeat a name.")
+    assert loads(b"A 1\n" * 22).notes[-1] == "1 more line repeats a name."
+
+
+@pytest.mark.parametrize(
+    ("text", "value", "note"),
+    [
+        ("A 1\nB 5\nA 2 # new", 2, "A stands twice: 2 in line 3 counts, not 1 in line 1."),
+        ("A 0.0\nA -0.0\nB 5", -0.0, "A stands twice: -0.0 in line 2 counts, not 0.0 in line 1."),
+        ("1\t1\tA\t1\t6\n1\t1\tB\t5\t6\n1\t1\tA\t2\t6\n", 2, "2 (INT32) in line 3 counts, not 1 (INT32)"),
+        ("1\t1\tA\t1\t9\n1\t1\tB\t5\t6\n1\t1\tA\t1\t6\n", 1, "1 (INT32) in line 3 counts, not 1.0 (REAL32)"),
+    ],
+)
+def test_of_a_name_that_comes_twice_the_last_value_counts(text: str, value: float, note: str) -> None:
+    file = loads(text.encode())
+    params = file.sets[0]
+    assert (list(params), repr(params["A"].value)) == (["A", "B"], repr(value))
+    (told,) = file.notes
+    assert note in told
+
+
+def test_the_last_of_three_counts_with_its_comment_and_line() -> None:
+    file = loads(b"A 1 # one\nA 2 # two\nA 3 # three\n")
+    param = file.sets[0]["A"]
+    assert (param.value, param.comment, param.line, len(file.notes)) == (3, "three", 3, 2)
+
+
+def test_two_components_may_have_one_name() -> None:
+    file = loads(b"1\t1\tA\t1\t6\n1\t100\tA\t2\t6\n")
+    assert ([each["A"].value for each in file.sets], file.notes) == ([1, 2], ())
 
 
 def test_what_only_ardupilot_reads_of_a_line_is_kept_as_a_comment() -> None:
@@ -496,10 +542,9 @@ def test_what_only_ardupilot_reads_of_a_line_is_kept_as_a_comment() -> None:
         ("AÄ 2", "only printable ASCII"),
         ("A: 2", "with a parameter's name"),
         ("A_VERY_LONG_NAME_ 2", "a param_id holds 16"),
-        ("@include other.parm", "what it brings in or takes out is not followed"),
+        ("@include other.parm", "only a file on the disk can include another one"),
+        ("@include", "a line for ArduPilot's tools that is not followed"),
         ("@delete A", "not followed"),
-        ("A 1\nA 2", "expected one value for A, found 2 behind 1 in line 1"),
-        ("A 0.0\nA -0.0", "expected one value for A"),
         ("<html>", "expected"),
         ("hello world", "with a number"),
     ],
@@ -522,8 +567,6 @@ def test_look_alikes_that_nobody_can_be_sure_of_are_refused(text: str, problem: 
         ("1\t1\tB\t1\t9\tx", "vehicle, component, name, value and type, with tabs"),
         ("1\t1\tB\t1", "vehicle, component"),
         ("B,1", "vehicle, component"),
-        ("1\t1\tA\t2\t9", "one value for A"),
-        ("1\t1\tA\t1\t6", "one value for A"),
     ],
 )
 def test_a_bad_row_of_qgroundcontrol_is_refused(row: str, problem: str) -> None:

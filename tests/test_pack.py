@@ -9,7 +9,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
-from hypothesis import example, given
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from paramclient.errors import PackError, UsageError
@@ -236,9 +236,11 @@ def entries(draw: st.DrawFn) -> PackedParam:
     return PackedParam(draw(names), kind, draw(bits), draw(st.none() | bits))
 
 
+busy = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])  # whatever else the machine does
 tables = st.lists(entries(), max_size=40, unique_by=lambda each: each.name)
 
 
+@busy
 @given(tables, st.integers(1, 239), st.booleans(), st.integers(0, 5))
 def test_what_is_encoded_is_decoded(
     rows: list[PackedParam], read_size: int, with_defaults: bool, more: int
@@ -248,6 +250,7 @@ def test_what_is_encoded_is_decoded(
     assert decode(data) == Pack(tuple(kept), len(rows) + more, with_defaults)
 
 
+@busy
 @given(tables)
 def test_what_is_encoded_to_be_written_is_decoded(rows: list[PackedParam]) -> None:
     assert decode_upload(encode_upload(rows)) == tuple(each._replace(default=None) for each in rows)

@@ -12,6 +12,7 @@ from typing import Final
 
 from paramclient.errors import FileError
 from paramclient.files.forms import LARGEST_FILE, Content, dumps, loads
+from paramclient.files.includes import Includes
 from paramclient.files.model import FileForm, ParamFile, as_form, form_of_name
 
 __all__ = ["read_file", "write_file"]
@@ -27,6 +28,9 @@ _NEW_MODE: Final = 0o666
 
 def read_file(path: str | os.PathLike[str], *, form: FileForm | str | None = None) -> ParamFile:
     """Read a parameter file of any ground station. It blocks for as long as the disk does.
+
+    A list of MAVProxy's or Mission Planner's form may include others with `@include FILE`, by a path that is
+    relative to its folder: files in that folder, beside it, or below either. Their lines count in its place.
 
     Args:
         path: the file.
@@ -45,7 +49,7 @@ def read_file(path: str | os.PathLike[str], *, form: FileForm | str | None = Non
         raise FileError(f"cannot be read: {error.strerror}", source=source) from error
     except ValueError as error:  # a NUL in the name
         raise FileError(f"cannot be read: {error}", source=source) from error
-    return loads(data, source=source, form=form)
+    return loads(data, source=source, form=form, includes=Includes.of(source, _read, size_max=LARGEST_FILE))
 
 
 def write_file(

@@ -8,6 +8,7 @@ from typing import Final, TypeAlias
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files import document, packed, script, tables
+from paramclient.files.includes import Includes
 from paramclient.files.model import AUTOPILOT, ENDINGS, FileForm, ParamFile, address, as_form
 from paramclient.files.text import decode_text, lines_of, time_of
 from paramclient.identity import autopilot_name
@@ -24,7 +25,9 @@ Content: TypeAlias = ParamFile | ParamSet | Iterable[ParamSet]
 """What can be written: a file as it was read, the parameters of one component, or of several."""
 
 
-def loads(data: bytes, *, source: str = "", form: FileForm | str | None = None) -> ParamFile:
+def loads(
+    data: bytes, *, source: str = "", form: FileForm | str | None = None, includes: Includes | None = None
+) -> ParamFile:
     """Read a parameter file from its bytes.
 
     The form is told by what is in it. MAVProxy and Mission Planner read each other's lists, so there the
@@ -35,6 +38,7 @@ def loads(data: bytes, *, source: str = "", form: FileForm | str | None = None) 
         data: all of it.
         source: its name, for errors and `ParamSet.source`.
         form: the form that it has; None to find out.
+        includes: follows the `@include` lines of a list; None refuses them, as bytes lie in no folder.
 
     Raises:
         FileError: it has none of the forms, is damaged, or holds no parameter. Up to 20 bad lines are named.
@@ -59,7 +63,7 @@ def loads(data: bytes, *, source: str = "", form: FileForm | str | None = None) 
         case FileForm.YAML:
             return document.read_yaml(text, source)
         case _:
-            return tables.read_pairs(text, form, source)
+            return tables.read_pairs(text, form, source, includes)
 
 
 def dumps(content: Content, *, form: FileForm | str | None = None, target: str = "") -> bytes:

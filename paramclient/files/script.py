@@ -30,7 +30,7 @@ _LEAVING: Final = frozenset({"exit", "return"})
 _hash: Final = re.compile(r"(?:(?<=[ \t])|^)#")
 _changes: Final = re.compile(r"\bparam\s+(?:set(?:-default)?|reset\w*|load|import|select\w*)\b").search
 _sets: Final = re.compile(
-    r"param[ \t]+set(?:-default(?:[ \t]+-s)?)?[ \t]+(\S+)[ \t]+(\S+)(?:[ \t]+fail)?"
+    r"param[ \t]+set(-default(?:[ \t]+-s)?)?[ \t]+(\S+)[ \t]+(\S+)(?:[ \t]+fail)?"
 ).fullmatch
 
 
@@ -42,6 +42,9 @@ def is_script_line(text: str) -> bool:
 def read_script(text: str, source: str) -> ParamFile:
     """Read what a script sets in any case. The default of `set-default` counts as a value.
 
+    Of a name that is set twice the last value counts, but a value of `set` more than any of `set-default`: a
+    default that comes later does not replace a value.
+
     Raises:
         FileError: a line sets, loads or resets parameters in a way that depends on more than the file.
     """
@@ -51,6 +54,7 @@ def read_script(text: str, source: str) -> ParamFile:
     skipped: list[int] = []
     left_out = 0
     state = _Flow()
+    assigned: set[str] = set()
     for line in lines_of(text, _hash):
         if not line.text:
             if line.comment is not None:
@@ -69,7 +73,14 @@ def read_script(text: str, source: str) -> ParamFile:
         try:
             if obstacle:
                 raise UsageError(f"{_EXPECTED}, not {obstacle}")
-            builder.add(_param(line, "\n".join(comments)))
+            param, is_default = _param(line, "\n".join(comments))
+            if is_default and param.name in assigned:
+                held, place = builder.sets[None, None][param.name], builder.place_of(param.name)
+                builder.note_repeated(held, place, param, f"line {line.number}")
+                continue
+            builder.add(param)
+            if not is_default:
+                assigned.add(param.name)
         except UsageError as error:
             builder.problems.add(line.number, str(error), shown(line.text))
     sets = builder.result()
@@ -104,17 +115,17 @@ class _Flow:
             self._left = self._left or words[0] in _LEAVING
 
 
-def _param(line: Line, comment: str) -> WrittenParam:
-    """The parameter that a line sets; UsageError says what was expected."""
+def _param(line: Line, comment: str) -> tuple[WrittenParam, bool]:
+    """The parameter that a line sets, and whether only its default; UsageError says what was expected."""
     match = _sets(line.text)
     if match is None:
         raise UsageError(f"{_EXPECTED} and nothing else")
-    name, value = match[1], parse_number(match[2])
+    name, value = match[2], parse_number(match[3])
     if "$" in line.text:
         raise UsageError(f"{_EXPECTED} without variables")
     if value is None:
         raise UsageError(f"{_EXPECTED} with a number")
-    return WrittenParam(check_name(name), value, comment=comment, line=line.number)
+    return WrittenParam(check_name(name), value, comment=comment, line=line.number), match[1] is not None
 
 
 def _left_out(lines: list[int], count: int) -> str:

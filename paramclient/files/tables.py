@@ -14,7 +14,8 @@ import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Final
 
-from paramclient.errors import UsageError
+from paramclient.errors import FileError, UsageError
+from paramclient.files.includes import Includes
 from paramclient.files.model import AUTOPILOT, FileForm, ParamFile
 from paramclient.files.text import (
     Builder,
@@ -36,6 +37,7 @@ _QGC_COLUMNS: Final = "Vehicle-Id Component-Id Name Value Type"
 _QGC_ROW: Final = "vehicle, component, name, value and type, with tabs between them"
 _qgc_nan: Final = re.compile(r"--\.-+").fullmatch
 """What QGroundControl writes for NaN (Fact.cc)."""
+_include: Final = re.compile(r"@include[ \t]+(.*\S)").fullmatch
 _blanks: Final = re.compile(r"[ \t]+")
 _between: Final = re.compile(r"[ \t]*[,=][ \t]*|[ \t]+")
 _decimal_comma: Final = re.compile(r"(?:^|[ \t,=])[+-]?[0-9]+,[0-9]+$").search
@@ -43,33 +45,72 @@ _name: Final = re.compile(r"(?=.*[A-Za-z])[^@\s,=#;/][^\s,=#;]*(?<!:)").fullmatc
 _qgc_row: Final = re.compile(r"[0-9]+[ \t]+[0-9]+[ \t]+[^ \t]+[ \t]+[^ \t]+[ \t]+[0-9]+").fullmatch
 
 
-def read_pairs(text: str, form: FileForm, source: str) -> ParamFile:
+def read_pairs(text: str, form: FileForm, source: str, includes: Includes | None = None) -> ParamFile:
     """Read a file with a name and a value on each line.
 
     A name is followed by a value, with spaces, tabs, a comma or `=` between them, and by nothing else but a
-    comment, or ArduPilot's `@READONLY`, which is kept as one.
+    comment, or ArduPilot's `@READONLY`, which is kept as one. `@include FILE` stands for the lines of another
+    file; of its comments only those of its parameters are kept.
+
+    Args:
+        text: what the file holds.
+        form: which of the two it is.
+        source: its name, for errors.
+        includes: follows its `@include` lines; None for bytes that are no file on a disk.
 
     Raises:
-        FileError: for any line that is something else.
+        FileError: for any line that is something else, also in an included file.
     """
-    expected = "NAME,VALUE" if form is FileForm.MISSION_PLANNER else "NAME VALUE"
     builder = Builder(Problems(source))
+    header, footer = _read_lines(text, form, builder, builder.problems, includes, is_included=False)
+    return ParamFile(builder.result(), form, source, header, footer, tuple(builder.notes))
+
+
+def _read_lines(
+    text: str,
+    form: FileForm,
+    builder: Builder,
+    problems: Problems,
+    includes: Includes | None,
+    *,
+    is_included: bool,
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Give the parameters of one file to the builder, and what is wrong with it to `problems`."""
+    expected = "NAME,VALUE" if form is FileForm.MISSION_PLANNER else "NAME VALUE"
+
+    def include(line: Line, path: str) -> None:
+        try:
+            if includes is None:
+                raise UsageError("only a file on the disk can include another one")
+            found = includes.follow(path)
+            inner = Problems(found.source)
+            _read_lines(found.text, form, builder, inner, found.includes, is_included=True)
+            inner.raise_if_any()
+        except FileError as error:
+            here = f"{problems.source}:{line.number}: includes that file"
+            raise error.with_more(here) from None
+        except UsageError as error:
+            problems.add(line.number, f"@include with a file that can be read ({error})", shown(line.text))
 
     def take(line: Line, comment: str) -> None:
+        if match := _include(line.text):
+            include(line, match[1])
+            return
         words = _between.split(line.text)
         if words[-1] == "@READONLY":
             comment = f"{comment}\n@READONLY" if comment else "@READONLY"
             words.pop()
         problem = _wrong_with_pair(line.text, words, expected)
         if problem is not None:
-            builder.problems.add(line.number, problem, shown(line.text))
+            problems.add(line.number, problem, shown(line.text))
             return
         value = parse_number(words[1])
         assert value is not None
-        builder.add(WrittenParam(words[0], value, comment=comment, line=line.number))
+        number = None if is_included else line.number
+        place = f"{problems.source}:{line.number}" if is_included else ""
+        builder.add(WrittenParam(words[0], value, comment=comment, line=number), place=place)
 
-    header, footer = _walk(text, take)
-    return ParamFile(builder.result(), form, source, header, footer, tuple(builder.notes))
+    return _walk(text, take)
 
 
 def write_pairs(sets: Sequence[ParamSet], form: FileForm, around: ParamFile) -> Iterator[str]:
@@ -184,7 +225,7 @@ def _framed(
 def _wrong_with_pair(text: str, words: list[str], expected: str) -> str | None:
     """What was expected of a line, or None where it is as it should be."""
     if text.startswith("@"):
-        return f"{expected} (a line for ArduPilot alone: what it brings in or takes out is not followed)"
+        return f"{expected} (a line for ArduPilot's tools that is not followed)"
     if _decimal_comma(text) and len(words) == 3:
         return f"{expected} with a decimal point (1.5, not 1,5)"
     if len(words) == 3 and parse_number(words[1]) is not None:

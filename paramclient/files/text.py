@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 
 from paramclient.errors import FileError, UsageError
 from paramclient.paramset import ParamSet, WrittenParam
-from paramclient.values import ParamType, Value, bits_of, format_value, from_bits
+from paramclient.values import ParamType, Value, bits_of, format_value, from_bits, type_name
 
 __all__ = [
     "ANY_MARK",
@@ -105,30 +105,57 @@ class Problems:
 class Builder:
     """Gathers the parameters of a file into sets, one for each component.
 
+    Of a name that comes twice the last value counts, as it does for ground stations and autopilots, which set
+    one after the other. A note tells.
+
     Args:
-        problems: what is wrong with the file; a name that comes twice with two values is added to it.
+        problems: what is wrong with the file.
     """
 
     problems: Problems
     sets: dict[tuple[int | None, int | None], dict[str, WrittenParam]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     repeated: int = 0
+    _places: dict[tuple[int | None, int | None, str], str] = field(default_factory=dict)
 
-    def add(self, param: WrittenParam, *, system: int | None = None, component: int | None = None) -> None:
-        """Take a parameter in."""
+    def add(
+        self,
+        param: WrittenParam,
+        *,
+        system: int | None = None,
+        component: int | None = None,
+        place: str = "",
+    ) -> None:
+        """Take a parameter in, in the place of one that has its name.
+
+        Args:
+            param: the parameter.
+            system, component: whose it is.
+            place: where it stands, in words; "" for its line.
+        """
         params = self.sets.setdefault((system, component), {})
-        first = params.setdefault(param.name, param)
-        if first is param or param.line is None:
+        before = params.get(param.name)
+        params[param.name] = param
+        key = (system, component, param.name)
+        place = place or f"line {param.line}"
+        if before is not None:
+            self.note_repeated(param, place, before, self._places[key])
+        self._places[key] = place
+
+    def place_of(self, name: str) -> str:
+        """Where the value stands that counts, for a file that names no components."""
+        return self._places[None, None, name]
+
+    def note_repeated(self, param: WrittenParam, place: str, other: WrittenParam, elsewhere: str) -> None:
+        """Tell that a name comes twice, and which value counts."""
+        self.repeated += 1
+        if self.repeated > MOST_PROBLEMS:
             return
-        if _same(first, param):
-            self.repeated += 1
-            if self.repeated <= MOST_PROBLEMS:
-                self.notes.append(
-                    f"{param.name} stands with one value in lines {first.line} and {param.line}."
-                )
+        if _same(other, param):
+            self.notes.append(f"{param.name} stands with one value in {elsewhere} and {place}.")
         else:
-            found = f"{_told(param)} behind {_told(first)} in line {first.line}"
-            self.problems.add(param.line, f"one value for {param.name}", found)
+            counts, not_this = f"{_told(param)} in {place}", f"{_told(other)} in {elsewhere}"
+            self.notes.append(f"{param.name} stands twice: {counts} counts, not {not_this}.")
 
     def result(self) -> tuple[ParamSet, ...]:
         """The sets.
@@ -140,7 +167,8 @@ class Builder:
         if not self.sets:
             raise FileError("the file holds no parameter", source=self.problems.source)
         if self.repeated > MOST_PROBLEMS:
-            self.notes.append(f"So do parameters in {self.repeated - MOST_PROBLEMS} more lines.")
+            more = self.repeated - MOST_PROBLEMS
+            self.notes.append(f"{more} more {'line repeats' if more == 1 else 'lines repeat'} a name.")
         return tuple(
             ParamSet(params, component, system, source=self.problems.source)
             for (system, component), params in self.sets.items()
@@ -280,7 +308,8 @@ def _split(text: str) -> Iterator[str]:
 
 
 def _told(param: WrittenParam) -> str:
-    return format_value(param.value, ParamType.REAL64)
+    kind = "" if param.type is None else f" ({type_name(param.type)})"
+    return format_value(param.value, ParamType.REAL64) + kind
 
 
 def _same(a: WrittenParam, b: WrittenParam) -> bool:
