@@ -182,6 +182,23 @@ def test_where_all_of_many_bursts_lose_half_as_many_run() -> None:
     assert road.running == 31 // 2
 
 
+def test_while_all_bursts_are_awaited_nothing_is_due() -> None:
+    """Those that took the place of others are not new, so there is nothing to look at before one comes."""
+    road = Road(40)
+    for lane in road.lanes:
+        lane.is_bursty = True
+    road.until(8)
+    for lane in [lane for lane in road.lanes if lane.is_running]:
+        road.end(lane)
+    while road.turns.next_deadline() <= road.now:
+        road.turns.tick(road.now)
+    road.turns._limit = road.running  # as many as run
+    road.turns._newest.clear()
+    assert all(lane.is_awaited for lane in road.lanes if lane.is_running)
+    road.turns.tick(road.now)
+    assert road.turns.next_deadline() > road.now
+
+
 def test_one_in_the_place_of_another_holds_up_nobody() -> None:
     """Where so many have run before, it need not have shown anything for further ones to begin."""
     road = bursty(100)

@@ -214,7 +214,9 @@ class Turns:
             return self._now if self._room() > 0 else self._next_at
         times = [stream.silent_at for stream in self._running if stream.silent_at > self._now]
         if not self._newest:
-            times.append(max(self._again_at, self._now))
+            # lists in bursts are judged once they come: while all are awaited, nothing is due
+            if not self._are_bursty or any(not stream.is_awaited for stream in self._running):
+                times.append(max(self._again_at, self._now))
         elif self._marked_at is not None:
             times.append(self._marked_at + SHOWING_TIME)
         return min(times, default=math.inf)
