@@ -21,6 +21,7 @@ from pathlib import Path
 from typing import Final
 
 import anyio
+import anyio.lowlevel
 
 from paramclient import ParamClient
 from paramclient.errors import LinkError, NoReply, ParamClientError, UsageError, VehicleArmed
@@ -105,6 +106,7 @@ class _Run:
             try:
                 with scope:
                     for check in checks(reboots=self._options.reboot):
+                        await anyio.lowlevel.checkpoint()  # a signal counts, also when a check fails at once
                         if self._options.only in check.name:
                             await self._make(check, session)
             finally:

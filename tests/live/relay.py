@@ -299,7 +299,7 @@ class Relay:
         assert self._process is not None
         self._control.close()
         self._process.join(STOP_TIMEOUT)
-        if self._process.is_alive():
+        if self._process.is_alive():  # it does not heed SIGTERM
             self._process.kill()
             self._process.join()
         self._process.close()
@@ -434,10 +434,12 @@ def _message_id(datagram: bytes) -> int | None:
 def _run(vehicle_link: str, listeners: Sequence[int], control: Connection) -> None:
     """Be the relay, in a process of its own.
 
-    Ctrl-C reaches every process of a terminal; the program that started this one still needs its vehicle
-    then, to put back what it has changed.
+    Ctrl-C and the end of a terminal reach every process in it; the program that started this one still needs
+    its vehicle then, to put back what it has changed. The relay ends with its control connection.
     """
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+        if hasattr(signal, name):
+            signal.signal(getattr(signal, name), signal.SIG_IGN)
     try:
         anyio.run(_Traffic(vehicle_link, listeners).run, control)
     except* LinkError as group:
