@@ -35,7 +35,7 @@ import sys
 import tempfile
 import time
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass
 from io import BytesIO
@@ -276,9 +276,11 @@ class TimedCache(ParamCache):
 
     seconds = 0.0
 
-    def save(self, update: TableUpdate | Sequence[TableUpdate]) -> None:
+    def save(
+        self, update: TableUpdate | Sequence[TableUpdate], *, clock: Callable[[], float] | None = None
+    ) -> None:
         start = time.thread_time()
-        super().save(update)
+        super().save(update, clock=clock)
         self.seconds += time.thread_time() - start
 
     def load(self, key: str, component: int) -> CachedComponent | None:

@@ -35,6 +35,8 @@ NAMES: Final = tuple(f"PARAM_{number}" for number in range(12))
 VEHICLE: Final = Identity(1, "fuzz", uid="a1b2c3", autopilot=12)
 OTHER: Final = Identity(2, "fuzz", uid="d4e5f6", autopilot=3)
 AT: Final = 1_700_000_000.0
+LATER: Final = 20_000_000_000.0
+"""Seconds after that at which more is saved: later than whatever a damaged file holds, or long before it."""
 
 logger = logging.getLogger("paramclient.cache")
 
@@ -82,7 +84,7 @@ def _run_blob(changed: bytes) -> None:
             table = kept.load(VEHICLE.key, 1)
             assert (table is None) == bool(kept.notes)
             assert table is None or (rows is not None and table.params.keys() == rows.keys())
-            kept.save(_update(VEHICLE, 3.0))
+            kept.save(_update(VEHICLE, 3.0, AT + LATER))
             held = kept.load(VEHICLE.key, 1)
             assert held is not None
             assert {name: held.params[name].value for name in NAMES} == dict.fromkeys(NAMES, 3.0)
@@ -100,23 +102,23 @@ def _use(path: Path) -> None:
                 told = kept.state_at(summary.key, each.component, each.id)
                 assert all(name in NAMES and param.value == 3.0 for name, param in told.items())
         kept.vehicles()
-        kept.save([_update(VEHICLE, 3.0), _update(OTHER, 4.0)])
+        kept.save([_update(VEHICLE, 3.0, AT + LATER), _update(OTHER, 4.0, AT + LATER)])
         held = kept.load(VEHICLE.key, 1)
         assert held is not None
         assert {name: held.params[name].value for name in NAMES} == dict.fromkeys(NAMES, 3.0)
         kept.snapshot(VEHICLE.key, 1, reason="fuzz", at=AT + 10)
 
 
-def _update(identity: Identity, value: float) -> TableUpdate:
+def _update(identity: Identity, value: float, at: float) -> TableUpdate:
     bits = int.from_bytes(bytes((0, 0, 0x40 if value == 3.0 else 0x80, 0x40)), "little")
     return TableUpdate(
         identity=identity,
         component=1,
         autopilot=identity.autopilot,
-        at=AT + value,
-        table=TableState(hash=7, count=len(NAMES), complete=True, synced_at=AT + value),
+        at=at,
+        table=TableState(hash=7, count=len(NAMES), complete=True, synced_at=at),
         params=[
-            StoredParam(Param(name, value, ParamType.REAL32, index, bits, Trust.LIVE), AT + value)
+            StoredParam(Param(name, value, ParamType.REAL32, index, bits, Trust.LIVE), at)
             for index, name in enumerate(NAMES)
         ],
     )
@@ -138,8 +140,8 @@ def _good_file() -> bytes:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cache.sqlite3"
         with ParamCache(path) as kept:
-            kept.save([_update(VEHICLE, 4.0)])
-            kept.save([_update(VEHICLE, 3.0)])
+            kept.save([_update(VEHICLE, 4.0, AT)])
+            kept.save([_update(VEHICLE, 3.0, AT + 1)])
             kept.snapshot(VEHICLE.key, 1, reason="before", at=AT + 5)
         return path.read_bytes()
 

@@ -31,6 +31,9 @@ an eighth of what Linux' usual buffer holds (see `paramclient.links.udp`): a bur
 HELD_UP: Final = 0.02
 """Seconds by which a deadline is missed where the program did something else meanwhile, or did not run. What
 has come in that time is read before anything counts as not answered."""
+LATE: Final = 0.05
+"""Seconds for which nothing was read, though the program ran, above which what has come may have come at any
+time since: more than a rest and the turns of other links take."""
 READING_TIME: Final = 0.002
 """Seconds that the reader is given for that: it is ready to go on, so one turn of the event loop would do."""
 MOST_BEHIND: Final = 3.0
@@ -108,6 +111,9 @@ class Carrier:
         self._sent = anyio.Event()  # set when anything is sent
         self._behind_since = math.inf  # since when more comes than is read at once
         self._read_at = -math.inf
+        self._due = math.inf  # when the sender is to go on
+        self._held_up_at = -math.inf  # when it went on that much later
+        self._unseen = 0.0  # seconds of sleep since the last read that the loop's clock has left out
         self._is_taking = False  # what was read, or waits for its turn to do so
         self._asked = True  # whether anything may have been asked of anybody
         self._standstill = Standstill()
@@ -122,8 +128,9 @@ class Carrier:
             crowd.left(self)
 
     async def _read(self, crowd: Crowd) -> None:
-        before = anyio.current_time()
+        before = drained_at = anyio.current_time()
         while True:
+            asked_at = anyio.current_time()
             try:
                 chunks = await self._link.receive()
             except LinkError as error:
@@ -131,9 +138,12 @@ class Carrier:
                     self._end(error)
                     return
                 await self._reopen(error)
+                drained_at = anyio.current_time()
                 continue
             now = anyio.current_time()
             self._look_at_the_clock(now)
+            moments = self._moments(len(chunks), drained_at, asked_at, now)
+            drained_at = now if len(chunks) < MANY else drained_at
             is_news = not chunks
             if not chunks:
                 self._station.over(now)
@@ -141,7 +151,7 @@ class Carrier:
             crowd.came(self, len(chunks))
             self._behind_since = math.inf if len(chunks) < MANY else min(self._behind_since, now)
             self._read_at = math.inf
-            rest = iter(chunks)
+            rest = zip(chunks, moments, strict=True)
             if len(chunks) >= SOME or (crowd.has_others and self._station.is_waiting):
                 self._is_taking = True
                 is_news |= await self._take_turns(rest, crowd)
@@ -157,7 +167,28 @@ class Carrier:
                 await self._rest(min(REST, MOST_PER_REST * (now - before) / max(1, len(chunks))))
             before = now
 
-    async def _take_turns(self, chunks: Iterator[tuple[Peer, bytes]], crowd: Crowd) -> bool:
+    def _moments(self, count: int, drained_at: float, asked_at: float, now: float) -> Sequence[float]:
+        """Return when each chunk of a read came from the link.
+
+        Where the link does not tell and the reader was late, that is open, and each counts as of the time
+        when everything had been read last: so none counts as newer than what another program has observed
+        meanwhile.
+
+        Args:
+            count: how many there are.
+            drained_at: when everything that had come was read last.
+            asked_at, now: when this read began and ended.
+        """
+        longest = now - drained_at + self._unseen
+        self._unseen = 0.0
+        waited: Sequence[float] = getattr(self._link, "waited", ())
+        if len(waited) == count:
+            return [now - min(each, longest) for each in waited]
+        was_held_up = now - self._held_up_at < LATE or now - self._due > LATE
+        is_late = was_held_up or asked_at - drained_at > LATE
+        return [now - longest if is_late else now] * count
+
+    async def _take_turns(self, chunks: Iterator[tuple[tuple[Peer, bytes], float]], crowd: Crowd) -> bool:
         """Take what has come, and give way to other tasks and to other links; whether it is news."""
         is_news = is_done = False
         while not is_done:
@@ -169,12 +200,12 @@ class Carrier:
                 await anyio.lowlevel.checkpoint()  # before another link has its turn
         return is_news
 
-    def _take(self, chunks: Iterator[tuple[Peer, bytes]], until: float) -> bool:
+    def _take(self, chunks: Iterator[tuple[tuple[Peer, bytes], float]], until: float) -> bool:
         """Take what has come, until this time has passed; whether any of it is news."""
         is_news = False
         now = anyio.current_time()
-        for peer, data in chunks:
-            is_news |= self._station.receive(data, peer, now)
+        for (peer, data), moment in chunks:
+            is_news |= self._station.receive(data, peer, now, moment)
             for tap in self._taps:
                 tap.received(data, peer)
             if time.perf_counter() >= until:
@@ -196,6 +227,7 @@ class Carrier:
             now = anyio.current_time()
             self._look_at_the_clock(now)
             self._standstill.expect(math.inf)  # a slow link may hold us up
+            self._due = math.inf
             everyone = self._asked
             is_behind = self._is_behind(now)
             bursts, awaited = station.bursts(now)
@@ -223,10 +255,14 @@ class Carrier:
             elif most_lists < math.inf:  # a list that waits for its turn may not begin, and wants to
                 due = max(due, now + LOOK_AGAIN)
             self._standstill.expect(due)
+            self._due = due
             wait = due - now
             with anyio.move_on_after(None if wait == math.inf else max(wait, 0.0)):
                 await self._something_to_send.wait()
-            if self._behind_since < math.inf or anyio.current_time() - due > HELD_UP:
+            now = anyio.current_time()
+            if now - due > LATE:
+                self._held_up_at = now
+            if self._behind_since < math.inf or now - due > HELD_UP:
                 await anyio.sleep(READING_TIME)
 
     def send_for_another(self, frame: bytes) -> None:
@@ -249,6 +285,10 @@ class Carrier:
         news, self.news = self.news, anyio.Event()
         news.set()
 
+    def look_at_the_clock(self) -> None:
+        """Notice that this computer has slept, or that nothing was done here."""
+        self._look_at_the_clock(anyio.current_time())
+
     def fail_for_good(self, error: LinkError) -> None:
         """No call can be answered any more."""
         self.ended = error
@@ -270,6 +310,7 @@ class Carrier:
         unseen = self._standstill.unseen(now)
         if unseen is not None:
             logger.info("%s: time has stood still here", self._link.name)
+            self._unseen += unseen
             self._station.stood_still(unseen, now)
             self.wake()
 

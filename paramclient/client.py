@@ -167,6 +167,7 @@ class ParamClient:
             identity_of=self._station.identity_of,
             is_doubted=self._station.is_doubted,
             renewed=self._dispatch,
+            look=lambda: self._carrier.look_at_the_clock(),
         )
         self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self._components: dict[Address, Component] = {}

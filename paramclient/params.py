@@ -67,13 +67,21 @@ class Params(MutableMapping[str, Param]):
     Attributes:
         held: what is kept, by name.
         defaults: the firmware's defaults, by the names of those of which they are known.
+        moments: when each value was observed last, by name, in seconds of the clock of whoever fills this;
+            without the names of which that is not known.
     """
 
-    __slots__ = ("defaults", "held")
+    __slots__ = ("defaults", "held", "moments")
 
-    def __init__(self, held: dict[str, Held] | None = None, defaults: dict[str, Value] | None = None) -> None:
+    def __init__(
+        self,
+        held: dict[str, Held] | None = None,
+        defaults: dict[str, Value] | None = None,
+        moments: dict[str, float] | None = None,
+    ) -> None:
         self.held: dict[str, Held] = {} if held is None else held
         self.defaults: dict[str, Value] = {} if defaults is None else defaults
+        self.moments: dict[str, float] = {} if moments is None else moments
 
     def __getitem__(self, name: str) -> Param:
         return param_of(name, self.held[name], self.defaults.get(name))
@@ -88,6 +96,7 @@ class Params(MutableMapping[str, Param]):
     def __delitem__(self, name: str) -> None:
         del self.held[name]
         self.defaults.pop(name, None)
+        self.moments.pop(name, None)
 
     def __contains__(self, name: object) -> bool:
         return name in self.held
@@ -108,15 +117,16 @@ class Params(MutableMapping[str, Param]):
 
     def copy(self) -> Params:
         """The same parameters, as they are now."""
-        return Params(self.held.copy(), self.defaults.copy())
+        return Params(self.held.copy(), self.defaults.copy(), self.moments.copy())
 
     def only(self, names: Iterable[str]) -> Params:
         """Those of these names that there are, as they are now."""
-        held, defaults = self.held, self.defaults
+        held, defaults, moments = self.held, self.defaults, self.moments
         known = [name for name in names if name in held]
         return Params(
             {name: held[name] for name in known},
             {name: defaults[name] for name in known if name in defaults} if defaults else None,
+            {name: moments[name] for name in known if name in moments},
         )
 
     def __repr__(self) -> str:

@@ -17,6 +17,7 @@ import anyio.from_thread
 import anyio.lowlevel
 
 from paramclient.cache import (
+    CLOCK_SLACK,
     CacheChange,
     CachedComponent,
     HeardParams,
@@ -24,10 +25,12 @@ from paramclient.cache import (
     StoredParam,
     TableState,
     TableUpdate,
+    UnixTimes,
 )
 from paramclient.errors import CacheError, UsageError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.table import Observation
 from paramclient.values import Param
 from paramclient.worker import Worker
 
@@ -69,6 +72,7 @@ class WriteThrough:
         identity_of: says who the vehicle is that a component belongs to; None while that is open.
         is_doubted: says whether another vehicle may have taken its place by now.
         renewed: is called when another station has brought tables up to date.
+        look: is called before moments become unix times: to notice that the computer has slept.
         clock: the time in unix seconds; None for that of this computer.
         now: the time of the components.
     """
@@ -81,6 +85,7 @@ class WriteThrough:
         identity_of: Callable[[ComponentMachine], Identity | None],
         is_doubted: Callable[[ComponentMachine], bool],
         renewed: Callable[[], None] | None = None,
+        look: Callable[[], None] | None = None,
         clock: Callable[[], float] | None = None,
         now: Callable[[], float] = anyio.current_time,
     ) -> None:
@@ -88,6 +93,7 @@ class WriteThrough:
         self._identity_of = identity_of
         self._is_doubted = is_doubted
         self._renewed = _nothing if renewed is None else renewed
+        self._look = _nothing if look is None else look
         self._clock = _time_of_day if clock is None else clock
         self._now = now
         self._owned = owned
@@ -104,6 +110,7 @@ class WriteThrough:
         self._are_many = False
         self._news: set[CacheChange] = set()
         self._end_news: Callable[[], None] = _nothing
+        self._flushed_at = (math.inf, -math.inf)  # by the components' clock, and in unix seconds
 
     async def open(self) -> None:
         """Find out which components the cache knows."""
@@ -149,6 +156,7 @@ class WriteThrough:
             del self._kept[machine]
             machine.table.take_dirty()
             machine.table.take_overwritten()
+            machine.table.take_gone()
         return False
 
     async def bring(self, machine: ComponentMachine, identity: Identity) -> bool:
@@ -194,8 +202,9 @@ class WriteThrough:
         """The table was proven to be the vehicle's just now; `is_whole` by a download of all of it."""
         kept = self._kept.get(machine)
         if kept is not None:
-            kept.is_synced = True
-            kept.is_whole |= is_whole
+            kept.proven_at = self._now() + machine.table.slept
+            if is_whole:
+                kept.whole_at = kept.proven_at
 
     def part_with(self, machine: ComponentMachine) -> None:
         """It is not followed any more."""
@@ -231,13 +240,14 @@ class WriteThrough:
         """
         portion: list[_News] = []
         size = 0
+        times = self._present_times()
         fetches = sum(machine.fetch is not None for machine in self._kept)
         self._are_many = fetches > (0 if self._are_many else FEW_FETCHES)  # the last ones of many count too
         for kept in list(self._kept.values()) if self._cache is not None else ():
             if self._are_many and not is_last and self._is_for_later(kept):
                 self._something_to_write.set()
             elif self._kept.get(kept.machine) is kept:
-                for new in self._news_of(kept):
+                for new in self._news_of(kept, times):
                     portion.append(new)
                     size += len(new.update.params)
             if size >= PORTION:
@@ -287,7 +297,7 @@ class WriteThrough:
             if CacheChange(identity.key, machine.component) in news and self._cache is not None:
                 cached = await self._run(partial(self._cache.load, identity.key, machine.component))
                 if cached is not None and self._kept.get(machine) is kept:
-                    machine.renew(cached.params)
+                    machine.renew(cached.params, self._moments(cached))
                     self._renewed()
 
     def _begin_anew(self, replacements: int) -> None:
@@ -299,14 +309,15 @@ class WriteThrough:
             return
         for kept in self._kept.values():
             table = kept.machine.table
-            kept.is_whole |= table.complete
+            if table.complete and kept.whole_at is None:
+                kept.whole_at = self._now() + table.slept
             kept.state = None
             for name in table.params:
                 table.dirty.setdefault(name, "vehicle")
         self.wake()
 
     async def _save(self, cache: ParamCache, updates: list[TableUpdate]) -> bool:
-        return await self._run(partial(_save, cache, updates)) is not None
+        return await self._run(partial(_save, cache, updates, self._clock)) is not None
 
     def _has_room(self, machine: ComponentMachine, identity: Identity) -> bool:
         """Whether a vehicle's table may be kept, beside those of this session that are."""
@@ -330,7 +341,8 @@ class WriteThrough:
 
     def _keep(self, machine: ComponentMachine, identity: Identity, cached: CachedComponent | None) -> None:
         table = machine.table
-        kept = _Kept(machine, identity, is_whole=table.complete, written_at=anyio.current_time())
+        whole_at = self._now() + table.slept if table.complete else None
+        kept = _Kept(machine, identity, whole_at=whole_at, written_at=anyio.current_time())
         self._kept[machine] = kept
         for name in table.params:
             table.dirty.setdefault(name, "vehicle")
@@ -346,6 +358,7 @@ class WriteThrough:
                 volatile=cached.volatile,
                 volatile_known=cached.volatile_known,
                 placed=cached.complete or (is_same and cached.count is not None),
+                moments=self._moments(cached),
             )
             machine.fetches.is_same_firmware = is_same
             if is_same and machine.fetches.file_works is None:
@@ -353,23 +366,48 @@ class WriteThrough:
             kept.synced_at = cached.synced_at
             kept.state = None if table.is_displaced else self._state(machine, kept)
         if machine.sync.synced:
-            kept.is_synced = True
+            kept.proven_at = self._now() + table.slept
 
-    def _news_of(self, kept: _Kept) -> list[_News]:
+    def _present_times(self) -> UnixTimes:
+        """Return what turns moments of the components into unix times, as the computer's clock is now.
+
+        Where that was set back by less than `CLOCK_SLACK` since the last flush, what has come since counts as
+        later than what was written then.
+        """
+        self._look()
+        since, last = self._flushed_at
+        now, at = self._now(), self._clock()
+        if at < last - CLOCK_SLACK:  # the cache sees to that
+            since, last = math.inf, -math.inf
+        times = UnixTimes(max(at, last), at - now, since, last)
+        self._flushed_at = (now, times.at)
+        return times
+
+    def _moments(self, cached: CachedComponent) -> dict[str, float]:
+        """Return when the values of a cached table were observed, as moments of the components."""
+        self._look()
+        now = self._now()
+        ahead = self._clock() - now
+        if not math.isfinite(ahead):
+            return {}
+        return {name: min(at - ahead, now) for name, at in cached.heard_at.items()}
+
+    def _news_of(self, kept: _Kept, times: UnixTimes) -> list[_News]:
         """What the cache does not know of a table yet; it counts as written from now on."""
         machine, table = kept.machine, kept.machine.table
         if self._is_doubted(machine):
             return []
-        now = self._clock()
-        is_synced, kept.is_synced = kept.is_synced, False
-        if is_synced:
-            kept.synced_at = now
+        proven_at, kept.proven_at = kept.proven_at, None
+        if proven_at is not None:
+            kept.synced_at = times(proven_at - table.slept)
         state = self._state(machine, kept)
-        if not (table.dirty or kept.is_whole or state != kept.state):
+        if not (table.dirty or kept.whole_at is not None or state != kept.state):
             return []
         dirty = table.take_dirty()
         overwritten = table.take_overwritten()
-        is_whole, kept.is_whole = kept.is_whole, False
+        gone = table.take_gone()
+        whole_at, kept.whole_at = kept.whole_at, None
+        is_whole = whole_at is not None
         kept.state = state
         kept.written_at = anyio.current_time()
         volatile = table.volatile if table.volatile or table.volatile_known else None
@@ -378,22 +416,26 @@ class WriteThrough:
             identity=kept.identity,
             component=machine.component,
             autopilot=machine.who.autopilot or 0,
-            at=now,
+            at=times.at,
             table=state,
             params=HeardParams(
                 known.copy() if is_whole else known.only(dirty),
-                now,
+                times,
                 volatile=volatile,
                 by=dirty,
                 overwritten=[
-                    StoredParam(param, now, None if volatile is None else param.name in volatile, by)
-                    for param, by in overwritten
+                    StoredParam(
+                        param, times(moment), None if volatile is None else param.name in volatile, by
+                    )
+                    for param, by, moment in overwritten
                 ],
             ),
             removed=[name for name in dirty if name not in known],
+            removed_at={name: times(moment) for name, moment in gone.items()},
             replace=is_whole,
+            whole_at=None if whole_at is None else times(whole_at - table.slept),
         )
-        return [_News(kept, dirty, overwritten, update, is_synced)]
+        return [_News(kept, dirty, overwritten, gone, update, proven_at, whole_at)]
 
     def _state(self, machine: ComponentMachine, kept: _Kept) -> TableState:
         table = machine.table
@@ -425,8 +467,8 @@ class _Kept:
     identity: Identity
     state: TableState | None = None
     synced_at: float | None = None
-    is_synced: bool = False  # since it was written last, whose time then counts: the clock may be wrong now
-    is_whole: bool = False
+    proven_at: float | None = None  # since it was written last: by the components' clock, with `Table.slept`
+    whole_at: float | None = None  # when all of it was downloaded, likewise
     written_at: float = 0.0  # by the event loop's clock
 
 
@@ -436,18 +478,23 @@ class _News:
 
     kept: _Kept
     dirty: dict[str, str]
-    overwritten: list[tuple[Param, str]]
+    overwritten: list[Observation]
+    gone: dict[str, float]
     update: TableUpdate
-    is_synced: bool
+    proven_at: float | None
+    whole_at: float | None
 
     def take_back(self) -> None:
         """It has not arrived: it is news again."""
-        self.kept.is_synced |= self.is_synced
-        table = self.kept.machine.table
+        kept, table = self.kept, self.kept.machine.table
+        if kept.proven_at is None:
+            kept.proven_at = self.proven_at
+        if kept.whole_at is None:
+            kept.whole_at = self.whole_at
         table.dirty = self.dirty | table.dirty
         table.overwritten = self.overwritten + table.overwritten
-        self.kept.is_whole |= self.update.replace
-        self.kept.state = None
+        table.gone = self.gone | table.gone
+        kept.state = None
 
 
 def chosen_cache(
@@ -475,8 +522,8 @@ def _firmware(identity: Identity) -> tuple[int, str]:
     return identity.firmware, identity.git_hash
 
 
-def _save(cache: ParamCache, updates: list[TableUpdate]) -> bool:
-    cache.save(updates)
+def _save(cache: ParamCache, updates: list[TableUpdate], clock: Callable[[], float]) -> bool:
+    cache.save(updates, clock=clock)
     return True
 
 

@@ -5,13 +5,15 @@ from __future__ import annotations
 import asyncio
 import functools
 import selectors
+import time
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
+from types import SimpleNamespace
 from typing import Any, ParamSpec, TypeVar
 from unittest import mock
 
 import anyio
 
-from paramclient import Component, Param, ParamClient, ParamType
+from paramclient import Component, Param, ParamClient, ParamType, writethrough
 from paramclient.errors import LinkError
 from paramclient.links import Peer, SimLink
 from paramclient.protocol import wire
@@ -39,6 +41,7 @@ class SwiftLoop(asyncio.SelectorEventLoop):
 
     Attributes:
         now: its clock.
+        ahead: seconds that the time of day, as the cache is told it, is ahead of that.
         threads: calls in threads that are under way.
         has_struck: whether the last `strike` met its task still at work.
     """
@@ -46,6 +49,7 @@ class SwiftLoop(asyncio.SelectorEventLoop):
     def __init__(self) -> None:
         super().__init__(_LeapingSelector(self))
         self.now = 1000.0
+        self.ahead = time.time() - self.now
         self.threads = 0
         self.has_struck = False
         self._patient: list[asyncio.Future[None]] = []
@@ -131,11 +135,12 @@ def swiftly(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
             finally:
                 swift_loop().threads -= 1
 
-        with (
-            mock.patch.object(Worker, "run", counted),
-            asyncio.Runner(loop_factory=SwiftLoop) as runner,
-        ):
-            return runner.run(test(*args, **kwargs))
+        with asyncio.Runner(loop_factory=SwiftLoop) as runner:
+            loop = runner.get_loop()
+            assert isinstance(loop, SwiftLoop)
+            clock = SimpleNamespace(time=lambda: loop.now + loop.ahead)
+            with mock.patch.object(Worker, "run", counted), mock.patch.object(writethrough, "time", clock):
+                return runner.run(test(*args, **kwargs))
 
     return run
 

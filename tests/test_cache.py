@@ -229,10 +229,10 @@ def test_a_change_of_what_the_hash_covers_takes_the_hash_away(path: Path, change
         assert table is not None
         assert table.hash == (0xABC if keeps else None)
         assert (table.count, table.complete, table.volatile_known, table.synced_at) == (3, True, True, NOW)
-        cache.save(replace(change, table=TableState(0xDEF)))
+        cache.save(replace(change, table=TableState(0xDEF, 7)))
         table = cache.load(PX4.key, 1)
         assert table is not None
-        assert (table.hash, table.count, table.complete, table.synced_at) == (0xDEF, None, False, None)
+        assert (table.hash, table.count, table.complete, table.synced_at) == (0xDEF, 7, False, None)
 
 
 # History
@@ -517,6 +517,88 @@ def test_to_import_it_takes_no_other_library() -> None:
     assert not {"pydantic", "pymavlink", "anyio", "asyncio"} & set(loaded)
 
 
+# Observations that come late
+
+
+def lines_of(cache: ParamCache) -> list[tuple[float, str, Any, Any]]:
+    """The history: seconds after NOW, name, old and new value."""
+    return [
+        (line.at - NOW, line.name, line.old.value, line.new and line.new.value)
+        for line in cache.history(PX4.key)
+    ]
+
+
+def test_an_older_observation_never_replaces_a_newer_one(path: Path) -> None:
+    with ParamCache(path) as one, ParamCache(path) as other:
+        one.save(whole_table(2, first=200))
+        other.save(update(stored("PARAM_0", 19, at=NOW + 2), at=NOW + 2.2))
+        late = [stored("PARAM_0", 200, at=NOW + 0.5), stored("PARAM_0", 17, at=NOW + 1, by=BY_US)]
+        one.save(update(*late, at=NOW + 2.4))
+        assert values(other) == {"PARAM_0": 19, "PARAM_1": 201}
+        assert lines_of(one) == [(1, "PARAM_0", 200, 17), (2, "PARAM_0", 17, 19)]
+        one.save(update(stored("PARAM_0", 19, at=NOW + 2.1), at=NOW + 2.6))
+        assert len(lines_of(one)) == 2, "it was told already"
+
+
+def test_what_was_observed_before_a_whole_table_leaves_it_whole(path: Path) -> None:
+    """And what was observed after a part of it stays."""
+    with ParamCache(path) as one, ParamCache(path) as other:
+        one.save(whole_table(2))
+        other.save(update(stored("PARAM_0", 19, at=NOW + 3), at=NOW + 3))
+        whole = [stored("PARAM_0", 17, index=0, at=NOW + 1), stored("PARAM_1", 5, index=1, at=NOW + 2)]
+        state = TableState(7, 2, complete=True, synced_at=NOW + 2.5)
+        one.save(update(*whole, at=NOW + 4, replace=True, whole_at=NOW + 2.5, table=state))
+        table = one.load(PX4.key, 1)
+        assert table is not None
+        assert values(one) == {"PARAM_0": 19, "PARAM_1": 5}
+        assert (table.complete, table.hash) == (True, None), "the hash is of another value"
+        assert lines_of(one) == [
+            (1, "PARAM_0", 0, 17),
+            (2, "PARAM_1", 1, 5),
+            (3, "PARAM_0", 17, 19),
+        ]
+
+
+def test_a_name_that_was_found_missing_before_it_was_heard_is_not_gone(path: Path) -> None:
+    with ParamCache(path) as one, ParamCache(path) as other:
+        one.save(whole_table(3))
+        other.save(update(stored("PARAM_0", 0, at=NOW + 3), at=NOW + 3))
+        gone = {"PARAM_0": NOW + 2, "PARAM_1": NOW + 2.5}
+        one.save(update(removed=list(gone), removed_at=gone, at=NOW + 4))
+        assert values(one).keys() == {"PARAM_0", "PARAM_2"}
+        assert lines_of(one) == [(2.5, "PARAM_1", 1, None)]
+        other.save(update(stored("PARAM_1", 1, at=NOW + 2.2), at=NOW + 5))
+        assert values(one).keys() == {"PARAM_0", "PARAM_2"}
+        other.save(update(stored("PARAM_3", 3, at=NOW + 4.5), at=NOW + 5))
+        whole = [stored("PARAM_0", 0, index=0, at=NOW + 4)]
+        one.save(update(*whole, replace=True, whole_at=NOW + 4, at=NOW + 6))
+        assert values(one).keys() == {"PARAM_0", "PARAM_3"}, "it appeared after the whole table"
+
+
+def test_a_part_that_a_fresh_file_has_of_a_whole_table_takes_the_rest(path: Path) -> None:
+    with ParamCache(path) as cache:
+        state = TableState(7, 2, complete=True, synced_at=NOW + 3)
+        cache.save(update(stored("PARAM_1", 1, index=1, at=NOW + 3), table=state, at=NOW + 3))
+        cache.save(update(stored("PARAM_0", 0, index=0, at=NOW + 1), at=NOW + 4))
+        assert values(cache) == {"PARAM_0": 0, "PARAM_1": 1}
+
+
+def test_a_clock_that_was_set_back_is_told_from_a_program_that_is_late(path: Path) -> None:
+    """In a file, where one clock counts: by the present at which the late one comes to write."""
+    with ParamCache(path) as cache:
+        cache.save(update(stored("A", 1), at=NOW))
+        cache.save(update(stored("A", 2, at=NOW + 600), at=NOW + 600))
+        cache.save(update(stored("A", 3, at=NOW + 5), at=NOW + 6), clock=lambda: NOW + 601.0)
+        assert values(cache) == {"A": 2}
+        assert [line[0] for line in lines_of(cache)] == [5, 600]
+        cache.save(update(stored("A", 4, at=NOW + 7), at=NOW + 8), clock=lambda: NOW + 9.0)
+        cache.save(update(stored("A", 5, at=NOW + 11), at=NOW + 12), clock=lambda: NOW + 13.0)
+        assert values(cache) == {"A": 5}
+        assert [line[2:] for line in lines_of(cache)] == [(1, 3), (3, 2), (2, 4), (4, 5)]
+        cache.save(update(stored("A", 9, at=NOW + 10), at=NOW + 14), clock=lambda: NOW + 14.0)
+        assert [line[3] for line in lines_of(cache)] == [3, 2, 4, 9, 5], "also among what came since"
+
+
 # The model
 
 
@@ -544,9 +626,11 @@ class Model:
     ) -> None:
         covered = self.covered()
         named = {item.param.name for item in params}
-        for name in self.by_index() if whole else removed:
-            if name in self.params and name not in named:
-                self.lines.append((name, self.params.pop(name).param.bits, None, BY_VEHICLE))
+        gone = {
+            name: self.params.pop(name)
+            for name in (self.by_index() if whole else removed)
+            if name in self.params and name not in named
+        }
         for item in params:
             name, param = item.param.name, item.param
             old = self.params.get(name)
@@ -557,6 +641,11 @@ class Model:
                     self.lines.append((name, old.param.bits, param.bits, item.by))
             volatile = bool(old and old.volatile) if item.volatile is None else item.volatile
             self.params[name] = replace(item, param=param, volatile=volatile)
+        self.lines += [(name, item.param.bits, None, BY_VEHICLE) for name, item in gone.items()]
+        is_less = state is not None and not state.complete and self.state.complete and not whole
+        counts: tuple[int | None, ...] = (self.state.count,) if params else (self.state.count, None)
+        if is_less and state is not None and state.count in counts:
+            state = None  # a program that knows less of a table takes nothing away from it
         if state is not None:
             self.state = state
         elif covered != self.covered():
@@ -570,7 +659,7 @@ PARAMS = st.builds(
     st.sampled_from([0, 1, 2, 0x80000000, 0xFFFFFFFF]),
     st.sampled_from([ParamType.UINT32, ParamType.INT32, REAL32, 99]),
     index=st.one_of(st.none(), st.integers(0, 3)),
-    at=st.floats(NOW, NOW + 100),
+    at=st.floats(0.0, 0.9),
     volatile=st.sampled_from([None, True, False]),
     by=st.sampled_from([BY_US, BY_VEHICLE, by_station(1, 2)]),
 )
@@ -594,6 +683,7 @@ class CacheMachine(RuleBasedStateMachine):
         self.path = Path(self.folder.name) / "cache"
         self.caches = [ParamCache(self.path), ParamCache(self.path)]
         self.model: dict[tuple[Identity, int], Model] = {}
+        self.now = NOW
 
     def teardown(self) -> None:
         for cache in self.caches:
@@ -616,12 +706,16 @@ class CacheMachine(RuleBasedStateMachine):
     )
     def save(self, by: int, updates: list[Any]) -> None:
         batch = []
-        for (identity, component), params, removed, whole, state in updates:
+        for (identity, component), drawn, removed, whole, state in updates:
+            params = [replace(item, heard_at=self.now + item.heard_at) for item in drawn]
+            params.sort(key=lambda item: item.heard_at)
+            self.now += 1.0
             batch.append(
                 update(
                     *params,
                     identity=identity,
                     component=component,
+                    at=self.now,
                     removed=removed,
                     replace=whole,
                     table=state,

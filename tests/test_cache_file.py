@@ -30,7 +30,7 @@ from paramclient.cache.database import APPLICATION_ID, Database
 from paramclient.cache.packed import unpack
 from paramclient.cache.rows import Damaged, checksum
 from paramclient.cache.schema import MIGRATIONS
-from paramclient.errors import CacheError
+from paramclient.errors import CacheError, UnknownVehicle
 from paramclient.identity import Identity
 from paramclient.values import ParamType
 from tests.caches import (
@@ -617,7 +617,7 @@ def test_a_file_from_before_tables_were_packed_keeps_every_cell(path: Path, vers
         assert list(after[0].params) == list(before[0].params)
         assert after[0].params["\xdf\0"].default == -5
         assert cache.components() == summaries
-        cache.save(update(stored("PLAIN", 2, at=NOW + 5), at=NOW + 5))
+        cache.save(update(stored("PLAIN", 2)))
         assert [entry.old.value for entry in cache.history(PX4.key)] == [1]
         assert not cache.notes
         works(cache)
@@ -1046,7 +1046,7 @@ def test_no_descriptor_is_left_open(path: Path, monkeypatch: pytest.MonkeyPatch)
                 other.execute("BEGIN IMMEDIATE")
                 with pytest.raises(CacheError):
                     cache.save(update())
-            with pytest.raises(CacheError):
+            with pytest.raises(UnknownVehicle):
                 cache.component("beef")
         ParamCache(path).save(update())
     assert descriptors() == before

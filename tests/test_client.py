@@ -1407,9 +1407,9 @@ async def test_what_comes_during_a_rest_is_taken_in_order(monkeypatch: pytest.Mo
     taken: list[bytes] = []
     receive = Station.receive
 
-    def record(station: Station, data: bytes, peer: Peer, now: float) -> bool:
+    def record(station: Station, data: bytes, peer: Peer, now: float, moment: float) -> bool:
         taken.append(data)
-        return receive(station, data, peer, now)
+        return receive(station, data, peer, now, moment)
 
     monkeypatch.setattr(Station, "receive", record)
     vehicle = small_px4()

@@ -811,10 +811,10 @@ async def test_what_could_not_be_written_is_written_later(
         def __enter__(self) -> Moody:
             return self
 
-        def save(self, update: Any) -> None:
+        def save(self, update: Any, **more: Any) -> None:
             if self.is_broken:
                 raise CacheError("no room")
-            super().save(update)
+            super().save(update, **more)
 
     vehicle = small_px4()
     with Moody(path) as cache:

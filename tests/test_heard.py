@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from paramclient.cache import HeardParams, StoredParam
+from paramclient.cache import HeardParams, StoredParam, UnixTimes
 from paramclient.cache.heard import FirstRows
 from paramclient.cache.packed import Packed, pack
 from paramclient.cache.rows import Damaged, Row, read_param, read_params
@@ -14,6 +14,8 @@ from paramclient.params import Params
 from paramclient.values import Encoding, Param, ParamType, Trust, decode, from_bits, known_type
 
 AT = 1_795_000_000.5
+TIMES = UnixTimes(AT, AT - 100.0)
+"""At AT, where the clock of the observations stands at 100 s."""
 
 
 @st.composite
@@ -29,6 +31,8 @@ def tables(draw: st.DrawFn) -> Params:
         index = draw(st.sampled_from([place, None]))
         default = from_bits(bits, number) if draw(st.booleans()) and not isinstance(value, bytes) else None
         params[name] = Param(name, value, known_type(number), index, bits, Trust.LIVE, default)
+        if draw(st.booleans()):
+            params.moments[name] = draw(st.floats(0.0, 100.0))
     return params
 
 
@@ -40,12 +44,16 @@ def tables(draw: st.DrawFn) -> Params:
 def test_a_table_gives_the_same_rows_in_every_way(
     params: Params, volatile: frozenset[str] | None, by: dict[str, str]
 ) -> None:
-    heard = HeardParams(params, AT, volatile=volatile, by=by)
+    heard = HeardParams(params, TIMES, volatile=volatile, by=by)
     stored = list(heard)
+    times = {name: AT - 100.0 + params.moments.get(name, 100.0) for name in params}
     assert stored == [
-        StoredParam(param, AT, None if volatile is None else name in volatile, by.get(name, "vehicle"))
+        StoredParam(
+            param, times[name], None if volatile is None else name in volatile, by.get(name, "vehicle")
+        )
         for name, param in params.items()
     ]
+    assert dict(heard.heard_at()) == times
     expected = {
         each.param.name: Row.of(each.param, each.param.index, bool(each.volatile), each.heard_at)
         for each in stored
@@ -71,7 +79,7 @@ def test_a_table_gives_the_same_rows_in_every_way(
     kept, left_out, heard_at = Packed(pack(first)).params()
     assert kept == read_params(expected)
     assert left_out == frozenset(name for name, row in expected.items() if row.volatile)
-    assert list(heard_at.items()) == [(name, AT) for name in kept]
+    assert heard_at == times
     again = read_params(expected)
     one_by_one = {
         name: read_param(name, *row.value, row.param_index, row.default_bits)
@@ -87,8 +95,9 @@ def test_what_was_overwritten_comes_first_and_by_itself() -> None:
     params = Params()
     params["A"] = Param("A", 2, ParamType.INT32, 0, 2)
     before = StoredParam(Param("A", 1, ParamType.INT32, 0, 1), AT, None, "us")
-    heard = HeardParams(params, AT, volatile=None, by={}, overwritten=[before])
+    heard = HeardParams(params, TIMES, volatile=None, by={}, overwritten=[before])
     assert (len(heard), heard[0], [each.param.value for each in heard[-1:]]) == (2, before, [2])
+    assert list(heard.heard_at()) == [("A", AT), ("A", AT)]
     rows = [(name, row.bits, by) for name, row, _, by in heard.rows()]
     assert rows == [("A", 1, "us"), ("A", 2, "vehicle")]
     assert heard.first_rows() is None, "a name is in it twice"

@@ -267,7 +267,7 @@ class Watched(Station):
         self.most_lists = math.inf
         self.on_receive: Callable[[], None] = lambda: None
 
-    def receive(self, data: bytes, peer: Peer, now: float) -> bool:
+    def receive(self, data: bytes, peer: Peer, now: float, moment: float | None = None) -> bool:
         self.on_receive()
         return True
 
@@ -507,11 +507,11 @@ class Portions(ParamCache):
         super().__init__(path)
         self.given: list[dict[int, int]] = []
 
-    def save(self, update: object) -> None:
+    def save(self, update: object, *, clock: Callable[[], float] | None = None) -> None:
         assert isinstance(update, list)
         updates: list[TableUpdate] = update
         self.given.append({each.identity.system: len(each.params) for each in updates})
-        super().save(updates)
+        super().save(updates, clock=clock)
 
 
 @swiftly

@@ -328,10 +328,13 @@ def test_a_time_that_the_clock_went_through_twice_is_refused(path: Path) -> None
 
 
 def test_two_programs_that_write_a_moment_apart_are_no_clock_set_back(path: Path) -> None:
+    late = NOW + earlier.CLOCK_SLACK
     with ParamCache(path) as cache:
-        cache.save(update(stored("A", 1), table=DONE, at=NOW + earlier.CLOCK_SLACK))
-        cache.save(update(stored("A", 2), at=NOW))
-        assert numbers(cache.state_at(PX4.key, 1, NOW + earlier.CLOCK_SLACK)) == {"A": 2}
+        cache.save(update(stored("A", 1), table=DONE))
+        cache.save(update(stored("A", 3, at=late), at=late))
+        cache.save(update(stored("A", 2, at=NOW + 1), at=NOW + 1))
+        assert numbers(cache.state_at(PX4.key, 1, NOW + 2)) == {"A": 2}
+        assert numbers(cache.state_at(PX4.key, 1, late)) == {"A": 3}, "it was observed later"
 
 
 def same(state: ParamSet, table: dict[str, Param]) -> bool:

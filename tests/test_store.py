@@ -39,6 +39,7 @@ from tests.caches import NOW, PX4, stored, update, values, whole_table
 from tests.commands import in_process
 from tests.postgres import GIVEN, PROGRAMS, WHY_NONE, Server, database_on, server
 from tests.shell import Tap, small_px4, swiftly
+from tests.test_moments import interleaved
 from tests.test_service_process import served
 
 PATIENCE = 60.0
@@ -62,8 +63,7 @@ OF_A_FILE = {
     # a time that lies before another one is another station's, not a clock that was set back
     "test_a_time_that_the_clock_went_through_twice_is_refused",
     "test_two_programs_that_write_a_moment_apart_are_no_clock_set_back",
-    # a station that knows less of a table than others takes nothing away from it
-    "test_a_change_of_what_the_hash_covers_takes_the_hash_away",
+    "test_a_clock_that_was_set_back_is_told_from_a_program_that_is_late",
     # they have fixtures of their own
     "test_what_is_claimed_of_any_moment_is_what_was_so",
     "test_every_value_comes_back_to_the_last_bit",
@@ -276,6 +276,12 @@ def test_in_whatever_order_values_come_the_latest_are_kept_and_lines_make_a_chai
         assert [line[4] for line in chain] == known[:-1]
         assert known[-1] == rows[name].bits
         assert all(old != new for old, new in pairwise(known))
+
+
+def test_whatever_two_programs_write_to_a_database_was_so(path: str, tmp_path: Path) -> None:
+    interleaved(
+        lambda: (ParamCache(path, local=tmp_path / "a"), ParamCache(path, local=tmp_path / "b")), examples=15
+    )
 
 
 def kept_of(updates: Iterable[TableUpdate]) -> tuple[Mapping[str, Row], Sequence[Line]]:

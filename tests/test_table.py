@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import pytest
 
-from paramclient.cache import HeardParams, StoredParam
+from paramclient.cache import HeardParams, StoredParam, UnixTimes
 from paramclient.protocol import table as room
 from paramclient.protocol.change import Change
 from paramclient.protocol.table import Table
@@ -391,8 +391,9 @@ HALF = 0x3F000000
 
 def rows_of(table: Table) -> dict[str, int | None]:
     """The defaults that the cache makes of all that it is given of a table."""
-    overwritten = [StoredParam(param, 1.0, by=by) for param, by in table.overwritten]
-    heard = HeardParams(table.params.copy(), 1.0, volatile=None, by={}, overwritten=overwritten)
+    overwritten = [StoredParam(each.param, 1.0, by=each.by) for each in table.overwritten]
+    times = UnixTimes(1.0)
+    heard = HeardParams(table.params.copy(), times, volatile=None, by={}, overwritten=overwritten)
     return {f"{name} {row.type}": row.default_bits for name, row, *_ in heard.rows()}
 
 
@@ -404,7 +405,7 @@ def test_what_was_overwritten_keeps_the_default_of_its_own_type() -> None:
     assert change.old is not None
     assert change.new is not None
     assert (change.old.default, change.new.default) == (None, 0.5)
-    assert [(param.value, param.default) for param, _ in table.overwritten] == [(5, None)]
+    assert [(each.param.value, each.param.default) for each in table.overwritten] == [(5, None)]
     assert rows_of(table) == {"A 2": None, "A 9": HALF}
     change = table.hear(param_value("A", 6, index=0, kind=ParamType.INT8), "us")
     assert change is not None

@@ -1,21 +1,22 @@
 """Tables, identities and history on disk: what a vehicle's parameters were when it was last heard.
 
 `records` says what goes in and comes out. The other rooms stand on one another: `store` is what is called,
-and `interface` what it calls; `operations` are what can be written. `merge` brings in what is of the past,
+and `interface` what it calls; `operations` are what can be written. `settle` brings in what programs and
+stations observe, and `merge` what is of the past;
 `tables` keeps tables and their history, `earlier` tells what they were before,
 `fleet` puts those of many vehicles beside each other, `rows` lays them into cells. `session` is one
 transaction in the SQL of every database, `sqlite` in that of a file, where `packed` makes a blob of a table;
 `database` looks after the file, and `schema` says what is in it.
 
 Where stations share a database, `shared` puts this together: `postgres` (with `migrations` and `address`),
-the local copy with its `outbox`, and `settle` for what comes from several stations. `transfer` copies tables.
+and the local copy with its `outbox`. `transfer` copies tables.
 """
 
 from __future__ import annotations
 
-from paramclient.cache.earlier import SNAPSHOTS
+from paramclient.cache.earlier import CLOCK_SLACK, SNAPSHOTS
 from paramclient.cache.fleet import FleetDiff, FleetValue, FleetVehicle, Holder, NameSpread
-from paramclient.cache.heard import HeardParams
+from paramclient.cache.heard import HeardParams, UnixTimes
 from paramclient.cache.records import (
     BY_US,
     BY_VEHICLE,
@@ -38,6 +39,7 @@ from paramclient.cache.transfer import CopyResult
 __all__ = [
     "BY_US",
     "BY_VEHICLE",
+    "CLOCK_SLACK",
     "CacheChange",
     "CachedComponent",
     "CachedSummary",
@@ -58,6 +60,7 @@ __all__ = [
     "StoredParam",
     "TableState",
     "TableUpdate",
+    "UnixTimes",
     "by_station",
     "default_path",
 ]

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, overload
 
 from paramclient.cache.records import BY_VEHICLE, StoredParam
@@ -10,7 +12,31 @@ from paramclient.cache.rows import Row, signed, time_cell
 from paramclient.params import NOWHERE, Params, iter_parts, parts_of
 from paramclient.values import bits_of
 
-__all__ = ["FirstRows", "HeardParams"]
+__all__ = ["FirstRows", "HeardParams", "UnixTimes"]
+
+
+@dataclass(frozen=True, slots=True)
+class UnixTimes:
+    """Turns moments of a clock that nobody sets into unix times.
+
+    Attributes:
+        at: the present, in unix seconds: no moment is after it.
+        ahead: seconds that unix time is ahead of the other clock.
+        since, not_before: a moment from `since` on is not before the unix time `not_before`, though the
+            computer's clock was set back a little in between.
+    """
+
+    at: float
+    ahead: float = 0.0
+    since: float = math.inf
+    not_before: float = 0.0
+
+    def __call__(self, moment: float) -> float:
+        """Return the unix time of a moment."""
+        at = moment + self.ahead
+        if moment >= self.since and at < self.not_before:
+            at = self.not_before
+        return min(max(at, 0.0), self.at)
 
 
 class HeardParams(Sequence[StoredParam]):
@@ -20,8 +46,8 @@ class HeardParams(Sequence[StoredParam]):
     table holds.
 
     Args:
-        params: as they are now: a copy of what the table holds.
-        heard_at: when the vehicle said so.
+        params: as they are now: a copy of what the table holds, with the moments of the observations.
+        times: what turns these into unix times. A value without a moment counts as observed at `times.at`.
         volatile: the names that it leaves out of its hash; None leaves what is known.
         by: who caused the changes, by name; of the others it was the vehicle.
         overwritten: what some of them were before, and is to be kept first.
@@ -30,14 +56,14 @@ class HeardParams(Sequence[StoredParam]):
     def __init__(
         self,
         params: Params,
-        heard_at: float,
+        times: UnixTimes,
         *,
         volatile: frozenset[str] | None,
         by: Mapping[str, str],
         overwritten: Sequence[StoredParam] = (),
     ) -> None:
         self._params = params
-        self._heard_at = heard_at
+        self._times = times
         self._volatile = volatile
         self._by = by
         self._overwritten = overwritten
@@ -56,9 +82,20 @@ class HeardParams(Sequence[StoredParam]):
 
     def __iter__(self) -> Iterator[StoredParam]:
         yield from self._overwritten
-        for name, param in self._params.items():
+        for (name, param), (_, at) in zip(self._params.items(), self._current_times(), strict=True):
             is_volatile = None if self._volatile is None else name in self._volatile
-            yield StoredParam(param, self._heard_at, is_volatile, self._by.get(name, BY_VEHICLE))
+            yield StoredParam(param, at, is_volatile, self._by.get(name, BY_VEHICLE))
+
+    def heard_at(self) -> Iterator[tuple[str, float]]:
+        """Give the name and the time of each, without making anything of it."""
+        for item in self._overwritten:
+            yield item.param.name, item.heard_at
+        yield from self._current_times()
+
+    def _current_times(self) -> Iterator[tuple[str, float]]:
+        times, moments = self._times, self._params.moments
+        for name in self._params.held:
+            yield name, times(moments[name]) if name in moments else times.at
 
     def rows(self) -> Iterator[tuple[str, Row, bool | None, str]]:
         """Each one's name and cells, whether it is volatile, and who caused its change."""
@@ -75,7 +112,8 @@ class HeardParams(Sequence[StoredParam]):
         return self._rows() if self._params and not self._overwritten else None
 
     def _rows(self) -> FirstRows:
-        return FirstRows(self._params, self._volatile or frozenset(), time_cell(self._heard_at))
+        times = [time_cell(at) for _, at in self._current_times()]
+        return FirstRows(self._params, self._volatile or frozenset(), times)
 
 
 class FirstRows(Mapping[str, Row]):
@@ -87,13 +125,13 @@ class FirstRows(Mapping[str, Row]):
     Args:
         params: at least one.
         volatile: the names of those that the vehicle leaves out of its hash.
-        heard_at: when the vehicle said so.
+        heard_at: when the vehicle said so, in their order.
     """
 
-    def __init__(self, params: Params, volatile: frozenset[str], heard_at: float) -> None:
+    def __init__(self, params: Params, volatile: frozenset[str], heard_at: Sequence[float]) -> None:
         self._params = params
         self._volatile = volatile
-        self._heard_at = heard_at
+        self._heard_at = dict(zip(params.held, heard_at, strict=True))
 
     def __len__(self) -> int:
         return len(self._params)
@@ -106,7 +144,8 @@ class FirstRows(Mapping[str, Row]):
         default = self._params.defaults.get(name)
         initial = None if default is None else signed(bits_of(default, number))
         index = None if place == NOWHERE else place
-        return Row(number, signed(bits), is_raw, index, int(name in self._volatile), self._heard_at, initial)
+        is_volatile = int(name in self._volatile)
+        return Row(number, signed(bits), is_raw, index, is_volatile, self._heard_at[name], initial)
 
     def columns(self) -> tuple[Sequence[str], list[Sequence[Any]]]:
         """The names, and the cells of all rows in the order of `Row`."""
@@ -124,6 +163,6 @@ class FirstRows(Mapping[str, Row]):
             is_raw,
             [None if place == NOWHERE else place for place in places] if NOWHERE in places else places,
             bytes(map(self._volatile.__contains__, held)),
-            (self._heard_at,) * len(held),
+            tuple(self._heard_at.values()),
             initial,
         ]

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
-from paramclient.cache import earlier, tables
+from paramclient.cache import earlier
 from paramclient.cache.merge import merge
 from paramclient.cache.records import Snapshot, TableUpdate
 from paramclient.cache.rows import read_param
@@ -41,17 +41,23 @@ class Operation(ABC, Generic[T_co]):
 
 @dataclass(frozen=True)
 class Save(Operation[None]):
-    """Write what was learnt, see `ParamCache.save`."""
+    """Write what was learnt, see `ParamCache.save`.
+
+    Attributes:
+        updates: in the order given.
+        clock: gives the present by the clock that their times were read from; None for `at` of each, which is
+            what counts after a wait, too.
+    """
 
     updates: Sequence[TableUpdate]
+    clock: Callable[[], float] | None = field(default=None, compare=False)
 
     @property
     def tables(self) -> Iterable[tuple[str, int | None]]:
         return {(each.identity.key, each.component) for each in self.updates}
 
     def do(self, session: Session) -> None:
-        write = settle if session.is_shared else tables.save
-        write(session, self.updates)
+        settle(session, self.updates, None if self.clock is None else self.clock())
 
 
 @dataclass(frozen=True)

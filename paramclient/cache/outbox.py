@@ -231,11 +231,14 @@ def _update_cells(update: TableUpdate) -> list[Any]:
         [_item_cells(each) for each in update.params],
         list(update.removed),
         update.replace,
+        dict(update.removed_at),
+        update.whole_at,
     ]
 
 
 def _update(data: list[Any]) -> TableUpdate:
-    who, component, autopilot, at, state, items, removed, is_whole = data
+    who, component, autopilot, at, state, items, removed, is_whole, *times = data
+    removed_at, whole_at = times or ({}, None)  # an earlier version has kept neither
     return TableUpdate(
         identity=read_identity(who),
         component=component,
@@ -244,7 +247,9 @@ def _update(data: list[Any]) -> TableUpdate:
         table=None if state is None else TableState(*state),
         params=[_item(each) for each in items],
         removed=removed,
+        removed_at=removed_at,
         replace=is_whole,
+        whole_at=whole_at,
     )
 
 

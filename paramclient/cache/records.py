@@ -46,7 +46,8 @@ class StoredParam:
     Attributes:
         param: the parameter; its trust is not kept. An index of None leaves a known index as it is, except
             in a whole table.
-        heard_at: when the vehicle said so, not after the update's `at`.
+        heard_at: when the vehicle said so, not after the update's `at`. Of two observations of a parameter
+            the later one counts, whichever is saved first.
         volatile: whether the vehicle leaves it out of its hash; None leaves what is known.
         by: who caused the change, should it be one: `BY_US`, `us for NAME`, `BY_VEHICLE` or `by_station(…)`.
     """
@@ -91,7 +92,9 @@ class TableUpdate:
             of what the hash covers takes the hash away.
         params: what to insert or change, in the order in which it was heard.
         removed: names that the vehicle no longer has.
+        removed_at: when each of them was found missing; of the others it was at `at`.
         replace: `params` are the whole table: names that are not in it go.
+        whole_at: when the vehicle was found to have no other names than those; None for `at`.
     """
 
     identity: Identity
@@ -101,7 +104,16 @@ class TableUpdate:
     table: TableState | None = None
     params: Sequence[StoredParam] = ()
     removed: Sequence[str] = ()
+    removed_at: Mapping[str, float] = field(default_factory=dict)
     replace: bool = False
+    whole_at: float | None = None
+
+    def gone_at(self, name: str) -> float:
+        """Return when a name that this update takes away was found missing."""
+        at = self.removed_at.get(name)
+        if at is None:
+            at = self.whole_at if self.replace and name not in self.removed else None
+        return self.at if at is None else at
 
 
 @dataclass(frozen=True, slots=True)

@@ -275,6 +275,18 @@ class Session(ABC):
             (owner, name, after, until),
         )
 
+    def last_line_at(self, owner: int) -> float:
+        """The time of the last line of a table; minus infinity where it has none."""
+        found = self._all("SELECT at FROM history WHERE owner = ? ORDER BY id DESC LIMIT 1", (owner,))
+        return max((float(at) for (at,) in found), default=float("-inf"))
+
+    def gone(self, owner: int) -> Mapping[str, float]:
+        """By name, when a parameter went last, of those that did and have left a line."""
+        found = self._all(
+            "SELECT name, max(at) FROM history WHERE owner = ? AND new_type IS NULL GROUP BY name", (owner,)
+        )
+        return dict(cells(row, "sf") for row in found)
+
     def gone_at(self, owner: int, name: str) -> float:
         """When a name went last, by its lines; minus infinity where it never did."""
         [(at,)] = self._all(

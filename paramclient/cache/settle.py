@@ -1,54 +1,52 @@
-"""What several stations hear of one vehicle, in one table: of each value the later observation counts.
+"""What programs and stations observe of one vehicle, in one table: the later observation of a value counts.
 
-What comes in the order of its time is written as ever. What comes late (a station was away, or another one
-was quicker) finds its place in the history, and changes of the table only what nobody has heard since. So it
-does not matter which of two stations comes first. That a value was heard again and was the same leaves no
-line, so a late observation may find its change later, or earlier, than a log of everything would have it.
-Times are those of the stations' clocks: these have to agree.
+An observation that is not older than what is kept of its parameter is written, with a line where the value
+has changed. An older one (its program was slow, or a station was away) finds its place in the history, and
+changes of the table only what nobody has observed since. So it does not matter which of two programs comes
+first. That a value was heard again and was the same leaves no line, so a late observation may find its change
+later, or earlier, than a log of everything would have it. Of two observations of the same moment the one that
+is written later counts.
+
+Times are those of the clocks of the stations: these have to agree. Programs that share a file share a clock
+too. What such a file has of a later time than it is shows that the clock was set back since: that is older
+than what comes, whatever its time says.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from paramclient.cache import tables
+from paramclient.cache.earlier import CLOCK_SLACK
+from paramclient.cache.heard import HeardParams
 from paramclient.cache.merge import SAME_CHANGE
-from paramclient.cache.records import BY_VEHICLE, CachedSummary, StoredParam, TableUpdate
+from paramclient.cache.records import BY_VEHICLE, CachedSummary, StoredParam, TableState, TableUpdate
 from paramclient.cache.rows import Row, time_cell
 from paramclient.cache.session import Line, NumberedLine, Session
 from paramclient.cache.tables import (
     applied,
     forget_other_firmware,
     hashed,
-    save,
+    write_lines,
     write_state,
 )
 
 __all__ = ["Past", "settle"]
 
 
-def settle(session: Session, updates: Iterable[TableUpdate]) -> None:
-    """Write what stations learnt, see `ParamCache.save`."""
+def settle(session: Session, updates: Iterable[TableUpdate], present: float | None = None) -> None:
+    """Write what was learnt, see `ParamCache.save`.
+
+    Args:
+        session: the transaction.
+        updates: in the order given.
+        present: unix seconds by the clock that the times of the updates were read from; None for `at` of
+            each.
+    """
     for update in updates:
-        key = update.identity.key
-        at = time_cell(update.at)
-        vehicle = next(iter(session.vehicles(key)), None)
-        if vehicle is not None and vehicle.last_seen > at:
-            update = replace(update, identity=vehicle.identity)
-        found = session.summaries(key, update.component)
-        if not found:
-            save(session, [update])
-        else:
-            [(owner, table)] = found
-            heard = session.heard_last(owner)
-            is_late = at < table.updated_at or any(item.heard_at < heard for item in update.params)
-            if not is_late:
-                save(session, [_respectful(update, table)])
-            else:
-                _bring_in(session, update, owner, table)
-        if vehicle is not None:
-            session.seen(key, min(vehicle.first_seen, at), max(vehicle.last_seen, at))
+        _settle(session, update, max(time_cell(update.at), 0.0 if present is None else present))
 
 
 @dataclass
@@ -65,21 +63,24 @@ class Past:
     known_since: float | None = None
     new_names: frozenset[str] = frozenset()
 
-    def observe(self, name: str, seen: Row, by: str, kept: Row | None) -> None:
+    def observe(self, name: str, seen: Row, by: str, kept: Row | None, *, has_changed: bool = False) -> None:
         """Put in what was observed at a time after which the value was heard again.
 
         Args:
+            name: the parameter.
             seen: the value and its time.
             by: who caused it, should it be a change.
             kept: what the table has now, heard later; None where it has no such name.
+            has_changed: whether there is a line of it ahead of `lines`.
         """
         at = seen.heard_at
         place = next((n for n, (_, line) in enumerate(self.lines) if line[1] == name and line[0] > at), None)
         if place is None:
             if kept is None or seen.same_value(kept):
                 return
-            is_first = self.known_since is None or at < self.known_since or name in self.new_names
-            if not is_first:
+            is_known = has_changed or any(line[1] == name for _, line in self.lines)
+            is_new = self.known_since is None or at < self.known_since or name in self.new_names
+            if is_known or not is_new:
                 self._insert((at, name, by, *kept.value, *seen.value))
             self._insert((kept.heard_at, name, BY_VEHICLE, *seen.value, *kept.value))
             return
@@ -104,52 +105,138 @@ class Past:
         self.lines.insert(place, (None, line))
 
 
-def _bring_in(session: Session, update: TableUpdate, owner: int, table: CachedSummary) -> None:
-    """Bring in what others have overtaken, wholly or in part."""
+def _settle(session: Session, update: TableUpdate, present: float) -> None:
+    key, at = update.identity.key, update.at
+    horizon = math.inf if session.is_shared else present + CLOCK_SLACK
+    vehicle = next(iter(session.vehicles(key)), None)
+    if vehicle is not None and at < vehicle.last_seen <= horizon:
+        update = replace(update, identity=vehicle.identity)
     forget_other_firmware(session, update.identity)
-    session.make(update)
-    before = session.table(owner)
-    gone_since = table.synced_at if table.complete and table.synced_at is not None else float("-inf")
-    is_late = update.at < table.updated_at
+    found = next(iter(session.summaries(key, update.component)), None)
+    owner = session.make(update)
+    if vehicle is not None:
+        last = vehicle.last_seen if vehicle.last_seen <= horizon else at
+        session.seen(key, min(vehicle.first_seen, at), max(last, at))
+    table = None if found is None else found[1]
+    is_late = False
+    if table is not None:
+        if table.updated_at > horizon:
+            session.add_setback(owner, present, table.updated_at)
+        elif table.updated_at > at:
+            is_late = True
+            session.describe(owner, updated_at=table.updated_at)
+    before: Mapping[str, Row] = {}
+    after = before
+    agrees = is_whole = True
+    if update.params or update.removed or update.replace:  # else it is about the table as a whole only
+        before = session.table(owner)
+        seen = _Seen(session, owner, table, before, horizon)
+        after, agrees, is_whole = _write_values(session, owner, update, seen, is_late=is_late)
+    state = update.table if table is None else _respectful(update, table)
+    if state is not None and is_whole and (state.complete or not is_late):
+        if agrees:
+            write_state(session, owner, state)
+        elif state.complete and table is not None and not table.complete:
+            write_state(session, owner, replace(state, hash=None))  # the hash is of other values
+        else:
+            state = None
+    else:
+        state = None
+    if state is not None and state.complete:
+        session.begin(owner, at)
+    if state is None and hashed(before) != hashed(after):
+        session.describe(owner, hash=None)
+
+
+def _write_values(
+    session: Session, owner: int, update: TableUpdate, seen: _Seen, *, is_late: bool
+) -> tuple[Mapping[str, Row], bool, bool]:
+    """Write the values of an update.
+
+    Returns:
+        the rows then, whether they agree with the update, and whether it has all of their names, where it is
+        of a whole table.
+    """
+    before = seen.rows
+    part = update
+    older: Sequence[StoredParam] = ()
+    agrees = True
+    if not all(seen.is_news(name, at) for name, at in _times(update.params)):
+        part, older, agrees = _divided(update, seen, is_late=is_late)
+    heard = {name for name, _ in _times(update.params)}
+    gone = before.keys() - heard if update.replace else update.removed
+    stays = {name for name in gone if name in before and not seen.is_news(name, update.gone_at(name))}
+    after, lines, births = applied(part, before, stays.union(item.param.name for item in older))
+    if len(after) != len(before) or after != before:
+        session.put_table(owner, before, after)
+    session.add_births(owner, births)
+    _write_past(session, owner, older, lines, seen)
+    return after, agrees, not (stays and update.replace)
+
+
+def _divided(
+    update: TableUpdate, seen: _Seen, *, is_late: bool
+) -> tuple[TableUpdate, list[StoredParam], bool]:
+    """Return what of an update is news, what is overtaken, and whether that agrees with what is kept."""
+    table = seen.table
     newer: list[StoredParam] = []
     older: list[StoredParam] = []
     agrees = True
     for item in update.params:
-        row = before.get(item.param.name)
-        known_at = max(gone_since, session.gone_at(owner, item.param.name)) if row is None else row.heard_at
-        if known_at <= item.heard_at:
+        name, is_listed = item.param.name, item.param.index is not None
+        if seen.is_news(name, item.heard_at, is_listed=is_listed):
             newer.append(item)
             continue
+        row = seen.rows.get(name)
         older.append(item)
         if row is not None and row.same_value(Row.of(item.param, None, False, item.heard_at)):
             newer.append(replace(item, heard_at=row.heard_at))  # its place, perhaps, was not known yet
         else:
             agrees = False
     count = None if update.table is None else update.table.count
-    if is_late and (count is None or table.count not in (None, count)):
+    if is_late and table is not None and (count is None or table.count not in (None, count)):
         newer = [_placeless(item) for item in newer]  # the places may be those of another count
-    heard = {item.param.name for item in update.params}
-    gone = before.keys() - heard if update.replace else update.removed
-    part = replace(
-        update,
-        params=newer,
-        removed=[name for name in gone if name in before and before[name].heard_at <= update.at],
-        replace=False,
-    )
-    after, lines, births = applied(part, before)
-    if after != before:
-        session.put_table(owner, before, after)
-    session.add_births(owner, births)
-    _write_past(session, owner, older, lines, before)
-    session.describe(owner, updated_at=max(table.updated_at, update.at))
-    state = _respectful(update, table).table
-    is_whole = not update.replace or after.keys() == heard
-    if state is not None and agrees and is_whole and (state.complete or not is_late):
-        write_state(session, owner, state)
-        if state.complete:
-            session.begin(owner, update.at)
-    elif hashed(before) != hashed(after):
-        session.describe(owner, hash=None)
+    return replace(update, params=newer), older, agrees
+
+
+@dataclass
+class _Seen:
+    """What is kept of a table, and since when it is known.
+
+    Attributes:
+        session, owner: where it is.
+        table: as it was before the update; None where there was none.
+        rows: its parameters.
+        horizon: unix seconds; what is kept of a later time is of a clock that was set back since.
+        gone: when parameters went last, once that was looked up.
+    """
+
+    session: Session
+    owner: int
+    table: CachedSummary | None
+    rows: Mapping[str, Row]
+    horizon: float
+    gone: Mapping[str, float] | None = None
+
+    def is_news(self, name: str, at: float, *, is_listed: bool = True) -> bool:
+        """Whether nothing later is kept of a parameter than an observation of this time.
+
+        Args:
+            name: the parameter.
+            at: the time.
+            is_listed: whether a whole table would have it, if the vehicle has.
+        """
+        row, table = self.rows.get(name), self.table
+        if row is not None:
+            return row.heard_at <= at or row.heard_at > self.horizon
+        if table is None or table.updated_at <= at or table.updated_at > self.horizon:
+            return True
+        is_whole = table.complete and table.size >= (table.count or 0)  # a fresh file may have a part of it
+        if is_listed and is_whole and table.synced_at is not None and table.synced_at > at:
+            return False
+        if self.gone is None:
+            self.gone = self.session.gone(self.owner)
+        return self.gone.get(name, -math.inf) <= at
 
 
 def _write_past(
@@ -157,20 +244,28 @@ def _write_past(
     owner: int,
     older: Sequence[StoredParam],
     lines: Sequence[Line],
-    before: Mapping[str, Row],
+    seen: _Seen,
 ) -> None:
+    """Put lines and overtaken observations into their places in the history, by their times."""
     times = [item.heard_at for item in older] + [line[0] for line in lines]
     if not times:
         return
     since = min(times)
+    if not older and not since < session.last_line_at(owner) <= seen.horizon:
+        write_lines(session, owner, sorted(lines, key=_time_of))
+        return
     _, _, known_since = session.described(owner)
     kept: list[NumberedLine] = session.lines_from(owner, since)
+    ahead = max((place for place, (_, line) in enumerate(kept, 1) if line[0] > seen.horizon), default=0)
+    kept = kept[ahead:]
     past = Past(list(kept), known_since, frozenset(name for _, name in session.births_after(owner, since)))
-    for line in lines:
-        past.add(line)
     for item in older:
         name = item.param.name
-        past.observe(name, Row.of(item.param, None, False, item.heard_at), item.by, before.get(name))
+        row = Row.of(item.param, None, False, item.heard_at)
+        has_changed = bool(session.became(owner, name, -1.0, since))
+        past.observe(name, row, item.by, seen.rows.get(name), has_changed=has_changed)
+    for line in lines:  # after the others: up to here it was as the row says
+        past.add(line)
     if past.lines == kept:
         return
     if past.lines[: len(kept)] == kept:
@@ -182,13 +277,23 @@ def _write_past(
         session.forget(owner, at)
 
 
-def _respectful(update: TableUpdate, table: CachedSummary) -> TableUpdate:
-    """The same, without what a station that knows less than the table would say of it as a whole."""
+def _respectful(update: TableUpdate, table: CachedSummary) -> TableState | None:
+    """What an update says of the table as a whole, unless that is less than what is known."""
     state = update.table
-    knows_less = state is not None and not state.complete and table.complete and not update.replace
-    if knows_less and state is not None and state.count in (None, table.count):
-        return replace(update, table=None)
-    return update
+    if state is None or state.complete or update.replace or not table.complete:
+        return state
+    has_heard_less = state.count == table.count or (state.count is None and not update.params)
+    return None if has_heard_less else state
+
+
+def _times(params: Sequence[StoredParam]) -> Iterator[tuple[str, float]]:
+    if isinstance(params, HeardParams):
+        return params.heard_at()
+    return ((item.param.name, item.heard_at) for item in params)
+
+
+def _time_of(line: Line) -> float:
+    return float(line[0])
 
 
 def _placeless(item: StoredParam) -> StoredParam:

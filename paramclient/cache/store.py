@@ -120,18 +120,29 @@ class ParamCache:
         """How often a fresh file was made, or another one found in its place: what was saved is not in it."""
         return self._store.replacements
 
-    def save(self, update: TableUpdate | Sequence[TableUpdate]) -> None:
+    def save(
+        self, update: TableUpdate | Sequence[TableUpdate], *, clock: Callable[[], float] | None = None
+    ) -> None:
         """Write what was learnt, in one transaction: all of it is kept, or nothing.
 
-        A parameter that appears for the first time leaves no line of history, one that goes leaves a line
-        with its last value. −0 and 0 are no change of a value.
+        Of two observations of a parameter the later one counts, whichever is saved first; the other one finds
+        its place in the history. A parameter that appears for the first time leaves no line of history, one
+        that goes leaves a line with its last value. −0 and 0 are no change of a value.
+
+        A file is written by the clock of one computer: what it has of a time more than 5 s after the present
+        was written before that clock was set back, and counts as older than what is saved.
+
+        Args:
+            update: what was learnt, or several of these.
+            clock: gives the present, in unix seconds, by the clock that the times were read from. It is asked
+                when the cache is free to be written, from any thread. None: the present is `at`.
 
         Raises:
             UsageError: a time that is not in unix seconds.
         """
         updates = (update,) if isinstance(update, TableUpdate) else tuple(update)
         if updates:
-            self._store.do(Save(updates))
+            self._store.do(Save(updates, clock))
 
     def merge(
         self, updates: Sequence[TableUpdate], *, based_on: Mapping[tuple[str, int], float] | None = None

@@ -1,13 +1,14 @@
 """Tables: written, compared, read. Each function works inside its caller's transaction.
 
-One mechanism writes history: `save` compares every value that it is given with the one that is stored, and
-where they differ it writes a line in the same transaction. So no change of a stored value can miss its line,
-and when two processes hear the same change, the second finds nothing to write.
+One mechanism writes history: `applied` compares every value that it is given with the one that is stored,
+and where they differ there is a line, written in the same transaction. So no change of a stored value can
+miss its line, and when two processes hear the same change, the second finds nothing to write. Which values
+count is said by `settle` and `merge`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import fields
 from types import MappingProxyType
 from typing import Final
@@ -45,7 +46,7 @@ gathered before it is saved."""
 
 
 def save(session: Session, updates: Iterable[TableUpdate]) -> None:
-    """Write what was learnt, in the order given."""
+    """Write what was learnt, in the order given: whatever is kept is older."""
     for update in updates:
         forget_other_firmware(session, update.identity)
         earlier.watch_clock(session, update.identity.key, update.component, time_cell(update.at))
@@ -98,9 +99,15 @@ def forget_other_firmware(session: Session, identity: Identity) -> None:
 
 
 def applied(
-    update: TableUpdate, before: Mapping[str, Row]
+    update: TableUpdate, before: Mapping[str, Row], stays: Collection[str] = ()
 ) -> tuple[Mapping[str, Row], list[Line], Iterable[tuple[str, float]]]:
-    """The rows after an update, the lines of history that it causes, and the new names with their times."""
+    """The rows after an update, the lines of history that it causes, and the new names with their times.
+
+    Args:
+        update: what is news of it.
+        before: the rows.
+        stays: names that it does not take away.
+    """
     if not before and isinstance(update.params, HeardParams):
         first = update.params.first_rows()
         if first is not None:
@@ -110,9 +117,9 @@ def applied(
     news = list(_news(update.params))
     heard = {name for name, *_ in news}
     lines: list[Line] = [
-        (update.at, name, BY_VEHICLE, *after.pop(name).value, None, None, None)
+        (update.gone_at(name), name, BY_VEHICLE, *after.pop(name).value, None, None, None)
         for name in dict.fromkeys(before if update.replace else update.removed)
-        if name in before and name not in heard
+        if name in before and name not in heard and name not in stays
     ]
     for name, new, volatile, by in news:
         old = after.get(name)

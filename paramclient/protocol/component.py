@@ -89,10 +89,10 @@ class ComponentMachine(Parts):
 
     # what comes in
 
-    def receive(self, message: Message, now: float, *, version: int = 2) -> None:
-        """Take a message that this component sent."""
+    def receive(self, message: Message, now: float, *, version: int = 2, moment: float | None = None) -> None:
+        """Take a message that this component sent; the arguments are those of `receive_value`."""
         if isinstance(message, ParamValue):
-            self.receive_value(message, now, version)
+            self.receive_value(message, now, version, moment)
             return
         self._heard(now, version)
         if isinstance(message, Heartbeat):
@@ -132,8 +132,17 @@ class ComponentMachine(Parts):
         self.who.heard(now)
         self._follow_identity(now)
 
-    def receive_value(self, message: ParamValue, now: float, version: int = 2) -> None:
-        """Take a PARAM_VALUE that it sent: for those who know that it is one."""
+    def receive_value(
+        self, message: ParamValue, now: float, version: int = 2, moment: float | None = None
+    ) -> None:
+        """Take a PARAM_VALUE that it sent: for those who know that it is one.
+
+        Args:
+            message: the message.
+            now: the time.
+            version: the MAVLink version of the frame.
+            moment: when it came from the link, where that was earlier; None for `now`.
+        """
         self._heard(now, version)
         who = self.who
         who.heard(now)
@@ -169,7 +178,8 @@ class ComponentMachine(Parts):
             if until > now:
                 self._receive_ambiguous(message, until, now)
                 return
-        change = table.hear(message, by, is_exact=is_wanted)
+        came_at = now if moment is None else moment
+        change = table.hear(message, by, came_at, is_exact=is_wanted)
         if change is not None:
             authors.changed(name, now, is_ours)
             self._note_replaced(change, message, now)
@@ -223,6 +233,7 @@ class ComponentMachine(Parts):
         volatile: frozenset[str],
         volatile_known: bool,
         placed: bool = True,
+        moments: Mapping[str, float] | None = None,
     ) -> None:
         """Take what the cache knows of this component. What was heard on this link stays as it is.
 
@@ -233,6 +244,7 @@ class ComponentMachine(Parts):
             confirmed: the hash under which the vehicle would confirm it, or None.
             complete, placed: whether it held every index below the count, and whether these still hold.
             volatile, volatile_known: as in `Table`.
+            moments: when each value was observed last, in seconds as `now`.
         """
         if self.table.complete:
             return
@@ -246,13 +258,18 @@ class ComponentMachine(Parts):
             placed=placed,
             volatile=volatile,
             volatile_known=volatile_known,
+            moments=moments,
         )
         self._report(changes)
         self.sync.compare(now)
 
-    def renew(self, params: Mapping[str, Param]) -> None:
-        """Take what another station has heard since, where a value is only *cached* here."""
-        self._report(self.table.renew(params))
+    def renew(self, params: Mapping[str, Param], moments: Mapping[str, float] | None = None) -> None:
+        """Take what another station has heard since, where a value is only *cached* here.
+
+        Args:
+            params, moments: as in `use_cached`.
+        """
+        self._report(self.table.renew(params, moments))
 
     # what is asked of it
 

@@ -72,6 +72,7 @@ class PackFetch(Operation[None]):
         self._job: FileRead | None = None
         self._silent_at = math.inf
         self._doubts = table.doubts
+        self._asked_at = now
         self.held_up = 0.0
         self.is_useless = False
         self.is_unheard = False
@@ -138,6 +139,7 @@ class PackFetch(Operation[None]):
 
     def _read(self, now: float) -> None:
         self._attempts += 1
+        self._asked_at = now
         self._silent_at = now + SILENCE
         self._doubts = self._table.doubts
         self._heard.clear()
@@ -199,7 +201,9 @@ class PackFetch(Operation[None]):
         for index, (name, number, bits, default) in enumerate(pack.entries):
             if default is None and pack.with_defaults:
                 default = bits  # the vehicle gives those that differ
-            change = table.take(name, number, bits, index, default, is_older=name in self._heard)
+            change = table.take(
+                name, number, bits, index, default, self._asked_at, is_older=name in self._heard
+            )
             if change is not None:
                 changes.append(change)
         present = {entry.name for entry in pack.entries}

@@ -167,10 +167,15 @@ class Station:
         """Give a vehicle its signing key, in clear, or with None take it away. Nothing answers."""
         self._send(SetupSigning(system, component, key, timestamp), system, 2)
 
-    def receive(self, data: bytes, peer: Peer, now: float) -> bool:
+    def receive(self, data: bytes, peer: Peer, now: float, moment: float | None = None) -> bool:
         """Take a datagram, or a chunk of a stream. An empty chunk says that the peer's stream has ended.
 
         Gives whether there was anything of interest in it; all that is not telemetry is.
+
+        Args:
+            data, peer: what came, and from where.
+            now: the time.
+            moment: when it came from the link, where it is taken later than that; None for `now`.
         """
         self.bytes_received += len(data)
         if self._is_watched:
@@ -182,9 +187,9 @@ class Station:
             if number == PARAM_VALUE_ID and machine is not None:  # the short way for what comes in thousands
                 self._peers[system] = peer
                 self._touched[machine] = None
-                machine.receive_value(decode_param_value(payload), now, version)
+                machine.receive_value(decode_param_value(payload), now, version, moment)
             else:
-                self._receive_other(frame, peer, now)
+                self._receive_other(frame, peer, now, moment)
         if self._is_stream and not data:
             self._peers = {system: each for system, each in self._peers.items() if each != peer}
         if self._awaits_autopilot and self._request_heartbeat(data, peer, now):
@@ -306,6 +311,7 @@ class Station:
         """
         for machine in self.components.values():
             machine.presence.age(unseen)
+            machine.table.age(unseen)
         if not self._is_paused:
             self._outbox.clear()  # for whoever was there before
             self.resume(now)
@@ -466,7 +472,7 @@ class Station:
         self._skipped += framer.skipped
         self._damaged += framer.damaged
 
-    def _receive_other(self, frame: Frame, peer: Peer, now: float) -> None:
+    def _receive_other(self, frame: Frame, peer: Peer, now: float, moment: float | None) -> None:
         """Take a frame that is no value of a known component."""
         sender = (frame.system, frame.component)
         if sender == self.own or frame.system == 0 or (message := decode(frame)) is None:
@@ -480,7 +486,7 @@ class Station:
         machine = self.components.get(sender) or self._meet(sender, message, now)
         if machine is not None:
             self._touch_all(self._of_system[machine.system])  # what one says of the vehicle counts for all
-            machine.receive(message, now, version=frame.version)
+            machine.receive(message, now, version=frame.version, moment=moment)
 
     def _meet(self, sender: Address, message: Message, now: float) -> ComponentMachine | None:
         """A component that was not heard before; only what shows that it has parameters makes it one."""

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection, Mapping
 from struct import unpack
-from typing import Final
+from typing import Final, NamedTuple
 
 from paramclient.params import (
     CACHED,
@@ -40,7 +41,7 @@ from paramclient.values import (
     known_type,
 )
 
-__all__ = ["MOST_NAMES", "Room", "Table"]
+__all__ = ["MOST_NAMES", "Observation", "Room", "Table"]
 
 MOST_NAMES: Final = 65_535
 """Names that one table may hold: as many as can have an index, and as many again of parameters that are not
@@ -78,8 +79,25 @@ class Room:
         return held < MOST_NAMES and (held < ENOUGH_NAMES or self.taken < MOST_NAMES_OF_LINK)
 
 
+class Observation(NamedTuple):
+    """One value of a parameter as it was observed.
+
+    Attributes:
+        param: the parameter with that value.
+        by: the author of the change that brought it, as in `Change`.
+        moment: when the value came from the link, in seconds of the core's clock.
+    """
+
+    param: Param
+    by: str
+    moment: float
+
+
 class Table:
     """All that is known of a component's parameters.
+
+    Each value carries the moment at which it came from the link (`Params.moments`), in seconds of the core's
+    clock, whenever it is processed or written to the cache.
 
     Args:
         encoding: how the component writes values, as far as known.
@@ -98,8 +116,10 @@ class Table:
         doubts: how often what had been heard was no longer to be relied on.
         passed_over: by a name that several parameters share, the indices of those that it does not mean.
         dirty: names whose value, type or index changed since `take_dirty` was called last.
-        overwritten: what writes of ours had made of them or have replaced, and is no more; each with who did
-            it.
+        gone: the moments at which removed names were found missing, since `take_gone` was called last.
+        slept: seconds of sleep of this computer by which moments were moved back, see `age`.
+        overwritten: values that the cache has not been told of and that are no longer current: those that
+            our writes have set or replaced, and the first observation of a changed value that came again.
     """
 
     def __init__(self, encoding: Encoding = Encoding.BYTEWISE, room: Room | None = None) -> None:
@@ -107,6 +127,11 @@ class Table:
         self.params = Params()
         self._held = self.params.held
         self._defaults = self.params.defaults
+        self._moments = self.params.moments
+        self._latest = -math.inf  # the moment of the newest observation
+        self._changed: dict[str, tuple[float, str]] = {}  # when a value changed, by whom: not yet told
+        self.gone: dict[str, float] = {}
+        self.slept = 0.0
         self.count: int | None = None
         self.volatile: frozenset[str] = frozenset()
         self.volatile_known = False
@@ -115,7 +140,7 @@ class Table:
         self.doubts = 0
         self.passed_over: dict[str, frozenset[int]] = {}
         self.dirty: dict[str, str] = {}
-        self.overwritten: list[tuple[Param, str]] = []
+        self.overwritten: list[Observation] = []
         self._hash: int | None = None
         self._hash_is_stale = False
         self._encoding = encoding
@@ -157,7 +182,9 @@ class Table:
         """Values may have moved under the confirmed hash: compute it again when it is asked for."""
         self._hash_is_stale = self._hash is not None
 
-    def hear(self, message: ParamValue, by: str, *, is_exact: bool = False) -> Change | None:
+    def hear(
+        self, message: ParamValue, by: str, moment: float = 0.0, *, is_exact: bool = False
+    ) -> Change | None:
         """Take one PARAM_VALUE; give the change if it brought one (a first value is one).
 
         The value counts whatever the index says. An index of 65535 leaves the known one as it is, one that
@@ -166,6 +193,7 @@ class Table:
         Args:
             message: what came.
             by: who did it, as in `Change`.
+            moment: when it came from the link, not before the last one.
             is_exact: whether it says what was just written, so that it cannot stand for an integer that it
                 would round.
         """
@@ -174,6 +202,7 @@ class Table:
             return None
         everything = self._held
         old = everything.get(name)
+        self._latest = moment
         if old is None:  # the short way for a first value
             room = self._room
             if not room.has_some(len(everything)):
@@ -183,11 +212,12 @@ class Table:
             bits, is_raw = bits_of_wire(raw, number, self._encoding)
             new = everything[name] = to_hold(bits, number, is_raw, LIVE, place)
             self._wire[name] = raw
+            self._moments[name] = moment
             self.dirty[name] = by
             if self._hash is not None:
                 self._moved(name)
             return _new(Change, (name, None, new, by, None, None))
-        return self._hear_again(name, old, message, by, is_exact=is_exact)
+        return self._hear_again(name, old, message, by, moment, is_exact=is_exact)
 
     def with_known_type(self, message: ParamValue) -> ParamValue:
         """Return a PARAM_VALUE of the type REAL32 with the integer type that is known of the parameter.
@@ -221,13 +251,15 @@ class Table:
             self.dirty.setdefault(name, "vehicle")
 
     def _hear_again(
-        self, name: str, old: Held, message: ParamValue, by: str, *, is_exact: bool
+        self, name: str, old: Held, message: ParamValue, by: str, moment: float, *, is_exact: bool
     ) -> Change | None:
         """Take a PARAM_VALUE of a parameter that is known."""
         _, raw, number, count, given = message
         old_bits, old_number, old_is_raw, _, place = parts_of(old)
         if given != NO_INDEX:
             place = NOWHERE if given >= count or count > MOST_PARAMETERS else given
+        seen_at = self._moments.get(name, moment)
+        self._moments[name] = moment
         is_same_type = old_number == number
         if is_same_type and self._wire.get(name) == raw and not is_exact:
             if placed(old, place) != old:
@@ -246,13 +278,21 @@ class Table:
             if placed(old, place) != old:
                 self.dirty.setdefault(name, by)
             return None
-        self._news(name, old, by, before)
+        self._news(name, old, by, before, seen_at)
         if self._hash is not None:
             self._moved(name)
         return _new(Change, (name, old, new, by, self._defaults.get(name), before))
 
     def take(
-        self, name: str, number: int, bits: int, index: int, default: int | None, *, is_older: bool
+        self,
+        name: str,
+        number: int,
+        bits: int,
+        index: int,
+        default: int | None,
+        moment: float = 0.0,
+        *,
+        is_older: bool,
     ) -> Change | None:
         """Take one entry of a packed parameter file; give the change if it brought one.
 
@@ -262,6 +302,7 @@ class Table:
             name, number: param_id and type.
             bits, default: the value and the firmware's default, as in `Param.bits`.
             index: its place in the list.
+            moment: when the file was requested: the vehicle may have read the value at any time since.
             is_older: whether a PARAM_VALUE of it was heard since the file was asked for: then that counts,
                 unless it rounds what the file says.
         """
@@ -282,6 +323,9 @@ class Table:
             return None
         self._set_default(name, initial)
         is_raw = isinstance(from_bits(bits, number), bytes)
+        seen_at = self._moments.get(name, moment)
+        self._moments[name] = moment
+        self._latest = max(self._latest, moment)
         new = self._held[name] = to_hold(bits, number, is_raw, LIVE, index)
         self._wire[name] = raw
         self._filed.add(name)
@@ -289,7 +333,7 @@ class Table:
             self.dirty.setdefault(name, "vehicle")
         if old is not None and same_held(old, new):
             return None
-        self._news(name, old, "vehicle", before)
+        self._news(name, old, "vehicle", before, seen_at)
         self._moved(name)
         return _new(Change, (name, old, new, "vehicle", initial, before))
 
@@ -322,6 +366,7 @@ class Table:
         placed: bool,
         volatile: frozenset[str],
         volatile_known: bool,
+        moments: Mapping[str, float] | None = None,
     ) -> list[Change]:
         """Put in what the cache knows, as *cached*; what was heard on this link stays.
 
@@ -331,9 +376,10 @@ class Table:
             confirmed: the hash under which the vehicle would confirm it, or None.
             placed: whether its indices still hold.
             complete, volatile, volatile_known: as the attributes.
+            moments: as in `fill`.
         """
         known = kept(params)
-        changes = self.fill(known, are_placed=placed and self.count in (None, count))
+        changes = self.fill(known, are_placed=placed and self.count in (None, count), moments=moments)
         if self.count not in (None, count):
             return changes
         self.count = count
@@ -350,7 +396,13 @@ class Table:
                 self.unconfirm()
         return changes
 
-    def fill(self, params: Mapping[str, Param], *, are_placed: bool = True) -> list[Change]:
+    def fill(
+        self,
+        params: Mapping[str, Param],
+        *,
+        are_placed: bool = True,
+        moments: Mapping[str, float] | None = None,
+    ) -> list[Change]:
         """Put in what the cache knows, as *cached*; what was heard on this link stays.
 
         To that it adds the firmware's default, and an integer that the message has rounded.
@@ -358,7 +410,9 @@ class Table:
         Args:
             params: the cached table.
             are_placed: whether its indices are still worth anything.
+            moments: when each value was observed last, in seconds of the core's clock.
         """
+        seen = {} if moments is None else moments
         changes = []
         known = kept(params)
         for name, cached in known.held.items():
@@ -373,17 +427,21 @@ class Table:
                 if not are_placed and is_listed(new):
                     new = self._displaced(name, new)
                 self._held[name] = new
+                if name in seen:
+                    self._moments[name] = seen[name]
                 if default is not None:
                     self._defaults[name] = default
                 changes.append(self._change(name, None, new))
         return changes
 
-    def renew(self, params: Mapping[str, Param]) -> list[Change]:
+    def renew(self, params: Mapping[str, Param], moments: Mapping[str, float] | None = None) -> list[Change]:
         """Take what another station has heard since, where a value is only *cached* here.
 
         Args:
             params: the table as it is cached now.
+            moments: as in `fill`.
         """
+        seen = {} if moments is None else moments
         changes = []
         for name, cached in kept(params).held.items():
             old = self._held.get(name)
@@ -393,6 +451,8 @@ class Table:
             is_same_type = parts_of(cached)[1] == number
             before = self._defaults.get(name) if is_same_type else self._defaults.pop(name, None)
             new = self._held[name] = placed(trusted(cached, CACHED), place)
+            if name in seen:
+                self._moments[name] = seen[name]
             self._wire.pop(name, None)  # should the vehicle say that again, it is a change
             if self._hash is not None:
                 self._moved(name)
@@ -533,10 +593,37 @@ class Table:
         dirty, self.dirty = self.dirty, {}
         return dirty
 
-    def take_overwritten(self) -> list[tuple[Param, str]]:
-        """Values of ours that have come and gone since the last call, each with who did it."""
+    def take_overwritten(self) -> list[Observation]:
+        """Return the observations since the last call that are not the latest of their parameter.
+
+        A value that changed and was heard again is among them with the moment of the change.
+        """
         overwritten, self.overwritten = self.overwritten, []
+        changed, self._changed = self._changed, {}
+        for name, (moment, by) in changed.items():
+            if name in self._held and moment < self._moments[name]:
+                overwritten.append(Observation(self.params[name], by, moment))
         return overwritten
+
+    def take_gone(self) -> dict[str, float]:
+        """Return the moments at which names removed since the last call were found missing."""
+        gone, self.gone = self.gone, {}
+        return gone
+
+    def age(self, seconds: float) -> None:
+        """Move every moment back by time that has passed but that the core's clock has left out.
+
+        Args:
+            seconds: of sleep of this computer, see `Station.stood_still`.
+        """
+        if not seconds:
+            return
+        for moments in (self._moments, self.gone):
+            moments.update({name: moment - seconds for name, moment in moments.items()})
+        self._changed = {name: (moment - seconds, by) for name, (moment, by) in self._changed.items()}
+        self.overwritten = [each._replace(moment=each.moment - seconds) for each in self.overwritten]
+        self._latest -= seconds
+        self.slept += seconds
 
     def _remove(self, names: Collection[str]) -> list[Change]:
         """Take out these."""
@@ -546,8 +633,12 @@ class Table:
             default = self._defaults.pop(name, None)
             self._wire.pop(name, None)
             self._filed.discard(name)
+            self._moments.pop(name, None)
+            self._changed.pop(name, None)
             if name in self.dirty or len(self.dirty) < MOST_GONE:
                 self.dirty[name] = "vehicle"
+                if self._latest > -math.inf:
+                    self.gone[name] = self._latest
             if self._hash is not None:
                 self._moved(name)
             changes.append(_new(Change, (name, held, None, "vehicle", None, default)))
@@ -564,13 +655,27 @@ class Table:
         default = self._defaults.get(name)
         return _new(Change, (name, old, new, "vehicle", default, default))
 
-    def _news(self, name: str, old: Held | None, by: str, default: Value | None) -> None:
-        """A value has changed. What was written for somebody is told of, however short it stood, and with
-        what it has replaced, however short that was known; the default is that of what it was."""
+    def _news(self, name: str, old: Held | None, by: str, default: Value | None, seen_at: float) -> None:
+        """Note that a value has changed, at the moment that the table has of it by now.
+
+        The cache is told of each value that our writes have set, however short it stood, and of what they
+        replaced.
+
+        Args:
+            name, by: the parameter and the author of the change.
+            old, default: what it was, and the default of its type then; None where it is new.
+            seen_at: the moment at which it was observed last as it was.
+        """
         before = self.dirty.get(name)
-        if old is not None and before is not None and (is_ours(before) or is_ours(by)):
-            self.overwritten.append((param_of(name, old, default), before))
-            del self.overwritten[:-MOST_OVERWRITTEN]
+        if old is not None:
+            if before is not None and (is_ours(before) or is_ours(by)):
+                since, author = self._changed.get(name, (seen_at, before))
+                param = param_of(name, old, default)
+                if since < seen_at:
+                    self.overwritten.append(Observation(param, author, since))
+                self.overwritten.append(Observation(param, before, seen_at))
+                del self.overwritten[:-MOST_OVERWRITTEN]
+            self._changed[name] = (self._moments[name], by)
         self.dirty[name] = by
 
     def _complement(self, name: str, heard: Held, cached: Held, default: Value | None) -> list[Change]:
