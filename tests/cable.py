@@ -15,7 +15,7 @@ from paramclient.sim import Endpoint
 
 __all__ = ["Cable"]
 
-PATIENCE = 20.0
+PATIENCE = 120.0
 """Seconds after which a test gives up; nothing waits that long when all is well."""
 
 
