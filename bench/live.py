@@ -19,6 +19,7 @@ import argparse
 import json
 import math
 import os
+import socket
 import statistics
 import subprocess
 import sys
@@ -36,6 +37,7 @@ from peers import TITLES, firmware, machine
 
 from paramclient import Component, FetchResult, ParamClient, ParamSet, WrittenParam
 from paramclient.errors import LinkError, NoReply, ParamClientError, UsageError, VehicleArmed
+from paramclient.protocol.wire import AUTOPILOT_COMPONENT, CommandAck, CommandLong, Framer, decode, encode
 from paramclient.provision import apply
 from paramclient.values import Param
 from paramclient.version import __version__
@@ -85,6 +87,12 @@ NO_LIMITS: Final = (
 """Ends of names of members that choose something, instead of limiting it."""
 COMMAND_TIMEOUT: Final = 30.0
 """Seconds for one call of the command."""
+ATTITUDE_ID: Final = 30
+TELEMETRY_INTERVAL: Final = 0.1
+"""Seconds between two ATTITUDE while the command is timed."""
+MAV_CMD_SET_MESSAGE_INTERVAL: Final = 511
+ENVIRONMENT: Final = {name: text for name, text in os.environ.items() if name != "PYTHONDONTWRITEBYTECODE"}
+"""Of the command: where bytecode is not kept, Python compiles every module at each start."""
 
 
 class WrongResult(Exception):
@@ -210,15 +218,42 @@ async def time_fetch(vehicle: Vehicle, seed: int, *, conditions: Conditions) -> 
 
 
 async def time_command(vehicle: Vehicle, seed: int) -> float:
-    """Call `paramclient get` once; the seconds from the start of its process to the printed value."""
+    """Call `paramclient get` once; the seconds from the start of its process to the printed value.
+
+    The vehicle sends telemetry meanwhile, as it does to a ground station. One that sends only heartbeats is
+    heard up to a second later.
+    """
     vehicle.relay.change(CLEAN)
+    set_attitude_interval(vehicle, TELEMETRY_INTERVAL)
+    try:
+        return await time_one_get(vehicle, seed)
+    finally:
+        set_attitude_interval(vehicle, 0.0)
+
+
+def set_attitude_interval(vehicle: Vehicle, seconds: float) -> None:
+    """Have the vehicle send ATTITUDE so often, by MAV_CMD_SET_MESSAGE_INTERVAL; 0 is its own choice again."""
+    host, port = vehicle.relay.link.removeprefix("udpout:").split(":")
+    params = (float(ATTITUDE_ID), seconds * 1e6, *[0.0] * 5)
+    command = CommandLong(vehicle.system, AUTOPILOT_COMPONENT, MAV_CMD_SET_MESSAGE_INTERVAL, params)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as station:
+        station.settimeout(COMMAND_TIMEOUT)
+        framer = Framer(stream=False)
+        station.sendto(encode(command, system=255, component=190, sequence=0), (host, int(port)))
+        while True:
+            answers = [decode(frame) for frame in framer.receive(station.recv(2048))]
+            if any(isinstance(each, CommandAck) and each.command == command.command for each in answers):
+                return
+
+
+async def time_one_get(vehicle: Vehicle, seed: int) -> float:
     names = sorted(name for name, param in vehicle.journal.before.items() if isinstance(param.value, int))
     name = names[seed % len(names)]
     command = [sys.executable, "-m", "paramclient", "get", vehicle.relay.link, name]
     command += ["--cache", str(vehicle.new_cache())]
     began = time.monotonic()
     with anyio.fail_after(COMMAND_TIMEOUT):
-        async with await anyio.open_process(command, stderr=subprocess.DEVNULL) as process:
+        async with await anyio.open_process(command, stderr=subprocess.DEVNULL, env=ENVIRONMENT) as process:
             assert process.stdout is not None
             printed = b""
             while name.encode() not in printed or b"\n" not in printed:
