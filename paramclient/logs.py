@@ -19,7 +19,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentForgotten, ComponentHeard, ComponentIdentified, Fetched
 from paramclient.protocol.station import Address, Station
 from paramclient.protocol.sync import Upkeep
-from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, Framer
+from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, HEARTBEAT_ID, Framer
 from paramclient.writethrough import FLUSH_INTERVAL, WriteThrough
 
 __all__ = ["ImportedTable", "import_log"]
@@ -40,6 +40,7 @@ class ImportedTable:
         params: how many parameters were heard.
         complete: whether those are all.
         hash: the PX4 hash that confirms the table at the end of the log, or None.
+        notes: what was not taken from files that a ground station read over MAVFTP, in sentences.
     """
 
     key: str
@@ -49,6 +50,7 @@ class ImportedTable:
     params: int
     complete: bool
     hash: int | None
+    notes: tuple[str, ...] = ()
 
 
 async def import_log(path: str | os.PathLike[str], cache: ParamCache) -> tuple[ImportedTable, ...]:
@@ -68,18 +70,18 @@ async def import_log(path: str | os.PathLike[str], cache: ParamCache) -> tuple[I
     """
     name = f"replay:{await anyio.Path(path).resolve()}"
     with closing(open_log(os.fspath(path), name)) as file:
-        versions = await _versions(read_records(file))
+        said = await _introductions(read_records(file))
         file.seek(0)
-        return await _Import(name, versions, cache).read(read_records(file))
+        return await _Import(name, said, cache).read(read_records(file))
 
 
-async def _versions(records: Iterator[Record]) -> dict[Address, bytes]:
-    """The first AUTOPILOT_VERSION of each component, as it stands in the log."""
-    framer = Framer({AUTOPILOT_VERSION_ID}, stream=False)
-    found: dict[Address, bytes] = {}
+async def _introductions(records: Iterator[Record]) -> dict[int, dict[Address, bytes]]:
+    """The first HEARTBEAT and AUTOPILOT_VERSION of each component, by message, as they stand in the log."""
+    found: dict[int, dict[Address, bytes]] = {HEARTBEAT_ID: {}, AUTOPILOT_VERSION_ID: {}}
+    framer = Framer(set(found), stream=False)
     for number, record in enumerate(records):
         for frame in framer.receive(record.data):
-            found.setdefault((frame.system, frame.component), record.data)
+            found[frame.message_id].setdefault((frame.system, frame.component), record.data)
         if not number % RECORDS_PER_TURN:
             await anyio.lowlevel.checkpoint()
     return found
@@ -90,12 +92,13 @@ class _Import:
 
     Args:
         name: of the log as a link, which an identity without a hardware id has.
-        versions: who the components are, ahead of the time when they say it.
+        said: who the components are, and how they write values, ahead of the time when they say it.
         cache: where to.
     """
 
-    def __init__(self, name: str, versions: Mapping[Address, bytes], cache: ParamCache) -> None:
-        self._versions = versions
+    def __init__(self, name: str, said: Mapping[int, Mapping[Address, bytes]], cache: ParamCache) -> None:
+        self._heartbeats = said[HEARTBEAT_ID]
+        self._versions = said[AUTOPILOT_VERSION_ID]
         self._at = 0.0
         self._station = Station(link=name, is_stream=False, upkeep=Upkeep.chosen(None, "auto", is_log=True))
         self._writer = _PastWriter(
@@ -112,6 +115,8 @@ class _Import:
             flush_at = 0.0
             for number, record in enumerate(records):
                 if record.at >= flush_at and number:
+                    station.tick(record.at)  # what ended in a pause, ended at its beginning
+                    await self._follow()
                     await writer.flush()
                     flush_at = record.at + FLUSH_INTERVAL
                 self._at = max(self._at, record.at)  # a clock that was set back does not make time go back
@@ -119,12 +124,14 @@ class _Import:
                 await self._follow()
                 if not number % RECORDS_PER_TURN:
                     await anyio.lowlevel.checkpoint()
+            station.over(self._at)
+            await self._follow()
             await writer.flush()
             await writer.merge()
         finally:
             await writer.close()
         heard = (machines[address] for address in sorted(machines))
-        return tuple(self._told(machine) for machine in heard if machine.table.params)
+        return tuple(self._told(each) for each in heard if each.table.params or each.fetches.notes)
 
     async def _follow(self) -> None:
         """See to what has happened, as the client does."""
@@ -133,9 +140,10 @@ class _Import:
             for event in events:
                 machine = event.machine
                 if isinstance(event, ComponentHeard):
-                    version = self._versions.get((machine.system, machine.component))
-                    if version is not None:  # what comes before it is of the same vehicle
-                        station.receive(version, LOG_PEER, self._at)
+                    address = (machine.system, machine.component)
+                    for said in (self._heartbeats, self._versions):
+                        if address in said:  # what comes before it is of the same vehicle
+                            station.receive(said[address], LOG_PEER, self._at)
                     await self._bring(machine)
                 elif isinstance(event, ComponentIdentified):
                     for each in station.components.values():
@@ -168,6 +176,7 @@ class _Import:
             params=len(machine.table.params),
             complete=complete,
             hash=machine.table.hash if complete else None,
+            notes=machine.fetches.notes,
         )
 
 

@@ -16,7 +16,6 @@ from paramclient import (
     NoReply,
     ParamCache,
     ParamClient,
-    ParamType,
     SyncState,
     Trust,
     UsageError,
@@ -27,71 +26,14 @@ from paramclient.cli import run
 from paramclient.identity import Identity
 from paramclient.links import LinkKind, ReplayLink, create_link, parse_link
 from paramclient.links.replay import LONGEST_PAUSE
-from paramclient.links.tlog import FIRST_WITHIN, packed_time
+from paramclient.links.tlog import FIRST_WITHIN
 from paramclient.logs import ImportedTable, import_log
 from paramclient.protocol import wire
-from paramclient.values import Encoding, Param, encode
+from paramclient.values import Param
 from tests.recordings import DATA, from_vehicle, param_values, read
 from tests.shell import swiftly
-from tests.simulation import known, param_value
-
-NOW = 1_700_000_000.0
-UID = "00000000deadbeef"
-KEY = f"uid:{UID}"
-
-
-class Log:
-    """A log to be written: a vehicle with a table of INT32, and a ground station.
-
-    Attributes:
-        at: when the next frame comes.
-    """
-
-    def __init__(self, at: float = NOW) -> None:
-        self.at = at
-        self.values: dict[str, int] = {}
-        self.data = b""
-
-    def say(self, *messages: wire.Message, system: int = 1, component: int = 1) -> Log:
-        for message in messages:
-            self.data += packed_time(self.at) + wire.encode(
-                message, system=system, component=component, sequence=0
-            )
-        return self
-
-    def beat(self) -> Log:
-        return self.say(wire.Heartbeat(2, wire.MAV_AUTOPILOT_GENERIC, system_status=4))
-
-    def identify(self) -> Log:
-        return self.say(wire.AutopilotVersion(0, uid=0xDEADBEEF, flight_sw_version=7))
-
-    def wait(self, seconds: float) -> Log:
-        self.at += seconds
-        return self
-
-    def list(self, **values: int) -> Log:
-        self.values |= values
-        for index, name in enumerate(self.values):
-            self.tell(name, index)
-        return self
-
-    def tell(self, name: str, index: int = 65535, **values: int) -> Log:
-        self.values |= values
-        count = len(self.values)
-        kind = ParamType.INT32
-        return self.say(param_value(name, self.values[name], index=index, count=count, kind=kind))
-
-    def change(self, name: str, value: int) -> Log:
-        return self.tell(name, **{name: value})
-
-    def set(self, name: str, value: int) -> Log:
-        raw = encode(value, ParamType.INT32, Encoding.BYTEWISE)
-        self.say(wire.ParamSet(1, 1, name, raw, ParamType.INT32), system=255, component=190)
-        return self.change(name, value)
-
-    def write(self, path: Path) -> Path:
-        path.write_bytes(self.data)
-        return path
+from tests.simulation import known
+from tests.telemetry import KEY, NOW, UID, Log
 
 
 def whole(**values: int) -> Log:

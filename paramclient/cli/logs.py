@@ -46,6 +46,9 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
                 code = max(code, code_of(error))
                 continue
             found += ((each, table) for table in tables)
+            for table in tables:
+                for note in table.notes:
+                    report(f"{each.name}, {table.system}/{table.component}: {note}")
             if not tables:
                 report(f"{each} holds no parameters")
     if options.json:

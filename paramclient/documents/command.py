@@ -260,6 +260,7 @@ class ImportedDoc(Document):
     params: int
     complete: bool
     hash: str | None
+    notes: list[str]
 
     @classmethod
     def of(cls, file: str, table: ImportedTable) -> ImportedDoc:
@@ -273,6 +274,7 @@ class ImportedDoc(Document):
             params=table.params,
             complete=table.complete,
             hash=hash_text(table.hash),
+            notes=list(table.notes),
         )
 
 

@@ -101,6 +101,8 @@ class ComponentMachine(Parts):
                 self._rebooted(now)
             self._authors.forget(now)
             self._checks.forget(now)
+            if self.fetches.overheard is not None:
+                self.fetches.overheard.file.tick(now)  # in a log nothing else tells the time
         elif isinstance(message, AutopilotVersion):
             before = self.who.firmware
             if self.who.version(message, now):
@@ -124,6 +126,8 @@ class ComponentMachine(Parts):
                 self._rebooted(now)
         elif isinstance(message, FileTransfer):
             self.files.heard(message, now)
+            if self.fetches.overheard is not None:
+                self.fetches.overheard.file.reply_heard(message, now)
         elif isinstance(message, ComponentMetadata):
             self.descriptions.heard(message, now)
         elif isinstance(message, HighLatency2):
@@ -221,6 +225,11 @@ class ComponentMachine(Parts):
     def foreign_set(self, name: str, station: str, now: float) -> None:
         """Another station was heard setting a parameter of this component."""
         self._authors.foreign_set(self.spelling(name), station, now)
+
+    def foreign_file_request(self, message: FileTransfer, station: tuple[int, int], now: float) -> None:
+        """Another station was heard asking for a file of this component, where we only listen."""
+        if self.fetches.overheard is not None:
+            self.fetches.overheard.file.request_heard(message, station, now)
 
     def use_cached(
         self,
@@ -409,6 +418,8 @@ class ComponentMachine(Parts):
         self.reads.tick(now)
         self.writes.tick(now)
         self.files.tick(now)
+        if self.fetches.overheard is not None:
+            self.fetches.overheard.file.tick(now)
         self.commands.tick(now)
         if self.restart is not None:
             self.restart.tick(now)
@@ -438,6 +449,8 @@ class ComponentMachine(Parts):
             first = min(first, self.writes.next_deadline())
         if len(self.commands):
             first = min(first, self.commands.next_deadline())
+        if self.fetches.overheard is not None:
+            first = min(first, self.fetches.overheard.file.next_deadline())
         return min(
             first,
             self.files.next_deadline(),
@@ -537,6 +550,7 @@ class ComponentMachine(Parts):
         self.descriptions.lose(now)
         self.commands.lose(now)
         self.who.lose()
+        self.fetches.interrupt(now)
         self._doubt()
 
     def _check_values(self, now: float) -> None:
@@ -572,6 +586,7 @@ class ComponentMachine(Parts):
     def _rebooted(self, now: float) -> None:
         """The vehicle has started again: what it had not saved is gone, and its list begins anew."""
         self._emit(events.ComponentRebooted(self))
+        self.fetches.interrupt(now)
         self._doubt()
         self.following.forget()
         self._authors.clear()

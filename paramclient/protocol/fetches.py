@@ -59,6 +59,11 @@ class Fetches:
         self._ended = ended
         self._file_took: float | None = None
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """What was not taken from files that others read, in sentences."""
+        return () if self.overheard is None else tuple(self.overheard.file.notes)
+
     def may_use_file(self) -> bool | None:
         """Whether the table is worth asking for as a file: it has come as one, or the component says so."""
         return self._says_file() if self.file_works is None else self.file_works
@@ -124,9 +129,15 @@ class Fetches:
             if self.current is fetch:
                 self.current = None
 
+    def interrupt(self, now: float) -> None:
+        """The component is lost, or starts again: nothing more comes of the files that others read."""
+        if self.overheard is not None:
+            self.overheard.file.close(now)
+
     def forget(self) -> None:
         """Another vehicle has taken the address."""
         if self.overheard is not None:
+            self.overheard.file.forget()
             self.overheard.forget()
         self.file_works = self._file_took = None
         self.is_same_firmware = False
@@ -140,6 +151,7 @@ class Fetches:
 
     def over(self, now: float) -> None:
         """Nothing more will come."""
+        self.interrupt(now)
         if self.overheard is not None:
             self.overheard.is_over = True
         if isinstance(self.current, Overhearing):

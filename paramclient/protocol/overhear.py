@@ -8,6 +8,7 @@ from typing import Final
 
 from paramclient.errors import NoReply
 from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.file_observer import FileObserver, ObservedPack
 from paramclient.protocol.proof import Proof
 from paramclient.protocol.result import Announcement, FetchResult, Means, Policy, Progress
 from paramclient.protocol.sync import Sync
@@ -25,8 +26,9 @@ LONGEST_PAUSE: Final = 5.0
 class Overheard:
     """Follows the lists of a component that others ask for, and the hashes that it announces to them.
 
-    A table is whole when every index below the count has come since it was last in doubt, from one list or
-    from several. What was announced proves it where the hash computed from it is the same.
+    A table is whole when every index below the count has come since it was last in doubt, from lists, or in
+    the packed file that another station reads over MAVFTP. What was announced proves it where the hash
+    computed from it is the same.
 
     Args:
         means: the component's.
@@ -40,6 +42,7 @@ class Overheard:
         news_at: when the last index came that was not there yet.
         is_log: as above.
         is_over: whether nothing more will come.
+        file: the packed file, as others read it.
     """
 
     def __init__(
@@ -50,16 +53,20 @@ class Overheard:
         self.news_at = -math.inf
         self.is_log = is_log
         self.is_over = False
+        self.file = FileObserver(self._file_came)
         self._means = means
         self._table = means.table
         self._sync = sync
         self._whole = whole
         self._began_at = 0.0
         self._is_whole = False
+        self._source = "stream"
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here after it went into the table."""
         name, _, _, count, index = message
+        if self.file.is_reading:
+            self.file.value_heard(message)
         if index >= count or count > MOST_PARAMETERS:
             return
         names = self.names
@@ -71,7 +78,7 @@ class Overheard:
             names[index] = name
             self.news_at = now
             if len(names) == count:
-                self._complete(now)
+                self._complete("stream", now)
 
     def announced(self, announcement: Announcement, now: float) -> None:
         """The component has announced a hash to somebody."""
@@ -82,7 +89,7 @@ class Overheard:
             if not self._sync.synced:
                 self._whole(self._result("cache", (), announcement.hash, now), now)
         elif self._is_whole and self._is_proven(announcement):
-            self._whole(self._result("stream", (), table.hash, now), now)
+            self._whole(self._result(self._source, (), table.hash, now), now)
         elif table.hash is not None:
             self.forget()
             self._sync.contradicted()
@@ -97,7 +104,8 @@ class Overheard:
         """The table, where it is known to be the vehicle's."""
         if not self._sync.synced:
             return None
-        return self._result("stream" if self._is_whole else "cache", (), self._table.hash, now, notes)
+        source = self._source if self._is_whole else "cache"
+        return self._result(source, (), self._table.hash, now, notes)
 
     def result(self, now: float, notes: tuple[str, ...] = ()) -> FetchResult | None:
         """What has come so far; None where that is nothing."""
@@ -110,17 +118,43 @@ class Overheard:
         missing = tuple(index for index in range(self.count) if index not in self.names)
         return self._result("stream", missing, None, now, notes)
 
-    def _complete(self, now: float) -> None:
+    def _file_came(self, came: ObservedPack, now: float) -> None:
+        """Another station has read the packed file, or the beginning of it."""
+        table, total = self._table, came.pack.total
+        if table.count != total:
+            if table.count is not None:
+                self._sync.count_moved(now)
+            table.move(total)
+        names = {index: entry.name for index, entry in came.entries()}
+        is_all = len(names) == total
+        if (
+            is_all
+            or total != self.count
+            or any(self.names.get(at, name) != name for at, name in names.items())
+        ):
+            self.forget()
+            self.count = total
+            self._began_at = came.began_at
+        was_whole = len(self.names) == total
+        self.names |= names
+        self.news_at = now
+        self._means.changed(table.take_pack(came.pack, came.began_at, came.newer, start=came.start))
+        if len(self.names) == total and not was_whole:
+            self._complete("ftp" if is_all else "stream", now)
+
+    def _complete(self, source: str, now: float) -> None:
         """Every index has come."""
         table = self._table
         self._is_whole = True
+        self._source = source
+        self.file.notes.clear()
         self._means.changed(table.settle(self.names))
         table.complete = True
         table.count = self.count
         announced = self._sync.announced
         if announced is None or not self._is_proven(announced):
             table.unconfirm()
-        self._whole(self._result("stream", (), table.hash, now), now)
+        self._whole(self._result(source, (), table.hash, now), now)
 
     def _is_proven(self, announcement: Announcement) -> bool:
         proof = Proof(self._table)
@@ -145,7 +179,7 @@ class Overheard:
             missing,
             confirmed,
             max(0.0, now - self._began_at),
-            notes,
+            (*self.file.notes, *notes),
         )
 
 
@@ -189,7 +223,7 @@ class Overhearing(Fetch):
 
     def next_deadline(self) -> float:
         overheard = self._overheard
-        if overheard.is_log or not overheard.names:
+        if overheard.is_log or overheard.file.is_reading or not overheard.names:
             return math.inf
         return max(overheard.news_at, self.begun_at) + LONGEST_PAUSE
 
@@ -201,7 +235,8 @@ class Overhearing(Fetch):
 
     @property
     def is_silent(self) -> bool:
-        return not (self._overheard.names or self._overheard.is_log)
+        overheard = self._overheard
+        return not (overheard.names or overheard.file.is_reading or overheard.is_log)
 
     def progress(self, now: float) -> Progress:
         return Progress(len(self._overheard.names), self._overheard.count, 0.0, None)

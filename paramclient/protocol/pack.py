@@ -18,7 +18,7 @@ from typing import Final, NamedTuple
 from paramclient.errors import PackError, UsageError
 from paramclient.values import NAME_LENGTH, ParamType, check_name
 
-__all__ = ["Pack", "PackedParam", "decode", "decode_upload", "encode", "encode_upload"]
+__all__ = ["Pack", "PackedParam", "decode", "decode_prefix", "decode_upload", "encode", "encode_upload"]
 
 FULL_READ: Final = 239
 """Bytes that one message of MAVFTP carries at the most, and that a file is usually read by."""
@@ -77,12 +77,24 @@ def decode(data: bytes) -> Pack:
             off, it has more or less than the header says, or is longer than any can be.
     """
     magic, number, total = _header(data)
-    if magic not in (_MAGIC, _MAGIC_WITH_DEFAULTS):
-        raise PackError(f"a packed parameter file does not begin with 0x{magic:04x}", offset=0)
-    if total < number:
-        raise PackError(f"{number} entries of a table of {total}", offset=2)
+    _check_header(magic, number, total)
     with_defaults = magic == _MAGIC_WITH_DEFAULTS
     return Pack(_entries(data, number, with_defaults), total, with_defaults)
+
+
+def decode_prefix(data: bytes) -> tuple[Pack, int]:
+    """Read the beginning of a file that came from a vehicle: the entries of which every byte is there.
+
+    No entry depends on those behind it, so each of these holds, whatever is missing. With them comes the
+    number of entries that the whole file has by its header.
+
+    Raises:
+        PackError: as in `decode`, but for a file that is cut off behind its header.
+    """
+    magic, number, total = _header(data)
+    _check_header(magic, number, total)
+    with_defaults = magic == _MAGIC_WITH_DEFAULTS
+    return Pack(_entries(data, number, with_defaults, may_end=True), total, with_defaults), number
 
 
 def total_of(beginning: bytes) -> int | None:
@@ -164,8 +176,17 @@ def _header(data: bytes) -> tuple[int, int, int]:
     return magic, number, last
 
 
-def _entries(data: bytes, number: int, with_defaults: bool) -> tuple[PackedParam, ...]:
-    """All entries behind the header: so many, and nothing else."""
+def _check_header(magic: int, number: int, total: int) -> None:
+    if magic not in (_MAGIC, _MAGIC_WITH_DEFAULTS):
+        raise PackError(f"a packed parameter file does not begin with 0x{magic:04x}", offset=0)
+    if total < number:
+        raise PackError(f"{number} entries of a table of {total}", offset=2)
+
+
+def _entries(
+    data: bytes, number: int, with_defaults: bool, *, may_end: bool = False
+) -> tuple[PackedParam, ...]:
+    """All entries behind the header: so many, and nothing else; fewer where the file may end before."""
     found: dict[str, PackedParam] = {}
     name = b""
     at = _HEADER.size
@@ -173,6 +194,8 @@ def _entries(data: bytes, number: int, with_defaults: bool) -> tuple[PackedParam
         match = _padding(data, at)
         at = at if match is None else match.end()
         if at + 2 > len(data):
+            if may_end:
+                break
             raise PackError(f"the file is cut off: {place} of {number} entries", offset=len(data))
         kind = _TYPES.get(data[at] & 0x0F)
         flags = data[at] & 0xF0
@@ -182,6 +205,8 @@ def _entries(data: bytes, number: int, with_defaults: bool) -> tuple[PackedParam
         value_at = at + 2 + more
         end = value_at + (2 * kind.size if flags else kind.size)
         if end > len(data):
+            if may_end:
+                break
             raise PackError(f"the file is cut off in entry {place} of {number}", offset=len(data))
         if shared > len(name):
             raise PackError(f"entry {place} shares {shared} characters with {name!r}", offset=at)
@@ -195,7 +220,7 @@ def _entries(data: bytes, number: int, with_defaults: bool) -> tuple[PackedParam
         default = int.from_bytes(data[value_at + kind.size : end], "little") if flags else None
         found[text] = PackedParam(text, kind, bits, default)
         at = end
-    if at < len(data):
+    if len(found) == number and at < len(data):
         raise PackError(f"{len(data) - at} bytes are left over behind {number} entries", offset=at)
     return tuple(found.values())
 

@@ -197,15 +197,7 @@ class PackFetch(Operation[None]):
 
     def _fill(self, pack: Pack) -> None:
         table = self._table
-        changes = []
-        for index, (name, number, bits, default) in enumerate(pack.entries):
-            if default is None and pack.with_defaults:
-                default = bits  # the vehicle gives those that differ
-            change = table.take(
-                name, number, bits, index, default, self._asked_at, is_older=name in self._heard
-            )
-            if change is not None:
-                changes.append(change)
+        changes = table.take_pack(pack, self._asked_at, self._heard)
         present = {entry.name for entry in pack.entries}
         changes += table.remove(
             lambda param: (

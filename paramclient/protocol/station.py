@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Hashable, Iterable, Sequence
 from heapq import heapify, heappop, heappush
 from typing import Final, TypeAlias
@@ -13,6 +14,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.download import present_of
 from paramclient.protocol.events import ComponentForgotten, ComponentHeard, Event
 from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.file_observer import acknowledges_open, opens_parameter_file
 from paramclient.protocol.result import Policy
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.table import Room
@@ -22,6 +24,7 @@ from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import (
     AUTOPILOT_COMPONENT,
     COMP_ID_ALL,
+    COMP_ID_MISSIONPLANNER,
     HEARTBEAT_ID,
     MAV_AUTOPILOT_INVALID,
     MAV_CMD_REQUEST_MESSAGE,
@@ -29,6 +32,7 @@ from paramclient.protocol.wire import (
     MAV_TYPE_GCS,
     PARAM_VALUE_ID,
     CommandLong,
+    FileTransfer,
     Frame,
     Framer,
     Heartbeat,
@@ -73,6 +77,9 @@ HEARTBEAT_REQUESTS_MAX: Final = 8
 """Such requests on one link: in the 2 s that they take, two heartbeats are due."""
 MOST_PEERS: Final = 256
 """Stream peers whose unfinished frames are kept."""
+EARLY_REQUESTS_MAX: Final = 32
+"""Requests for parameter files that are kept for components that were not heard yet: a log may begin with the
+reading of one."""
 HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
 """The message ids that matter here: HEARTBEAT, SYSTEM_TIME, PARAM_VALUE, PARAM_SET (of others), COMMAND_ACK,
 FILE_TRANSFER_PROTOCOL, AUTOPILOT_VERSION, HIGH_LATENCY2, STATUSTEXT, PARAM_ERROR."""
@@ -151,6 +158,7 @@ class Station:
         self._deadlines: dict[ComponentMachine, float] = {}  # as noted
         self._order: list[tuple[float, int, int]] = []  # a heap of these, with some that are of the past
         self._room = Room()
+        self._early_requests: deque[tuple[FileTransfer, Address]] = deque(maxlen=EARLY_REQUESTS_MAX)
         self._full_until = -math.inf
         self._awaits_autopilot = not self.listens_only  # none was heard yet
         self._heartbeat_requested_at = -math.inf
@@ -216,8 +224,12 @@ class Station:
         Without `everyone`, only components that were heard or touched, or whose deadline has come, are
         looked at: a share of the link that has become larger meanwhile is then used a little later. No
         list begins beside `most_lists` others. Where it `is_crowded`, lists of other links come as well.
+        In a log nothing is due but the end of what others have begun and left.
         """
-        if self._is_paused or self.is_log:
+        if self.is_log:
+            self._tick_log(now)
+            return
+        if self._is_paused:
             return
         if self._signer is not None:
             self._signer.advance(now)
@@ -422,6 +434,11 @@ class Station:
     def _touch_all(self, machines: Iterable[ComponentMachine]) -> None:
         self._touched.update(dict.fromkeys(machines))
 
+    def _tick_log(self, now: float) -> None:
+        for machine in self.components.values():
+            if machine.fetches.overheard is not None:
+                machine.fetches.overheard.file.tick(now)
+
     def _watch(self, data: bytes, peer: Peer, now: float) -> None:
         """What somebody wants done with everything that comes, before it is looked into."""
         if self._signer is not None:
@@ -483,14 +500,22 @@ class Station:
         if isinstance(message, ParamSet):
             self._receive_foreign_set(message, sender, now)
             return
+        if isinstance(message, FileTransfer) and self.listens_only:
+            self._receive_foreign_file_request(message, sender, now)
         machine = self.components.get(sender) or self._meet(sender, message, now)
         if machine is not None:
             self._touch_all(self._of_system[machine.system])  # what one says of the vehicle counts for all
             machine.receive(message, now, version=frame.version, moment=moment)
 
     def _meet(self, sender: Address, message: Message, now: float) -> ComponentMachine | None:
-        """A component that was not heard before; only what shows that it has parameters makes it one."""
-        is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue)
+        """A component that was not heard before; only what shows that it has parameters makes it one.
+
+        A PARAM_VALUE of component 190 is no such sign. When it has read a parameter file, MAVProxy writes one
+        of each parameter into its log, with the vehicle's system id, this component and the type REAL32.
+        """
+        is_sign = isinstance(message, Heartbeat | HighLatency2)
+        is_sign = is_sign or (isinstance(message, ParamValue) and sender[1] != COMP_ID_MISSIONPLANNER)
+        is_sign = is_sign or self._is_awaited_file(message, sender)
         if not is_sign or not self._has_room(now):
             return None
         system, component = sender
@@ -520,6 +545,9 @@ class Station:
         self.components[sender] = machine
         self._of_system.setdefault(system, []).append(machine)
         self._events.append(ComponentHeard(machine))
+        for request, station in self._early_requests:
+            if _is_for(request, sender):
+                machine.foreign_file_request(request, station, now)
         return machine
 
     def _has_room(self, now: float) -> bool:
@@ -569,6 +597,22 @@ class Station:
                 self._touched[machine] = None
                 machine.foreign_set(message.param_id, station, now)
 
+    def _receive_foreign_file_request(self, message: FileTransfer, sender: Address, now: float) -> None:
+        """Take what another station asks for over MAVFTP, where we only listen."""
+        target = (message.target_system, message.target_component)
+        if target not in self.components and opens_parameter_file(message):
+            self._early_requests.append((message, sender))
+        for machine in self._of_system.get(message.target_system, ()):
+            if message.target_component in (machine.component, COMP_ID_ALL):
+                self._touched[machine] = None
+                machine.foreign_file_request(message, sender, now)
+
+    def _is_awaited_file(self, message: Message, sender: Address) -> bool:
+        """Whether a component that was not heard before has opened its parameter file for another station."""
+        if not isinstance(message, FileTransfer) or not acknowledges_open(message):
+            return False
+        return any(_is_for(request, sender) for request, _ in self._early_requests)
+
     def _send(self, message: Message, system: int | None, version: int) -> None:
         if self.listens_only:
             return
@@ -584,3 +628,7 @@ class Station:
         if system is not None:
             self._trace("to system %s: %s", system, Told(message))
         self._outbox.append((data, None if system is None else self._peers.get(system)))
+
+
+def _is_for(message: FileTransfer, address: Address) -> bool:
+    return message.target_system == address[0] and message.target_component in (address[1], COMP_ID_ALL)

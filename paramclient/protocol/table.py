@@ -28,6 +28,7 @@ from paramclient.params import (
 from paramclient.protocol.authors import is_ours
 from paramclient.protocol.change import Change
 from paramclient.protocol.hashing import hash_of
+from paramclient.protocol.pack import Pack
 from paramclient.protocol.wire import MOST_PARAMETERS, NO_INDEX, ParamValue
 from paramclient.values import (
     Encoding,
@@ -336,6 +337,24 @@ class Table:
         self._news(name, old, "vehicle", before, seen_at)
         self._moved(name)
         return _new(Change, (name, old, new, "vehicle", initial, before))
+
+    def take_pack(self, pack: Pack, moment: float, newer: Collection[str], *, start: int = 0) -> list[Change]:
+        """Take the entries of a packed parameter file; give the changes that they brought.
+
+        Args:
+            pack: the file, or a part of it.
+            moment: when it was asked for.
+            newer: names of which a PARAM_VALUE was heard since the file was asked for, as in `take`.
+            start: the index of the first entry.
+        """
+        changes = []
+        for index, (name, number, bits, default) in enumerate(pack.entries, start=start):
+            if default is None and pack.with_defaults:
+                default = bits  # the vehicle gives those that differ
+            change = self.take(name, number, bits, index, default, moment, is_older=name in newer)
+            if change is not None:
+                changes.append(change)
+        return changes
 
     def use_encoding(self, encoding: Encoding) -> list[Change]:
         """Read everything that was heard in another encoding; give what looks different now."""

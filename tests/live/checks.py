@@ -13,7 +13,7 @@ from typing import Final
 
 import anyio
 
-from paramclient import Component, FetchResult, Ftp, ParamClient
+from paramclient import Component, FetchResult, Ftp, ParamCache, ParamClient
 from paramclient.errors import (
     FileTransferError,
     NoReply,
@@ -23,11 +23,12 @@ from paramclient.errors import (
     UsageError,
     ValueNotApplied,
 )
+from paramclient.logs import import_log
 from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, message_name
-from paramclient.values import ParamType, type_name
+from paramclient.values import Param, ParamType, type_name
 from tests.live.choice import another_value
 from tests.live.relay import FILE_TRANSFER_ID, LIST_REQUEST_ID, Conditions
-from tests.live.session import Check, CheckFailed, Measured, Session, Skip
+from tests.live.session import HEARING_TIMEOUT, Check, CheckFailed, Measured, Session, Skip
 
 __all__ = ["checks"]
 
@@ -130,6 +131,9 @@ def checks(*, reboots: bool) -> Iterator[Check]:
         "as quick as the first, the file was closed",
         {"ardupilot": 0.6},
         kinds=("ardupilot",),
+    )
+    yield Check(
+        "the log of a session, replayed and imported", replay_log, "the table of the session, of 1 vehicle"
     )
     yield Check("two sessions, fetch at the same time", fetch_in_two, "every value right in both")
     yield Check(
@@ -282,6 +286,36 @@ def _open_file_and_die(link: str, system: int) -> None:
 
 
 # Single reads
+
+
+async def replay_log(session: Session) -> Measured:
+    """Replay and import the log of a fetch: both hold what the client held, with types and defaults."""
+    path = session.folder / "session.tlog"
+    async with ParamClient(session.relay.link, cache=False, tlog=path) as client:
+        vehicle = await client.component(session.system, timeout=HEARING_TIMEOUT)
+        source = (await vehicle.fetch_all(timeout=SLOWEST_FETCH)).source
+    began = time.monotonic()
+    async with ParamClient(f"replay:{path}?speed=0") as log:
+        result = await (await log.component(session.system, vehicle.component)).fetch_all()
+        address = (vehicle.system, vehicle.component)
+        others = [each for each in log.autopilots if (each.system, each.component) != address]
+    if others or not result.complete or result.source != source:
+        raise CheckFailed(f"{result!r} {' '.join(result.notes)}, other vehicles: {others}")
+    with ParamCache(session.folder / "session.sqlite3") as cache:
+        tables = [each for each in await import_log(path, cache) if each.system == session.system]
+        imported = cache.load(tables[0].key, vehicle.component)
+    if len(tables) != 1 or imported is None or not imported.complete:
+        raise CheckFailed(f"imported: {tables}")
+    for params in (result.params, imported.params):
+        differing = [name for name, param in vehicle.params.items() if not _is_same(params.get(name), param)]
+        if differing:
+            raise CheckFailed(f"{len(differing)} differ: {', '.join(differing[:5])}")
+    seconds = time.monotonic() - began
+    return Measured(f"{len(result.params)} {source}, {seconds:.2f} s for both")
+
+
+def _is_same(param: Param | None, expected: Param) -> bool:
+    return param is not None and param.same_value(expected) and param.default == expected.default
 
 
 async def get_some(session: Session, *, by_name: bool) -> Measured:

@@ -14,7 +14,7 @@ from tests.live.choice import Choice
 from tests.live.journal import Journal
 from tests.live.relay import CLEAN, Conditions, Relay
 
-__all__ = ["Check", "CheckFailed", "Measured", "Session", "Skip"]
+__all__ = ["HEARING_TIMEOUT", "Check", "CheckFailed", "Measured", "Session", "Skip"]
 
 HEARING_TIMEOUT: Final = 15.0
 """Seconds to wait for the vehicle's heartbeat at the beginning of a check."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from paramclient.protocol.ftp.observed import ObservedRead, ObservedReads
 from paramclient.protocol.ftp.reading import LARGEST_FILE, FileRead
 from paramclient.protocol.ftp.transfers import (
     DirectoryEntry,
@@ -19,4 +20,6 @@ __all__ = [
     "FileRead",
     "FileTransfers",
     "FileWrite",
+    "ObservedRead",
+    "ObservedReads",
 ]

@@ -40,6 +40,16 @@ class Blocks:
         return b"".join(self._pieces[at] for at in sorted(self._pieces))
 
     @property
+    def prefix(self) -> bytes:
+        """Everything from the beginning of the file to its first gap."""
+        pieces: list[bytes] = []
+        reached = 0
+        while (piece := self._pieces.get(reached)) is not None:
+            pieces.append(piece)
+            reached += len(piece)
+        return b"".join(pieces)
+
+    @property
     def pieces(self) -> int:
         """How many pieces it has come in."""
         return len(self._pieces)

@@ -16,6 +16,7 @@ __all__ = [
     "CAPABILITY_PARAM_ENCODE_C_CAST",
     "COMPONENT_METADATA_ID",
     "COMP_ID_ALL",
+    "COMP_ID_MISSIONPLANNER",
     "CommandAck",
     "CommandLong",
     "ComponentMetadata",
@@ -63,6 +64,8 @@ HASH_CHECK: Final = "_HASH_CHECK"
 """param_id under which PX4 gives the hash of its table."""
 COMP_ID_ALL: Final = 0
 AUTOPILOT_COMPONENT: Final = 1
+COMP_ID_MISSIONPLANNER: Final = 190
+"""MAV_COMP_ID_MISSIONPLANNER: the component id of ground stations."""
 
 MAV_TYPE_GCS: Final = 6
 MAV_AUTOPILOT_GENERIC: Final = 0
