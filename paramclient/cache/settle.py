@@ -15,7 +15,7 @@ than what comes, whatever its time says.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from paramclient.cache import tables
@@ -161,10 +161,11 @@ def _write_values(
     part = update
     older: Sequence[StoredParam] = ()
     agrees = True
-    if not all(seen.is_news(name, at) for name, at in _times(update.params)):
+    if seen.table is not None and not all(seen.is_news(name, at) for name, at in _times(update.params)):
         part, older, agrees = _divided(update, seen, is_late=is_late)
-    heard = {name for name, _ in _times(update.params)}
-    gone = before.keys() - heard if update.replace else update.removed
+    gone: Collection[str] = update.removed
+    if update.replace:
+        gone = before.keys() - {name for name, _ in _times(update.params)} if before else ()
     stays = {name for name in gone if name in before and not seen.is_news(name, update.gone_at(name))}
     after, lines, births = applied(part, before, stays.union(item.param.name for item in older))
     if len(after) != len(before) or after != before:
