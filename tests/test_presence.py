@@ -8,7 +8,9 @@ from collections.abc import Sequence
 import pytest
 
 from paramclient.protocol.presence import (
+    CLOCKS_MAX,
     DETOUR,
+    FIRST_FRAMES,
     LONGEST_PATIENCE,
     LOST_AFTER,
     LOST_AFTER_HIGH_LATENCY,
@@ -181,3 +183,89 @@ def test_clock_and_heartbeat_tell_of_one_reboot_only() -> None:
     assert presence.heartbeat(BOOT, 6.0)
     assert not presence.system_time(SystemTime(0, 500), 6.0)
     assert not presence.system_time(SystemTime(0, 1_500), 7.0)
+
+
+# clocks in telemetry
+
+ATTITUDE_ID, GLOBAL_POSITION_ID = 30, 33
+
+
+def telemetry_reboots(clock: Sequence[tuple[float, int, int]]) -> list[float]:
+    """When telemetry shows a reboot, by messages with a time in seconds, an id and milliseconds."""
+    presence = Presence()
+    return [now for now, number, boot_ms in clock if presence.boot_clock(number, boot_ms, now)]
+
+
+def test_a_clock_in_telemetry_that_begins_anew_is_a_reboot() -> None:
+    clock = [(0.0, ATTITUDE_ID, 60_000), (0.1, GLOBAL_POSITION_ID, 60_080), (1.9, GLOBAL_POSITION_ID, 316)]
+    assert telemetry_reboots([*clock, (2.0, ATTITUDE_ID, 400), (2.1, GLOBAL_POSITION_ID, 500)]) == [1.9]
+
+
+def test_clocks_of_different_messages_are_not_compared() -> None:
+    """One that is filled with another clock, with a constant or with nothing shows no reboot."""
+    clock = [
+        (second, number, boot_ms)
+        for second in range(20)
+        for number, boot_ms in (
+            (ATTITUDE_ID, 90_000 + 1000 * second),
+            (GLOBAL_POSITION_ID, 1000 * second + 1),
+            (132, 700),
+            (143, 0 if second % 2 else 90_000),
+        )
+    ]
+    assert telemetry_reboots(clock) == []
+
+
+def test_late_frames_of_the_run_before_are_no_second_reboot() -> None:
+    """They come over a slower way, after those of the new run."""
+    clock = [(0.0, 60_000), (2.0, 400), (2.1, 61_000), (2.2, 600), (4.0, 61_500), (4.1, 2_500), (9.0, 7_400)]
+    assert telemetry_reboots([(now, ATTITUDE_ID, boot_ms) for now, boot_ms in clock]) == [2.0]
+
+
+def test_a_second_reboot_soon_after_the_first_one_counts() -> None:
+    clock = [(0.0, 60_000), (2.0, 400), (6.0, 4_400), (8.0, 300), (12.0, 4_300), (14.0, 200)]
+    assert telemetry_reboots([(now, ATTITUDE_ID, boot_ms) for now, boot_ms in clock]) == [2.0, 8.0, 14.0]
+
+
+def test_clocks_of_telemetry_may_wrap_and_come_over_two_ways() -> None:
+    wrapping = [(now, ATTITUDE_ID, (WRAP - 3_000 + int(1000 * now)) % WRAP or 1) for now in range(10)]
+    assert telemetry_reboots(wrapping) == []
+    lag = int(1000 * (DETOUR - 1))
+    ways = [(0.5 * turn, ATTITUDE_ID, 100_000 + 500 * turn - (lag if turn % 2 else 0)) for turn in range(40)]
+    assert telemetry_reboots(ways) == []
+
+
+def test_the_clock_is_told_by_any_message() -> None:
+    presence = Presence()
+    assert presence.started_at is None
+    presence.boot_clock(ATTITUDE_ID, 4_000, 10.0)
+    assert is_so(presence.started_at == 6.0)
+    assert presence.clock_at == 10.0
+    presence.forget_clock(11.0)
+    assert is_so(presence.started_at is None)
+    assert not presence.boot_clock(ATTITUDE_ID, 500, 11.5)
+
+
+def test_message_ids_with_clocks_are_bounded() -> None:
+    presence = Presence()
+    for number in range(1_000):
+        presence.boot_clock(number, 5_000, 1.0)
+    assert len(presence._clocks) == CLOCKS_MAX
+
+
+# sequence numbers
+
+
+def test_a_numbering_that_begins_is_noticed() -> None:
+    presence = Presence()
+    assert not presence.numbering_begins(0), "the first frame that is heard"
+    presence.numbering_begins(200)
+    assert presence.numbering_begins(1)
+    assert not presence.numbering_begins(2)
+
+
+@pytest.mark.parametrize(("before", "sequence"), [(254, 0), (250, 1), (0, 1), (100, FIRST_FRAMES), (40, 200)])
+def test_the_usual_step_over_255_begins_no_numbering(before: int, sequence: int) -> None:
+    presence = Presence()
+    presence.numbering_begins(before)
+    assert not presence.numbering_begins(sequence)

@@ -21,6 +21,7 @@ from pymavlink.generator.mavcrc import x25crc_slow
 
 from paramclient.protocol import wire
 from paramclient.protocol.wire import (
+    BOOT_CLOCK_OFFSETS,
     AutopilotVersion,
     CommandAck,
     CommandLong,
@@ -757,3 +758,42 @@ def test_in_datagrams_every_whole_frame_is_found(mixes: list[list[Piece]]) -> No
         check_that_whole_frames_are_found(mix, expected)
         assert framer.receive(datagram) == list(expected.values())
     assert framer.flush() == []
+
+
+@pytest.mark.parametrize("number", sorted(BOOT_CLOCK_OFFSETS))
+def test_where_the_time_since_boot_stands(number: int) -> None:
+    """pymavlink packs each message that has it; in the payload its trailing zeros are cut off."""
+    kind = dialect.mavlink_map[number]
+    for boot_ms in (0xA1B2C3D4, 0x00000017):
+        fields = {
+            name: (b"" if field == "char" else [0] * length if length else 0)
+            for name, field, length in zip(
+                kind.ordered_fieldnames,
+                (kind.fieldtypes[kind.fieldnames.index(name)] for name in kind.ordered_fieldnames),
+                kind.array_lengths,
+                strict=True,
+            )
+        }
+        packed = kind(**fields | {"time_boot_ms": boot_ms}).pack(dialect.MAVLink(None, 1, 1))
+        (frame,) = Framer(stream=False).receive(bytes(packed))
+        at = BOOT_CLOCK_OFFSETS[number]
+        assert int.from_bytes(frame.payload[at : at + 4], "little") == boot_ms
+
+
+def test_requests_and_times_of_applications_are_no_clocks() -> None:
+    assert {2, 30, 32, 33, 83} <= BOOT_CLOCK_OFFSETS.keys()
+    assert BOOT_CLOCK_OFFSETS.keys().isdisjoint({84, 86, 251, 252, 254, 263})
+
+
+def test_occasional_ids_are_given_out_while_they_are_wanted() -> None:
+    attitude = build_frame(30, bytes(28), system=1, component=1, sequence=0)
+    heartbeat = encode(Heartbeat(2, 12), system=1, component=1, sequence=1)
+    for guard in (None, lambda frame: True):
+        framer = Framer({0}, occasional={30}, stream=False)
+        framer.guard = guard
+        for takes in (False, True, False):
+            framer.takes_occasional = takes
+            assert framer.takes_occasional is takes
+            seen = [frame.message_id for frame in framer.receive(attitude + heartbeat)]
+            assert seen == ([30, 0] if takes else [0])
+        assert framer.frames == 6

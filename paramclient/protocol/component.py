@@ -64,6 +64,7 @@ class ComponentMachine(Parts):
         is_link_busy: whether anything is being asked for on the link.
         is_vehicle_doubted: whether it is open which vehicle its autopilot belongs to.
         another: is told that another vehicle has taken the system id; by default `become_another`.
+        read_clock: has `boot_clock` called with clocks from its telemetry for a while; see `ClockSampling`.
         turns: those of the lists on the link; None for a link that it has for itself.
         room: what the tables of the link may hold together; None likewise.
         trace: is told of each step.
@@ -79,6 +80,8 @@ class ComponentMachine(Parts):
         files: its files.
         descriptions: where it says that what it has to say of itself lies.
         commands: what it is told to do.
+        clock_requests: the requests for its time since boot.
+        start_values: the reading of what it measures at each start.
         restart: the restart that it was told to make and that is under way, or None.
         fetches: what was and is being fetched.
         tells_changes: whether somebody wants to be told of each change. An event for each value of a long
@@ -89,16 +92,32 @@ class ComponentMachine(Parts):
 
     # what comes in
 
-    def receive(self, message: Message, now: float, *, version: int = 2, moment: float | None = None) -> None:
-        """Take a message that this component sent; the arguments are those of `receive_value`."""
+    def receive(
+        self,
+        message: Message,
+        now: float,
+        *,
+        version: int = 2,
+        moment: float | None = None,
+        sequence: int | None = None,
+    ) -> None:
+        """Take a message that this component sent; the arguments are those of `receive_value`.
+
+        `sequence` is the sequence number of its frame, where it had one.
+        """
         if isinstance(message, ParamValue):
             self.receive_value(message, now, version, moment)
             return
         self._heard(now, version)
+        if sequence is not None and self.presence.numbering_begins(sequence):
+            self._numbering_began(now)
         if isinstance(message, Heartbeat):
             self.who.heartbeat(message)
+            state = self.presence.state
             if self.presence.heartbeat(message, now):
                 self._rebooted(now)
+            elif state not in (None, message.system_status):
+                self.clock_requests.want(now)
             self._authors.forget(now)
             self._checks.forget(now)
             if self.fetches.overheard is not None:
@@ -122,8 +141,7 @@ class ComponentMachine(Parts):
             if denied:
                 self.writes.denied(denied.group(1), now)
         elif isinstance(message, SystemTime):
-            if self.presence.system_time(message, now):
-                self._rebooted(now)
+            self._clock_told(self.presence.system_time(message, now), now)
         elif isinstance(message, FileTransfer):
             self.files.heard(message, now)
             if self.fetches.overheard is not None:
@@ -199,6 +217,22 @@ class ComponentMachine(Parts):
         if writes.queues:
             writes.heard(message, now)
         self._value_heard(message, now)
+
+    def boot_clock(self, message_id: int, boot_ms: int, now: float) -> None:
+        """Take `time_boot_ms` of a message of telemetry that it sent."""
+        self._clock_told(self.presence.boot_clock(message_id, boot_ms, now), now)
+
+    def _clock_told(self, has_restarted: bool, now: float) -> None:
+        if has_restarted:
+            self._rebooted(now, by_clock=True)
+        started_at = self.presence.started_at
+        if started_at is not None and self.presence.clock_at == now:
+            self.start_values.clock_told(now - started_at, now)
+
+    def _numbering_began(self, now: float) -> None:
+        """Its frames may be numbered from 0 again, as after a start: its clock tells whether it is one."""
+        if self.restart is None or not self.restart.numbering_began(now):
+            self.clock_requests.want(now)
 
     def _note_replaced(self, change: Change, message: ParamValue, now: float) -> None:
         """Remember the value before a change. PX4 has none on the way: it answers with the value of now."""
@@ -346,10 +380,12 @@ class ComponentMachine(Parts):
                 self.presence,
                 self.round_trip,
                 self._saved_at,
-                self._rebooted,
+                self._restart_noticed,
+                self.clock_requests,
                 returns=returns,
                 now=now,
             )
+        self._read_clock(now)
         self.restart.waiters += 1
         return self.restart
 
@@ -428,7 +464,9 @@ class ComponentMachine(Parts):
         self.who.tick(now)
         self.descriptions.tick(now)
         self._follow_identity(now)
+        self.clock_requests.tick(now)
         self.sync.tick(now)
+        self.start_values.tick(now)
         for name in self._authors.doubted(now):
             if self._policy is Policy.AUTO and len(self.reads) < MOST_DOUBTED:
                 self.reads.ask(name, now, urgent=False)
@@ -456,7 +494,9 @@ class ComponentMachine(Parts):
             self.files.next_deadline(),
             self.who.next_deadline(),
             self.descriptions.next_deadline(),
+            self.clock_requests.next_deadline(),
             self.sync.next_deadline(),
+            self.start_values.next_deadline(),
             self._authors.next_deadline(),
             self._checks.next_deadline(),
         )
@@ -489,6 +529,8 @@ class ComponentMachine(Parts):
         if self.restart is not None:
             self.restart.fail(error, now)
         self.commands.fail_all(error, now)
+        self.clock_requests.stop()
+        self.start_values.stop()
         self.writes.fail_all(error, now)
         self.reads.fail_all(error, now)
         self.sync.stop()
@@ -549,6 +591,7 @@ class ComponentMachine(Parts):
         self.files.lose(now)
         self.descriptions.lose(now)
         self.commands.lose(now)
+        self.start_values.stop()
         self.who.lose()
         self.fetches.interrupt(now)
         self._doubt()
@@ -583,10 +626,16 @@ class ComponentMachine(Parts):
         if presence.has_beaten:  # else nothing says when it should have been heard
             self.sync.silence(now)
 
-    def _rebooted(self, now: float) -> None:
+    def _restart_noticed(self, now: float) -> None:
+        """It has started again on command, and its clock has not shown that, or not by going back."""
+        self.presence.forget_clock(now)
+        self._rebooted(now)
+
+    def _rebooted(self, now: float, *, by_clock: bool = False) -> None:
         """The vehicle has started again: what it had not saved is gone, and its list begins anew."""
         self._emit(events.ComponentRebooted(self))
         self.fetches.interrupt(now)
+        self.start_values.restarted(now, by_clock=by_clock)
         self._doubt()
         self.following.forget()
         self._authors.clear()
@@ -595,6 +644,8 @@ class ComponentMachine(Parts):
         self.who.doubt(now)
         if self.restart is not None:
             self.restart.rebooted(now)
+        if not by_clock:
+            self.clock_requests.want(now)
         if self.fetch is not None and self.fetch.is_under_way:
             self.fetch.restart(now)
 
@@ -610,6 +661,8 @@ class ComponentMachine(Parts):
         if self.who.settled and self._known_as != self.identity.key:
             self._known_as = self.identity.key
             self._emit(events.ComponentIdentified(self))
+            if self.who.is_autopilot:
+                self.clock_requests.want_baseline(now)
         if self.writes.is_held and self.may_be_written:
             self.writes.proceed(now)
 

@@ -9,6 +9,7 @@ from collections.abc import Callable
 from paramclient.identity import Identity
 from paramclient.protocol.authors import Authors
 from paramclient.protocol.change import Change
+from paramclient.protocol.clock_requests import ClockRequests
 from paramclient.protocol.commands import Commands
 from paramclient.protocol.descriptions import Descriptions
 from paramclient.protocol.events import Event
@@ -21,7 +22,8 @@ from paramclient.protocol.presence import Presence
 from paramclient.protocol.reads import Key, Reads
 from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.restart import Restart
-from paramclient.protocol.result import FetchResult, Means, Sampled
+from paramclient.protocol.result import FetchResult, Means, Policy, Sampled
+from paramclient.protocol.start_values import StartValues
 from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
 from paramclient.protocol.table import Room, Table
 from paramclient.protocol.timing import RoundTrip
@@ -54,6 +56,7 @@ class Parts(ABC):
         is_link_busy: Callable[[], bool] = lambda: False,
         is_vehicle_doubted: Callable[[], bool] = lambda: False,
         another: Callable[[float], None] | None = None,
+        read_clock: Callable[[float], None] = lambda now: None,
         turns: Turns | None = None,
         room: Room | None = None,
         trace: Trace = silent,
@@ -100,6 +103,20 @@ class Parts(ABC):
             target, own, self.round_trip, send, is_identifying=lambda: self.who.is_asking
         )
         self.commands = Commands(target, own, self.round_trip, send)
+        self.clock_requests = ClockRequests(
+            target,
+            self.presence,
+            send,
+            is_requesting=lambda: self.who.is_asking or self.descriptions.is_asking,
+            may_send=not upkeep.listens_only,
+        )
+        self.start_values = StartValues(
+            self.reads,
+            self.table,
+            is_wanted=lambda: self._may_read_start_values,
+            is_fetching=lambda: self.fetch is not None,
+            fetch_file=self.sync.fetch_cheap_file,
+        )
         self.restart: Restart | None = None
         self.files = FileTransfers(target, own, self.round_trip, send)
         self.following = Following()
@@ -129,8 +146,10 @@ class Parts(ABC):
         self._own = own
         self._emit = emit
         self._policy = upkeep.policy
+        self._is_kept_up = upkeep.interval < math.inf and upkeep.policy is Policy.AUTO
         self._listens_only = upkeep.listens_only
         self._another = another or self.become_another
+        self._read_clock = read_clock
         self._is_vehicle_doubted = is_vehicle_doubted
         self._known_as: str | None = None  # the key of the identity that was reported
         self._saved_at = -math.inf  # when all that we have written will have been saved
@@ -215,6 +234,11 @@ class Parts(ABC):
         """Whether it is lost, or in a mode in which nothing is asked of it unasked."""
         presence = self.presence
         return presence.is_lost or presence.is_high_latency or self.reads.pace.gap >= LOW_BANDWIDTH_GAP
+
+    @property
+    def _may_read_start_values(self) -> bool:
+        """Whether what is measured at each start is to be read again without being asked."""
+        return self._is_kept_up and not self.sync.expects_hash and not self._is_spared
 
     def _is_known(self, key: Key) -> bool:
         """Whether anything speaks for such a parameter."""

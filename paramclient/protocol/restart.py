@@ -8,6 +8,7 @@ from typing import Final
 
 from paramclient.errors import AnotherVehicle, NoReply
 from paramclient.identity import Identity
+from paramclient.protocol.clock_requests import ClockRequests
 from paramclient.protocol.commands import Command, Commands
 from paramclient.protocol.identify import Identification
 from paramclient.protocol.operation import Operation
@@ -32,6 +33,12 @@ CLOCK_PATIENCE: Final = 2.5
 STEP: Final = 0.15
 """Seconds by which a start must be later than the one before for the clock to show that it is another one:
 messages are not equally long on their way."""
+DOWN_DELAY: Final = 0.3
+"""Seconds from accepting until a vehicle is certainly off: ArduPilot goes off after 0.2 s, and the first
+frame of its new run comes at the earliest 0.31 s after the acknowledgement (measured)."""
+CLOCK_SILENCE: Final = 0.25
+"""Seconds without a clock from a vehicle before the numbers of its frames mean anything: of one that streams
+telemetry they pass 0 all the time."""
 UNNOTICED: Final = 10.0
 """Seconds after which an accepted restart counts as done where nothing can show it: the component is heard
 without a gap, tells no clock, and does not say that it boots."""
@@ -54,6 +61,7 @@ class Restart(Operation[None]):
         commands, who, presence, round_trip: the component's.
         saved_at: when all that was written is saved.
         restarted: is told when the component has started again and nobody else has noticed; calls `rebooted`.
+        clock_requests: the component's.
         returns: whether it comes back under its address. Else it ends as soon as it obeys, or is gone.
         now: the time.
 
@@ -71,6 +79,7 @@ class Restart(Operation[None]):
         round_trip: RoundTrip,
         saved_at: float,
         restarted: Callable[[float], None],
+        clock_requests: ClockRequests,
         *,
         returns: bool,
         now: float,
@@ -83,6 +92,7 @@ class Restart(Operation[None]):
         self._round_trip = round_trip
         self._saved_at = saved_at
         self._restarted = restarted
+        self._clock_requests = clock_requests
         self._returns = returns
         self.waiters = 0
         self._command: Command | None = None
@@ -111,10 +121,25 @@ class Restart(Operation[None]):
         """Its clock or its heartbeat shows that it has started again."""
         if self._command is None:
             return
+        self._clock_requests.stop_following()
         if not self._returns:
             self.finish(None, now)
         self._back_at = now
         self._ask_at = now
+
+    def numbering_began(self, now: float) -> bool:
+        """Its frames may be numbered from 0 again; gives whether that shows that it has started again.
+
+        It does where the component has accepted the command, has had the time to go off, and is not telling
+        its clock meanwhile. ArduPilot sends its clock only 1.4 s after its first heartbeat.
+        """
+        accepted_at = self._accepted_at
+        if self.done or accepted_at is None or self._back_at is not None:
+            return False
+        if now < accepted_at + DOWN_DELAY or now < self._presence.clock_at + CLOCK_SILENCE:
+            return False
+        self._restarted(now)
+        return True
 
     def silent(self, silence: float, now: float) -> None:
         """It is heard again after so many seconds that something must have happened."""
@@ -131,6 +156,7 @@ class Restart(Operation[None]):
 
     def stop(self, now: float) -> None:
         """Nobody waits any more. What was sent cannot be taken back."""
+        self._clock_requests.stop_following()
         if self._command is not None:
             self._commands.cancel(self._command, now)
 
@@ -174,6 +200,7 @@ class Restart(Operation[None]):
             MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, (1.0,), now, repeats=False
         )
         command.on_done.append(self._answered)
+        self._clock_requests.follow(now)
 
     def _answered(self) -> None:
         command = self._command

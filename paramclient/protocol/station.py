@@ -10,6 +10,7 @@ from typing import Final, TypeAlias
 
 from paramclient.errors import LinkError, UsageError
 from paramclient.identity import Identity
+from paramclient.protocol.clock_sampling import ClockSampling
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.download import present_of
 from paramclient.protocol.events import ComponentForgotten, ComponentHeard, Event
@@ -23,6 +24,7 @@ from paramclient.protocol.traffic import Traffic
 from paramclient.protocol.turns import Turns
 from paramclient.protocol.wire import (
     AUTOPILOT_COMPONENT,
+    BOOT_CLOCK_OFFSETS,
     COMP_ID_ALL,
     COMP_ID_MISSIONPLANNER,
     HEARTBEAT_ID,
@@ -84,6 +86,8 @@ HEARD: Final = frozenset({0, 2, 22, 23, 77, 110, 148, 235, 253, 345, 397})
 """The message ids that matter here: HEARTBEAT, SYSTEM_TIME, PARAM_VALUE, PARAM_SET (of others), COMMAND_ACK,
 FILE_TRANSFER_PROTOCOL, AUTOPILOT_VERSION, HIGH_LATENCY2, STATUSTEXT, PARAM_ERROR."""
 _SETS: Final = frozenset({23})
+_TELEMETRY_CLOCKS: Final = {number: at for number, at in BOOT_CLOCK_OFFSETS.items() if number not in HEARD}
+"""Where `time_boot_ms` stands in messages that matter for nothing else."""
 
 
 class Station:
@@ -140,7 +144,9 @@ class Station:
         self._encoding = encoding
         self.policy = Policy.AUTO if upkeep is None else upkeep.policy
         self._upkeep = upkeep
-        self._framer = Framer(HEARD, stream=False)  # for datagrams, whoever they come from
+        # for datagrams, whoever they come from
+        self._framer = Framer(HEARD, occasional=_TELEMETRY_CLOCKS, stream=False)
+        self._clock_sampling = ClockSampling(self._take_clocks)
         self._framers: dict[Peer, Framer] = {}  # for streams
         self._peers: dict[int, Peer] = {}
         self._outbox: list[tuple[bytes, Peer | None]] = []
@@ -189,6 +195,7 @@ class Station:
         if self._is_watched:
             self._watch(data, peer, now)
         frames = self._cut_stream(data, peer) if self._is_stream else self._framer.receive(data)
+        clocks = 0
         for frame in frames:
             number, system, component, _, payload, version = frame
             machine = self.components.get((system, component))
@@ -196,13 +203,17 @@ class Station:
                 self._peers[system] = peer
                 self._touched[machine] = None
                 machine.receive_value(decode_param_value(payload), now, version, moment)
+            elif number in _TELEMETRY_CLOCKS:
+                clocks += 1
+                if machine is not None and self._clock_sampling.is_open((system, component)):
+                    self._receive_clock(machine, number, payload, now)
             else:
                 self._receive_other(frame, peer, now, moment)
         if self._is_stream and not data:
             self._peers = {system: each for system, each in self._peers.items() if each != peer}
         if self._awaits_autopilot and self._request_heartbeat(data, peer, now):
             return True
-        return bool(frames)
+        return len(frames) > clocks
 
     def touch(self, machine: ComponentMachine) -> None:
         """Something was asked of a component, or is no longer."""
@@ -450,8 +461,9 @@ class Station:
         """The frames that a chunk of a peer's stream completes, or that its end leaves."""
         framer = self._framers.get(peer)
         if framer is None:
-            framer = self._framers[peer] = Framer(HEARD)
+            framer = self._framers[peer] = Framer(HEARD, occasional=_TELEMETRY_CLOCKS)
             framer.guard = self._framer.guard
+            framer.takes_occasional = self._framer.takes_occasional
             if len(self._framers) > MOST_PEERS:
                 self._retire(next(iter(self._framers)))
         if data:
@@ -505,7 +517,21 @@ class Station:
         machine = self.components.get(sender) or self._meet(sender, message, now)
         if machine is not None:
             self._touch_all(self._of_system[machine.system])  # what one says of the vehicle counts for all
-            machine.receive(message, now, version=frame.version, moment=moment)
+            machine.receive(message, now, version=frame.version, moment=moment, sequence=frame.sequence)
+            if isinstance(message, Heartbeat):
+                self._clock_sampling.open(sender, now)
+
+    def _receive_clock(self, machine: ComponentMachine, number: int, payload: bytes, now: float) -> None:
+        """Take the time since boot in a frame of telemetry. Trailing zeros may be cut off."""
+        at = _TELEMETRY_CLOCKS[number]
+        self._touched[machine] = None
+        machine.boot_clock(number, int.from_bytes(payload[at : at + 4], "little"), now)
+        if machine.restart is None:
+            self._clock_sampling.sampled((machine.system, machine.component), now)
+
+    def _take_clocks(self, takes: bool) -> None:
+        for framer in (self._framer, *self._framers.values()):
+            framer.takes_occasional = takes
 
     def _meet(self, sender: Address, message: Message, now: float) -> ComponentMachine | None:
         """A component that was not heard before; only what shows that it has parameters makes it one.
@@ -538,6 +564,7 @@ class Station:
             is_link_busy=lambda: self.is_waiting,
             is_vehicle_doubted=lambda: self._autopilot_is_doubted(system),
             another=lambda now: self._become_another(system, now),
+            read_clock=lambda now: self._clock_sampling.open(sender, now),
             turns=self._turns,
             room=self._room,
             trace=self._trace,
@@ -572,6 +599,7 @@ class Station:
         address = (machine.system, machine.component)
         del self.components[address]
         self._of_system[machine.system].remove(machine)
+        self._clock_sampling.close(address)
         self._touched.pop(machine, None)
         self._deadlines.pop(machine, None)
         self._last_waiting = None

@@ -298,6 +298,13 @@ class Sync:
             read = self._reads.ask(HASH_CHECK, now)
             read.on_done.append(lambda: self._hash_came(read))
 
+    def fetch_cheap_file(self, now: float) -> bool:
+        """Fetch the table anew where it comes as a file in no time; false where it does not, or may not."""
+        if not self._is_kept_up or self._is_spared() or not self._file_is_cheap(self._upkeep.interval):
+            return False
+        self._begin_resync(now, refresh=True)
+        return True
+
     def compare(self, now: float) -> bool:
         """Whether the vehicle has just announced the hash that belongs to the table; then it is confirmed."""
         table, announced = self._table, self.announced

@@ -10,6 +10,7 @@ from paramclient.protocol.wire.codec import (
     text_of,
 )
 from paramclient.protocol.wire.frames import (
+    BOOT_CLOCK_OFFSETS,
     Frame,
     Framer,
     bears_key,
@@ -49,6 +50,7 @@ from paramclient.protocol.wire.messages import (
     MOST_PARAMETERS,
     NO_INDEX,
     PARAM_VALUE_ID,
+    SYSTEM_TIME_ID,
     AutopilotVersion,
     CommandAck,
     CommandLong,
@@ -81,6 +83,7 @@ __all__ = [
     "AUTOPILOT_COMPONENT",
     "AUTOPILOT_VERSION_ID",
     "AutopilotVersion",
+    "BOOT_CLOCK_OFFSETS",
     "CAPABILITY_FTP",
     "CAPABILITY_PARAM_ENCODE_BYTEWISE",
     "CAPABILITY_PARAM_ENCODE_C_CAST",
@@ -128,6 +131,7 @@ __all__ = [
     "SigningPolicy",
     "SigningReport",
     "SigningStream",
+    "SYSTEM_TIME_ID",
     "StatusText",
     "SystemTime",
     "UNDERSTOOD",

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Callable, Collection
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as dialect
@@ -17,6 +17,7 @@ from pymavlink.dialects.v20 import all as dialect
 from paramclient.protocol.wire.signing import SIGNATURE_LENGTH, Signer
 
 __all__ = [
+    "BOOT_CLOCK_OFFSETS",
     "Frame",
     "Framer",
     "bears_key",
@@ -71,6 +72,7 @@ class Framer:
     Args:
         wanted: the message ids to give out; None for every known one. Frames with other ids are still
             checked and stepped over, but no object is made of them.
+        occasional: further ids, given out only while `takes_occasional` is set.
         stream: whether a frame may be spread over several calls (TCP, serial). Datagrams are taken one by
             one and never joined.
 
@@ -80,9 +82,16 @@ class Framer:
         damaged: what looked like a frame of a known id and had a wrong checksum.
     """
 
-    def __init__(self, wanted: Collection[int] | None = None, *, stream: bool = True) -> None:
-        ids = _CRC_EXTRA if wanted is None else wanted
-        self._numbers = {number.to_bytes(3, "little"): number for number in ids}
+    def __init__(
+        self,
+        wanted: Collection[int] | None = None,
+        *,
+        occasional: Collection[int] = (),
+        stream: bool = True,
+    ) -> None:
+        self._usual = _by_id_bytes(_CRC_EXTRA if wanted is None else wanted)
+        self._all = self._usual | _by_id_bytes(occasional)
+        self._numbers = self._usual
         self._number_of = self._numbers.get
         self._guard: Callable[[bytes], bool] | None = None
         self._stream = stream
@@ -102,8 +111,21 @@ class Framer:
     @guard.setter
     def guard(self, guard: Callable[[bytes], bool] | None) -> None:
         self._guard = guard
+        self._choose()
+
+    @property
+    def takes_occasional(self) -> bool:
+        """Whether frames with the occasional ids are given out too. Choosing costs nothing per frame."""
+        return self._numbers is self._all
+
+    @takes_occasional.setter
+    def takes_occasional(self, takes: bool) -> None:
+        self._numbers = self._all if takes else self._usual
+        self._choose()
+
+    def _choose(self) -> None:
         # a guarded frame never takes the short way, so that the guard costs nothing where there is none
-        self._number_of = self._numbers.get if guard is None else _NO_NUMBERS.get
+        self._number_of = self._numbers.get if self._guard is None else _NO_NUMBERS.get
 
     def receive(self, data: bytes, *, final: bool = False) -> list[Frame]:
         """Take bytes from the link; give the frames that are complete now, in order.
@@ -258,6 +280,25 @@ def enum_word(enum: str, number: int) -> str:
     )
 
 
+def _by_id_bytes(ids: Collection[int]) -> dict[bytes, int]:
+    """Message ids by their three bytes in a header of MAVLink 2."""
+    return {number.to_bytes(3, "little"): number for number in ids}
+
+
+def _boot_clock_offsets() -> dict[int, int]:
+    """Where `time_boot_ms` lies in the payload, for each message in which its sender tells its own clock."""
+    offsets = {}
+    for number, message in dialect.mavlink_map.items():
+        names = message.ordered_fieldnames
+        if "time_boot_ms" not in names or "target_system" in names or number in _OTHER_CLOCKS:
+            continue
+        types = dict(zip(message.fieldnames, message.fieldtypes, strict=True))
+        before = names[: names.index("time_boot_ms")]
+        lengths = dict(zip(names, message.array_lengths, strict=True))
+        offsets[number] = sum(_SIZES[types[name]] * max(1, lengths[name]) for name in before)
+    return offsets
+
+
 def _frame_of(number: int, data: bytes) -> Frame:
     """The frame that stands in its bytes from the first one to the checksum."""
     if data[0] == _MAGIC_V2:
@@ -273,3 +314,25 @@ _CRC_EXTRA: dict[int, int] = _MISSING_EXTRA | {
     number: message.crc_extra for number, message in dialect.mavlink_map.items()
 }
 _EXTRA_BY_ID_BYTES = {number.to_bytes(3, "little"): bytes((extra,)) for number, extra in _CRC_EXTRA.items()}
+_SIZES = {
+    "char": 1,
+    "int8_t": 1,
+    "uint8_t": 1,
+    "uint8_t_mavlink_version": 1,
+    "int16_t": 2,
+    "uint16_t": 2,
+    "int32_t": 4,
+    "uint32_t": 4,
+    "float": 4,
+    "int64_t": 8,
+    "uint64_t": 8,
+    "double": 8,
+}
+_OTHER_CLOCKS = frozenset({251, 252, 254, 257, 263, 11060})
+"""Messages whose `time_boot_ms` is no clock of the sender at the moment of sending: NAMED_VALUE_FLOAT,
+NAMED_VALUE_INT, DEBUG and NAMED_VALUE_STRING have the time of an application, BUTTON_CHANGE and
+CAMERA_IMAGE_CAPTURED that of an earlier event, and are repeated."""
+
+BOOT_CLOCK_OFFSETS: Final = _boot_clock_offsets()
+"""By message id, where the four bytes of `time_boot_ms` begin in the payload. Messages with a target are
+requests to a vehicle, whose time is that of another program, and are left out. SYSTEM_TIME is among them."""

@@ -50,6 +50,7 @@ __all__ = [
     "ParamSet",
     "ParamValue",
     "SetupSigning",
+    "SYSTEM_TIME_ID",
     "StatusText",
     "SystemTime",
 ]
@@ -76,6 +77,7 @@ MAV_MODE_FLAG_SAFETY_ARMED: Final = 128
 MAV_STATE_BOOT: Final = 1
 MAV_STATE_ACTIVE: Final = 4
 HEARTBEAT_ID: Final = 0
+SYSTEM_TIME_ID: Final = 2
 PARAM_VALUE_ID: Final = 22
 AUTOPILOT_VERSION_ID: Final = 148
 COMPONENT_METADATA_ID: Final = 397
