@@ -72,6 +72,7 @@ async def run(px4: PX4Vehicle, url: str, cache: Path) -> bool:
         console.print(f"   equal to the vehicle's own table: {'yes' if is_equal else 'NO'}\n")
 
         console.print("[bold]3. One set[/bold], confirmed by the value that the vehicle reports")
+        vehicle = await client.only_component()
         meter.reset()
         done = await vehicle.set(NAME, WANTED)
         meter.lap("one set, confirmed")

@@ -17,7 +17,7 @@ from paramclient import ParamCache, ParamClient
 async def visit(link: str) -> str:
     """Fetch everything; give the name under which the cache keeps the vehicle."""
     async with ParamClient(link) as client:
-        vehicle = await client.component()
+        vehicle = await client.only_component()
         print("visit:", await vehicle.fetch_all())
         if link == "sim:px4":  # leave a trace in the history; a real vehicle is only looked at
             await vehicle.set("MC_ROLL_P", 7.0)

@@ -15,7 +15,7 @@ EXAMPLES = ["MC_ROLL_P", "7.0", "COM_DISARM_LAND", "3", "SYS_AUTOSTART", "1.5", 
 
 async def main(link: str, pairs: list[str]) -> None:
     async with ParamClient(link) as client:
-        vehicle = await client.component()
+        vehicle = await client.only_component()
         for name, text in zip(pairs[::2], pairs[1::2], strict=True):
             try:
                 done = await vehicle.set(name, int(text) if text.lstrip("-").isdecimal() else float(text))

@@ -31,7 +31,7 @@ FILE = Path(__file__).parent / "parameters/px4/quad.params"
 async def main(link: str, file: Path) -> bool:
     wanted = read_file(file).choose()
     async with ParamClient(link) as client:
-        vehicle = await client.component()
+        vehicle = await client.only_component()
         if vehicle.autopilot != "px4":
             raise UsageError(f"this is for px4, and the vehicle is {vehicle.autopilot}")
         if not await show(vehicle, wanted):

@@ -25,7 +25,7 @@ INDOOR = {"MPC_XY_VEL_MAX": 2.0, "MPC_Z_VEL_MAX_UP": 1.0, "COM_RC_IN_MODE": 1}
 async def prepare_for_indoors(link: str | Link | Endpoint) -> list[str]:
     """Limit a PX4 vehicle's speed; give the names of the parameters that had to be changed."""
     async with ParamClient(link) as client:
-        vehicle = await client.component()
+        vehicle = await client.only_component()
         if vehicle.autopilot != "px4":
             raise ValueError(f"this is for px4, and the vehicle is {vehicle.autopilot}")
         changed = []

@@ -1,4 +1,6 @@
-"""The cache file, damaged in any way: only CacheError comes, nothing is lost, and nothing wrong is believed.
+"""The cache file, damaged in any way: nothing is lost, and nothing wrong is believed.
+
+Only CacheError comes, or UnknownVehicle where a file that was set aside had the vehicle.
 
 The input says what is changed in a file that was written before; a whole file would leave the fuzzer with
 nothing but bytes that SQLite refuses at once. What is left of the input changes the bytes of a table, under a
@@ -22,7 +24,7 @@ from fuzz.draw import Draw
 from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
 from paramclient.cache.packed import pack, row_checksum, unpack
 from paramclient.cache.rows import Damaged
-from paramclient.errors import CacheError
+from paramclient.errors import CacheError, UnknownVehicle
 from paramclient.identity import Identity
 from paramclient.values import Param, ParamType, Trust
 
@@ -54,7 +56,7 @@ def _run_file(content: bytes) -> None:
         path = Path(folder) / "cache.sqlite3"
         path.write_bytes(content)
         # each damaged file is worth a warning
-        with suppress(CacheError), mock.patch.object(logger, "disabled", True):
+        with suppress(CacheError, UnknownVehicle), mock.patch.object(logger, "disabled", True):
             _use(path)
         files = [
             each for each in Path(folder).iterdir() if not each.name.endswith(("-wal", "-shm", "-journal"))

@@ -289,6 +289,17 @@ class Carrier:
         """Notice that this computer has slept, or that nothing was done here."""
         self._look_at_the_clock(anyio.current_time())
 
+    async def read_up(self, due: float) -> None:
+        """Wait until what had come by now was read, where the reader is behind or this call is late.
+
+        Args:
+            due: when the caller was to go on.
+        """
+        now = anyio.current_time()
+        while now - due > HELD_UP or self._is_behind(now):
+            await anyio.sleep(READING_TIME)
+            now, due = anyio.current_time(), math.inf
+
     def fail_for_good(self, error: LinkError) -> None:
         """No call can be answered any more."""
         self.ended = error

@@ -21,7 +21,7 @@ from paramclient.errors import ClientClosed, LinkError, NoReply, UsageError
 from paramclient.events import Events, told
 from paramclient.ftp import Ftp
 from paramclient.identity import Identity
-from paramclient.links import Link, ReplayLink, create_link
+from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.links.names import names_service
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import (
@@ -39,6 +39,7 @@ from paramclient.protocol.station import Address, Station
 from paramclient.protocol.succession import SEARCH_PACE, Succession
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.traffic import TrafficReport
+from paramclient.protocol.vehicle_choice import LOOK_TIME, VehicleChoice
 from paramclient.protocol.wire import SigningKey, SigningReport
 from paramclient.signing import Signing, refused_in_words
 from paramclient.stats import ClientStats
@@ -250,7 +251,7 @@ class ParamClient:
         tasks = anyio.create_task_group()
         await tasks.__aenter__()
         self._tasks = tasks
-        self._opened_at = anyio.current_time()
+        self._opened_at = self._station.listening_since = anyio.current_time()
         tasks.start_soon(self._carrier.read, name="paramclient reader")
         tasks.start_soon(self._carrier.send, name="paramclient sender")
         tasks.start_soon(self._writer.run, name="paramclient cache writer")
@@ -329,8 +330,9 @@ class ParamClient:
         """The component with this address, as soon as it has been heard.
 
         Without arguments the first autopilot; with a system alone, that system's autopilot; with a component
-        alone, the first of that id. If the cache may have its table, it is in `params` on return, unless the
-        vehicle does not say who it is.
+        alone, the first of that id. Which one is the first is a matter of chance where there are several:
+        programs that write use `only_component`. If the cache may have its table, it is in `params` on
+        return, unless the vehicle does not say who it is.
 
         Args:
             system: system id.
@@ -354,6 +356,62 @@ class ParamClient:
             wanted = address_in_words(system, component) + refused_in_words(self.signing_report())
             raise NoReply(wanted, attempts=0, waited=waited)
         return found
+
+    async def only_component(
+        self,
+        system: int | None = None,
+        component: int | None = None,
+        *,
+        timeout: float | None = HEARING_PATIENCE,
+    ) -> Component:
+        """Return the component with this address if no other vehicle can be meant; for programs that write.
+
+        Without arguments it is the only autopilot on the link; with a component alone, the component of that
+        id of the only vehicle. For `LOOK_TIME` (1.2 s) from the first autopilot heard on, a second one is
+        looked for: every autopilot sends a heartbeat once a second. With a system alone it is that system's
+        autopilot, component 1 where that is one; with both, that component. Neither takes longer than
+        `component`. A vehicle that is lost is not there. Nothing is sent but what identifies vehicles.
+
+        The call takes no time where a second autopilot would have been heard already. So a program that did
+        something else since can make sure by another call, directly before it writes.
+
+        Args:
+            system: system id.
+            component: component id.
+            timeout: seconds for everything; None waits for ever.
+
+        Raises:
+            AmbiguousVehicle: several vehicles are on the link, or the only one has several autopilots.
+                `vehicles` and the text list them.
+            NoReply: it was not heard in time, or not for long enough to see that it is the only one.
+            LinkError: the link failed, or the client was closed.
+        """
+        if self._has_one_vehicle:
+            return await self.component(system, component, timeout=timeout)
+        self._check_open()
+        began = anyio.current_time()
+        choice = VehicleChoice(system, component)
+        station = self._station
+        machine = None
+        with anyio.move_on_after(timeout):
+            while True:
+                news, now = self._carrier.news, anyio.current_time()
+                since = station.listening_since
+                machine = choice.look(station.components.values(), now, listening_since=since)
+                if machine is not None or station.is_over:
+                    break
+                with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
+                    await news.wait()
+                await self._carrier.read_up(choice.due)
+                self._check_open()
+            if machine is not None:
+                await self._components[machine.system, machine.component]._wait_for_cache()
+        if machine is not None:
+            return self._components[machine.system, machine.component]
+        wanted = address_in_words(system, component) + refused_in_words(self.signing_report())
+        if choice.due < math.inf:
+            wanted += f", and {LOOK_TIME} s more to see that it is the only one"
+        raise NoReply(wanted, attempts=0, waited=anyio.current_time() - began)
 
     async def successor(
         self, component: Component, system: int, *, timeout: float | None = HEARING_PATIENCE
@@ -581,6 +639,11 @@ class ParamClient:
             machine.files.on_closed.append(closed.set)
             self._wake(machine)
             await closed.wait()
+
+    @property
+    def _has_one_vehicle(self) -> bool:
+        """Whether no vehicle can be taken for another: there is one, or none is written to."""
+        return self.listens_only or (isinstance(self._link, SimLink) and self._link.has_one_vehicle)
 
     def _find(self, system: int | None, component: int | None) -> Component | None:
         found = self._station.find(system, component)

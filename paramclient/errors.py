@@ -217,12 +217,21 @@ class AmbiguousVehicle(UsageError):
     """Several vehicles fit, on the link or in the cache, and none of them was chosen. Nothing was done.
 
     Attributes:
-        vehicles: the vehicles that fit, in words.
+        vehicles: the vehicles that fit, in words: `1/1 PX4 quadrotor` on a link.
+        choose_by: the argument that chooses one of them, "system" or "component"; "link" where only the link
+            of a service tells them apart; "" for vehicles in the cache, which have keys.
+        summary: the text of the error without what to do next.
     """
 
-    def __init__(self, message: str, *, vehicles: Sequence[str]) -> None:
-        super().__init__(message)
+    def __init__(self, message: str, *, vehicles: Sequence[str], choose_by: str = "") -> None:
+        ways = {
+            "": "",
+            "link": " Name its link in the address of the service: http://HOST:PORT?link=NAME.",
+        }
+        super().__init__(message + ways.get(choose_by, f" Choose one with the argument {choose_by}."))
         self.vehicles = tuple(vehicles)
+        self.choose_by = choose_by
+        self.summary = message
 
 
 class VehicleError(ParamClientError):

@@ -7,12 +7,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NoReturn, TypeAlias
 
+import anyio
+import anyio.to_thread
 import pytest
 
 from paramclient import ParamClient
 from paramclient.cli import run, session
 from paramclient.links import SimLink
 from paramclient.sim import Endpoint
+from paramclient.worker import Worker
+from tests.shell import SwiftLoop, swift_loop
 
 
 def strict(text: str) -> Any:
@@ -79,3 +83,25 @@ def behind(monkeypatch: pytest.MonkeyPatch, url: str) -> Put:
         return url
 
     return place
+
+
+def leaping(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs commands on a loop whose clock leaps: what they wait for takes no time."""
+    in_worker, in_thread = Worker.run, anyio.to_thread.run_sync
+
+    def waits(call: Callable[..., Any]) -> Callable[..., Any]:
+        async def counted(*arguments: Any, **options: Any) -> Any:
+            swift_loop().threads += 1
+            try:
+                return await call(*arguments, **options)
+            finally:
+                swift_loop().threads -= 1
+
+        return counted
+
+    really_run = anyio.run
+    monkeypatch.setattr(Worker, "run", waits(in_worker))
+    monkeypatch.setattr(anyio.to_thread, "run_sync", waits(in_thread))
+    monkeypatch.setattr(
+        anyio, "run", lambda *call: really_run(*call, backend_options={"loop_factory": SwiftLoop})
+    )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import functools
+import math
 import selectors
 import time
 from collections.abc import Awaitable, Callable, Collection, Coroutine, Mapping
@@ -199,6 +200,42 @@ class Tap:
     def data_to_send(self) -> list[bytes]:
         data = self._endpoint.data_to_send()
         return [] if self.is_mute else data
+
+
+class Late:
+    """A vehicle that is switched on later than the link is opened, or was heard before and falls silent.
+
+    Args:
+        endpoint: the vehicle.
+        by: seconds from the opening of the link.
+        until: seconds after which it says nothing more.
+    """
+
+    def __init__(self, endpoint: Endpoint, by: float, until: float = math.inf) -> None:
+        self._endpoint = endpoint
+        self._by, self._until = by, until
+        self._on_at = self._off_at = math.inf  # known from the first tick on
+
+    def receive(self, data: bytes, now: float) -> None:
+        if self._on_at <= now < self._off_at:
+            self._endpoint.receive(data, now)
+
+    def tick(self, now: float) -> None:
+        if self._on_at == math.inf:
+            self._on_at, self._off_at = now + self._by, now + self._until
+        if now >= self._off_at:
+            self._on_at = self._off_at
+        elif now >= self._on_at:
+            self._endpoint.tick(now)
+
+    def next_deadline(self) -> float | None:
+        if self._on_at == self._off_at:
+            return None
+        deadline = self._endpoint.next_deadline()
+        return min(self._on_at if deadline is None else deadline, self._off_at)
+
+    def data_to_send(self) -> list[bytes]:
+        return self._endpoint.data_to_send()
 
 
 class Radio(Tap):

@@ -493,6 +493,47 @@ async def test_where_the_state_cannot_be_stored_nothing_is_sent(tmp_path: Path) 
     assert tap.messages(wire.ParamSet) == []
 
 
+@pytest.mark.parametrize("bring", [apply, restore])
+@swiftly
+async def test_before_anything_is_stored_or_written_the_caller_may_stop_it(
+    bring: Callable[..., Any], tmp_path: Path
+) -> None:
+    cache = ParamCache(tmp_path / "cache.sqlite3")
+    tap = Tap(ardupilot())
+    seen: list[int] = []
+
+    async def stop() -> None:
+        seen.append(len(component.params))
+        raise UsageError("not now")
+
+    async with ParamClient(tap, cache=cache) as client:
+        component = await client.component()
+        with pytest.raises(UsageError, match="not now"):
+            await bring(component, written(another()), before_writing=stop)
+        assert len(seen) == 1
+        assert seen[0] > len(SETTINGS), "it has been read"
+        assert not tap.messages(wire.ParamSet)
+        key = component.identity.key
+        await anyio.sleep(1.0)
+    assert cache.snapshots(key) == []
+
+
+@swiftly
+async def test_of_several_vehicles_each_may_be_stopped() -> None:
+    one, two = ardupilot(system=1), ardupilot(system=2)
+
+    async def stop(component: Component) -> None:
+        if component.system == 2:
+            raise UsageError("not this one")
+
+    async with a_client(Air([one, two])) as client:
+        both = [await client.component(system) for system in (1, 2)]
+        fleet = await apply_all(both, written(another("TUNE_01")), before_writing=stop)
+    assert fleet.results[1, 1].complete
+    assert str(fleet.errors[2, 1]) == "not this one"
+    assert (one.requests["PARAM_SET"], two.requests["PARAM_SET"]) == (1, 0)
+
+
 @swiftly
 async def test_progress_is_told() -> None:
     told: list[ApplyProgress] = []

@@ -16,6 +16,7 @@ import anyio.lowlevel
 import pytest
 
 from paramclient import (
+    AmbiguousVehicle,
     Change,
     ClientClosed,
     Component,
@@ -37,6 +38,7 @@ from paramclient import client as client_module
 from paramclient.errors import LinkError
 from paramclient.links import Link, create_link, serve_endpoint
 from paramclient.metadata import metadata_of
+from paramclient.protocol.vehicle_choice import LOOK_TIME
 from paramclient.provision import apply, prepare, restore, verify
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, Vehicle
 from tests.cable import PATIENCE, Cable
@@ -131,6 +133,20 @@ async def test_a_session_where_we_listen(ours: str) -> None:
         await tasks.start(serve, vehicle, create_link(there), scope)
         await everything(await client.component(), vehicle)
         scope.cancel()
+
+
+async def test_a_second_vehicle_is_looked_for() -> None:
+    async with beside() as tasks, a_client("udpin:127.0.0.1:0") as client:
+        there = f"udpout:127.0.0.1:{port_of(client.link)}"
+        began = anyio.current_time()
+        await tasks.start(serve_endpoint, generic(**QUICK), create_link(there))
+        assert (await client.only_component()).system == 1
+        assert anyio.current_time() - began >= LOOK_TIME
+        await tasks.start(serve_endpoint, generic(system=2, **QUICK), create_link(there))
+        await client.component(2)
+        with pytest.raises(AmbiguousVehicle, match="2 vehicles"):
+            await client.only_component()
+        assert (await client.only_component(2)).system == 2
 
 
 async def test_a_tcp_connection_that_drops_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,16 +12,13 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import anyio
 import pytest
 
 from paramclient import ParamCache, ParamType, read_file
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle
 from paramclient.sim.table import Entry
 from paramclient.values import Value
-from paramclient.worker import Worker
-from tests.commands import Command, Put, behind, in_process
-from tests.shell import SwiftLoop, swift_loop
+from tests.commands import Command, Put, behind, in_process, leaping
 
 TABLE: dict[str, Value | tuple[ParamType, Value]] = {
     "RTL_ALT": 1500,
@@ -48,24 +45,7 @@ def cache(tmp_path: Path) -> Path:
 @pytest.fixture
 def in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
     """Runs commands on a loop whose clock leaps: what they wait for takes no time."""
-    in_worker, in_thread = Worker.run, anyio.to_thread.run_sync
-
-    def waits(call: Callable[..., Any]) -> Callable[..., Any]:
-        async def counted(*arguments: Any, **options: Any) -> Any:
-            swift_loop().threads += 1
-            try:
-                return await call(*arguments, **options)
-            finally:
-                swift_loop().threads -= 1
-
-        return counted
-
-    really_run = anyio.run
-    monkeypatch.setattr(Worker, "run", waits(in_worker))
-    monkeypatch.setattr(anyio.to_thread, "run_sync", waits(in_thread))
-    monkeypatch.setattr(
-        anyio, "run", lambda *call: really_run(*call, backend_options={"loop_factory": SwiftLoop})
-    )
+    leaping(monkeypatch)
 
 
 @pytest.fixture

@@ -13,7 +13,7 @@ from paramclient import ParamClient
 
 async def main(service: str, name: str, value: float) -> None:
     async with ParamClient(service) as client:
-        vehicle = await client.component(timeout=30)
+        vehicle = await client.only_component(timeout=30)
         result = await vehicle.fetch_all()
         print(f"{result.received} parameters, {len(result.missing)} missing")
         changes = vehicle.changes()

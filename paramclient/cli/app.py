@@ -15,7 +15,7 @@ from typing import Final
 import anyio
 from cyclopts import App, CycloptsError, Parameter
 
-from paramclient.cli.outcome import ExitCode, code_of
+from paramclient.cli.outcome import ExitCode, code_of, text_of
 from paramclient.cli.output import printable, report, say
 from paramclient.errors import ParamClientError
 from paramclient.version import __version__
@@ -45,7 +45,7 @@ def run(arguments: Sequence[str]) -> int:
             report(str(error))
             return ExitCode.USAGE
         except ParamClientError as error:
-            report(str(error))
+            report(text_of(error))
             return code_of(error)
         except BrokenPipeError:
             raise

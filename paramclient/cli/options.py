@@ -103,7 +103,7 @@ class LinkOptions(SigningOptions):
     """Print JSON, for programs."""
 
     system: Id = None
-    """The system to speak to, 1 to 255. Without it, the first one that is heard."""
+    """The system to speak to, 1 to 255. Without it, the first one heard; the only one, for what writes."""
 
     component: Id = None
     """The component to speak to, 1 to 255. Without it, the autopilot."""

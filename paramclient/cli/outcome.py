@@ -6,6 +6,7 @@ from enum import IntEnum
 from typing import Final
 
 from paramclient.errors import (
+    AmbiguousVehicle,
     AnotherVehicle,
     CacheError,
     FileTransferError,
@@ -22,7 +23,7 @@ from paramclient.errors import (
     VehicleError,
 )
 
-__all__ = ["ExitCode", "code_of", "status_of"]
+__all__ = ["ExitCode", "code_of", "status_of", "text_of"]
 
 
 class ExitCode(IntEnum):
@@ -44,6 +45,13 @@ class ExitCode(IntEnum):
 def code_of(error: ParamClientError) -> ExitCode:
     """The exit code for an error."""
     return next(code for kind, code in _CODES.items() if isinstance(error, kind))
+
+
+def text_of(error: ParamClientError) -> str:
+    """The text of an error for users of the command, who choose by options in the place of arguments."""
+    if isinstance(error, AmbiguousVehicle) and error.choose_by in ("system", "component"):
+        return f"{error.summary} Choose one with --{error.choose_by}."
+    return str(error)
 
 
 def status_of(error: ParamClientError) -> str:

@@ -14,7 +14,7 @@ import anyio
 from paramclient.cli.options import LinkOptions
 from paramclient.client import ParamClient
 from paramclient.component import Component
-from paramclient.errors import UsageError
+from paramclient.errors import AmbiguousVehicle, UsageError
 from paramclient.links import LinkKind, ReplayLink, parse_link
 from paramclient.links.names import names_service
 from paramclient.protocol.result import Policy
@@ -24,6 +24,9 @@ __all__ = ["Deadline", "Session", "connect", "listen"]
 
 HEARING_PATIENCE: Final = 10.0
 """Seconds for a vehicle to be heard, where the user sets no limit."""
+CHECKING_PATIENCE: Final = 2.5
+"""Seconds for a vehicle to be seen to be still the only one: it is known, unless it was lost or its link was
+away, and then it takes as long as before."""
 
 
 class Deadline:
@@ -51,6 +54,7 @@ class Session:
     client: ParamClient
     component: Component
     deadline: Deadline
+    options: LinkOptions
 
     @property
     def now(self) -> float:
@@ -65,17 +69,50 @@ class Session:
         component = self.component
         return f"{component.system}/{component.component} {component.autopilot}"
 
+    async def check_only(self) -> None:
+        """Check that the component is still the only one that the options can mean.
+
+        For commands that write, directly before they do: vehicles may come and go while others are read.
+
+        Raises:
+            AmbiguousVehicle: another vehicle is there, beside it or in its place.
+            NoReply: no vehicle is there any more.
+            LinkError: the link failed.
+        """
+        options, component = self.options, self.component
+        patience = self.deadline.left(CHECKING_PATIENCE)
+        found = await self.client.only_component(options.system, options.component, timeout=patience)
+        if found is not component:
+            heard = f"{found.system}/{found.component} {found.autopilot}"
+            raise AmbiguousVehicle(
+                f"{self.who} was chosen and is not heard any more, {heard} is. Nothing was written.",
+                vehicles=(self.who, heard),
+                choose_by="system" if found.system != component.system else "component",
+            )
+
 
 @asynccontextmanager
 async def connect(
-    url: str, options: LinkOptions, *, policy: Policy = Policy.AUTO, is_live: bool = False
+    url: str,
+    options: LinkOptions,
+    *,
+    policy: Policy = Policy.AUTO,
+    is_live: bool = False,
+    only: bool = False,
 ) -> AsyncIterator[Session]:
     """Open a link and wait for the component that the options name.
 
     A log is read as fast as it goes, unless its name says otherwise or somebody looks on live.
 
+    Args:
+        url: the link.
+        options: which component, and how to reach it.
+        policy, is_live: see `ParamClient` and above.
+        only: whether several vehicles are an error, unless the options name one: for commands that write.
+
     Raises:
         UsageError: no such link, or options that exclude each other.
+        AmbiguousVehicle: with `only`, several vehicles were heard.
         NoReply: the component was not heard.
         LinkError: the link cannot be opened, or failed.
     """
@@ -91,8 +128,9 @@ async def connect(
         signing=options.signing,
     ) as client:
         patience = HEARING_PATIENCE if options.timeout is None else deadline.left()
-        component = await client.component(options.system, options.component, timeout=patience)
-        yield Session(client, component, deadline)
+        find = client.only_component if only else client.component
+        component = await find(options.system, options.component, timeout=patience)
+        yield Session(client, component, deadline, options)
 
 
 def listen(

@@ -6,6 +6,7 @@ import sys
 import time
 from collections.abc import Awaitable, Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Final, TypeAlias, TypeVar
 
@@ -33,7 +34,6 @@ from paramclient.cli.results import (
     show_verified,
     verified_doc,
 )
-from paramclient.cli.session import Session
 from paramclient.cli.sources import is_file, open_file
 from paramclient.cli.targets import (
     Address,
@@ -100,7 +100,8 @@ async def apply(
 
     What it had before is kept in the cache, for `restore`. On a terminal it is shown what will be set, and
     asked. Exit code 0 says that the vehicle has all of it, 1 that something is not as the file says. Ended
-    in the middle, the same call goes on from what the vehicle has.
+    in the middle, the same call goes on from what the vehicle has. Where several vehicles are heard, --system
+    has to choose one, or --all takes all.
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, or sim:ardupilot for a simulated vehicle.
@@ -125,9 +126,9 @@ async def apply(
     check_pattern("--overlay", over, everybody=everybody)
     check_pattern("--backup", backup, everybody=everybody)
     chosen = from_file(metadata)
-    values = Source(source, over, options)
+    values = Source(source, over, options, only=True)
     await values.open()
-    async with targets(url, options, everybody=everybody, expect=expect) as found:
+    async with targets(url, options, everybody=everybody, expect=expect, only=True) as found:
         wanted = await values.wanted(found.vehicles)
         info = await _described(found, metadata, chosen)
         backups = await _backups(backup, found.vehicles)
@@ -158,6 +159,7 @@ async def apply(
                 backup=None if backup is None else lambda each: backups[each.system, each.component],
                 timeout=found.deadline.left(),
                 progress=tell,
+                before_writing=lambda _: found.check_only(),
             )
         return show.applied(show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors))
 
@@ -193,9 +195,9 @@ async def verify(
     """
     check_pattern("--overlay", over, everybody=everybody)
     chosen = from_file(metadata)
-    values = Source(source, over, options)
+    values = Source(source, over, options, only=False)
     await values.open()
-    async with targets(url, options, everybody=everybody, expect=expect) as found:
+    async with targets(url, options, everybody=everybody, expect=expect, only=False) as found:
         wanted = await values.wanted(found.vehicles)
         info = await _described(found, metadata, chosen)
         show = _Show(found, as_json=options.json, is_fleet=everybody, full=full)
@@ -236,7 +238,7 @@ async def restore(
         full: Print also what is as it should be, or left out.
         yes: Do not ask.
     """
-    async with targets(url, options, everybody=False, expect=None) as found:
+    async with targets(url, options, everybody=False, expect=None, only=True) as found:
         [vehicle] = found.vehicles
         state = await _state(found, vehicle, when, options)
         say(printable(f"the state: {described(state)}"))
@@ -267,6 +269,7 @@ async def restore(
                 backup=backups.get(address),
                 timeout=found.deadline.left(),
                 progress=lambda how_far: tell(vehicle, how_far),
+                before_writing=found.check_only,
             )
         return show.applied(show.by_vehicle({address: result}), {})
 
@@ -303,7 +306,7 @@ async def _described(
     """What is known of each vehicle's parameters."""
     known = {
         (each.system, each.component): chosen
-        or await known_of_session(Session(found.client, each, found.deadline), choice)
+        or await known_of_session(replace(found.session, component=each), choice)
         for each in found.vehicles
     }
     return lambda component: known[component.system, component.component]

@@ -37,7 +37,7 @@ class VehicleOptions(KeyOptions):
     """Nobody else can listen on this link: a USB cable, a wire. Without it, you are asked."""
 
     system: Id = None
-    """The system to speak to, 1 to 255. Without it, the first one that is heard."""
+    """The system to speak to, 1 to 255. Without it, the only one that is heard."""
 
     component: Id = None
     """The component to speak to, 1 to 255. Without it, the autopilot."""
@@ -146,7 +146,7 @@ async def _send(
     signing = None if present is None else Signing(present, SigningPolicy.ACCEPT_ALL)
     async with ParamClient(link, cache=False, signing=signing) as client:
         patience = HEARING_PATIENCE if options.timeout is None else deadline.left()
-        vehicle = await client.component(options.system, options.component, timeout=patience)
+        vehicle = await client.only_component(options.system, options.component, timeout=patience)
         await vehicle.setup_signing(key, link_is_safe=True)
         return vehicle.system, vehicle.component
 

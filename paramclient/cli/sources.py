@@ -55,13 +55,15 @@ SOURCES: Final = f"""\
 _CACHED: Final = "cache:"
 
 
-async def resolve(text: str, options: LinkOptions) -> ParamSet:
+async def resolve(text: str, options: LinkOptions, *, only: bool = False) -> ParamSet:
     """The parameters that a user's word stands for: of a file, of a vehicle in the cache, or of a link.
 
     A link is opened and its whole table fetched, from the cache where the vehicle's hash confirms that.
 
     Args:
         text: see the top of this room.
+        only: whether several vehicles on the link are an error, unless the options name one: for values that
+            will be written.
         options: `component` chooses in all three (without it the autopilot, or the only one there is);
             `system`, `timeout` and `encoding` are for links.
 
@@ -69,17 +71,17 @@ async def resolve(text: str, options: LinkOptions) -> ParamSet:
         UsageError: it is none of the three; a file that cannot be read (FileError); options that exclude
             each other.
         UnknownVehicle: the cache has no such vehicle or component.
-        AmbiguousVehicle: several vehicles in the cache have this name.
+        AmbiguousVehicle: several vehicles in the cache have this name; with `only`, several are on the link.
         CacheError: the cache does not have its whole table.
         VehicleError: some parameters did not come; the text names them.
         NoReply: nobody was heard, or answered.
         LinkError: the link cannot be opened, or failed.
     """
-    (params,) = await resolve_all([text], options)
+    (params,) = await resolve_all([text], options, only=only)
     return params
 
 
-async def resolve_all(texts: Sequence[str], options: LinkOptions) -> list[ParamSet]:
+async def resolve_all(texts: Sequence[str], options: LinkOptions, *, only: bool = False) -> list[ParamSet]:
     """As `resolve`, for several: links side by side, and not before all the others are at hand.
 
     A text that is given twice is resolved once. The first error ends all.
@@ -98,7 +100,7 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions) -> list[ParamS
 
     async def fetch(url: str) -> None:
         try:
-            found[url] = await _from_link(url, options, is_alone=len(links) == 1)
+            found[url] = await _from_link(url, options, is_alone=len(links) == 1, only=only)
         except Exception as error:  # out of the group it would come wrapped
             errors.append(error)
             tasks.cancel_scope.cancel()
@@ -216,9 +218,9 @@ def _from_cache(vehicle: str, options: LinkOptions) -> ParamSet:
         return cached_set(cache, table.key, table.component)
 
 
-async def _from_link(url: str, options: LinkOptions, *, is_alone: bool) -> ParamSet:
+async def _from_link(url: str, options: LinkOptions, *, is_alone: bool, only: bool) -> ParamSet:
     """The whole table of a component; progress is drawn for a link that is alone, as two would mingle."""
-    async with connect(url, options) as session:
+    async with connect(url, options, only=only) as session:
         component, deadline = session.component, session.deadline
         link = session.client.link.name
         with progress_bar(f"fetching {session.who}") if is_alone else nullcontext() as progress:

@@ -11,7 +11,7 @@ from typing import Final, TypeAlias
 import anyio
 
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.session import HEARING_PATIENCE, Deadline, connect
+from paramclient.cli.session import HEARING_PATIENCE, Deadline, Session, connect
 from paramclient.cli.sources import choose, is_file, open_file, resolve
 from paramclient.client import ParamClient
 from paramclient.component import Component
@@ -36,19 +36,42 @@ PLACES: Final = ("{uid}", "{system}")
 class Targets:
     """An open client, and the vehicles that the command is about."""
 
-    client: ParamClient
+    session: Session
     vehicles: list[Component]
-    deadline: Deadline
+    everybody: bool
+
+    @property
+    def client(self) -> ParamClient:
+        """The client."""
+        return self.session.client
+
+    @property
+    def deadline(self) -> Deadline:
+        """The moment at which everything is to be over."""
+        return self.session.deadline
+
+    async def check_only(self) -> None:
+        """See `Session.check_only`; with `everybody` every vehicle is named."""
+        if not self.everybody:
+            await self.session.check_only()
 
 
 @asynccontextmanager
 async def targets(
-    url: str, options: LinkOptions, *, everybody: bool, expect: int | None
+    url: str, options: LinkOptions, *, everybody: bool, expect: int | None, only: bool
 ) -> AsyncIterator[Targets]:
     """Open a link and wait for the vehicle that the options name, or listen for all that are there.
 
+    Args:
+        url: the link.
+        options: which vehicle.
+        everybody: all of them.
+        expect: how many are waited for.
+        only: as in `connect`: for commands that write. With `everybody` every vehicle is named.
+
     Raises:
         UsageError: no such link, or options that exclude each other.
+        AmbiguousVehicle: with `only`, several vehicles were heard, and none is named.
         NoReply: nobody was heard, or fewer than expected.
         LinkError: the link cannot be opened, or failed.
     """
@@ -56,11 +79,11 @@ async def targets(
         raise UsageError("--all and --system exclude each other")
     if expect is not None and not everybody:
         raise UsageError("--expect goes with --all")
-    async with connect(url, options) as session:
+    async with connect(url, options, only=only and not everybody) as session:
         vehicles = [session.component]
         if everybody:
             vehicles = await _all_heard(session.client, options.component, expect, session.deadline)
-        yield Targets(session.client, vehicles, session.deadline)
+        yield Targets(session, vehicles, everybody)
 
 
 class Source:
@@ -70,12 +93,14 @@ class Source:
         text: a file, or another source of parameters (see `paramclient.cli.sources`).
         over: the name of a file that lies over it, with `{uid}` or `{system}` for the vehicle's own; or None.
         options: `component` chooses in files.
+        only: as in `connect`, where it is a link: its values will be written.
     """
 
-    def __init__(self, text: str, over: str | None, options: LinkOptions) -> None:
+    def __init__(self, text: str, over: str | None, options: LinkOptions, *, only: bool) -> None:
         self._text = text
         self._over = over
         self._options = options
+        self._only = only
         self._file: ParamFile | None = None
         self._set: ParamSet | None = None
 
@@ -88,7 +113,7 @@ class Source:
         if is_file(self._text):
             self._file = open_file(self._text)
         else:
-            self._set = await resolve(self._text, self._options)
+            self._set = await resolve(self._text, self._options, only=self._only)
 
     async def wanted(self, vehicles: list[Component]) -> dict[Address, ParamSet]:
         """What each of them shall have, by address.

@@ -169,7 +169,8 @@ async def set_(
 
     A value is a decimal number, a hexadecimal one (0x1F), nan or inf. Written as NAME=VALUE it may also be
     the name of a value, or names of bits with | between them, where the parameter is described: the vehicle
-    is asked for that, unless --metadata names a file. All are tried even if one is refused.
+    is asked for that, unless --metadata names a file. All are tried even if one is refused. Where several
+    vehicles are heard, --system has to choose one.
 
     Args:
         url: The link.
@@ -183,13 +184,14 @@ async def set_(
     described = from_file(metadata)
     if described is not None:
         wanted = [*resolved(wanted, described)]
-    async with connect(url, options) as session:
+    async with connect(url, options, only=True) as session:
         if described is None:
             has_names = any(isinstance(value, str) for _, value in wanted)
             described = await known_of_session(session, metadata, must=has_names)
         writes = resolved(wanted, described)
         for problem in problems(writes, described):
             report(problem)
+        await session.check_only()
         began = anyio.current_time()
         outcomes = [await _write(session, name, value, force=force) for name, value in writes]
         if settle:

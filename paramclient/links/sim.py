@@ -48,6 +48,11 @@ class SimLink:
     def __repr__(self) -> str:
         return f"<{type(self).__name__} {self.name} {'closed' if self._wake is None else 'open'}>"
 
+    @property
+    def has_one_vehicle(self) -> bool:
+        """Whether it is certain that there is one vehicle at the far end, and no second one to look for."""
+        return getattr(self.endpoint, "vehicle_count", None) == 1
+
     async def open(self) -> None:
         """See `Link.open`; switches the vehicle on."""
         await anyio.lowlevel.checkpoint()

@@ -613,6 +613,8 @@ class ComponentMachine(Parts):
     def _was_silent(self, silence: float, now: float) -> None:
         """It is heard again. After a while, who it is and its hash are asked for before anything counts."""
         presence = self.presence
+        if presence.is_lost or silence == math.inf:
+            presence.since = now
         if presence.is_lost:
             presence.is_lost = False
             self.reads.forgive()  # the silence of before says nothing of it

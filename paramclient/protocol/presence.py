@@ -53,6 +53,7 @@ class Presence:
         heard_at: when anything came from it last.
         clock_at: when a message told its time since boot last; minus infinity before one did.
         is_lost: whether it has been silent for too long since.
+        since: when it was heard first, or again after it was lost.
         state: MAV_STATE of the last heartbeat; None before one came.
         is_high_latency: whether it said so: HIGH_LATENCY2 came, and no heartbeat since.
     """
@@ -72,12 +73,14 @@ class Presence:
         "heard_at",
         "is_high_latency",
         "is_lost",
+        "since",
         "state",
     )
 
     def __init__(self) -> None:
         self.heard_at = -math.inf
         self.is_lost = False
+        self.since = math.inf
         self.is_high_latency = False
         self.gap = BEATS_IN_A_GAP * USUAL_INTERVAL
         self.beat_at = -math.inf

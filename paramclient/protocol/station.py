@@ -112,6 +112,8 @@ class Station:
         traffic: the counts, or None where they are not wanted.
         policy: what may be asked to bring tables up to date.
         listens_only: whether nothing is ever sent.
+        listening_since: since when everything on the link is received, without an absence of the link or of
+            this program; infinity while the link is away.
         is_log: whether the link is a log, which ends: then no time-out means anything, and nobody is lost.
         is_over: whether nothing more will come, as at the end of a log.
         verifier: looks at signatures; None where there is no key, and they count for nothing.
@@ -134,6 +136,7 @@ class Station:
         self.listens_only = upkeep is not None and upkeep.listens_only
         self.is_log = upkeep is not None and upkeep.is_log
         self.is_over = False
+        self.listening_since = -math.inf
         self.own: Address = NOBODY if self.listens_only else (system, component)
         self.components: dict[Address, ComponentMachine] = {}
         self.bytes_received = 0
@@ -305,6 +308,7 @@ class Station:
     def pause(self) -> None:
         """The link is away: time stands still for whatever waits."""
         self._is_paused = True
+        self.listening_since = math.inf
         self._outbox.clear()
         for peer in list(self._framers):
             self._retire(peer)
@@ -315,6 +319,7 @@ class Station:
     def resume(self, now: float) -> None:
         """The link is back: our heartbeat goes out, and whatever waits is asked for again."""
         self._is_paused = False
+        self.listening_since = now
         if not self.listens_only:
             self._heartbeat_at = now
         self._turns.resume(now)

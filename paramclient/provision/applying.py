@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Awaitable, Callable, Iterable, Mapping
 from typing import Final
 
 import anyio
@@ -41,6 +41,7 @@ async def apply(
     timeout: float | None = None,
     asker: str | None = None,
     progress: Callable[[ApplyProgress], None] | None = None,
+    before_writing: Callable[[], Awaitable[object]] | None = None,
 ) -> ApplyResult:
     """Bring a vehicle to the wanted values, and prove each of them by reading it back at the end.
 
@@ -70,6 +71,8 @@ async def apply(
         timeout: seconds, after which the result says how far it came.
         asker: for whom it is done, as in `Component.set`.
         progress: called after each value and when a phase begins; it must not raise.
+        before_writing: awaited once, when the vehicle has been read, and before its state is stored and the
+            first value is written; what it raises ends the call.
 
     Raises:
         InvalidParameters: values cannot be right, and `skip_invalid` is not given.
@@ -92,6 +95,7 @@ async def apply(
         backup=backup,
         asker=asker,
         progress=progress,
+        before_writing=before_writing,
         reason=BEFORE_APPLY,
     )
     return await _done(run, timeout)
@@ -110,6 +114,7 @@ async def restore(
     timeout: float | None = None,
     asker: str | None = None,
     progress: Callable[[ApplyProgress], None] | None = None,
+    before_writing: Callable[[], Awaitable[object]] | None = None,
 ) -> ApplyResult:
     """Bring an earlier state of a vehicle back: `apply`, with its own identity and calibration included.
 
@@ -119,7 +124,8 @@ async def restore(
         component: the vehicle.
         state: what it had, such as a snapshot, or the file of a backup. If it does not say that it is this
             vehicle's own, identity and calibration are left out.
-        include, info, reboot, allow_armed, force, backup, timeout, asker, progress: as in `apply`.
+        include, info, reboot, allow_armed, force, backup, timeout, asker, progress, before_writing: as in
+            `apply`.
 
     Raises:
         UsageError: it is the state of another vehicle.
@@ -138,6 +144,7 @@ async def restore(
         backup=backup,
         asker=asker,
         progress=progress,
+        before_writing=before_writing,
         reason=BEFORE_RESTORE,
     )
     return await _done(run, timeout)

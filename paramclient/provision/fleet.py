@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Awaitable, Callable, Iterable, Mapping
+from functools import partial
 from typing import TypeAlias, TypeVar
 
 import anyio
@@ -38,6 +39,7 @@ async def apply_all(
     timeout: float | None = None,
     asker: str | None = None,
     progress: Callable[[Component, ApplyProgress], None] | None = None,
+    before_writing: Callable[[Component], Awaitable[object]] | None = None,
 ) -> FleetApplied:
     """`apply` to several vehicles side by side. What becomes of one does not stop the others.
 
@@ -48,7 +50,7 @@ async def apply_all(
         include, reboot, allow_armed, skip_invalid, force, timeout, asker: as in `apply`.
         info: gives the metadata for a vehicle.
         backup: gives the name of the file for the state before of a vehicle.
-        progress: as in `apply`, with the vehicle.
+        progress, before_writing: as in `apply`, with the vehicle.
 
     Raises:
         UsageError: there is nothing in `wanted` for one of them; then nothing was sent to any.
@@ -73,6 +75,7 @@ async def apply_all(
             timeout=timeout,
             asker=asker,
             progress=tell,
+            before_writing=None if before_writing is None else partial(before_writing, component),
         )
 
     return FleetApplied(*await _side_by_side(components, wanted, one))

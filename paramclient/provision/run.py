@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
 from typing import Final
@@ -91,6 +91,7 @@ class Run:
         backup: str | os.PathLike[str] | None,
         asker: str | None,
         progress: Callable[[ApplyProgress], None] | None,
+        before_writing: Callable[[], Awaitable[object]] | None,
         reason: str,
     ) -> None:
         self._component = component
@@ -110,6 +111,7 @@ class Run:
         self._backup = backup
         self._asker = check_asker(asker)
         self._progress = progress
+        self._before_writing = before_writing
         self._reason = reason
         self._cautions = cautions_for("")
         self._began = anyio.current_time()
@@ -144,6 +146,8 @@ class Run:
         if invalid and not self._skip_invalid:
             raise InvalidParameters(invalid)
         self._check_resets()
+        if self._before_writing is not None:
+            await self._before_writing()
         await self._store()
 
     async def work(self) -> None:

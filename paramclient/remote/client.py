@@ -237,12 +237,31 @@ class RemoteClient(ParamClient):
             UsageError: it is on several links, and the address of the service names none of them.
             NoReply, LinkError: as there.
         """
+        return await self._found({"system": system, "component": component}, timeout)
+
+    async def only_component(
+        self,
+        system: int | None = None,
+        component: int | None = None,
+        *,
+        timeout: float | None = HEARING_PATIENCE,
+    ) -> RemoteComponent:
+        """See `ParamClient.only_component`. The vehicles on all links of the service count, or on the one
+        that the address names.
+
+        Raises:
+            AmbiguousVehicle, UsageError, NoReply, LinkError: as there, and as `component`.
+        """
+        return await self._found({"system": system, "component": component, "only": True}, timeout)
+
+    async def _found(self, sought: Document, timeout: float | None) -> RemoteComponent:
+        """Return the component that the service finds."""
         began = anyio.current_time()
         answer = await self._connection.ask(
             "POST",
             "/find",
-            {"system": system, "component": component},
-            awaited=address_in_words(system, component),
+            sought,
+            awaited=address_in_words(sought["system"], sought["component"]),
             timeout=timeout,
             waits_for_ever=True,
             link=self._chosen,

@@ -109,7 +109,9 @@ _MAKERS: Final[dict[str, Callable[[str, Problem], ParamClientError]]] = {
     "FileError": lambda detail, problem: FileError(detail),
     "InvalidParameters": lambda detail, problem: InvalidParameters(dict(problem["problems"])),
     "UnknownVehicle": lambda detail, problem: UnknownVehicle(detail, vehicles=_vehicles(problem)),
-    "AmbiguousVehicle": lambda detail, problem: AmbiguousVehicle(detail, vehicles=_vehicles(problem)),
+    "AmbiguousVehicle": lambda detail, problem: AmbiguousVehicle(
+        str(problem["summary"]), vehicles=_vehicles(problem), choose_by=str(problem["choose_by"])
+    ),
     "UnknownParameter": lambda detail, problem: UnknownParameter(detail, **_whom(problem)),
     "TypeMismatch": lambda detail, problem: TypeMismatch(detail, **_whom(problem)),
     "VehicleArmed": lambda detail, problem: VehicleArmed(detail, **_whom(problem)),

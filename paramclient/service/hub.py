@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import time
 from collections.abc import Callable, Iterable
@@ -21,6 +22,7 @@ from paramclient.documents.component import ProgressDoc
 from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata.store import MetadataStore
+from paramclient.protocol.vehicle_choice import LOOK_TIME, VehicleChoice
 from paramclient.service.feed import Feed
 from paramclient.service.following import Followed
 from paramclient.service.jobs import Job, Jobs
@@ -234,6 +236,50 @@ class Hub:
             raise NoReply(awaited, attempts=0, waited=anyio.current_time() - began)
         return found[0]
 
+    async def wait_for_only(
+        self, system: int | None, component: int | None, link: str | None, timeout: float | None
+    ) -> Followed:
+        """Wait for the component with this address if no other vehicle on any of the links can be meant.
+
+        See `ParamClient.only_component`. Vehicles on links that are not open are not there.
+
+        Raises:
+            ServiceError: there is no such link.
+            AmbiguousVehicle: several vehicles are there.
+            NoReply: it was not heard in time.
+        """
+        self._check_link(link)
+        chosen = [line for line in self.lines.values() if link in (None, line.name)]
+        choice = VehicleChoice(system, component, spans_links=len(chosen) > 1)
+        began = anyio.current_time()
+        with anyio.move_on_after(timeout):
+            while True:
+                self._check_open()
+                now = anyio.current_time()
+                clients = [(line, line.client) for line in chosen if line.client is not None]
+                news = [line.news for line in chosen] + [client._carrier.news for _, client in clients]
+                machines = {
+                    machine: line
+                    for line, client in clients
+                    for machine in client._station.components.values()
+                }
+                since = max((client._station.listening_since for _, client in clients), default=math.inf)
+                machine = choice.look(machines, now, listening_since=since)
+                followed = None
+                if machine is not None:
+                    followed = machines[machine].followed.get((machine.system, machine.component))
+                if followed is not None:
+                    await followed.component._wait_for_cache()
+                    return followed
+                with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
+                    await _any_of([*news, self._closing])
+                for _, client in clients:
+                    await client._carrier.read_up(choice.due)
+        awaited = address_in_words(system, component)
+        if choice.due < math.inf:
+            awaited += f", and {LOOK_TIME} s more to see that it is the only one"
+        raise NoReply(awaited, attempts=0, waited=anyio.current_time() - began)
+
     def _check_open(self) -> None:
         if self._closing.is_set():
             raise ServiceError(503, "closing", "The service is ending.")
@@ -288,6 +334,18 @@ class Hub:
         store = MetadataStore.beside(cache.path)
         identity = component.identity
         followed.metadata = await self.aside(lambda: store.known(identity, component.component))
+
+
+async def _any_of(events: Iterable[anyio.Event]) -> None:
+    """Wait until one of the events is set."""
+    async with anyio.create_task_group() as tasks:
+
+        async def wait(event: anyio.Event) -> None:
+            await event.wait()
+            tasks.cancel_scope.cancel()
+
+        for event in events:
+            tasks.start_soon(wait, event)
 
 
 async def _fetch(options: dict[str, Any], job: Job) -> FetchResultDoc:

@@ -234,6 +234,13 @@ class Air:
         self.downlink = FaultyLink() if downlink is None else downlink
         self._out: list[bytes] = []
 
+    @property
+    def vehicle_count(self) -> int | None:
+        """The number of vehicles; None where an endpoint does not say how many it has."""
+        counts = [getattr(each, "vehicle_count", None) for each in self.vehicles]
+        known = [count for count in counts if isinstance(count, int)]
+        return sum(known) if len(known) == len(counts) else None
+
     @classmethod
     def symmetric(
         cls,

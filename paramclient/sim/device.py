@@ -7,6 +7,7 @@ import struct
 from abc import ABC, abstractmethod
 from collections import Counter
 from dataclasses import replace
+from typing import Final
 
 from paramclient.errors import UsageError
 from paramclient.protocol import wire
@@ -21,6 +22,8 @@ class Device(ABC):
     `Vehicle` adds the parameters, and says what the arguments and attributes are.
     """
 
+    vehicle_count: Final = 1
+    """See `Air.vehicle_count`."""
     _ack_first = True  # whether COMMAND_ACK comes before what the command asked for
     _restart_delay = 0.3  # seconds from accepting to start again until it is off
     _armed_result = wire.MAV_RESULT_DENIED  # what becomes of a restart while it is armed

@@ -40,6 +40,7 @@ __all__ = [
     "MAV_STATE_ACTIVE",
     "MAV_STATE_BOOT",
     "MAV_TYPE_GCS",
+    "MAV_TYPE_GENERIC",
     "MOST_PARAMETERS",
     "Message",
     "NO_INDEX",
@@ -68,6 +69,7 @@ AUTOPILOT_COMPONENT: Final = 1
 COMP_ID_MISSIONPLANNER: Final = 190
 """MAV_COMP_ID_MISSIONPLANNER: the component id of ground stations."""
 
+MAV_TYPE_GENERIC: Final = 0
 MAV_TYPE_GCS: Final = 6
 MAV_AUTOPILOT_GENERIC: Final = 0
 MAV_AUTOPILOT_ARDUPILOTMEGA: Final = 3

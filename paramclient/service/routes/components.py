@@ -28,10 +28,14 @@ class Patience(Body):
 
 
 class Sought(Body):
-    """Whom to wait for; null is any. Without `timeout_s` as long as the library waits, null for ever."""
+    """Whom to wait for; null is any. Without `timeout_s` as long as the library waits, null for ever.
+
+    With `only`, the answer is a problem where another vehicle can be meant, see `ParamClient.only_component`.
+    """
 
     system: Id = None
     component: Id = None
+    only: bool = False
     timeout_s: Seconds = HEARING_PATIENCE
 
 
@@ -95,7 +99,8 @@ async def successor(request: Request, target: Target, body: Moved) -> ComponentD
 @router.post("/find")
 async def find(request: Request, hub: TheHub, body: Sought, link: LinkName = None) -> ComponentDoc:
     """Wait for a component on any link: the first autopilot, or what is named; also on links to come."""
-    found = await answered(request, lambda: hub.wait_for(body.system, body.component, link, body.timeout_s))
+    wait_for = hub.wait_for_only if body.only else hub.wait_for
+    found = await answered(request, lambda: wait_for(body.system, body.component, link, body.timeout_s))
     found.look()
     return found.document
 
