@@ -636,7 +636,11 @@ class ParamClient:
         carrier = self._carrier
         while machine.files.is_closing and not (carrier.is_away or carrier.ended or machine.presence.is_lost):
             closed = anyio.Event()
-            machine.files.on_closed.append(closed.set)
+
+            def tell(now: float, closed: anyio.Event = closed) -> None:
+                closed.set()
+
+            machine.files.on_closed.append(tell)
             self._wake(machine)
             await closed.wait()
 
