@@ -573,8 +573,12 @@ def test_files_of_several_vehicles_on_a_radio_take_no_longer_than_one_after_the_
 
 
 def upkept(server: Server) -> Simulation:
-    station = Station(link="sim:test", is_stream=False, upkeep=Upkeep.chosen(None, "auto"))
-    return Simulation(server, station=station)
+    """A session with a vehicle that has run for a while: one that has just started is looked at once more."""
+    session = Simulation(server)
+    session.run(10.0)
+    server.opened.clear()
+    session.next_session(Station(link="sim:test", is_stream=False, upkeep=Upkeep.chosen(None, "auto")))
+    return session
 
 
 def test_a_file_that_comes_quickly_is_read_again_every_half_minute() -> None:
