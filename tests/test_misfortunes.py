@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import TypeAlias
 
 import pytest
@@ -223,7 +224,9 @@ class TestTheCountMoves:
             vehicle.when_listed(count, lambda: vehicle.set_param("EK2_ENABLE", 1))
             vehicle.when_listed(count + 100, lambda: vehicle.set_param("EK2_ENABLE", 0))
         world = world_of(vehicle, loss=loss)
-        check(world, vehicle, world.fetch(limit=40.0))
+        result = world.fetch(limit=40.0)
+        world.run(1.0)  # a change back within 0.3 s may be a late answer: a read has to confirm it
+        check(world, vehicle, replace(result, params=world.machine.table.params.copy()))
 
     @BOTH_AUTOPILOTS
     def test_while_it_is_away_from_the_vehicle_it_is_noticed_later(self, kind: Make, loss: float) -> None:
