@@ -179,6 +179,7 @@ class Station:
         self._is_watched = True
         self.verifier = verifier
         self._framer.guard = verifier.accepts
+        self._awaits_autopilot = False  # a frame is proven once, and what asks for heartbeats proves none
 
     def send_setup_signing(self, system: int, component: int, key: SigningKey | None, timestamp: int) -> None:
         """Give a vehicle its signing key, in clear, or with None take it away. Nothing answers."""
