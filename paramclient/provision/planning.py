@@ -287,7 +287,16 @@ def plan(
     if encoding is None:
         encoding = Encoding.C_CAST if autopilot == "ardupilot" else Encoding.BYTEWISE
     cautions = cautions_for(autopilot or "")
-    planner = _Planner(current, cautions, Choice(given), info or {}, encoding, autopilot or "", force=force)
+    planner = _Planner(
+        current,
+        cautions,
+        Choice(given),
+        info or {},
+        encoding,
+        autopilot or "",
+        vehicle_type=None if identity is None else identity.vehicle_type,
+        force=force,
+    )
     rows = {name: planner.row(each) for name, each in wanted.items()}
     stages = planner.stages(rows)
     unstarted = planner.unstarted(rows)
@@ -352,9 +361,11 @@ class _Planner:
         encoding: Encoding,
         autopilot: str,
         *,
+        vehicle_type: int | None,
         force: bool,
     ) -> None:
         self._current = current
+        self._vehicle_type = vehicle_type
         self._cautions = cautions
         self._choice = choice
         self._info = info
@@ -485,7 +496,9 @@ class _Planner:
 
     def _needs_reboot(self, name: str) -> bool:
         info = self._info.get(name)
-        return (info is not None and info.reboot_required) or self._cautions.needs_reboot(name)
+        return (info is not None and info.reboot_required) or self._cautions.needs_reboot(
+            name, self._vehicle_type
+        )
 
 
 def _taken(steps: list[Step], fits: Callable[[Step], bool]) -> list[Step]:
