@@ -361,7 +361,7 @@ async def time_rows(
 ) -> tuple[str, list[Timing]]:
     """Look at the vehicle, do every row, and see that the vehicle is as before; its name and the timings."""
     async with ParamClient(relay.link, cache=False) as client:
-        component = await client.component(options.system, timeout=HEARING_TIMEOUT)
+        component = await client.only_component(options.system, timeout=HEARING_TIMEOUT)
         if component.autopilot != options.kind:
             raise UsageError(f"the vehicle is {component.autopilot}, not {options.kind}")
         result = await component.fetch_all(timeout=FETCH_TIMEOUT)

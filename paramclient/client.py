@@ -393,7 +393,7 @@ class ParamClient:
         choice = VehicleChoice(system, component)
         station = self._station
         machine = None
-        with anyio.move_on_after(timeout):
+        with anyio.move_on_after(timeout), station.looking_for_others():
             while True:
                 news, now = self._carrier.news, anyio.current_time()
                 since = station.listening_since

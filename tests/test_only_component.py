@@ -68,6 +68,27 @@ async def test_several_are_refused_with_the_list_as_soon_as_they_are_heard(phase
     assert {type(message) for _, _, message in tap.heard} <= {wire.Heartbeat, wire.CommandLong}
 
 
+class Unheard(Tap):
+    """A vehicle of which no heartbeat comes through until it was asked for one."""
+
+    def data_to_send(self) -> list[bytes]:
+        is_asked = any(message.params[0] == wire.HEARTBEAT_ID for message in self.messages(wire.CommandLong))
+        framer = wire.Framer(wire.UNDERSTOOD, stream=False)
+        return [
+            data
+            for data in super().data_to_send()
+            if is_asked or not any(frame.message_id == wire.HEARTBEAT_ID for frame in framer.receive(data))
+        ]
+
+
+@swiftly
+async def test_a_vehicle_that_sends_telemetry_is_found_although_its_heartbeats_are_lost() -> None:
+    other = Unheard(small_px4(system=2, telemetry=10))
+    async with a_client(Tap(Air([px4(), other]))) as client:
+        with pytest.raises(AmbiguousVehicle, match="2 vehicles"):
+            await client.only_component()
+
+
 @swiftly
 async def test_who_is_named_is_given_beside_others() -> None:
     async with a_client(Air([px4(), copter(), px4(3)])) as client:

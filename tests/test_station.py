@@ -176,6 +176,26 @@ def test_a_vehicle_that_never_sends_a_heartbeat_is_not_asked_for_ever() -> None:
     assert len(heartbeat_requests(station)) == room.HEARTBEAT_REQUESTS_MAX
 
 
+@pytest.mark.parametrize("is_stream", [False, True])
+def test_while_others_are_looked_for_each_that_speaks_is_asked_for_its_heartbeat(is_stream: bool) -> None:
+    station = a_station(is_stream=is_stream)
+    hear(station, PX4, 4)
+    sent(station)
+    with station.looking_for_others(), station.looking_for_others():
+        station.receive(telemetry(4), "there", 1.0)
+        assert heartbeat_requests(station) == [], "it was heard"
+        for step in range(100):
+            station.receive(telemetry(5), "there", 1.0 + 0.1 * step)
+            station.receive(telemetry(4), "here", 1.0 + 0.1 * step)
+        assert heartbeat_requests(station) == [(5, 1, "there")] * 34
+        hear(station, PX4, 5, now=11.0)
+        sent(station)
+        station.receive(telemetry(5), "there", 12.0)
+        assert heartbeat_requests(station) == []
+    station.receive(telemetry(6), "there", 13.0)
+    assert heartbeat_requests(station) == []
+
+
 def test_a_ground_station_does_not_stand_in_the_way_of_that() -> None:
     station = a_station()
     hear(station, GCS, 254, 190)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from heapq import heapify, heappop, heappush
 from typing import Final, TypeAlias
 
@@ -172,6 +173,7 @@ class Station:
         self._awaits_autopilot = not self.listens_only  # none was heard yet
         self._heartbeat_requested_at = -math.inf
         self._heartbeat_requests = 0
+        self._looks_for_others = 0  # callers of `looking_for_others`
 
     def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
         """From now on sign what is sent and take what the verifier accepts; before anything has come."""
@@ -215,9 +217,22 @@ class Station:
                 self._receive_other(frame, peer, now, moment)
         if self._is_stream and not data:
             self._peers = {system: each for system, each in self._peers.items() if each != peer}
-        if self._awaits_autopilot and self._request_heartbeat(data, peer, now):
+        is_seeking = self._awaits_autopilot or (self._looks_for_others and self.verifier is None)
+        if is_seeking and self._request_heartbeat(data, peer, now):
             return True
         return len(frames) > clocks
+
+    @contextmanager
+    def looking_for_others(self) -> Iterator[None]:
+        """Request the heartbeats of vehicles that speak and have not sent one, for the time of the block.
+
+        So a vehicle that sends telemetry is found although its heartbeat is lost.
+        """
+        self._looks_for_others += 1
+        try:
+            yield
+        finally:
+            self._looks_for_others -= 1
 
     def touch(self, machine: ComponentMachine) -> None:
         """Something was asked of a component, or is no longer."""
@@ -482,17 +497,20 @@ class Station:
         """Request the heartbeat of an autopilot that sends other messages; return whether one was found.
 
         A heartbeat comes once a second; MAV_CMD_REQUEST_MESSAGE brings it in one round trip (measured on PX4
-        and ArduPilot). That is done until the first autopilot is heard: others are heard by the heartbeats
-        that they send.
+        and ArduPilot). That is done until the first autopilot is heard, and while others are looked for: else
+        these are heard by the heartbeats that they send.
         """
         if self._is_paused or now < self._heartbeat_requested_at + HEARTBEAT_REQUEST_INTERVAL:
             return False
         for frame in Framer(stream=False).receive(data):
+            address = (frame.system, frame.component)
             is_autopilot = frame.component == AUTOPILOT_COMPONENT and frame.system != 0
-            if is_autopilot and (frame.system, frame.component) != self.own:
+            known = self.components.get(address)
+            if is_autopilot and address != self.own and not (known and known.presence.has_beaten):
                 self._heartbeat_requested_at = now
-                self._heartbeat_requests += 1
-                self._awaits_autopilot = self._heartbeat_requests < HEARTBEAT_REQUESTS_MAX
+                if self._awaits_autopilot:
+                    self._heartbeat_requests += 1
+                    self._awaits_autopilot = self._heartbeat_requests < HEARTBEAT_REQUESTS_MAX
                 self._peers[frame.system] = peer
                 request = (float(HEARTBEAT_ID), *[0.0] * 6)
                 command = CommandLong(frame.system, frame.component, MAV_CMD_REQUEST_MESSAGE, request)

@@ -6,7 +6,7 @@ import math
 import os
 import time
 from collections.abc import Callable, Iterable
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from functools import partial
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Final, TypeVar
@@ -271,8 +271,11 @@ class Hub:
                 if followed is not None:
                     await followed.component._wait_for_cache()
                     return followed
-                with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
-                    await _any_of([*news, self._closing])
+                with ExitStack() as looking:
+                    for _, client in clients:
+                        looking.enter_context(client._station.looking_for_others())
+                    with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
+                        await _any_of([*news, self._closing])
                 for _, client in clients:
                     await client._carrier.read_up(choice.due)
         awaited = address_in_words(system, component)
