@@ -369,8 +369,9 @@ class ParamClient:
         Without arguments it is the only autopilot on the link; with a component alone, the component of that
         id of the only vehicle. For `LOOK_TIME` (1.2 s) from the first autopilot heard on, a second one is
         looked for: every autopilot sends a heartbeat once a second. With a system alone it is that system's
-        autopilot, component 1 where that is one; with both, that component. Neither takes longer than
-        `component`. A vehicle that is lost is not there. Nothing is sent but what identifies vehicles.
+        autopilot: component 1 as soon as it is heard, or another one when it is the only one for as long.
+        With both ids it is that component, as soon as it is heard. A vehicle that is lost is not there.
+        Nothing is sent but what identifies vehicles.
 
         The call takes no time where a second autopilot would have been heard already. So a program that did
         something else since can make sure by another call, directly before it writes.
