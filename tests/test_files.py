@@ -359,6 +359,21 @@ def test_two_lines_may_include_one_file(tmp_path: Path) -> None:
     assert values(first) == {"A": 1}
 
 
+def test_a_delete_line_takes_out_what_stands_above_it(tmp_path: Path) -> None:
+    first = tree(
+        tmp_path,
+        a_parm="A_X 1\nB 1\n@include b.parm\n@delete A_*  # of the other board\n@delete NONE\nA_X 3\n",
+        b_parm="A_X 2\nA_Y 2\nC 2\nD 2\nB 2\n@delete B\n@delete D\n",
+    )
+    assert values(first) == {"B": 1, "C": 2, "A_X": 3}
+    assert read_file(first).notes == (
+        f"@delete B in {tmp_path}/b.parm:6 takes out B.",
+        f"@delete D in {tmp_path}/b.parm:7 takes out D.",
+        "@delete A_* in line 4 takes out A_X, A_Y.",
+        "@delete NONE in line 5 fits no parameter above it.",
+    )
+
+
 @pytest.mark.parametrize(
     ("line", "problem"),
     [

@@ -12,6 +12,8 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 from typing import Final
 
 from paramclient.errors import FileError, UsageError
@@ -33,11 +35,16 @@ from paramclient.values import ParamType, Value, check_name
 
 __all__ = ["is_pair", "is_qgc_row", "read_pairs", "read_qgc", "write_pairs", "write_qgc"]
 
+DELETED_SHOWN_MAX: Final = 10
+"""Names that the note on one `@delete` line lists."""
+DELETES_MAX: Final = 256
+"""`@delete` lines of one file: each looks through all parameters above it."""
 _QGC_COLUMNS: Final = "Vehicle-Id Component-Id Name Value Type"
 _QGC_ROW: Final = "vehicle, component, name, value and type, with tabs between them"
 _qgc_nan: Final = re.compile(r"--\.-+").fullmatch
 """What QGroundControl writes for NaN (Fact.cc)."""
 _include: Final = re.compile(r"@include[ \t]+(.*\S)").fullmatch
+_delete: Final = re.compile(r"@delete[ \t]+(\S{1,64})").fullmatch
 _blanks: Final = re.compile(r"[ \t]+")
 _between: Final = re.compile(r"[ \t]*[,=][ \t]*|[ \t]+")
 _decimal_comma: Final = re.compile(r"(?:^|[ \t,=])[+-]?[0-9]+,[0-9]+$").search
@@ -45,12 +52,40 @@ _name: Final = re.compile(r"(?=.*[A-Za-z])[^@\s,=#;/][^\s,=#;]*(?<!:)").fullmatc
 _qgc_row: Final = re.compile(r"[0-9]+[ \t]+[0-9]+[ \t]+[^ \t]+[ \t]+[^ \t]+[ \t]+[0-9]+").fullmatch
 
 
+@dataclass(slots=True)
+class _Lines:
+    """What the lines of one file say, with those of the files that it includes.
+
+    Attributes:
+        params: the parameters in order, each with the place where it stands, for notes.
+        notes: what its `@delete` lines took out.
+        deletes: how many such lines it has.
+    """
+
+    params: list[tuple[WrittenParam, str]] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+    deletes: int = 0
+
+    def delete(self, pattern: str, place: str) -> None:
+        """Take out the parameters so far whose names fit a glob."""
+        self.deletes += 1
+        names = {param.name for param, _ in self.params if fnmatchcase(param.name, pattern)}
+        if not names:
+            self.notes.append(f"@delete {pattern} in {place} fits no parameter above it.")
+            return
+        self.params = [each for each in self.params if each[0].name not in names]
+        listed = ", ".join(sorted(names)[:DELETED_SHOWN_MAX])
+        listed += ", …" if len(names) > DELETED_SHOWN_MAX else ""
+        self.notes.append(f"@delete {pattern} in {place} takes out {listed}.")
+
+
 def read_pairs(text: str, form: FileForm, source: str, includes: Includes | None = None) -> ParamFile:
     """Read a file with a name and a value on each line.
 
     A name is followed by a value, with spaces, tabs, a comma or `=` between them, and by nothing else but a
     comment, or ArduPilot's `@READONLY`, which is kept as one. `@include FILE` stands for the lines of another
-    file; of its comments only those of its parameters are kept.
+    file; of its comments only those of its parameters are kept. `@delete GLOB` takes out the parameters above
+    it in its file, and in those included there, whose names fit; forks of ArduPilot have it.
 
     Args:
         text: what the file holds.
@@ -61,21 +96,26 @@ def read_pairs(text: str, form: FileForm, source: str, includes: Includes | None
     Raises:
         FileError: for any line that is something else, also in an included file.
     """
-    builder = Builder(Problems(source))
-    header, footer = _read_lines(text, form, builder, builder.problems, includes, is_included=False)
-    return ParamFile(builder.result(), form, source, header, footer, tuple(builder.notes))
+    problems = Problems(source)
+    lines = _Lines()
+    header, footer = _read_lines(text, form, lines, problems, includes, is_included=False)
+    builder = Builder(problems)
+    for param, place in lines.params:
+        builder.add(param, place=place)
+    sets = builder.result()
+    return ParamFile(sets, form, source, header, footer, (*lines.notes, *builder.notes))
 
 
 def _read_lines(
     text: str,
     form: FileForm,
-    builder: Builder,
+    lines: _Lines,
     problems: Problems,
     includes: Includes | None,
     *,
     is_included: bool,
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Give the parameters of one file to the builder, and what is wrong with it to `problems`."""
+    """Add the parameters of one file to `lines`, and what is wrong with it to `problems`."""
     expected = "NAME,VALUE" if form is FileForm.MISSION_PLANNER else "NAME VALUE"
 
     def include(line: Line, path: str) -> None:
@@ -83,9 +123,11 @@ def _read_lines(
             if includes is None:
                 raise UsageError("only a file on the disk can include another one")
             found = includes.follow(path)
-            inner = Problems(found.source)
-            _read_lines(found.text, form, builder, inner, found.includes, is_included=True)
-            inner.raise_if_any()
+            inner, problems_inside = _Lines(), Problems(found.source)
+            _read_lines(found.text, form, inner, problems_inside, found.includes, is_included=True)
+            problems_inside.raise_if_any()
+            lines.params += inner.params
+            lines.notes += inner.notes
         except FileError as error:
             here = f"{problems.source}:{line.number}: includes that file"
             raise error.with_more(here) from None
@@ -93,8 +135,15 @@ def _read_lines(
             problems.add(line.number, f"@include with a file that can be read ({error})", shown(line.text))
 
     def take(line: Line, comment: str) -> None:
+        place = f"{problems.source}:{line.number}" if is_included else f"line {line.number}"
         if match := _include(line.text):
             include(line, match[1])
+            return
+        if match := _delete(line.text):
+            if lines.deletes < DELETES_MAX:
+                lines.delete(match[1], place)
+            else:
+                problems.add(line.number, f"at most {DELETES_MAX} lines with @delete", shown(line.text))
             return
         words = _between.split(line.text)
         if words[-1] == "@READONLY":
@@ -107,8 +156,7 @@ def _read_lines(
         value = parse_number(words[1])
         assert value is not None
         number = None if is_included else line.number
-        place = f"{problems.source}:{line.number}" if is_included else ""
-        builder.add(WrittenParam(words[0], value, comment=comment, line=number), place=place)
+        lines.params.append((WrittenParam(words[0], value, comment=comment, line=number), place))
 
     return _walk(text, take)
 
@@ -225,7 +273,7 @@ def _framed(
 def _wrong_with_pair(text: str, words: list[str], expected: str) -> str | None:
     """What was expected of a line, or None where it is as it should be."""
     if text.startswith("@"):
-        return f"{expected} (a line for ArduPilot's tools that is not followed)"
+        return f"{expected} (a line for ArduPilot's tools that is not known)"
     if _decimal_comma(text) and len(words) == 3:
         return f"{expected} with a decimal point (1.5, not 1,5)"
     if len(words) == 3 and parse_number(words[1]) is not None:
