@@ -639,6 +639,40 @@ async def test_a_vehicle_gets_an_earlier_state_of_its_own_back() -> None:
 
 
 @swiftly
+async def test_a_state_brings_back_nothing_that_the_vehicle_measures_or_keeps_to_itself() -> None:
+    own: dict[str, Value | tuple[ParamType, Value]]
+    own = {"BARO1_GND_PRESS": 94500.0, "BARO1_DEVID": 65540, "INS_GYROFFS_X": 0.25, "LOCKED": 1.0}
+    vehicle = ArduPilotVehicle(
+        table=SETTINGS | OTHERS | own, read_only=["BARO1_GND_PRESS", "BARO1_DEVID", "LOCKED"], live_period=0.0
+    )
+    tap = Tap(vehicle)
+    async with a_client(tap) as client:
+        component = await client.component()
+        before = (await apply(component, written(another("TUNE_01")))).before
+        for name, value in {
+            "BARO1_GND_PRESS": 9.0,
+            "BARO1_DEVID": 7,
+            "INS_GYROFFS_X": 0.5,
+            "LOCKED": 2.0,
+        }.items():
+            vehicle.set_param(name, value)
+        result = await restore(component, before)
+        assert result.complete
+        assert set(sets(tap)) == {"LOCKED", "TUNE_01"}
+        told = {row.name: (row.category, row.actual) for row in result.news}
+        assert told == {
+            "TUNE_01": ("", 0.25),
+            "BARO1_GND_PRESS": ("read-only", 9.0),
+            "BARO1_DEVID": ("read-only", 7),
+            "INS_GYROFFS_X": ("measured", 0.5),
+            "LOCKED": ("read-only", 2.0),
+        }
+        assert "it can only be read" in str(result.rows["LOCKED"])
+        # who asks for just this is told that it was refused
+        assert statuses(await apply(component, written({"LOCKED": 1.0}))) == {"LOCKED": "refused"}
+
+
+@swiftly
 async def test_more_than_the_state_has_is_left_alone_and_said() -> None:
     vehicle = ardupilot()
     state = {name: param for name, param in vehicle.params.items() if name != "TUNE_05"}

@@ -111,12 +111,16 @@ def test_the_file_of_another_vehicle_is_not_taken_for_mistyped() -> None:
         ("ardupilot", "MAV_SYSID", "identity"),
         ("ardupilot", "COMPASS_DEV_ID2", "hardware"),
         ("ardupilot", "COMPASS_PRIO1_ID", "hardware"),
-        ("ardupilot", "BARO1_DEVID", "hardware"),
+        ("ardupilot", "BARO1_DEVID", "read-only"),
         ("ardupilot", "INS_ACC2_ID", "hardware"),
         ("ardupilot", "INS_GYR_ID", "hardware"),
         ("ardupilot", "COMPASS_OFS2_X", "calibration"),
         ("ardupilot", "INS_ACC2OFFS_Y", "calibration"),
-        ("ardupilot", "INS_GYROFFS_Z", "calibration"),
+        ("ardupilot", "INS_GYROFFS_Z", "measured"),
+        ("ardupilot", "INS4_GYR2_CALTEMP", "measured"),
+        ("ardupilot", "BARO2_GND_PRESS", "read-only"),
+        ("ardupilot", "ARSPD_OFFSET", "measured"),
+        ("ardupilot", "COMPASS_DEC", "measured"),
         ("ardupilot", "AHRS_TRIM_X", "calibration"),
         (
             "ardupilot",
@@ -138,6 +142,7 @@ def test_the_file_of_another_vehicle_is_not_taken_for_mistyped() -> None:
         ("px4", "MAV_SYS_ID", "identity"),
         ("px4", "CAL_MAG0_ID", "hardware"),
         ("px4", "CAL_MAG0_XOFF", "calibration"),
+        ("px4", "CAL_BARO0_OFF", "measured"),
         ("px4", "SENS_BOARD_X_OFF", "calibration"),
         ("px4", "LND_FLIGHT_T_LO", "counter"),
         ("px4", "_HASH_CHECK", "counter"),
@@ -156,6 +161,26 @@ def test_what_is_not_a_setting_is_left_out_and_can_be_included(
     assert not left_out.stages
     for include in (category, name, name[:5] + "*", (category,)):
         assert order(plan(table, wanted, autopilot=autopilot, include=include)) == [[name]]
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "name", "switch", "value"),
+    [
+        ("ardupilot", "INS_GYR2OFFS_X", "INS_GYR_CAL", 0),
+        ("ardupilot", "ARSPD2_OFFSET", "ARSPD2_SKIP_CAL", 2),
+        ("ardupilot", "COMPASS_DEC", "COMPASS_AUTODEC", 0),
+        ("px4", "CAL_BARO0_OFF", "SENS_BAR_AUTOCAL", 0),
+    ],
+)
+def test_what_a_vehicle_measures_is_a_calibration_where_it_is_told_not_to(
+    autopilot: str, name: str, switch: str, value: int
+) -> None:
+    def category(held_value: int, **wanted: Value) -> str:
+        table = held(**{name: 1, switch: held_value})
+        return plan(table, written(**{name: 2}, **wanted), autopilot=autopilot).rows[name].category
+
+    assert category(1) == category(value, **{switch: 1}) == "measured"
+    assert category(value) == category(1, **{switch: value}) == "calibration"
 
 
 @pytest.mark.parametrize(

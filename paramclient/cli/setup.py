@@ -106,8 +106,8 @@ async def apply(
     Args:
         url: The link, such as udpin:0.0.0.0:14550, or sim:ardupilot for a simulated vehicle.
         source: A parameter file; or a vehicle in the cache, as cache:VEHICLE.
-        include: A category of what is left out (identity, hardware, calibration, counter, action, read-only,
-            out-of-range), or a name or pattern such as "COMPASS_OFS*". It may be given again.
+        include: A category of what is left out (identity, hardware, calibration, measured, counter, action,
+            read-only, out-of-range), or a name or pattern such as "COMPASS_OFS*". It may be given again.
         reboot: Start the vehicle again where values count only from then on.
         allow_armed: Go on although it is armed.
         skip_invalid: Set the others although some values cannot be right.

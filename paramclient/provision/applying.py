@@ -118,7 +118,9 @@ async def restore(
 ) -> ApplyResult:
     """Bring an earlier state of a vehicle back: `apply`, with its own identity and calibration included.
 
-    Parameters that the vehicle has and the state does not are left alone; `extra` of the result names them.
+    What the vehicle measures at each start, counts, or does not let others set stays as it is: its rows are
+    skipped, with the reason, and the result is complete all the same. Parameters that the vehicle has and the
+    state does not are left alone; `extra` of the result names them.
 
     Args:
         component: the vehicle.
@@ -146,6 +148,7 @@ async def restore(
         progress=progress,
         before_writing=before_writing,
         reason=BEFORE_RESTORE,
+        leaves_read_only=True,
     )
     return await _done(run, timeout)
 

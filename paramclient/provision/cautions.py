@@ -5,7 +5,7 @@ from __future__ import annotations
 import fnmatch
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
@@ -17,8 +17,11 @@ __all__ = ["CATEGORIES", "OUT_OF_RANGE", "READ_ONLY", "Caution", "Cautions", "Ch
 
 READ_ONLY: Final = "read-only"
 OUT_OF_RANGE: Final = "out-of-range"
-CATEGORIES: Final = ("identity", "hardware", "calibration", "counter", "action", READ_ONLY, OUT_OF_RANGE)
-"""What a choice of what to include may name besides globs. The last two come from metadata."""
+CATEGORIES: Final = (
+    *("identity", "hardware", "calibration", "measured", "counter", "action"),
+    *(READ_ONLY, OUT_OF_RANGE),
+)
+"""What a choice of what to include may name besides globs. The last two come from metadata too."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +33,7 @@ class Caution:
         reason: why it is there; a sentence that begins with what the parameter is or does.
         category: for what is left out, one of `CATEGORIES`; else "".
         autopilot: "px4" or "ardupilot".
+        unless: other parameters with values; the entry does not count while one of them has its value.
         elsewhere: by glob, where those belong that the tables of the simulated vehicles do not have.
     """
 
@@ -37,6 +41,7 @@ class Caution:
     reason: str
     category: str
     autopilot: str
+    unless: Mapping[str, int]
     elsewhere: Mapping[str, str]
 
 
@@ -54,9 +59,19 @@ class Cautions:
             for section, cautions in entries.items()
         }
 
-    def left_out(self, name: str) -> Caution | None:
-        """Why a parameter is left out unless asked for, or None."""
-        return self._first("left_out", name)
+    def left_out(self, name: str, value_of: Callable[[str], object] | None = None) -> Caution | None:
+        """Why a parameter is left out unless asked for, or None.
+
+        Args:
+            name: param_id.
+            value_of: the value that another parameter has, or is to have; by default none has a value.
+        """
+        for pattern, caution in self._patterns["left_out"]:
+            if pattern.match(name) and (
+                value_of is None or all(value_of(other) != value for other, value in caution.unless.items())
+            ):
+                return caution
+        return None
 
     def chooses_frame(self, name: str) -> bool:
         return self._first("frame", name) is not None
@@ -129,6 +144,7 @@ def cautions_for(autopilot: str) -> Cautions:
                 reason=entry["reason"],
                 category=entry.get("category", ""),
                 autopilot=entry["autopilot"],
+                unless=entry.get("unless", {}),
                 elsewhere=entry.get("elsewhere", {}),
             )
             for entry in entries

@@ -9,6 +9,7 @@ from enum import StrEnum
 
 from paramclient.errors import ParamClientError
 from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.provision.cautions import CATEGORIES, OUT_OF_RANGE
 from paramclient.provision.planning import Plan
 from paramclient.values import ParamType, Value, format_value
 
@@ -195,4 +196,4 @@ class FleetVerified:
         return not self.errors and all(result.is_met for result in self.results.values())
 
 
-_ON_PURPOSE = frozenset({"identity", "hardware", "calibration", "counter", "action", "read-only"})
+_ON_PURPOSE = frozenset(CATEGORIES) - {OUT_OF_RANGE}

@@ -287,7 +287,9 @@ def plan(
     if encoding is None:
         encoding = Encoding.C_CAST if autopilot == "ardupilot" else Encoding.BYTEWISE
     cautions = cautions_for(autopilot or "")
-    planner = _Planner(current, cautions, Choice(given), info or {}, encoding, autopilot or "", force=force)
+    planner = _Planner(
+        current, wanted, cautions, Choice(given), info or {}, encoding, autopilot or "", force=force
+    )
     rows = {name: planner.row(each) for name, each in wanted.items()}
     stages = planner.stages(rows)
     unstarted = planner.unstarted(rows)
@@ -346,6 +348,7 @@ class _Planner:
     def __init__(
         self,
         current: ParamSet | Mapping[str, Param],
+        wanted: ParamSet,
         cautions: Cautions,
         choice: Choice,
         info: Mapping[str, ParamInfo],
@@ -355,6 +358,7 @@ class _Planner:
         force: bool,
     ) -> None:
         self._current = current
+        self._wanted = wanted
         self._cautions = cautions
         self._choice = choice
         self._info = info
@@ -374,7 +378,7 @@ class _Planner:
         def verdict(status: PlanStatus, category: str = "", reason: str = "") -> PlanRow:
             return PlanRow(wanted, status, before, kind, category, reason)
 
-        caution = self._cautions.left_out(name)
+        caution = self._cautions.left_out(name, self._value_to_be)
         if caution is not None and not self._choice.has(name, caution.category):
             return verdict(PlanStatus.SKIPPED, caution.category, f"left out: it {caution.reason}")
         if before is None:
@@ -482,6 +486,11 @@ class _Planner:
         assert row.before is not None, "only what the vehicle has is set"
         kind = ParamType.REAL32 if row.type is None else row.type
         return Step(row.name, row.wanted.value, kind, row.before, self._needs_reboot(row.name))
+
+    def _value_to_be(self, name: str) -> Value | None:
+        """The value that a parameter shall have, or else has."""
+        param: Param | WrittenParam | None = self._wanted.get(name) or self._current.get(name)
+        return None if param is None else param.value
 
     def _needs_reboot(self, name: str) -> bool:
         info = self._info.get(name)

@@ -18,6 +18,8 @@ from paramclient.errors import (
     LinkError,
     NoReply,
     ParamClientError,
+    ParamErrorCode,
+    Refused,
     UsageError,
     VehicleArmed,
     VehicleError,
@@ -25,7 +27,7 @@ from paramclient.errors import (
 from paramclient.identity import SHARED_UIDS, Identity
 from paramclient.paramset import ParamSet
 from paramclient.protocol.authors import check_asker
-from paramclient.provision.cautions import cautions_for
+from paramclient.provision.cautions import READ_ONLY, cautions_for
 from paramclient.provision.looking import LOOKING_PACE, Seen, identified, look, plan_for
 from paramclient.provision.outcome import ApplyProgress, ApplyResult, ApplyRow, ApplyStatus
 from paramclient.provision.planning import (
@@ -93,6 +95,7 @@ class Run:
         progress: Callable[[ApplyProgress], None] | None,
         before_writing: Callable[[], Awaitable[object]] | None,
         reason: str,
+        leaves_read_only: bool = False,
     ) -> None:
         self._component = component
         self._planned_for: Identity | None = None
@@ -113,6 +116,7 @@ class Run:
         self._progress = progress
         self._before_writing = before_writing
         self._reason = reason
+        self._leaves_read_only = leaves_read_only
         self._cautions = cautions_for("")
         self._began = anyio.current_time()
         self.rows: dict[str, ApplyRow] = {}
@@ -287,7 +291,12 @@ class Run:
             done = await self._component.set(step.name, step.value, force=self._force, asker=self._asker)
         except (VehicleError, UsageError) as error:
             self._silent = 0
-            self._settle(step, ApplyStatus.REFUSED, step.before, str(error))
+            is_read_only = isinstance(error, Refused) and error.code == ParamErrorCode.READ_ONLY
+            if is_read_only and self._leaves_read_only:
+                reason = "left out: the vehicle says that it can only be read"
+                self._settle(step, ApplyStatus.SKIPPED, step.before, reason, READ_ONLY)
+            else:
+                self._settle(step, ApplyStatus.REFUSED, step.before, str(error))
             return
         except NoReply as error:
             self._silent += 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 import struct
 from bisect import bisect_right
 from collections import deque
@@ -49,7 +50,8 @@ class ArduPilotVehicle(Vehicle):
         groups: by the name of a switch in the table, the parameters that follow it while it is not 0.
             None: with the table of the real quad, the 52 of EK2_ENABLE; with another table, none.
         reboot_groups: names of switches whose group appears, or goes, with the next start only.
-        read_only: names that cannot be set.
+        read_only: names that cannot be set. None: those that ArduPilot marks for its own use, such as
+            BARO1_GND_PRESS and BARO1_DEVID.
         live: names of parameters that change by themselves: whole numbers count seconds, others waver in
             their last bit. Names that are not in the table are passed over.
         live_period: seconds between two such changes; 0 for none.
@@ -77,7 +79,7 @@ class ArduPilotVehicle(Vehicle):
         table: Table | None = None,
         groups: Mapping[str, Table] | None = None,
         reboot_groups: Iterable[str] = (),
-        read_only: Iterable[str] = (),
+        read_only: Iterable[str] | None = None,
         live: Iterable[str] = ("STAT_RUNTIME", "BARO1_GND_PRESS"),
         live_period: float = 30.0,
         burst: int = 10,
@@ -90,7 +92,12 @@ class ArduPilotVehicle(Vehicle):
             groups = {"EK2_ENABLE": ek2_group()} if table is None else {}
         rows = with_system_id(ardupilot_table() if table is None else as_table(table), _SYSTEM_ID, system)
         members = {switch: as_table(group) for switch, group in groups.items()}
-        if unknown := (members.keys() | frozenset(read_only)).difference(row.name for row in rows):
+        if read_only is None:
+            every = (row.name for group in (rows, *members.values()) for row in group)
+            read_only = [name for name in every if _INTERNAL.fullmatch(name)]
+        elif unknown := frozenset(read_only).difference(row.name for row in rows):
+            raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
+        if unknown := frozenset(members).difference(row.name for row in rows):
             raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
         if uid2 is None:
             uid2 = (int.from_bytes(_UID2, "little") + system - 1).to_bytes(18, "little")
@@ -268,6 +275,7 @@ class ArduPilotVehicle(Vehicle):
                     self._write(entry, entry.bits ^ 1)
 
 
+_INTERNAL = re.compile(r"MIS_TOTAL|BARO\d_(GND_PRESS|DEVID)|ARSPD\d?_DEVID|MNT\d_DEVID")
 _SYSTEM_ID = "SYSID_THISMAV"
 _QUADROTOR = 2
 _STANDBY = 3
