@@ -69,7 +69,8 @@ class Carrier:
 
     `read` and `send` run side by side for as long as the client is open. A link that drops and can come back
     is opened again; meanwhile time stands still for the station. So it does while this computer sleeps, or
-    nobody lets us work.
+    nobody lets us work. A second call of either waits until the first one has ended, and goes on in its place
+    if that was cancelled.
 
     Args:
         link: an open one.
@@ -83,7 +84,7 @@ class Carrier:
         is_away: whether the link is away and being opened again.
         broken: what calls raise now, or None.
         ended: the same, for good.
-        news: is set, and replaced, when anything was received or the calls fail.
+        news: is set, and replaced, when anything was received, the link drops or the calls fail.
     """
 
     def __init__(
@@ -117,17 +118,20 @@ class Carrier:
         self._is_taking = False  # what was read, or waits for its turn to do so
         self._asked = True  # whether anything may have been asked of anybody
         self._standstill = Standstill()
+        self._reading, self._sending = anyio.Lock(), anyio.Lock()
 
     async def read(self) -> None:
         """Take what comes, until the link fails for good."""
         crowd = Crowd.of_this_loop()
-        crowd.joined(self)
-        try:
-            await self._read(crowd)
-        finally:
-            crowd.left(self)
+        async with self._reading:
+            crowd.joined(self)
+            try:
+                await self._read(crowd)
+            finally:
+                crowd.left(self)
 
     async def _read(self, crowd: Crowd) -> None:
+        self._is_taking, self._behind_since = False, math.inf
         before = drained_at = anyio.current_time()
         while True:
             asked_at = anyio.current_time()
@@ -215,10 +219,11 @@ class Carrier:
     async def send(self) -> None:
         """Send what is to be sent, and do what is due, until the calls have failed for good."""
         crowd = Crowd.of_this_loop()
-        try:
-            await self._send(crowd)
-        finally:
-            crowd.left(self)
+        async with self._sending:
+            try:
+                await self._send(crowd)
+            finally:
+                crowd.left(self)
 
     async def _send(self, crowd: Crowd) -> None:
         station = self._station
@@ -335,6 +340,7 @@ class Carrier:
         """Open the link again, for as long as it takes."""
         logger.warning("%s; trying to open it again", error)
         self.is_away = True
+        self.tell()
         self._of_others.clear()
         self._station.pause()
         for tap in self._taps:

@@ -6,7 +6,7 @@ import logging
 import math
 import os
 import weakref
-from collections.abc import Callable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from types import MappingProxyType, TracebackType
 from typing import TYPE_CHECKING, Final
 
@@ -73,7 +73,8 @@ class ParamClient:
     Inside the `async with`, it sends its heartbeat once a second, follows every component that it hears, and
     keeps their tables in the cache. At its end every call that still waits, in other tasks, raises
     ClientClosed, what is new is written, and neither task nor socket nor thread remains. What the body
-    raises comes out as it is.
+    raises comes out as it is. File sessions are closed on board first, also when the body is cancelled: a
+    vehicle that does not acknowledge that takes at most `SESSION_PATIENCE` (2 s).
 
     A TCP connection that drops, a serial port that is unplugged or a UDP socket that fails is opened again
     with back-off for as long as the client lives. Calls that wait meanwhile go on when it is back: what had
@@ -173,6 +174,7 @@ class ParamClient:
         self._subscriptions: weakref.WeakSet[Events] = weakref.WeakSet()
         self._components: dict[Address, Component] = {}
         self._tasks: anyio.abc.TaskGroup | None = None
+        self._outlasting: list[anyio.CancelScope] = []
         self._beside = Beside(tlog, forward, is_stream=self._link.is_stream)
         self._carrier = Carrier(
             self._link,
@@ -252,8 +254,8 @@ class ParamClient:
         await tasks.__aenter__()
         self._tasks = tasks
         self._opened_at = self._station.listening_since = anyio.current_time()
-        tasks.start_soon(self._carrier.read, name="paramclient reader")
-        tasks.start_soon(self._carrier.send, name="paramclient sender")
+        tasks.start_soon(self._outlast, self._carrier.read, name="paramclient reader")
+        tasks.start_soon(self._outlast, self._carrier.send, name="paramclient sender")
         tasks.start_soon(self._writer.run, name="paramclient cache writer")
         self._beside.start(tasks)
         if self._keeper is not None:
@@ -274,7 +276,8 @@ class ParamClient:
                 await self._close_files(closed)
             finally:
                 self._end(closed)
-                tasks.cancel_scope.cancel()
+                for scope in (*self._outlasting, tasks.cancel_scope):
+                    scope.cancel()
             try:
                 # not told of the caller's exception: it would come out wrapped in a group
                 await tasks.__aexit__(None, None, None)
@@ -613,6 +616,13 @@ class ParamClient:
             ):
                 await self._carrier.news.wait()
 
+    async def _outlast(self, work: Callable[[], Awaitable[None]]) -> None:
+        """Do this until the files are closed, also when a scope around the client is cancelled before."""
+        if self._carrier.ended is None:
+            with anyio.CancelScope(shield=True) as scope:
+                self._outlasting.append(scope)
+                await work()
+
     async def _close_files(self, error: LinkError) -> None:
         """End what still waits, and have the sessions of open files closed on board, also when cancelled.
 
@@ -620,9 +630,17 @@ class ParamClient:
         """
         if self._carrier.broken is None:
             self._carrier.fail_calls(error)
+            machines = [each for each in self._station.components.values() if each.files.is_closing]
+            if not machines:
+                return
             with anyio.CancelScope(shield=True), anyio.move_on_after(SESSION_PATIENCE):
-                for machine in list(self._station.components.values()):
-                    await self._wait_until_closed(machine)
+                async with anyio.create_task_group() as tasks:
+                    # `asyncio.run` cancels each task for itself when its main one has ended: these go on then
+                    tasks.start_soon(self._carrier.read)
+                    tasks.start_soon(self._carrier.send)
+                    for machine in machines:
+                        await self._wait_until_closed(machine)
+                    tasks.cancel_scope.cancel()
 
     async def _files_closed(self, machine: ComponentMachine) -> None:
         """Wait until the session of a file that nobody wants any more is closed on board: for one round trip.
@@ -634,12 +652,12 @@ class ParamClient:
                 await self._wait_until_closed(machine)
 
     async def _wait_until_closed(self, machine: ComponentMachine) -> None:
-        carrier = self._carrier
-        while machine.files.is_closing and not (carrier.is_away or carrier.ended or machine.presence.is_lost):
-            closed = anyio.Event()
-            machine.files.on_closed.append(closed.set)
-            self._wake(machine)
-            await closed.wait()
+        carrier, files = self._carrier, machine.files
+        self._wake(machine)
+        while files.is_closing and not (carrier.is_away or carrier.ended or machine.presence.is_lost):
+            if carrier.tell not in files.on_closed:
+                files.on_closed.append(carrier.tell)
+            await carrier.news.wait()
 
     @property
     def _has_one_vehicle(self) -> bool:

@@ -38,6 +38,8 @@ from paramclient import client as client_module
 from paramclient.errors import LinkError
 from paramclient.links import Link, create_link, serve_endpoint
 from paramclient.metadata import metadata_of
+from paramclient.protocol import wire
+from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.protocol.vehicle_choice import LOOK_TIME
 from paramclient.provision import apply, prepare, restore, verify
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, Vehicle
@@ -396,6 +398,30 @@ async def test_a_client_that_is_cancelled_writes_what_it_has_learnt(tmp_path: Pa
     assert scope.cancelled_caught
     with ParamCache(tmp_path / "cache") as cache:
         assert len(cache.component(system=1).params) == len(vehicle.params)
+
+
+async def test_a_scope_around_a_client_has_the_file_closed_before_it_ends() -> None:
+    vehicle = ArduPilotVehicle(live_period=0)
+    tap = Tap(Air.symmetric([vehicle], delay=0.02))
+
+    def cancel_in_the_file(progress: Progress) -> None:
+        if progress.received > 0:
+            assert vehicle.open_files
+            scope.cancel()
+
+    async with beside():
+        with anyio.CancelScope() as scope:
+            async with a_client(tap) as client:
+                await (await client.component()).fetch_all(progress=cancel_in_the_file)
+        assert scope.cancelled_caught
+        assert not vehicle.open_files
+        assert client.components[1, 1]._machine.files.is_idle, "the acknowledgement was awaited"
+        *_, last = tap.messages(wire.FileTransfer)
+        assert Packet.unpack(last.payload).opcode == Opcode.TERMINATE_SESSION
+        async with a_client(tap) as client:
+            again = await (await client.component()).fetch_all()
+        assert again.source == "ftp"
+        assert again.elapsed < 2.0, "a session that stays open is closed on board after 3 s"
 
 
 async def test_a_link_that_fails_reaches_everyone(

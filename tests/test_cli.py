@@ -36,6 +36,7 @@ from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.sim.table import Entry
 from tests.commands import Command, Outcome, Put, behind, in_process, strict
+from tests.flying import flying
 from tests.shell import swiftly
 
 ROOT = Path(__file__).parent.parent
@@ -1139,6 +1140,22 @@ def test_a_fetch_that_is_interrupted_ends_cleanly(number: int, code: int, tmp_pa
             listener.recv(100)  # the client is at work
             fetching.send_signal(number)
             assert ended(fetching) == Outcome(code, "", "")
+
+
+def test_a_fetch_that_is_interrupted_in_a_file_has_it_closed_on_board() -> None:
+    vehicle = ArduPilotVehicle(live_period=0)
+    with flying(Air.symmetric([vehicle], delay=0.05)) as url:
+        with process("fetch", url, "--no-cache") as fetching:
+            while not vehicle.open_files:
+                assert fetching.poll() is None
+                time.sleep(0.001)
+            fetching.send_signal(signal.SIGINT)
+            assert ended(fetching) == Outcome(130, "", "")
+        assert not vehicle.open_files
+        assert vehicle.requests["FILE_TRANSFER_PROTOCOL"] >= 2
+        again = run_process("fetch", url, "--no-cache", "--json")
+        assert again.json["source"] == "ftp"
+        assert again.json["elapsed_s"] < 2.0, "a session that stays open is closed on board after 3 s"
 
 
 def test_a_second_signal_does_not_wait(command: Command, warm: Path) -> None:

@@ -10,8 +10,10 @@ import anyio
 import pytest
 
 from paramclient import ClientClosed, NoReply, ParamClient, UsageError
+from paramclient.client import SESSION_PATIENCE
 from paramclient.errors import FileErrorCode, FileTransferError, LinkError
 from paramclient.ftp import Ftp
+from paramclient.links import SimLink
 from paramclient.protocol.ftp import DirectoryEntry
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.values import ParamType, crc32_px4
@@ -130,7 +132,7 @@ async def test_cancellation_closes_the_file() -> None:
         assert client.components[1, 1]._machine.files.is_idle
 
 
-@pytest.mark.parametrize("how", ["timeout", "error", "cancelled"])
+@pytest.mark.parametrize("how", ["timeout", "error", "cancelled", "scope"])
 @swiftly
 async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str) -> None:
     requests = 0
@@ -148,16 +150,94 @@ async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str)
                 with suppress(NoReply):
                     await component.fetch_all(timeout=seconds if how == "timeout" else None)
 
-        task = asyncio.ensure_future(session(vehicle, step / 100))
+        async def session_in_a_scope(vehicle: ArduPilotVehicle, seconds: float) -> None:
+            with anyio.move_on_after(seconds) as scope:
+                await session(vehicle, seconds)
+            assert scope.cancelled_caught
+
+        run = session_in_a_scope if how == "scope" else session
+        task = asyncio.ensure_future(run(vehicle, step / 100))
         if how == "cancelled":
             await anyio.sleep(step / 100)
             task.cancel()
         await asyncio.wait([task])
         assert task.cancelled() == (how == "cancelled")
+        assert not tasks_beside()
         assert how == "cancelled" or bool(task.exception()) == (how == "error")
         assert not vehicle.open_files
         requests += vehicle.requests["FILE_TRANSFER_PROTOCOL"]
     assert requests > 80
+
+
+@pytest.mark.parametrize(
+    ("fault", "longest"),
+    [
+        ("none", 1.1),
+        ("deaf", SESSION_PATIENCE),
+        ("dropped", 0),
+        ("failed", 0),
+        ("drops", 0.1),
+        ("fails", 0.1),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+@swiftly
+async def test_a_scope_around_a_client_ends_it_whatever_the_link_does(fault: str, longest: float) -> None:
+    vehicle = with_files()
+    tap = Tap(Air.symmetric([vehicle], delay=0.05))
+    link = FlakyLink(tap) if fault in ("dropped", "drops") else SimLink(tap)
+
+    async def close_later() -> None:
+        await anyio.sleep(0.1)
+        await link.close()
+
+    with anyio.CancelScope() as scope:
+        async with a_client(link) as client:
+            files = await files_of(client)
+            reading = asyncio.ensure_future(outcome(files.read("/APM/LOGS/1.BIN")))
+            await anyio.sleep(0.3)
+            assert vehicle.open_files
+            tap.is_deaf = fault == "deaf"
+            if fault in ("dropped", "failed"):
+                await link.close()
+                await anyio.sleep(0.01)
+            if fault in ("drops", "fails"):
+                closing = asyncio.ensure_future(close_later())
+            scope.cancel()
+            cancelled_at = anyio.current_time()
+            await anyio.sleep_forever()
+    assert scope.cancelled_caught
+    took = anyio.current_time() - cancelled_at
+    assert took <= longest + 0.01, "a burst of a second, which the vehicle ends first, and a round trip"
+    if fault in ("drops", "fails"):
+        await closing
+    ending = await reading
+    assert isinstance(ending, LinkError)
+    assert isinstance(ending, ClientClosed) == (fault != "failed")
+    assert bool(vehicle.open_files) == (fault != "none")
+    assert not tasks_beside()
+
+
+@swiftly
+async def test_tasks_that_are_cancelled_each_for_itself_leave_no_file_open() -> None:
+    """As `asyncio.run` does with all that remain when its main task has ended."""
+    vehicle = with_files()
+
+    async def session() -> None:
+        async with a_client(Air.symmetric([vehicle], delay=0.02)) as client:
+            await (await client.component()).fetch_all()
+
+    fetching = asyncio.ensure_future(session())
+    await anyio.sleep(0.25)
+    assert vehicle.open_files
+    for task in asyncio.all_tasks() - {asyncio.current_task()}:
+        task.cancel()
+    began = anyio.current_time()
+    await asyncio.wait([fetching])
+    assert fetching.cancelled()
+    assert anyio.current_time() - began < 0.5
+    assert not vehicle.open_files
+    assert not tasks_beside()
 
 
 @swiftly
