@@ -185,9 +185,9 @@ class Carrier:
         """
         longest = now - drained_at + self._unseen
         self._unseen = 0.0
-        waited: Sequence[float] = getattr(self._link, "waited", ())
-        if len(waited) == count:
-            return [now - min(each, longest) for each in waited]
+        arrived_at: Sequence[float] = getattr(self._link, "arrived_at", ())
+        if len(arrived_at) == count:
+            return [min(max(at, now - longest), now) for at in arrived_at]
         was_held_up = now - self._held_up_at < LATE or now - self._due > LATE
         is_late = was_held_up or asked_at - drained_at > LATE
         return [now - longest if is_late else now] * count

@@ -27,6 +27,7 @@ from paramclient.cache import (
     TableUpdate,
     UnixTimes,
 )
+from paramclient.clocks import seconds_ahead
 from paramclient.errors import CacheError, UsageError
 from paramclient.identity import Identity
 from paramclient.protocol.component import ComponentMachine
@@ -376,10 +377,12 @@ class WriteThrough:
         """
         self._look()
         since, last = self._flushed_at
-        now, at = self._now(), self._clock()
+        ahead = seconds_ahead(self._clock, self._now)
+        now = self._now()
+        at = now + ahead
         if at < last - CLOCK_SLACK:  # the cache sees to that
             since, last = math.inf, -math.inf
-        times = UnixTimes(max(at, last), at - now, since, last)
+        times = UnixTimes(max(at, last), ahead, since, last)
         self._flushed_at = (now, times.at)
         return times
 
@@ -387,7 +390,7 @@ class WriteThrough:
         """Return when the values of a cached table were observed, as moments of the components."""
         self._look()
         now = self._now()
-        ahead = self._clock() - now
+        ahead = seconds_ahead(self._clock, self._now)
         if not math.isfinite(ahead):
             return {}
         return {name: min(at - ahead, now) for name, at in cached.heard_at.items()}

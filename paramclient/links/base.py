@@ -39,8 +39,8 @@ class Link(Protocol):
     One task may wait in `receive` and one in `send` at a time; `open` and `close` may come from a third.
     Every call may be cancelled: what had arrived by then stays for the next `receive`.
 
-    A link whose system tells when something arrived has an attribute `waited` too: the seconds for which each
-    item of the last `receive` had been waiting to be read, in their order; an empty list where that is open.
+    A link whose system tells when something arrived has an attribute `arrived_at` too: when each item of the
+    last `receive` did, in their order, by the event loop's clock; an empty list where that is open.
     """
 
     @property

@@ -36,6 +36,7 @@ from typing import Final
 import anyio
 import anyio.lowlevel
 
+from paramclient.clocks import seconds_ahead
 from paramclient.errors import LinkError
 from paramclient.links.base import OPEN_TIMEOUT, Address, Peer, SocketLink, claim, reason
 from paramclient.links.names import LinkSpec
@@ -73,8 +74,8 @@ class UdpLink(SocketLink):
         receive_buffer: bytes that the kernel granted for unread datagrams, its own book-keeping included.
         lost_sends: datagrams that the system did not take: no route, full buffer, firewall. Like those lost
             on the way they are made up for by the protocol's own repeats.
-        waited: seconds for which each datagram of the last `receive` was in the kernel's buffer, in their
-            order; empty where the system does not tell.
+        arrived_at: when each datagram of the last `receive` came into the kernel's buffer, in their order, by
+            the event loop's clock; empty where the system does not tell.
     """
 
     is_stream = False
@@ -84,7 +85,7 @@ class UdpLink(SocketLink):
         super().__init__(spec)
         self.receive_buffer = 0
         self.lost_sends = 0
-        self.waited: list[float] = []
+        self.arrived_at: list[float] = []
         self._tells_arrivals = False
         self._local_port = 0  # of the opening before
         self._room = memoryview(bytearray(_LARGEST_DATAGRAM))
@@ -96,7 +97,7 @@ class UdpLink(SocketLink):
         sock = self._open_socket()
         into, room = sock.recvfrom_into, self._room
         batch: list[tuple[Address, bytes]] = []
-        waited: list[float] = []
+        arrivals: list[float] = []
         while not batch:
             await self._readable(sock)
             asks = self._tells_arrivals
@@ -112,9 +113,12 @@ class UdpLink(SocketLink):
                 if size:
                     batch.append((address, bytes(room[:size])))
                     if asks:
-                        waited.append(_waited(sock))
-                        asks = waited[-1] > AT_ONCE
-        self.waited = waited + waited[-1:] * (len(batch) - len(waited))
+                        arrivals.append(_arrived_at(sock))
+                        asks = time.time() - arrivals[-1] > AT_ONCE
+        if arrivals:
+            ahead = seconds_ahead(time.time, anyio.current_time)
+            arrivals = [at - ahead for at in arrivals]
+        self.arrived_at = arrivals + arrivals[-1:] * (len(batch) - len(arrivals))
         self._learn(batch)
         return [*batch]
 
@@ -193,17 +197,17 @@ if sys.platform == "linux":
     def _note_arrivals(sock: socket.socket) -> bool:
         """Have the kernel note when datagrams arrive; whether it does."""
         try:
-            _waited(sock)
+            _arrived_at(sock)
         except OSError as error:
             return error.errno == errno.ENOENT  # nothing was read yet
         return True
 
-    def _waited(sock: socket.socket) -> float:
-        """Return for how many seconds the datagram that was read last was in the kernel's buffer."""
+    def _arrived_at(sock: socket.socket) -> float:
+        """Return when the datagram that was read last came into the kernel's buffer, in unix seconds."""
         stamp = ioctl(sock, _SIOCGSTAMP, bytes(_TIMEVAL.size))
         seconds, microseconds = _TIMEVAL.unpack(stamp)
         arrived_at: float = seconds + microseconds * 1e-6
-        return max(0.0, time.time() - arrived_at)
+        return arrived_at
 
 else:
 
@@ -211,7 +215,7 @@ else:
         """Return false: the system does not tell when a datagram arrived."""
         return False
 
-    def _waited(sock: socket.socket) -> float:
+    def _arrived_at(sock: socket.socket) -> float:
         """Return 0: nobody asks."""
         return 0.0
 
