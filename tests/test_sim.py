@@ -704,11 +704,6 @@ class TestArduPilot:
         station = Station(ArduPilotVehicle(burst=1, period=0.025, live_period=0.0)).send(LIST).wait(60.0)
         assert station.times()[-1] == pytest.approx(34.6, rel=0.01)
 
-    def test_asked_again_it_starts_again(self) -> None:
-        station = Station(ArduPilotVehicle())
-        assert len(station.ask(LIST, seconds=0.4)) == 510
-        assert indices(station.ask(LIST, seconds=2.0)) == list(range(1382))
-
     def test_early_after_boot_the_list_is_ignored(self) -> None:
         station = Station(ArduPilotVehicle(boot_time=2.0, table=SMALL))
         assert not station.ask(LIST, seconds=5.0)

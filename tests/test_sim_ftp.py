@@ -27,9 +27,7 @@ class Pilot:
         vehicle.data_to_send()
 
     def send(self, packet: Packet) -> None:
-        message = wire.FileTransfer(0, 1, 1, packet.pack())
-        data = wire.encode(message, system=255, component=self.component, sequence=0)
-        self.vehicle.receive(data, self.now)
+        self.vehicle.receive(file_request(packet, component=self.component), self.now)
 
     def listen(self, seconds: float) -> list[Packet]:
         """What comes in so long a time."""
@@ -63,6 +61,11 @@ class Pilot:
         self.send(Packet(self.sequence, session, Opcode.BURST_READ_FILE, size=size, offset=offset))
         self.sequence += 10_000
         return self.listen(10.0)
+
+
+def file_request(packet: Packet, *, component: int = 190) -> bytes:
+    message = wire.FileTransfer(0, 1, 1, packet.pack())
+    return wire.encode(message, system=255, component=component, sequence=0)
 
 
 def refusal(answer: Packet) -> tuple[int, ...]:
@@ -251,12 +254,77 @@ class TestSessions:
         assert pilot.ask(Opcode.RESET_SESSIONS, session=3).opcode == Opcode.ACK
         assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
 
-    def test_ardupilot_gives_up_one_that_is_idle(self) -> None:
+    @pytest.mark.parametrize("opcode", [Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS])
+    def test_ardupilot_acknowledges_to_others_and_closes_nothing(self, opcode: Opcode) -> None:
         pilot = Pilot(ArduPilotVehicle())
         pilot.vehicle.files["a"] = b"a"
         pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
+        assert pilot.ask(opcode, session=4).opcode == Opcode.ACK
+        assert pilot.vehicle.open_files == ["a"]
+        assert pilot.ask(opcode, session=3).opcode == Opcode.ACK
+        assert pilot.vehicle.open_files == []
+        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
+
+    @pytest.mark.parametrize(
+        "opcode",
+        [Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE, Opcode.LIST_DIRECTORY, Opcode.CALC_FILE_CRC32],
+    )
+    def test_ardupilot_has_one_for_all_stations(self, opcode: Opcode) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.vehicle.files["a"] = b"a"
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
+        other = Pilot(pilot.vehicle, component=191)
+        other.now = pilot.now
+        assert refusal(other.ask(opcode, b"a", session=4)) == (FileErrorCode.INVALID_SESSION,)
+        assert other.ask(Opcode.READ_FILE, session=3, size=1).data == b"a"
+
+    def test_ardupilot_gives_up_one_after_3_s_without_an_answer(self) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.vehicle.files["a"] = b"a"
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
+        pilot.listen(2.85)
+        assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4)) == (FileErrorCode.INVALID_SESSION,)
+        pilot.listen(2.95)
+        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
+        assert refusal(pilot.ask(Opcode.READ_FILE, session=3, size=1)) == (FileErrorCode.INVALID_SESSION,)
+
+    def test_ardupilot_is_kept_from_giving_it_up_by_each_refusal(self) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.vehicle.files["a"] = b"a"
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
+        for _ in range(20):
+            pilot.listen(0.4)
+            answer = pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4)
+            assert refusal(answer) == (FileErrorCode.INVALID_SESSION,)
+
+    def test_what_is_written_stands_when_the_session_is_given_up(self) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.ask(Opcode.CREATE_FILE, b"a", session=3)
+        pilot.ask(Opcode.WRITE_FILE, b"abc", session=3)
         pilot.listen(3.0)
         assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
+        assert pilot.vehicle.files["a"] == b"abc"
+
+    @pytest.mark.parametrize(("path", "texts"), [(b"a", 0), (PARAMS, 3), (PARAMS + b"?withdefaults=1", 3)])
+    def test_ardupilot_sends_its_banner_with_the_parameters(self, path: bytes, texts: int) -> None:
+        vehicle = ArduPilotVehicle()
+        vehicle.files["a"] = b"a"
+        vehicle.tick(0.0)
+        vehicle.receive(file_request(Packet(2, 3, Opcode.OPEN_FILE_RO, path)), 0.0)
+        vehicle.tick(0.1)
+        framer = wire.Framer(stream=False)
+        frames = [frame for data in vehicle.data_to_send() for frame in framer.receive(data)]
+        assert sum(isinstance(wire.decode(frame), wire.StatusText) for frame in frames) == texts
+
+    def test_px4_closes_one_after_11_s(self) -> None:
+        pilot = Pilot(PX4Vehicle())
+        pilot.vehicle.files["a"] = b"a"
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
+        pilot.listen(10.5)
+        assert pilot.ask(Opcode.READ_FILE, session=0, size=1).data == b"a"
+        pilot.listen(11.0)
+        assert refusal(pilot.ask(Opcode.READ_FILE, session=0, size=1)) == (FileErrorCode.INVALID_SESSION,)
+        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a").opcode == Opcode.ACK
 
     def test_px4_numbers_its_own(self) -> None:
         pilot = Pilot(PX4Vehicle(ftp=True))
@@ -330,12 +398,29 @@ class TestPace:
 
     def test_px4_ends_a_burst_early_and_says_so(self) -> None:
         pilot = Pilot(PX4Vehicle())
-        pilot.vehicle.files["a"] = bytes(40_000)
+        pilot.vehicle.files["a"] = bytes(50_000)
         pilot.ask(Opcode.OPEN_FILE_RO, b"a")
-        blocks = pilot.burst(session=0)
-        assert [each.burst_complete for each in blocks] == [False] * 145 + [True]
-        rest = pilot.burst(session=0, offset=146 * 239)
-        assert sum(len(each.data) for each in (*blocks, *rest) if each.opcode == Opcode.ACK) == 40_000
+        blocks = pilot.burst(session=0, size=100)
+        assert [each.burst_complete for each in blocks] == [False] * 167 + [True]
+        assert {len(each.data) for each in blocks} == {239}
+        rest = pilot.burst(session=0, offset=168 * 239)
+        assert sum(len(each.data) for each in (*blocks, *rest) if each.opcode == Opcode.ACK) == 50_000
+
+    def test_px4_sends_a_burst_in_its_loop_and_answers_meanwhile(self) -> None:
+        pilot = Pilot(PX4Vehicle())
+        pilot.vehicle.files["a"] = bytes(50_000)
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
+        pilot.send(Packet(100, 0, Opcode.BURST_READ_FILE, size=239))
+        assert pilot.listen(0.009) == []
+        first = pilot.listen(0.006)
+        assert len(first) == 57
+        pilot.send(Packet(300, 0, Opcode.READ_FILE, size=5))
+        (answer,) = pilot.listen(0.001)
+        assert answer.requested == Opcode.READ_FILE
+        pilot.send(Packet(400, 0, Opcode.BURST_READ_FILE, offset=20_000, size=239))
+        blocks = pilot.listen(0.1)
+        assert [each.offset for each in blocks] == [20_000 + 239 * at for at in range(126)] + [50_000]
+        assert [each.sequence for each in blocks[:2]] == [401, 402]
 
 
 class TestSwitches:

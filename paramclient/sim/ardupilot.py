@@ -12,8 +12,9 @@ from typing import Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
 from paramclient.protocol import wire
+from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.protocol.pack import PackedParam
-from paramclient.sim.ftp import FileServer
+from paramclient.sim.ftp import PARAM_FILE, Address, FileServer
 from paramclient.sim.table import Entry, Table, ardupilot_table, as_table, ek2_group, with_system_id
 from paramclient.sim.vehicle import Vehicle, VehicleOptions
 from paramclient.values import Encoding, ParamType, bits_of, from_bits
@@ -26,8 +27,14 @@ class ArduPilotVehicle(Vehicle):
 
     - Values are sent as float32 whatever their type; type and value are kept exactly on board.
     - PARAM_REQUEST_LIST: a banner, then all parameters by index from the next slot on (slots come every
-      100 ms), 10 every 5.9 ms. Asked for again it starts again. It goes on with the count that it began
+      100 ms), 10 every 5.95 ms. Asked for again it starts again. It goes on with the count that it began
       with, also when a group is shown or hidden meanwhile.
+    - A list of more than 1,000 values per second takes the whole loop: nothing received is looked at for
+      130 ms, and no block of a file is sent. Then everything that has come is handled. If a list was
+      requested, it begins at 0 at once, pauses 17.5 ms later and goes on with the next slot. If there are
+      reads, 5 are answered and the list pauses; the next slot answers 5 more, the one after it 5 more and
+      goes on with the list. So the list runs for 130 of every 300 ms. The first time in a list, up to 10
+      waiting reads do not make it pause.
     - Reads wait for the next slot, which serves 5; 20 more can wait, what comes on top is dropped without a
       word. By name the answer has index 65535 and the spelling that was asked for; case does not matter.
     - A set converts the value to the parameter's own type (cut to whole numbers, kept within its range) and
@@ -83,7 +90,7 @@ class ArduPilotVehicle(Vehicle):
         live: Iterable[str] = ("STAT_RUNTIME", "BARO1_GND_PRESS"),
         live_period: float = 30.0,
         burst: int = 10,
-        period: float = 0.0059,
+        period: float = 0.00595,
         ftp: bool = True,
         ftp_rate: float = 48_500.0,
         **options: Unpack[VehicleOptions],
@@ -134,6 +141,7 @@ class ArduPilotVehicle(Vehicle):
             period=period,
             **options,
         )
+        self._list_fills_loop = burst > _BUSY_RATE * period
 
     def _key(self, name: str) -> str:
         return name.upper()
@@ -145,14 +153,21 @@ class ArduPilotVehicle(Vehicle):
         return self._was_on[switch] if switch in self._late_switches else self._entry(switch).bits != 0
 
     def _timers(self) -> tuple[float, ...]:
-        return self._read_at, self._answer_at, self._live_at, self._system_id_at
+        return self._read_at, self._answer_at, self._live_at, self._system_id_at, self._window_at
+
+    def _take(self, frame: wire.Frame) -> None:
+        if self._window_at == math.inf:
+            super()._take(frame)
+        elif len(self._backlog) < _BACKLOG:
+            self._backlog.append(frame)
 
     def _on_list(self) -> None:
         if self._now < self._on_at + self._boot_time:
             return
-        for text in _BANNER:
-            self._send(wire.StatusText(_INFO, text))
+        self._send_banner()
         self._list_count = len(self._listed)
+        self._has_answered_in_list = False
+        self._list_pause_at = self._now + _LIST_START
         self._start_list(self._next(_SLOT) if self._position is None else self._next_burst)
 
     def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
@@ -216,6 +231,11 @@ class ArduPilotVehicle(Vehicle):
         self._system_id_at = math.inf
         self._live_at = at + self._live_period if self._live_period else math.inf
         self._list_count = 0
+        self._has_answered_in_list = False
+        self._list_pause_at = math.inf
+        self._window_at = math.inf
+        self._backlog: list[wire.Frame] = []
+        self._file_answers: list[tuple[Packet, Address]] = []
         super()._switch_on(at)
 
     def _work(self, now: float) -> None:
@@ -227,24 +247,107 @@ class ArduPilotVehicle(Vehicle):
             if self._live_at <= now:
                 self._live_at = now + self._live_period
             self._change_live()
-        super()._work(now)
         while self._read_at <= now:
-            for answer in self._ready:
-                self._send(answer)
-            self._ready.clear()
-            self._look_up()
+            self._answer_reads()
             self._read_at = self._read_at + _SLOT if self._ready else math.inf
+        super()._work(now)
+        self._mind_list(now)
         if self._answer_at <= now:
             self._answer_at = math.inf
             for entry in self._answers.values():
                 self._send_value(entry, index=wire.NO_INDEX)
             self._answers.clear()
 
-    def _next(self, period: float) -> float:
+    def _send_list(self, now: float) -> None:
+        starts_at = self._next_burst
+        if self._list_fills_loop and self._window_at == math.inf and starts_at <= now:
+            if not starts_at < self._list_pause_at:
+                self._list_pause_at = math.inf
+            self._window_at = min(self._list_pause_at, starts_at + _LIST_RUN)
+            if self._read_at <= starts_at + _ROUNDING:
+                self._answer_reads()
+            self._read_at = math.inf
+        super()._send_list(now)
+
+    def _mind_list(self, now: float) -> None:
+        """See to what has been received, where the list has taken the whole loop until now."""
+        if self._window_at == math.inf:
+            return
+        if self._position is None or self._high_latency:
+            self._window_at = self._list_pause_at = math.inf
+            self._take_backlog()
+            self._read_at = self._next(_SLOT) if self._ready else math.inf
+        elif self._window_at <= now:
+            self._open_window(self._window_at)
+
+    def _open_window(self, at: float) -> None:
+        """Handle what has been received during a run of the list, and decide how the list goes on."""
+        is_pause_due = self._list_pause_at <= at
+        self._list_pause_at = self._window_at = math.inf
+        self._take_backlog(until_list=not is_pause_due)
+        if self._position is None:  # a restart
+            return
+        if self._ready:
+            is_first = not self._has_answered_in_list
+            self._has_answered_in_list = True
+            is_pause_due = not is_first or len(self._ready) + len(self._waiting) > _READS_WITHOUT_PAUSE
+            self._answer_reads()
+            self._read_at = self._next(_SLOT) if self._ready and is_pause_due else math.inf
+            if is_pause_due:
+                self._next_burst = self._next(_SLOT, after=at + _LIST_PAUSE)
+        elif self._list_pause_at < math.inf:
+            self._window_at = self._list_pause_at
+            return
+        elif is_pause_due:
+            self._next_burst = self._next(_SLOT)
+        if not is_pause_due:
+            self._window_at = at + _LIST_RUN
+
+    def _take_backlog(self, *, until_list: bool = False) -> None:
+        """Handle the frames that wait, or those up to a request for the list."""
+        backlog, self._backlog = deque(self._backlog), []
+        while backlog and not (until_list and self._list_pause_at < math.inf):
+            super()._take(backlog.popleft())
+        self._backlog.extend(backlog)
+        if not self._high_latency:
+            self._serve_files(self._now)
+
+    def _answer_reads(self) -> None:
+        """Send the answers that are complete, and look up those for the next slot."""
+        for answer in self._ready:
+            self._send(answer)
+        self._ready.clear()
+        self._look_up()
+
+    def _serve_files(self, now: float) -> None:
+        if self._ftp is None:
+            return
+        is_held = self._window_at < math.inf
+        self._file_answers += self._ftp.work(now, _FILE_QUEUE - len(self._file_answers) if is_held else None)
+        if is_held:
+            return
+        for answer, sender in self._file_answers:
+            self._send(wire.FileTransfer(0, *sender, answer.pack()))
+            is_opened = answer.requested == Opcode.OPEN_FILE_RO and answer.opcode == Opcode.ACK
+            if is_opened and any(path.startswith(PARAM_FILE) for path in self.open_files):
+                self._send_banner()
+        self._file_answers.clear()
+
+    def _next_file_work(self) -> float:
+        is_full = self._window_at < math.inf and len(self._file_answers) >= _FILE_QUEUE
+        return math.inf if is_full else super()._next_file_work()
+
+    def _send_banner(self) -> None:
+        for text in _BANNER:
+            self._send(wire.StatusText(_INFO, text))
+
+    def _next(self, period: float, *, after: float | None = None) -> float:
         """When the next turn of something begins that comes every `period` seconds since switching on."""
-        if self._now < self._on_at:
+        if after is None:
+            after = self._now
+        if after < self._on_at:
             return self._on_at
-        turns = (self._now - self._on_at) / period
+        turns = (after - self._on_at) / period
         return self._on_at + (math.floor(turns + _ROUNDING) + 1) * period
 
     def _look_up(self) -> None:
@@ -288,6 +391,15 @@ _SLOT = 0.1  # seconds from one turn of the parameter task to the next, which an
 _ROUNDING = 1e-6  # a turn that begins at `now` may come out a little less than whole
 _READS_PER_SLOT = 5
 _READ_QUEUE = 20
+_BUSY_RATE = 1000.0  # values per second above which a list takes the whole loop
+_LIST_RUN = 0.130  # seconds for which a list then takes it
+_LIST_START = 0.0175  # seconds from a request for the list until it pauses, if a slot has begun in between
+_LIST_PAUSE = 0.080  # seconds from the answers to reads until a slot may go on with the list
+_READS_WITHOUT_PAUSE = 10  # reads, waiting for the first time in a list, that do not make it pause
+_FILE_QUEUE = (
+    19  # answers of MAVFTP that wait while a list takes the loop, besides the one that is being made
+)
+_BACKLOG = 1000  # frames that wait to be looked at
 
 
 def _converted(value: float, kind: ParamType | int) -> int:

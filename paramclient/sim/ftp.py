@@ -14,14 +14,20 @@ from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
 from paramclient.protocol.pack import PackedParam
 from paramclient.values import crc32_px4
 
-__all__ = ["FileServer"]
+__all__ = ["PARAM_FILE", "Address", "FileServer"]
 
 PARAM_FILE: Final = "@PARAM/param.pck"
 IDLE_LIMIT: Final = 3.0
-"""Seconds without a word after which ArduPilot gives a session to another (GCS_FTP.cpp)."""
+"""Seconds without an answer after which ArduPilot gives the session to another; each answer renews it."""
+PX4_IDLE_LIMIT: Final = 11.0
+"""Seconds without a request after which PX4 closes a session (measured: between 10.5 and 12)."""
+PX4_BURST_BLOCKS: Final = 168
+"""Blocks after which PX4 ends a burst and says so: 40,152 bytes."""
+PX4_STEP: Final = 0.010
+"""Seconds from one turn of PX4's MAVLink loop to the next: a burst begins and goes on with one."""
 EINVAL: Final = 22
 
-Sender: TypeAlias = tuple[int, int]
+Address: TypeAlias = tuple[int, int]
 """System and component."""
 
 
@@ -40,7 +46,7 @@ class _Session:
         written: what was written, or None while it is open for reading.
     """
 
-    owner: Sender
+    owner: Address
     path: str
     read: Callable[[int, int], bytes | None] | None
     used_at: float
@@ -49,11 +55,15 @@ class _Session:
 
 @dataclass(slots=True)
 class _Burst:
+    """A burst that is being sent; with PX4, at what time it goes on and how many bytes it may send then."""
+
     request: Packet
-    sender: Sender
+    sender: Address
     offset: int
     sequence: int
-    left: int
+    left: float
+    at: float = 0.0
+    budget: float = 0.0
 
 
 @dataclass(slots=True)
@@ -61,12 +71,19 @@ class FileServer:
     """The server's side of MAVFTP, one request after the other, as ArduPilot's worker takes them.
 
     - Up to 5 requests wait for their turn, which comes with the next one of the vehicle's loop; further ones
-      are dropped. While a burst runs nothing else is served.
+      are dropped. While a burst of ArduPilot runs nothing else is served.
     - A request that comes again, its number the same, gets the same answer, as long as that was the last.
+    - ArduPilot has one session for all stations and links. While its file is open, whatever another session
+      requests is refused with InvalidSession, except that closing it is acknowledged and closes nothing. The
+      session ends when nobody has been answered for 3 s; every answer counts, a refusal too.
     - param.pck is made anew for every read. All reads through one session ask for one size; its size in the
       answer to the open is an estimate, 12 bytes for each parameter. Written, it sets parameters when it
       is closed.
-    - A burst sends a block whenever a third of the link is free again, to the end of the file.
+    - A burst of ArduPilot sends a block whenever a third of the link is free again, to the end of the file.
+    - PX4 has one session for each link, closes it after 11 s without a request, and a reset closes it whoever
+      sends it. A burst begins up to 10 ms after its request, in blocks of 239 bytes whatever was asked for,
+      ends after 168 of them, and says so; other requests are answered meanwhile, and another burst takes its
+      place.
 
     Attributes:
         files: paths and contents; a path's directories exist with it.
@@ -76,25 +93,21 @@ class FileServer:
         apply: takes the parameters of a file that was written.
         rate: bytes per second of a burst; what is asked for singly goes three times as fast.
         turn: seconds until a request is looked at.
-        numbers_sessions: the server gives its own numbers, and a reset closes the sessions of everyone, as
-            with PX4; else a session has the number that its open asked for, and a reset only that one.
-        sessions: that can be open at once.
-        burst_blocks: after which a burst ends and says so.
+        is_px4: whether it serves as PX4 does, which gives sessions its own numbers; else as ArduPilot, where
+            a session has the number that its open asked for.
     """
 
     params: Callable[[], Sequence[PackedParam] | None]
     apply: Callable[[Sequence[PackedParam]], None]
     rate: float
-    turn: float = 0.0058
-    numbers_sessions: bool = False
-    sessions: int = 1
-    burst_blocks: int = 2000
+    is_px4: bool = False
     files: dict[str, bytes] = field(default_factory=dict)
     _open: dict[int, _Session] = field(default_factory=dict)
-    _waiting: deque[tuple[float, Packet, Sender]] = field(default_factory=deque)
+    _waiting: deque[tuple[float, Packet, Address]] = field(default_factory=deque)
     _burst: _Burst | None = None
     _free_at: float = -math.inf
-    _last: tuple[Sender, Packet] | None = None
+    _answered_at: float = -math.inf
+    _last: tuple[Address, Packet] | None = None
     _packed: tuple[object, bytes] | None = None
 
     def __post_init__(self) -> None:
@@ -111,52 +124,74 @@ class FileServer:
         self._open.clear()
         self._waiting.clear()
         self._burst = self._last = None
-        self._free_at = -math.inf
+        self._free_at = self._answered_at = -math.inf
 
-    def receive(self, payload: bytes, sender: Sender, now: float) -> None:
+    def receive(self, payload: bytes, sender: Address, now: float) -> None:
         """A request has come."""
         if len(self._waiting) < _QUEUE:
-            self._waiting.append((now + self.turn, Packet.unpack(payload), sender))
+            turn = _PX4_TURN if self.is_px4 else _LOOP
+            self._waiting.append((now + turn, Packet.unpack(payload), sender))
 
     def next_deadline(self) -> float:
         """When `work` has something to do, or infinity."""
-        if self._burst is not None:
-            return self._free_at
-        return max(self._waiting[0][0], self._free_at) if self._waiting else math.inf
+        request_at = max(self._waiting[0][0], self._free_at) if self._waiting else math.inf
+        if self._burst is None:
+            return request_at
+        return min(request_at, self._burst.at) if self.is_px4 else self._free_at
 
-    def work(self, now: float) -> list[tuple[Packet, Sender]]:
-        """Do what is due: the answers, and whom they are for."""
-        out: list[tuple[Packet, Sender]] = []
+    def work(self, now: float, most: int | None = None) -> list[tuple[Packet, Address]]:
+        """Do what is due, but make no more than `most` answers: the answers, and whom they are for."""
+        out: list[tuple[Packet, Address]] = []
         while (due := self.next_deadline()) <= now:
-            if self._burst is None:
+            if most is not None and len(out) >= most:
+                self._free_at = now
+                break
+            burst = self._burst
+            if burst is None or (self.is_px4 and due < burst.at):
                 _, request, sender = self._waiting.popleft()
                 answer = self._answer(request, sender, due)
-                rate = 3 * self.rate
+                if answer is not None:
+                    self._free_at = due + _size(answer) / (3 * self.rate)
             else:
-                sender = self._burst.sender
-                answer = self._next_block(self._burst, due)
-                rate = self.rate
+                sender = burst.sender
+                answer = self._next_block(burst, due)
+                if self.is_px4:
+                    burst.budget -= _size(answer)
+                    while burst.budget <= 0.0:
+                        burst.at += PX4_STEP
+                        burst.budget += PX4_STEP * self.rate
+                else:
+                    self._free_at = due + _size(answer) / self.rate
             if answer is not None:
                 out.append((answer, sender))
                 self._last = (sender, answer)
-                self._free_at = due + (_OVERHEAD + len(answer.data)) / rate
+                self._answered_at = due
         return out
 
-    def _answer(self, request: Packet, sender: Sender, now: float) -> Packet | None:
+    def _answer(self, request: Packet, sender: Address, now: float) -> Packet | None:
         """One request; None of a burst, whose blocks follow, and of what is no request."""
         if request.opcode in (Opcode.ACK, Opcode.NAK):
             return None
         if self._last is not None:
             to, last = self._last
             is_same = last.sequence == request.sequence + 1 & 0xFFFF and last.requested == request.opcode
-            if to == sender and is_same and (self.numbers_sessions or last.session == request.session):
+            if to == sender and is_same and (self.is_px4 or last.session == request.session):
                 return last
         number = request.session
+        closes = request.opcode in (Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS)
+        if not self.is_px4 and self._open and number not in self._open:
+            if closes:
+                return _packet(_Answer(Opcode.ACK), request, number, request.sequence + 1)
+            if now - self._answered_at < IDLE_LIMIT:
+                return _packet(_no(FileErrorCode.INVALID_SESSION), request, number, request.sequence + 1)
+            self._terminate(*self._open)
+        if self.is_px4 and self._open and now - self._open[0].used_at >= PX4_IDLE_LIMIT:
+            self._terminate(0)
         match request.opcode:
             case Opcode.TERMINATE_SESSION:
                 done = self._terminate(number)
             case Opcode.RESET_SESSIONS:
-                for each in list(self._open) if self.numbers_sessions else [number]:
+                for each in list(self._open) if self.is_px4 else [number]:
                     self._open.pop(each, None)
                 done = _Answer(Opcode.ACK)
             case Opcode.OPEN_FILE_RO | Opcode.CREATE_FILE:
@@ -166,12 +201,9 @@ class FileServer:
             case Opcode.WRITE_FILE:
                 done = self._write(number, request, now)
             case Opcode.BURST_READ_FILE:
-                done = self._read(number, request.offset, request.size or MOST_DATA, now)
+                done = self._read(number, request.offset, self._block_size(request), now)
                 if done.opcode is Opcode.ACK:
-                    self._burst = _Burst(
-                        request, sender, request.offset, request.sequence + 1, self.burst_blocks
-                    )
-                    self._free_at = max(self._free_at, now)
+                    self._begin_burst(request, sender, now)
                     return None
             case Opcode.LIST_DIRECTORY:
                 done = self._list(_text(request.data), request.offset)
@@ -182,9 +214,21 @@ class FileServer:
                 done = _no(FileErrorCode.UNKNOWN_COMMAND)
         return _packet(done, request, number, request.sequence + 1)
 
+    def _begin_burst(self, request: Packet, sender: Address, now: float) -> None:
+        burst = self._burst = _Burst(request, sender, request.offset, request.sequence + 1, math.inf)
+        if self.is_px4:
+            burst.left = PX4_BURST_BLOCKS
+            burst.at = (math.floor(now / PX4_STEP) + 1) * PX4_STEP
+            burst.budget = PX4_STEP * self.rate
+        else:
+            self._free_at = max(self._free_at, now)
+
+    def _block_size(self, request: Packet) -> int:
+        return MOST_DATA if self.is_px4 else request.size or MOST_DATA
+
     def _next_block(self, burst: _Burst, now: float) -> Packet:
         session = burst.request.session
-        done = self._read(session, burst.offset, burst.request.size or MOST_DATA, now)
+        done = self._read(session, burst.offset, self._block_size(burst.request), now)
         sequence = burst.sequence
         burst.sequence += 1
         burst.offset += len(done.data)
@@ -195,19 +239,14 @@ class FileServer:
         is_last_of_many = burst.left == 0
         return _packet(done, burst.request, session, sequence)._replace(burst_complete=is_last_of_many)
 
-    def _open_file(self, request: Packet, sender: Sender, now: float) -> tuple[int, _Answer]:
+    def _open_file(self, request: Packet, sender: Address, now: float) -> tuple[int, _Answer]:
         number, path = request.session, _text(request.data)
-        for each, session in list(self._open.items()):
-            if now - session.used_at >= IDLE_LIMIT:
-                del self._open[each]
-        if self.numbers_sessions:
-            number = next((each for each in range(self.sessions) if each not in self._open), -1)
-            if number < 0:
+        if self.is_px4:
+            if self._open:
                 return request.session, _no(FileErrorCode.NO_SESSIONS_AVAILABLE)
+            number = 0
         elif number in self._open:
             return number, _no(FileErrorCode.FAIL)
-        elif len(self._open) >= self.sessions:
-            return number, _no(FileErrorCode.INVALID_SESSION)
         session = _Session(sender, path, None, now)
         if request.opcode == Opcode.CREATE_FILE:
             session.written = bytearray()
@@ -230,7 +269,7 @@ class FileServer:
     def _read(self, number: int, offset: int, size: int, now: float) -> _Answer:
         session = self._open.get(number)
         if session is None:
-            return _no(FileErrorCode.INVALID_SESSION if self._open else FileErrorCode.FILE_NOT_FOUND)
+            return self._not_open()
         session.used_at = now
         if session.read is None:
             return _no(FileErrorCode.FAIL)
@@ -241,10 +280,14 @@ class FileServer:
             return _no(FileErrorCode.EOF)._replace(offset=offset)
         return _Answer(Opcode.ACK, data, offset)
 
+    def _not_open(self) -> _Answer:
+        """The refusal of a read or write in a session that has no file open."""
+        return _no(FileErrorCode.INVALID_SESSION if self.is_px4 else FileErrorCode.FILE_NOT_FOUND)
+
     def _write(self, number: int, request: Packet, now: float) -> _Answer:
         session = self._open.get(number)
         if session is None:
-            return _no(FileErrorCode.INVALID_SESSION if self._open else FileErrorCode.FILE_NOT_FOUND)
+            return self._not_open()
         session.used_at = now
         if session.written is None or request.offset > _LARGEST:
             return _no(FileErrorCode.FAIL)
@@ -255,7 +298,7 @@ class FileServer:
 
     def _terminate(self, number: int) -> _Answer:
         session = self._open.pop(number, None)
-        if session is None and self.numbers_sessions:
+        if session is None and self.is_px4:
             return _no(FileErrorCode.INVALID_SESSION)
         if session is not None and session.written is not None:
             if session.path != PARAM_FILE:
@@ -311,6 +354,8 @@ class FileServer:
 
 
 _QUEUE = 5
+_LOOP = 0.0058  # seconds until ArduPilot looks at a request
+_PX4_TURN = 0.0001  # seconds until PX4 does
 _OVERHEAD = 27  # bytes of a frame besides the data
 _ESTIMATE = 12
 _LARGEST = 0xFFFF  # of what is written, in bytes
@@ -336,6 +381,11 @@ def _packet(answer: _Answer, request: Packet, session: int, sequence: int) -> Pa
         offset=answer.offset,
         requested=request.opcode,
     )
+
+
+def _size(packet: Packet) -> int:
+    """Bytes on the wire."""
+    return _OVERHEAD + len(packet.data)
 
 
 def _text(data: bytes) -> str:

@@ -82,7 +82,7 @@ class PX4Vehicle(BytewiseVehicle):
         burst, period: by default UDP and USB. A serial port has a burst of 3, the low-bandwidth mode 1
             every 0.125 s.
         ftp: whether there is a param.pck, as after 1.17; otherwise it is said not to be found.
-        ftp_rate: bytes per second of a burst of MAVFTP.
+        ftp_rate: bytes per second of a burst of MAVFTP. By default UDP as measured.
         metadata: whether it describes its parameters, as those with enough memory do.
         options: those of every `Vehicle`. A list that is asked for within its `boot_time` starts then.
 
@@ -112,7 +112,7 @@ class PX4Vehicle(BytewiseVehicle):
         burst: int = 20,
         period: float = 0.020,
         ftp: bool = False,
-        ftp_rate: float = 48_500.0,
+        ftp_rate: float = 1_500_000.0,
         metadata: bool = False,
         **options: Unpack[VehicleOptions],
     ) -> None:
@@ -133,11 +133,7 @@ class PX4Vehicle(BytewiseVehicle):
             raise UsageError(f"clamp_delay is a number of seconds from 0 up, not {clamp_delay}")
         self._clamp_delay = clamp_delay
         self._ftp = FileServer(
-            self._packed_params if ftp else lambda: None,
-            self._apply_packed,
-            ftp_rate,
-            numbers_sessions=True,
-            burst_blocks=_BURST_BLOCKS,
+            self._packed_params if ftp else lambda: None, self._apply_packed, ftp_rate, is_px4=True
         )
         self._has_metadata = metadata
         if metadata:
@@ -333,7 +329,6 @@ _MAIN = 0x01120000  # 1.18
 _STANDBY = 3
 _UID = 5283920058631409231
 _PUSH_DELAY = 0.020
-_BURST_BLOCKS = 146  # a burst of MAVFTP ends after 35 kB
 
 
 def _third_compass(rows: tuple[SimParam, ...]) -> tuple[SimParam, ...]:

@@ -303,8 +303,11 @@ class Vehicle(Device):
             self._ftp.receive(message.payload, (sender.system, sender.component), self._now)
 
     def _next_transmission(self) -> float:
-        files = math.inf if self._ftp is None else self._ftp.next_deadline()
-        return min(super()._next_transmission(), self._next_burst, files)
+        return min(super()._next_transmission(), self._next_burst, self._next_file_work())
+
+    def _next_file_work(self) -> float:
+        """When MAVFTP has something to do."""
+        return math.inf if self._ftp is None else self._ftp.next_deadline()
 
     def _skip_what_was_left_out(self) -> None:
         super()._skip_what_was_left_out()
@@ -322,14 +325,21 @@ class Vehicle(Device):
 
     def _work(self, now: float) -> None:
         super()._work(now)
-        if self._high_latency:
-            return
+        if not self._high_latency:
+            self._send_list(now)
+            self._serve_files(now)
+
+    def _send_list(self, now: float) -> None:
+        """Send what is due of the list."""
         while self._next_burst <= now:
             self._next_burst += self._period
             for _ in range(self._burst):
                 if not self._send_next():
                     self._next_burst = math.inf
                     break
+
+    def _serve_files(self, now: float) -> None:
+        """Send what is due of MAVFTP."""
         if self._ftp is not None:
             for answer, sender in self._ftp.work(now):
                 self._send(wire.FileTransfer(0, *sender, answer.pack()))

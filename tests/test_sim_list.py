@@ -1,0 +1,162 @@
+"""The list of the simulated ArduPilot: what else it does while one is being sent."""
+
+from __future__ import annotations
+
+import itertools
+import struct
+from collections import Counter
+from collections.abc import Container, Sequence
+from functools import partial
+
+import pytest
+
+from paramclient.protocol import wire
+from paramclient.protocol.ftp.packets import Opcode, Packet
+from paramclient.sim import ArduPilotVehicle
+from tests.ground import LIST, Station, cast, indices, read
+
+SET = cast("RTL_ALT", 1234.0)
+LOOP = 0.006
+"""Seconds from one turn of the vehicle's loop to the next."""
+
+quiet = partial(ArduPilotVehicle, live_period=0.0)
+near = partial(pytest.approx, abs=LOOP)
+
+
+def listing(seconds: float, vehicle: ArduPilotVehicle | None = None) -> Station:
+    """A station that has requested the list, so long ago. The first slot begins at 0.1 s."""
+    return Station(quiet() if vehicle is None else vehicle).send(LIST).wait(seconds)
+
+
+def acknowledged(station: Station) -> list[float]:
+    """When the set was acknowledged."""
+    return [
+        time
+        for time, _, message in station.log
+        if isinstance(message, wire.ParamValue)
+        and (message.param_id, message.param_index) == ("RTL_ALT", wire.NO_INDEX)
+    ]
+
+
+def answered(station: Station, wanted: Container[int]) -> list[float]:
+    """When reads of these indices, far ahead of the list, were answered."""
+    return [
+        time
+        for time, _, message in station.log
+        if isinstance(message, wire.ParamValue) and message.param_index in wanted
+    ]
+
+
+def pauses(station: Station, without: Container[int] = ()) -> list[tuple[float, float]]:
+    """From when to when no value of the list came, where that was longer than 20 ms."""
+    times = [
+        time
+        for time, _, message in station.log
+        if isinstance(message, wire.ParamValue) and message.param_index not in without
+    ]
+    return [pair for pair in itertools.pairwise(times) if pair[1] - pair[0] > 0.02]
+
+
+def test_nothing_received_is_looked_at_while_it_runs() -> None:
+    station = listing(0.15).send(SET).wait(0.3)
+    assert acknowledged(station) == near([0.23])
+    assert pauses(station) == []
+
+
+def test_nothing_waits_when_it_has_ended() -> None:
+    station = listing(0.9).send(SET).wait(0.1)
+    assert acknowledged(station) == near([0.924])
+    assert station.values()[-2].param_index == 1381
+    assert acknowledged(station.send(SET).wait(0.1)) == near([1.006])
+
+
+def test_a_second_request_begins_at_0_and_makes_it_pause() -> None:
+    station = listing(0.25).send(LIST).wait(2.0)
+    (pause,) = pauses(station)
+    assert pause == near((0.375, 0.4))
+    times = station.times()
+    values = indices(station.values())
+    again = values.index(0, 1)
+    assert values == [*range(again), *range(1382)]
+    assert times[again] == near(0.36)
+    assert times[-1] == pytest.approx(1.2, abs=0.02)
+
+
+def test_a_request_just_before_a_slot_makes_it_pause_as_well() -> None:
+    station = Station(quiet()).wait(0.095).send(LIST).wait(2.0)
+    (pause,) = pauses(station)
+    assert pause == near((0.11, 0.2))
+
+
+def test_up_to_10_reads_do_not_make_it_pause_the_first_time() -> None:
+    station = listing(0.15).send(*(read(index=index) for index in range(1300, 1310))).wait(0.4)
+    assert answered(station, range(1300, 1310)) == near([0.23] * 5 + [0.36] * 5)
+    assert [first for first, _ in pauses(station, range(1300, 1310))] == near([0.36])
+
+
+def test_reads_make_it_pause() -> None:
+    """So many a second: 5 are answered in each 100 ms, and it runs for 130 of every 300 ms."""
+    station = listing(0.15)
+    for index in range(1200, 1380, 5):
+        station.send(*(read(index=each) for each in range(index, index + 5))).wait(0.1)
+    asked = range(1200, 1380)
+    runs = [(round(first, 2), round(last, 2)) for first, last in pauses(station, asked)]
+    assert runs[:4] == [(0.36, 0.5), (0.62, 0.8), (0.92, 1.1), (1.22, 1.4)]
+    answers = Counter(int(time * 10 + 0.01) for time in answered(station, asked) if time < 1.4)
+    assert answers == {2: 5, 3: 5} | dict.fromkeys(range(4, 14), 5)
+
+
+def test_40_reads_at_once_lose_15() -> None:
+    station = listing(0.15).send(*(read(index=index) for index in range(1300, 1340))).wait(2.0)
+    assert sorted(set(indices(station.values())) - set(range(1300))) == [*range(1300, 1382)]
+    station = listing(0.15).send(*(read(index=index) for index in range(1300, 1340))).wait(0.7)
+    times = answered(station, range(1300, 1340))
+    assert times == near([0.23] * 5 + [0.3] * 5 + [0.4] * 5 + [0.53] * 5 + [0.6] * 5)
+
+
+def test_on_a_slow_link_it_takes_nothing_from_others() -> None:
+    station = listing(0.15, quiet(burst=1, period=0.025)).send(SET, read(index=1000)).wait(0.1)
+    assert acknowledged(station) == near([0.156])
+    assert answered(station, [1000]) == near([0.2])
+
+
+def ask_for_file(station: Station, packets: Sequence[Packet]) -> Station:
+    return station.send(*(wire.FileTransfer(0, 1, 1, packet.pack()) for packet in packets))
+
+
+def test_a_burst_of_a_file_stands_still() -> None:
+    """20 blocks can wait. They come when it looks at the link, and the list goes on."""
+    station = Station(quiet())
+    ask_for_file(station, [Packet(2, 3, Opcode.OPEN_FILE_RO, b"@PARAM/param.pck")]).wait(0.02)
+    burst = Packet(4, 3, Opcode.BURST_READ_FILE, size=239)
+    ask_for_file(station, [burst]).send(LIST).wait(2.0)
+    times = [time for time, _, message in station.log if isinstance(message, wire.FileTransfer)][1:]
+    assert len(times) == 65
+    at_once = [(time, count) for time, count in Counter(times).items() if count > 1]
+    assert [count for _, count in at_once] == [20, 20, 11]
+    assert [time for time, _ in at_once] == near([0.23, 0.36, 0.49])
+    assert not [time for time in times if 0.1 < time < 0.229]
+    assert pauses(station) == []
+
+
+def test_a_restart_forgets_what_waits() -> None:
+    vehicle = quiet()
+    station = listing(0.15, vehicle).send(SET)
+    vehicle.reboot(station.now)
+    station.wait(1.0)
+    assert vehicle.param("RTL_ALT").value == 1500
+    assert struct.unpack("<f", cast("RTL_ALT", 1234.0).raw) == (1234.0,)
+
+
+def test_in_high_latency_what_waits_is_looked_at_and_the_list_waits() -> None:
+    vehicle = quiet()
+    station = listing(0.15, vehicle).send(SET)
+    vehicle.high_latency = True
+    station.wait(0.05)
+    assert vehicle.param("RTL_ALT").value == 1234
+    station.log.clear()
+    station.wait(1.0)
+    assert station.times() == []
+    vehicle.high_latency = False
+    station.wait(2.0)
+    assert station.values()[-1].param_index == 1381
