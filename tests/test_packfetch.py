@@ -304,9 +304,8 @@ def test_an_older_server_that_knows_no_query_is_asked_without() -> None:
     serve = vehicle._ftp._open_file
 
     def older(request: Packet, sender: tuple[int, int], now: float) -> Any:
-        if b"?" in request.data:
-            return request.session, type(serve(request, sender, now)[1])(Opcode.NAK, bytes((10,)))
-        return serve(request, sender, now)
+        is_known = b"?" not in request.data
+        return serve(request if is_known else request._replace(data=b"no such file"), sender, now)
 
     vehicle._ftp = _with_open(vehicle._ftp, older)
     session = Simulation(server)
@@ -329,14 +328,18 @@ def test_a_server_that_keeps_silent_is_remembered_once_the_list_has_come() -> No
 
 
 def test_a_server_that_is_busy_is_asked_again_next_time() -> None:
+    """Another station has left its session open, which ends by itself."""
     server = Server(vehicle := ArduPilotVehicle(live_period=0))
-    assert vehicle._ftp is not None
-    vehicle._ftp.sessions = 0
     session = Simulation(server)
+    session.meet()
+    vehicle.files["a"] = b"a"
+    opened = Packet(2, 200, Opcode.OPEN_FILE_RO, b"a")
+    session.other_station(wire.FileTransfer(0, 1, 1, opened.pack()))
+    session.run(0.1)
     result = session.fetch()
     assert (result.source, is_whole(result, vehicle)) == ("stream", True)
     assert remembered(session) is None
-    vehicle._ftp.sessions = 1
+    session.run(3.2)
     assert session.fetch().source == "ftp"
 
 
@@ -470,7 +473,7 @@ def test_two_callers_share_one_file() -> None:
 
 
 def test_one_who_wants_it_anew_while_the_hash_is_awaited_gets_what_has_come() -> None:
-    server = Server(vehicle := PX4Vehicle(ftp=True))
+    server = Server(vehicle := PX4Vehicle(ftp=True, ftp_rate=48_500.0))
     session = Simulation(server, air=Air.symmetric([server], delay=0.1))
     fetch = begin(session)
     session.until(lambda: fetch.file is not None and not fetch.file.is_awaited)
