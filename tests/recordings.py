@@ -1,14 +1,48 @@
-"""Reads the telemetry logs in tests/data: both directions of real sessions, frame by frame."""
+"""Reads the telemetry logs in tests/data: both directions of real sessions, frame by frame.
+
+`replay` gives a simulated vehicle the ground station's frames of a log at the recorded times. `differences`
+says where the vehicle's messages differ from the recorded ones, by these rules:
+
+Series: Each message belongs to one series: the values of a list; the other PARAM_VALUEs of each name (index
+65535) or index; the answers of MAVFTP; the texts of the banner; each further message type. A value belongs to
+the list if its index is one more than that of the list's last value, or 0 after another request for the list.
+
+Order: A series has the same messages in the same order. Two messages of different series that were recorded
+more than 50 ms apart come in the same order, within what the phase allows.
+
+Time: The time from a request to each message is that of the log, within 20 ms or 20 %, whichever is larger.
+The request of a list's value is the PARAM_REQUEST_LIST from which its pass began; of another PARAM_VALUE, the
+latest read or set of that parameter; of an answer of MAVFTP, the latest request of that kind with a lower
+number, so the request for the burst for each of its blocks; of the banner, the latest request for the list
+or for a file; of other messages, the latest command. Heartbeats have no request: their spacing is that of the
+log within 20 %.
+
+Phase: A log does not tell at which point of the vehicle's loop a request arrived. So each replay states the
+phase of the vehicle's loop, and a value of a list may come with the burst before or after (10 values of
+ArduPilot, 20 of PX4), a block of a file up to two blocks earlier or later. A pass of a list that another
+request ends may have as many values more or less.
+"""
 
 from __future__ import annotations
 
+import math
+import re
 import struct
-from collections.abc import Iterable
+from collections import defaultdict
+from collections.abc import Collection, Iterable
 from functools import cache
+from heapq import heappop, heappush
+from itertools import pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 from paramclient.protocol import wire
+from paramclient.protocol.ftp.packets import Opcode, Packet
+from paramclient.sim import Vehicle
+from paramclient.values import Value
+
+Messages: TypeAlias = list[tuple[float, wire.Message]]
+"""Messages, each with the seconds since the log's first frame."""
 
 DATA = Path(__file__).parent / "data"
 NAMES = tuple(sorted(path.stem for path in DATA.glob("*.tlog")))
@@ -65,7 +99,7 @@ def from_ground(name: str) -> list[Record]:
     return [record for record in read(name) if record.system == GROUND_STATION]
 
 
-def from_vehicle(name: str) -> list[tuple[float, wire.Message]]:
+def from_vehicle(name: str) -> Messages:
     """What the vehicle sent, as far as `wire` decodes it: the time, and the message."""
     return [
         (record.time, message)
@@ -77,3 +111,192 @@ def from_vehicle(name: str) -> list[tuple[float, wire.Message]]:
 def param_values(messages: Iterable[tuple[float, wire.Message]]) -> list[wire.ParamValue]:
     """The PARAM_VALUEs among them, in order."""
     return [message for _, message in messages if isinstance(message, wire.ParamValue)]
+
+
+def replay(
+    vehicle: Vehicle,
+    name: str,
+    *,
+    phase: float = 0.0,
+    on_board: Iterable[tuple[float, str, Value]] = (),
+) -> Messages:
+    """Let the vehicle hear the ground station of a log at the recorded times; what it sent meanwhile.
+
+    Args:
+        phase: seconds into the log at which the vehicle's heartbeats, and with them the slots of ArduPilot,
+            are due. It has been on for a second then.
+        on_board: what happened inside the vehicle: when, which parameter, and the value that it took.
+    """
+    inputs: list[tuple[float, bytes | tuple[str, Value]]] = [
+        *((record.time, record.data) for record in from_ground(name)),
+        *((time, (param, value)) for time, param, value in on_board),
+        (read(name)[-1].time + 0.05, b""),
+    ]
+    framer = wire.Framer(stream=False)
+    sent: Messages = []
+
+    def collect(now: float) -> None:
+        for data in vehicle.data_to_send():
+            (frame,) = framer.receive(data)
+            message = wire.decode(frame)
+            assert message is not None
+            sent.append((now, message))
+
+    vehicle.tick(phase - 1.0)
+    collect(phase - 1.0)
+    for time, action in sorted(inputs, key=lambda item: item[0]):
+        while (due := vehicle.next_deadline()) is not None and due <= time:
+            vehicle.tick(due)
+            collect(due)
+        if isinstance(action, bytes):
+            vehicle.receive(action, time)
+        else:
+            vehicle.tick(time)
+            vehicle.set_param(*action)
+        collect(time)
+    return [(time, message) for time, message in sent if time >= 0.0]
+
+
+def differences(
+    name: str, recorded: Messages, sent: Messages, *, burst: int, unasked: Collection[str] = ()
+) -> list[str]:
+    """Where what was sent in a replay differs from the log, by the rules above; none where it is right.
+
+    Args:
+        burst: values of a list that the vehicle sends in one go.
+        unasked: parameters whose values outside lists are left out.
+    """
+    expected, actual = _series(name, recorded, unasked), _series(name, sent, unasked)
+    if len(_passes(expected["list"])) != len(_passes(actual["list"])):
+        return [
+            f"{len(_passes(expected['list']))} passes of a list recorded, {len(_passes(actual['list']))} sent"
+        ]
+    found = _beats(expected.pop("Heartbeat", []), actual.pop("Heartbeat", []))
+    pairs = []
+    asked = _requests(name)
+    for key in sorted(expected.keys() | actual.keys()):
+        parts = [(expected[key], actual[key])]
+        if key == "list":
+            parts = list(zip(_passes(expected[key]), _passes(actual[key]), strict=True))
+        slack = {"list": burst, "FileTransfer": 2}.get(key, 0)
+        for number, (one, other) in enumerate(parts):
+            if number < len(parts) - 1 and abs(len(one) - len(other)) <= burst:
+                shorter = min(len(one), len(other))
+                one, other = one[:shorter], other[:shorter]
+            if [message for _, message in one] != [message for _, message in other]:
+                found.append(f"{key}: other messages: {len(one)} recorded, {len(other)} sent")
+                continue
+            for at, (time, message) in enumerate(other):
+                request = _request_of(one[0] if key == "list" else one[at], asked)
+                allowed = max(0.02, 0.2 * (one[at][0] - request))
+                pair = _Pair(one[max(at - slack, 0)][0], one[min(at + slack, len(one) - 1)][0], time)
+                pairs.append(pair)
+                if not pair.first - allowed <= time <= pair.last + allowed:
+                    found.append(f"{key}: recorded at {one[at][0]:.4f}, sent at {time:.4f}: {message}")
+    return found + _order(pairs)
+
+
+def last_list(name: str) -> list[wire.ParamValue]:
+    """The values of the last list of a log, in order."""
+    return param_values(_passes(_series(name, from_vehicle(name), ())["list"])[-1])
+
+
+class _Pair(NamedTuple):
+    """The earliest and latest time that the phase allows for a message, and when it was sent."""
+
+    first: float
+    last: float
+    sent: float
+
+
+def _series(name: str, messages: Messages, unasked: Collection[str]) -> defaultdict[str, Messages]:
+    """The messages by series; an index 0 begins a pass if a list was requested since the pass before."""
+    lists = [time for time, request in _requests(name) if isinstance(request, wire.ParamRequestList)]
+    series: defaultdict[str, Messages] = defaultdict(list)
+    last, passes = None, 0
+    for time, message in messages:
+        key = type(message).__name__
+        if isinstance(message, wire.ParamValue):
+            index = message.param_index
+            key = f"value {message.param_id.upper() if index == wire.NO_INDEX else index}"
+            is_first = index == 0 and passes < sum(asked <= time for asked in lists)
+            if is_first or (last is not None and index == last + 1):
+                key, last = "list", index
+                passes += is_first
+            elif message.param_id in unasked:
+                continue
+        elif isinstance(message, wire.StatusText):
+            message = wire.StatusText(message.severity, re.sub(r"\([0-9a-f]{8}\)", "(hash)", message.text))
+        series[key].append((time, message))
+    return series
+
+
+def _passes(values: Messages) -> list[Messages]:
+    passes: list[Messages] = []
+    for time, message in values:
+        assert isinstance(message, wire.ParamValue)
+        if message.param_index == 0:
+            passes.append([])
+        passes[-1].append((time, message))
+    return passes
+
+
+def _requests(name: str) -> list[tuple[float, wire.Message]]:
+    return [(record.time, message) for record in from_ground(name) if (message := record.message) is not None]
+
+
+def _request_of(answer: tuple[float, wire.Message], requests: Messages) -> float:
+    """When it was sent that a message of the vehicle answers; without a request, when the message came."""
+    came, message = answer
+    times = [time for time, request in requests if time <= came and _answers(message, request)]
+    return max(times, default=came)
+
+
+def _answers(message: wire.Message, request: wire.Message) -> bool:
+    match request:
+        case wire.ParamRequestList():
+            return isinstance(message, wire.StatusText) or (
+                isinstance(message, wire.ParamValue) and message.param_index in (0, wire.NO_INDEX)
+            )
+        case wire.ParamRequestRead(param_index=index) if index >= 0:
+            return isinstance(message, wire.ParamValue) and message.param_index == index
+        case wire.ParamRequestRead(param_id=wanted) | wire.ParamSet(param_id=wanted):
+            return isinstance(message, wire.ParamValue) and message.param_id.upper() == wanted.upper()
+        case wire.FileTransfer():
+            packet = Packet.unpack(request.payload)
+            if isinstance(message, wire.StatusText):
+                return packet.opcode == Opcode.OPEN_FILE_RO
+            if not isinstance(message, wire.FileTransfer):
+                return False
+            answer = Packet.unpack(message.payload)
+            return answer.requested == packet.opcode and answer.sequence > packet.sequence
+        case wire.CommandLong():
+            return isinstance(message, wire.CommandAck | wire.AutopilotVersion)
+    return False
+
+
+def _beats(recorded: Messages, sent: Messages) -> list[str]:
+    found = []
+    if {message for _, message in recorded} != {message for _, message in sent}:
+        found.append("Heartbeat: other messages")
+    spacings = [[then - now for (now, _), (then, _) in pairwise(each)] for each in (recorded, sent)]
+    for one, other in zip(*spacings, strict=False):
+        if not math.isclose(one, other, rel_tol=0.2):
+            found.append(f"Heartbeat: {one:.3f} s apart, sent {other:.3f} s apart")
+    return found if abs(len(recorded) - len(sent)) <= 1 else [*found, "Heartbeat: another number of them"]
+
+
+def _order(pairs: list[_Pair]) -> list[str]:
+    """Where messages come in another order, though they were recorded far from each other."""
+    found = []
+    near: list[tuple[float, float]] = []
+    ahead = -math.inf  # when the last of those was sent that were recorded long before
+    for pair in sorted(pairs):
+        while near and near[0][0] < pair.first - 0.05:
+            ahead = max(ahead, heappop(near)[1])
+        if pair.sent < ahead:
+            found.append(
+                f"recorded from {pair.first:.4f} on, sent at {pair.sent:.4f}, before what came before"
+            )
+        heappush(near, (pair.last, pair.sent))
+    return found

@@ -527,7 +527,7 @@ class TestPX4:
     def test_a_set_is_acknowledged_and_pushed_once(self) -> None:
         vehicle = PX4Vehicle()
         station = Station(vehicle).wait(0.3).send(write("MPC_XY_VEL_MAX", 11.5, ParamType.REAL32)).wait(2.0)
-        assert [time - 0.3 for time in station.times()] == pytest.approx([0.0, 0.020])
+        assert [time - 0.3 for time in station.times()] == pytest.approx([0.0, 0.010])
         first, second = station.values()
         assert first == second
         assert first.param_index == vehicle.param("MPC_XY_VEL_MAX").index
@@ -594,7 +594,7 @@ class TestPX4:
             station.send(write("SYS_AUTOSTART", value, ParamType.INT32)).wait(0.015)
         pushes = [time for time, _, message in station.log if "WV_GAIN" in str(message)]
         assert len(pushes) >= 10
-        assert pushes[0] == pytest.approx(0.020)
+        assert pushes[0] == pytest.approx(0.010)
         assert pushes[-1] <= 0.3
 
     def test_many_changes_are_pushed_20_at_a_time(self) -> None:
@@ -703,6 +703,28 @@ class TestArduPilot:
     def test_on_a_slow_link(self) -> None:
         station = Station(ArduPilotVehicle(burst=1, period=0.025, live_period=0.0)).send(LIST).wait(60.0)
         assert station.times()[-1] == pytest.approx(34.6, rel=0.01)
+
+    @pytest.mark.parametrize("name", ["EK3_IMU_MASK", "INS_GYRO_FILTER"])
+    def test_a_set_to_the_default_is_answered_with_another_type(self, name: str) -> None:
+        """Until the parameter has had another value once; measured on a real one."""
+        vehicle = ArduPilotVehicle()
+        param = vehicle.param(name)
+        assert isinstance(param.value, int)
+        station = Station(vehicle)
+        kinds = [
+            [value.param_type for value in station.ask(cast(name, value))]
+            for value in (param.value, param.value, param.value + 1, param.value + 1, param.value)
+        ]
+        assert kinds == [[ParamType.REAL32], [ParamType.REAL32], [param.type], [param.type], [param.type]]
+        assert vehicle.param(name).type == param.type
+
+    @pytest.mark.parametrize("name", ["RTL_ALT", "FLTMODE1"])
+    def test_a_set_of_a_parameter_in_no_group_keeps_its_type(self, name: str) -> None:
+        vehicle = ArduPilotVehicle()
+        param = vehicle.param(name)
+        assert isinstance(param.value, int)
+        (value,) = Station(vehicle).ask(cast(name, param.value))
+        assert value.param_type == param.type
 
     def test_early_after_boot_the_list_is_ignored(self) -> None:
         station = Station(ArduPilotVehicle(boot_time=2.0, table=SMALL))

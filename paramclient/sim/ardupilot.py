@@ -31,7 +31,7 @@ class ArduPilotVehicle(Vehicle):
       with, also when a group is shown or hidden meanwhile.
     - A list of more than 1,000 values per second takes the whole loop: nothing received is looked at for
       130 ms, and no block of a file is sent. Then everything that has come is handled. If a list was
-      requested, it begins at 0 at once, pauses 17.5 ms later and goes on with the next slot. If there are
+      requested, it begins at 0 at once, pauses 18 ms later and goes on with the next slot. If there are
       reads, 5 are answered and the list pauses; the next slot answers 5 more, the one after it 5 more and
       goes on with the list. So the list runs for 130 of every 300 ms. The first time in a list, up to 10
       waiting reads do not make it pause.
@@ -41,6 +41,9 @@ class ArduPilotVehicle(Vehicle):
       is answered within 6 ms, index 65535, even if nothing changed; sets of one name meanwhile share one
       answer. NaN, infinity and unknown names are met with silence. Of a read-only parameter the old value
       is sent, and a STATUSTEXT.
+    - The answer to a set has the type REAL32, whatever the parameter's own type is, if the value is the
+      default, the parameter never had another value, and it belongs to a group: of the real quad's table,
+      all but the first 57.
     - A parameter that switches a group shows it while it is not 0 and hides it at 0: count and indices move.
       Hidden parameters can be read and set by name.
     - MAVFTP serves `@PARAM/param.pck` and `files`: one session, 5 requests waiting, bursts paced to a third
@@ -114,6 +117,10 @@ class ArduPilotVehicle(Vehicle):
             raise UsageError(f"live_period is a number of seconds from 0 up, not {live_period}")
         if ftp:
             self._ftp = FileServer(self._packed_params, self._apply_packed, ftp_rate)
+        self._in_groups = (
+            frozenset(row.name for row in rows[_NOT_IN_GROUPS:]) if table is None else frozenset()
+        )
+        self._stored: set[str] = set()
         self._switch_of = {row.name: switch for switch, group in members.items() for row in group}
         self._switches = members.keys()
         self._late_switches = frozenset(reboot_groups)
@@ -189,7 +196,15 @@ class ArduPilotVehicle(Vehicle):
             self._send(wire.StatusText(_WARNING, f"Param write denied ({entry.name})"))
             self._refuse(ParamErrorCode.READ_ONLY, request, sender)
         else:
-            self._write(entry, _converted(value, entry.type))
+            bits = _converted(value, entry.type)
+            if bits == entry.bits and self._was_never_stored(entry):
+                self._untyped.add(entry.name)
+            self._write(entry, bits)
+
+    def _was_never_stored(self, entry: Entry) -> bool:
+        """Whether a parameter of a group has its default and has never had another value."""
+        has_default = entry.packed is not None and entry.packed.default is None
+        return has_default and entry.name in self._in_groups and entry.name not in self._stored
 
     def _write(self, entry: Entry, bits: int) -> None:
         self._hold(entry, bits)
@@ -211,6 +226,8 @@ class ArduPilotVehicle(Vehicle):
         self._hold(entry, param.bits if param.type == entry.type else _converted(value, entry.type))
 
     def _hold(self, entry: Entry, bits: int) -> None:
+        if bits != entry.bits:
+            self._stored.add(entry.name)
         entry.store(bits)
         if entry.name in self._switches:
             self._relist()
@@ -226,6 +243,7 @@ class ArduPilotVehicle(Vehicle):
         self._waiting: deque[tuple[wire.ParamRequestRead, wire.Frame]] = deque()
         self._ready: list[wire.ParamValue] = []
         self._answers: dict[str, Entry] = {}
+        self._untyped: set[str] = set()
         self._read_at = math.inf
         self._answer_at = math.inf
         self._system_id_at = math.inf
@@ -255,8 +273,10 @@ class ArduPilotVehicle(Vehicle):
         if self._answer_at <= now:
             self._answer_at = math.inf
             for entry in self._answers.values():
-                self._send_value(entry, index=wire.NO_INDEX)
+                kind = ParamType.REAL32 if entry.name in self._untyped else None
+                self._send_value(entry, index=wire.NO_INDEX, kind=kind)
             self._answers.clear()
+            self._untyped.clear()
 
     def _send_list(self, now: float) -> None:
         starts_at = self._next_burst
@@ -391,9 +411,10 @@ _SLOT = 0.1  # seconds from one turn of the parameter task to the next, which an
 _ROUNDING = 1e-6  # a turn that begins at `now` may come out a little less than whole
 _READS_PER_SLOT = 5
 _READ_QUEUE = 20
+_NOT_IN_GROUPS = 57  # parameters of the real quad's table
 _BUSY_RATE = 1000.0  # values per second above which a list takes the whole loop
 _LIST_RUN = 0.130  # seconds for which a list then takes it
-_LIST_START = 0.0175  # seconds from a request for the list until it pauses, if a slot has begun in between
+_LIST_START = 0.018  # seconds from a request for the list until it pauses, if a slot has begun in between
 _LIST_PAUSE = 0.080  # seconds from the answers to reads until a slot may go on with the list
 _READS_WITHOUT_PAUSE = 10  # reads, waiting for the first time in a list, that do not make it pause
 _FILE_QUEUE = (

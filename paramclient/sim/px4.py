@@ -45,10 +45,10 @@ class PX4Vehicle(BytewiseVehicle):
 
     - PARAM_REQUEST_LIST: `_HASH_CHECK` first (type UINT32, index 65535), then all parameters in use in the
       order of their names, 20 messages every 20 ms. While the list is being sent it starts again without
-      the hash.
+      the hash, at the earliest 10 ms after the last 20.
     - A read of `_HASH_CHECK` gives the hash alone; a set of it, to any value, stops the list.
     - A set with exactly the right type is acknowledged at once, whatever the value. If it changed the
-      value, 20 ms later that value is sent again, and with it every other one that is not yet saved; both
+      value, 10 ms later that value is sent again, and with it every other one that is not yet saved; both
       wait for the end of a list.
     - Its position controller looks at its own parameters 0.4 s after one of them has changed, and sets those
       to their limit that are beyond it (see `UPPER_LIMITS`); a real one takes 10 ms to 1.1 s. These changes
@@ -72,7 +72,7 @@ class PX4Vehicle(BytewiseVehicle):
         uid: the hardware id that it reports; by default its own for every system.
         hash_check: whether it has `_HASH_CHECK` at all; the parameter MAV_HASH_CHK_EN at 0 also turns it off.
         not_in_use: names in the table that nothing in the firmware has used yet.
-        late_use: by the name of one parameter, those that come into use 20 ms after it changes. Until then
+        late_use: by the name of one parameter, those that come into use 10 ms after it changes. Until then
             they are not in use. None: with the table of the real quad, CAL_MAG2_ID brings 16 more of
             CAL_MAG2_*; with another table, nothing.
         unsaved: names that the firmware itself has changed while it booted and not saved.
@@ -192,8 +192,10 @@ class PX4Vehicle(BytewiseVehicle):
         return self._push_at, self._save_at, self._clamp_at
 
     def _on_list(self) -> None:
-        self._hash_next = self._position is None and self.announced_hash() is not None
-        self._start_list(self._now)
+        is_running = self._position is not None
+        self._hash_next = not is_running and self.announced_hash() is not None
+        soon = max(self._now + _TURN, self._next_burst - 0.5 * self._period)
+        self._start_list(soon if is_running else self._now)
 
     def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
         general = self.files.get(GENERAL_FILE) if self._has_metadata else None
@@ -328,7 +330,8 @@ _RELEASE = 17891392  # 1.17.0
 _MAIN = 0x01120000  # 1.18
 _STANDBY = 3
 _UID = 5283920058631409231
-_PUSH_DELAY = 0.020
+_PUSH_DELAY = 0.010
+_TURN = 0.0002  # seconds in which what has been received is looked at
 
 
 def _third_compass(rows: tuple[SimParam, ...]) -> tuple[SimParam, ...]:

@@ -389,13 +389,15 @@ class Vehicle(Device):
         for index, entry in enumerate(self._listed):
             entry.index = index
 
-    def _send_value(self, entry: Entry, *, index: int | None = None, count: int | None = None) -> None:
-        """Send a PARAM_VALUE with the entry's own index and the list's count, or others."""
+    def _send_value(
+        self, entry: Entry, *, index: int | None = None, count: int | None = None, kind: int | None = None
+    ) -> None:
+        """Send a PARAM_VALUE with the entry's own index and type and the list's count, or others."""
         if index is None:
             index = wire.NO_INDEX if entry.index is None else entry.index
         if count is None:
             count = len(self._listed)
-        self._send(wire.ParamValue(entry.name, entry.raw, entry.type, count, index))
+        self._send(wire.ParamValue(entry.name, entry.raw, entry.type if kind is None else kind, count, index))
 
     def _refuse(
         self, code: ParamErrorCode, request: wire.ParamRequestRead | wire.ParamSet, sender: wire.Frame
