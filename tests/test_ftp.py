@@ -1334,7 +1334,8 @@ class TestSpeed:
         assert ground.now - start <= 3.4
         ground.settle()
         beats = 2 * (ground.now - start + 1)  # HEARTBEAT and SYSTEM_TIME
-        assert ground.air.downlink.sent - sent <= 64 + 1 + beats + 5
+        banner = 3
+        assert ground.air.downlink.sent - sent <= 64 + 1 + banner + beats + 5
 
     def test_a_slow_link_does_not_get_it_twice(self) -> None:
         vehicle = ardupilot(ftp_rate=400.0)

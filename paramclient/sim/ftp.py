@@ -76,9 +76,9 @@ class FileServer:
     - ArduPilot has one session for all stations and links. While its file is open, whatever another session
       requests is refused with InvalidSession, except that closing it is acknowledged and closes nothing. The
       session ends when nobody has been answered for 3 s; every answer counts, a refusal too.
-    - param.pck is made anew for every read. All reads through one session ask for one size; its size in the
-      answer to the open is an estimate, 12 bytes for each parameter. Written, it sets parameters when it
-      is closed.
+    - param.pck is made anew for every read. With ArduPilot all reads through one session ask for one size,
+      and its size in the answer to the open is an estimate, 12 bytes for each parameter. Written, it sets
+      parameters when it is closed.
     - A burst of ArduPilot sends a block whenever a third of the link is free again, to the end of the file.
     - PX4 has one session for each link, closes it after 11 s without a request, and a reset closes it whoever
       sends it. A burst begins up to 10 ms after its request, in blocks of 239 bytes whatever was asked for,
@@ -319,14 +319,13 @@ class FileServer:
             nonlocal first_size
             first_size = size if first_size is None else first_size
             rows = self.params()
-            if size != first_size or rows is None:
+            if rows is None or (size != first_size and not self.is_px4):
                 return None
-            key = (start, count, with_defaults, size, rows)
+            aligned = MOST_DATA if self.is_px4 else min(size, MOST_DATA)
+            key = (start, count, with_defaults, aligned, rows)
             if self._packed is None or self._packed[0] != key:
                 part = rows[start:] if count is None else rows[start : start + count]
-                content = pack.encode(
-                    part, total=len(rows), with_defaults=with_defaults, read_size=min(size, MOST_DATA)
-                )
+                content = pack.encode(part, total=len(rows), with_defaults=with_defaults, read_size=aligned)
                 self._packed = (key, content)
             return self._packed[1][offset : offset + size]
 
