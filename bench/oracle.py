@@ -1,15 +1,21 @@
 """The client that a download is measured against: it is told of each loss, so it never waits in vain.
 
-It sees what no client can see: a frame that the simulated link loses is reported to it at the moment when
-it, or the answer to it, would have arrived. So it never waits longer than one round trip for anything, and it
-keeps as many requests in flight as the vehicle serves. What it cannot do is to make the vehicle or the link
-faster. `oracle_time` runs it by list: reads for the gaps, after as many passes of the list as it is told.
-`file_oracle_time` runs it by file: one burst, and reads for the gaps.
+It begins as a program does, with the first heartbeat of the vehicle, which tells it all that it has to know:
+it needs no AUTOPILOT_VERSION. It sees what no client can see: a frame that the simulated link loses is
+reported to it at the moment when that frame, or the answer to it, would have arrived. So it never waits
+longer than one round trip for anything. It knows the rules by which the vehicle serves, and keeps as many
+requests in flight as the vehicle answers. It cannot make the vehicle or the link faster.
+
+`oracle_time` runs it by list: after as many passes of the list as it is told, it fills the gaps with reads,
+either as soon as it learns of them or once the list is over, since an ArduPilot pauses a list for reads.
+`file_oracle_time` runs it by file: one burst, reads for the gaps, and the end of the session, without which
+the next program would have to wait.
 """
 
 from __future__ import annotations
 
 import math
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable
 from heapq import heappop, heappush
@@ -55,239 +61,264 @@ class TellingLink(FaultyLink):
         return self._delay
 
 
-class _Oracle:
-    """One run: what is missing, when to ask for it, and what was reported lost."""
+class _Oracle(ABC):
+    """One run: it asks at the first heartbeat, and again for each loss that is reported.
+
+    Attributes:
+        next_send: when the next request of `ask` may leave.
+    """
+
+    understood: frozenset[int]
+    """The ids of the messages that it reads, sends, and is told the loss of."""
+
+    def __init__(self, air: Air) -> None:
+        assert isinstance(air.uplink, TellingLink)
+        assert isinstance(air.downlink, TellingLink)
+        self.air = air
+        self.uplink, self.downlink = air.uplink, air.downlink
+        self.next_send = 0.0
+        self._known: list[tuple[float, int, wire.Message]] = []  # reports that are still to come, in order
+        self._sequence = 0
+
+    def run(self) -> float:
+        """Seconds from the first heartbeat until everything has come."""
+        now = 0.0
+        began = math.inf
+        self.air.tick(now)
+        while not self.is_done() and now < LIMIT:
+            self._learn_of_losses(now)
+            self.ask(now)
+            now = self._next_event(now)
+            self.air.tick(now)
+            for data in self.air.data_to_send():
+                for message in self._read(data):
+                    if not isinstance(message, wire.Heartbeat):
+                        self.take(message, now)
+                    elif began == math.inf:
+                        began = now
+                        self.begin(now)
+        return now - began
+
+    @abstractmethod
+    def begin(self, now: float) -> None:
+        """Ask for the parameters."""
+
+    @abstractmethod
+    def take(self, message: wire.Message, now: float) -> None:
+        """A message of the vehicle has come."""
+
+    @abstractmethod
+    def reported(self, message: wire.Message, now: float) -> None:
+        """This message, or the answer to it, would have come by now."""
+
+    @abstractmethod
+    def ask(self, now: float) -> None:
+        """Ask for what is known to be missing, at the rate at which it is served."""
+
+    @abstractmethod
+    def wants(self) -> bool:
+        """Whether `ask` has something to ask for."""
+
+    @abstractmethod
+    def is_done(self) -> bool:
+        """Whether all the parameters have come."""
+
+    def send(self, message: wire.Message, now: float) -> None:
+        self._sequence += 1
+        self.air.receive(wire.encode(message, **GROUND, sequence=self._sequence & 0xFF), now)
+
+    def _read(self, data: bytes) -> list[wire.Message]:
+        messages = map(wire.decode, wire.Framer({0, *self.understood}, stream=False).receive(data))
+        return [message for message in messages if message is not None]
+
+    def _next_event(self, now: float) -> float:
+        deadline = self.air.next_deadline()
+        times = [math.inf if deadline is None else deadline]
+        if self._known:
+            times.append(self._known[0][0])
+        if self.wants():
+            times.append(self.next_send)
+        return max(min(times), now + 1e-7)
+
+    def _learn_of_losses(self, now: float) -> None:
+        """Turn what the links lost into reports at their time, and take those that are due."""
+        for losses, later in ((self.downlink.losses, 0.0), (self.uplink.losses, self.downlink.travel)):
+            for at, data in losses:
+                for message in self._read(data):
+                    self._sequence += 1
+                    heappush(self._known, (at + later, self._sequence, message))
+            losses.clear()
+        while self._known and self._known[0][0] <= now:
+            message = heappop(self._known)[2]
+            if not isinstance(message, wire.Heartbeat):
+                self.reported(message, now)
+
+
+class _ListOracle(_Oracle):
+    """By list: reads for the gaps, as soon as they are known or once the last pass is over."""
+
+    understood = frozenset({20, 21, 22})
 
     def __init__(
-        self, vehicle: Endpoint, air: Air, count: int, *, passes: int, reads_per_second: float
+        self, air: Air, count: int, *, passes: int, reads_per_second: float, reads_beside: bool
     ) -> None:
-        self.vehicle = vehicle
-        self.air = air
+        super().__init__(air)
         self.missing = set(range(count))
         self.count = count
         self.passes = passes
         self.per_read = 1.0 / reads_per_second
-        self.sequence = 0
-        self.to_ask: list[int] = []
-        self.known: list[tuple[float, int, int]] = []  # (when, kind, index) of reports that are still to come
-        self.next_send = 0.0
-        self.stream_end = math.inf
+        self.reads_beside = reads_beside
+        self.to_ask: deque[int] = deque()
+        self.is_over = False
 
-    def run(self, limit: float) -> float:
-        """Seconds until every parameter has come."""
-        now = 0.0
-        self.air.tick(now)
-        self.ask_for_list(now)
-        framer = wire.Framer({22}, stream=False)
-        while self.missing and now < limit:
-            self.learn_of_losses(now)
-            self.ask(now)
-            now = self.next_event(now)
-            self.air.tick(now)
-            for data in self.air.data_to_send():
-                for frame in framer.receive(data):
-                    message = wire.decode(frame)
-                    if isinstance(message, wire.ParamValue):
-                        self.missing.discard(message.param_index)
-                        if message.param_index == self.count - 1:
-                            self.end_of_stream(now)
-        return now
-
-    def next_event(self, now: float) -> float:
-        deadline = self.air.next_deadline()
-        times = [math.inf if deadline is None else deadline]
-        if self.known:
-            times.append(self.known[0][0])
-        if self.to_ask:
-            times.append(self.next_send)
-        return max(min(times), now + 1e-7)
-
-    def learn_of_losses(self, now: float) -> None:
-        """Turn what the links lost into reports at their time, and take those that are due."""
-        uplink, downlink = self.air.uplink, self.air.downlink
-        assert isinstance(uplink, TellingLink)
-        assert isinstance(downlink, TellingLink)
-        for at, data in downlink.losses:
-            self.report(at, data)
-        for at, data in uplink.losses:
-            self.report(at + downlink.travel, data)
-        downlink.losses.clear()
-        uplink.losses.clear()
-        while self.known and self.known[0][0] <= now:
-            _, kind, index = heappop(self.known)
-            if kind == 21:
-                self.ask_for_list(now)
-            elif index == self.count - 1 and kind == 22 and self.stream_end == math.inf:
-                self.end_of_stream(now)
-                self.want(index)
-            else:
-                self.want(index)
-
-    def report(self, at: float, data: bytes) -> None:
-        for frame in wire.Framer({20, 21, 22}, stream=False).receive(data):
-            message = wire.decode(frame)
-            if isinstance(message, wire.ParamValue):
-                heappush(self.known, (at, 22, message.param_index))
-            elif isinstance(message, wire.ParamRequestRead):
-                heappush(self.known, (at, 20, message.param_index))
-            else:
-                heappush(self.known, (at, 21, 0))
-
-    def want(self, index: int) -> None:
-        if index in self.missing:
-            self.to_ask.append(index)
-
-    def end_of_stream(self, now: float) -> None:
-        """The last value of a pass has come, or would have."""
-        if self.stream_end < math.inf:
-            return
-        self.stream_end = now
-        if self.passes > 1 and len(self.missing) > 1:
-            self.passes -= 1
-            self.stream_end = math.inf
-            self.to_ask.clear()
-            self.ask_for_list(now)
-
-    def ask_for_list(self, now: float) -> None:
+    def begin(self, now: float) -> None:
         self.send(wire.ParamRequestList(1, 1), now)
 
+    def take(self, message: wire.Message, now: float) -> None:
+        if isinstance(message, wire.ParamValue):
+            self.missing.discard(message.param_index)
+            if message.param_index == self.count - 1:
+                self._end_pass(now)
+
+    def reported(self, message: wire.Message, now: float) -> None:
+        if isinstance(message, wire.ParamRequestList):
+            self.begin(now)
+        elif isinstance(message, wire.ParamValue | wire.ParamRequestRead):
+            if message.param_index in self.missing:
+                self.to_ask.append(message.param_index)
+            if message.param_index == self.count - 1 and isinstance(message, wire.ParamValue):
+                self._end_pass(now)
+
+    def _end_pass(self, now: float) -> None:
+        """The last value of a pass has come, or would have."""
+        if self.is_over:
+            return
+        if self.passes > 1 and len(self.missing) > 1:
+            self.passes -= 1
+            self.to_ask.clear()
+            self.begin(now)
+        else:
+            self.is_over = True
+
+    def wants(self) -> bool:
+        return bool(self.to_ask) and (self.reads_beside or self.is_over)
+
     def ask(self, now: float) -> None:
-        """Ask for what is known to be missing, at the rate at which it is served."""
-        while self.to_ask and self.next_send <= now:
-            index = self.to_ask.pop(0)
+        while self.wants() and self.next_send <= now:
+            index = self.to_ask.popleft()
             if index in self.missing:
                 self.send(wire.ParamRequestRead(1, 1, "", index), now)
                 self.next_send = max(self.next_send, now - 4 * self.per_read) + self.per_read
-                uplink = self.air.uplink
-                assert isinstance(uplink, TellingLink)
-                self.next_send = max(self.next_send, uplink.is_free_at)
+                self.next_send = max(self.next_send, self.uplink.is_free_at)
 
-    def send(self, message: wire.Message, now: float) -> None:
-        self.sequence = (self.sequence + 1) & 0xFF
-        self.air.receive(wire.encode(message, **GROUND, sequence=self.sequence), now)
+    def is_done(self) -> bool:
+        return not self.missing
 
 
-class _FileOracle:
-    """One run by file: what has come, what was reported lost, and when to ask for it.
+class _FileOracle(_Oracle):
+    """By file: it asks for the burst together with the open, and for each lost block singly.
 
-    It asks for the burst together with the open, and for each lost block singly, so that the vehicle gets to
-    hear that as soon as its burst is over and then no quicker than it serves.
+    The requests for lost blocks arrive once the burst is over, and then no quicker than they are served. At
+    the end it closes the session.
 
     Attributes:
         end: where the file ends, once the end of the burst has come or was reported lost.
     """
 
+    understood = frozenset({110})
+
     def __init__(self, air: Air, *, burst_seconds: float, reads_per_second: float) -> None:
-        self.air = air
+        super().__init__(air)
         self.burst_seconds = burst_seconds
         self.per_read = 1.0 / reads_per_second
         self.end: int | None = None
-        self.sequence = 0
+        self.number = 0
         self.lost_opens: set[int] = set()
         self.missing: set[int] = set()
         self.to_ask: deque[int] = deque()
-        self.known: list[tuple[float, int, Packet]] = []  # reports that are still to come, and in which order
-        self.next_send = 0.0
+        self.is_closing = self.is_closed = False
 
-    def run(self) -> float:
-        """Seconds until the whole file has come."""
-        now = 0.0
-        self.air.tick(now)
-        self.begin(now)
-        framer = wire.Framer({110}, stream=False)
-        while (self.end is None or self.missing) and now < LIMIT:
-            self.learn_of_losses(now)
-            self.ask(now)
-            now = self.next_event(now)
-            self.air.tick(now)
-            for data in self.air.data_to_send():
-                for frame in framer.receive(data):
-                    message = wire.decode(frame)
-                    assert isinstance(message, wire.FileTransfer)
-                    self.take(Packet.unpack(message.payload))
-        return now
+    def begin(self, now: float) -> None:
+        self._request(Packet(0, SESSION, Opcode.OPEN_FILE_RO, (PARAMETER_FILE + WITH_DEFAULTS).encode()), now)
+        self._burst(now)
 
-    def take(self, packet: Packet) -> None:
-        if packet.opcode == Opcode.ACK:
+    def take(self, message: wire.Message, now: float) -> None:
+        assert isinstance(message, wire.FileTransfer)
+        packet = Packet.unpack(message.payload)
+        if packet.requested == Opcode.TERMINATE_SESSION:
+            self.is_closed = True
+        elif packet.opcode == Opcode.ACK:
             self.missing.discard(packet.offset)
         elif packet.requested == Opcode.BURST_READ_FILE and packet.data[:1] == b"\x06":
             self.end = packet.offset
+        self._close_when_whole(now)
 
-    def next_event(self, now: float) -> float:
-        deadline = self.air.next_deadline()
-        times = [math.inf if deadline is None else deadline]
-        if self.known:
-            times.append(self.known[0][0])
-        if self.to_ask:
-            times.append(self.next_send)
-        return max(min(times), now + 1e-7)
-
-    def learn_of_losses(self, now: float) -> None:
-        """Turn what the links lost into reports at their time, and take those that are due."""
-        uplink, downlink = self.air.uplink, self.air.downlink
-        assert isinstance(uplink, TellingLink)
-        assert isinstance(downlink, TellingLink)
-        for losses, later in ((downlink.losses, 0.0), (uplink.losses, downlink.travel)):
-            for at, data in losses:
-                for frame in wire.Framer({110}, stream=False).receive(data):
-                    message = wire.decode(frame)
-                    assert isinstance(message, wire.FileTransfer)
-                    packet = Packet.unpack(message.payload)
-                    heappush(self.known, (at + later, packet.sequence, packet))
-            losses.clear()
-        while self.known and self.known[0][0] <= now:
-            self.reported(heappop(self.known)[2], now)
-
-    def reported(self, packet: Packet, now: float) -> None:
-        """This would have come by now, or the answer to it."""
+    def reported(self, message: wire.Message, now: float) -> None:
+        assert isinstance(message, wire.FileTransfer)
+        packet = Packet.unpack(message.payload)
         match packet.opcode:
             case Opcode.OPEN_FILE_RO:
                 self.lost_opens.add(packet.sequence)
                 self.begin(now)
             case Opcode.BURST_READ_FILE:
                 if packet.sequence - 1 not in self.lost_opens:
-                    self.burst(now)
+                    self._burst(now)
             case Opcode.READ_FILE:
                 self.to_ask.append(packet.offset)
+            case Opcode.TERMINATE_SESSION:
+                self._close(now)
             case Opcode.ACK if packet.requested in (Opcode.READ_FILE, Opcode.BURST_READ_FILE):
                 self.missing.add(packet.offset)
                 self.to_ask.append(packet.offset)
+            case Opcode.ACK if packet.requested == Opcode.TERMINATE_SESSION:
+                self._close(now)
             case _:  # the answer to the open says nothing that it needs, the end of the burst does
-                self.take(packet)
+                self.take(message, now)
 
-    def begin(self, now: float) -> None:
-        self.send(Packet(0, SESSION, Opcode.OPEN_FILE_RO, (PARAMETER_FILE + WITH_DEFAULTS).encode()), now)
-        self.burst(now)
-
-    def burst(self, now: float) -> None:
-        self.send(Packet(0, SESSION, Opcode.BURST_READ_FILE, size=MOST_DATA), now)
-        self.next_send = now + self.burst_seconds
+    def wants(self) -> bool:
+        return bool(self.to_ask)
 
     def ask(self, now: float) -> None:
-        """Ask for what is known to be missing, at the rate at which it is served."""
         while self.to_ask and self.next_send <= now + ROUNDING:
             offset = self.to_ask.popleft()
-            self.send(Packet(0, SESSION, Opcode.READ_FILE, size=MOST_DATA, offset=offset), now)
+            self._request(Packet(0, SESSION, Opcode.READ_FILE, size=MOST_DATA, offset=offset), now)
             self.next_send = max(self.next_send, now) + self.per_read
 
-    def send(self, packet: Packet, now: float) -> None:
-        self.sequence += 1
-        payload = packet._replace(sequence=self.sequence).pack()
-        message = wire.FileTransfer(0, 1, 1, payload)
-        self.air.receive(wire.encode(message, **GROUND, sequence=self.sequence & 0xFF), now)
+    def is_done(self) -> bool:
+        return self.is_closed
+
+    def _burst(self, now: float) -> None:
+        self._request(Packet(0, SESSION, Opcode.BURST_READ_FILE, size=MOST_DATA), now)
+        self.next_send = now + self.burst_seconds
+
+    def _close_when_whole(self, now: float) -> None:
+        if self.end is not None and not self.missing and not self.is_closing:
+            self.is_closing = True
+            self._close(now)
+
+    def _close(self, now: float) -> None:
+        self._request(Packet(0, SESSION, Opcode.TERMINATE_SESSION), now)
+
+    def _request(self, packet: Packet, now: float) -> None:
+        self.number += 1
+        self.send(wire.FileTransfer(0, 1, 1, packet._replace(sequence=self.number).pack()), now)
 
 
-def oracle_time(vehicle: Endpoint, air: Air, count: int, *, passes: int, reads_per_second: float) -> float:
-    """Seconds that one run of the oracle takes.
+def oracle_time(
+    air: Air, count: int, *, passes: int, reads_per_second: float, reads_beside: bool = True
+) -> float:
+    """Seconds that one run of the oracle takes, by list.
 
     Args:
-        vehicle: a fresh simulated vehicle, the only one in `air`.
-        air: with a `TellingLink` in each direction.
+        air: with a fresh simulated vehicle, and a `TellingLink` in each direction.
         count: the vehicle's parameters.
         passes: times that the list is asked for; reads fill the gaps after the last one.
         reads_per_second: what the vehicle or the link serves.
+        reads_beside: read while the list runs, too.
     """
-    return _Oracle(vehicle, air, count, passes=passes, reads_per_second=reads_per_second).run(LIMIT)
+    return _ListOracle(
+        air, count, passes=passes, reads_per_second=reads_per_second, reads_beside=reads_beside
+    ).run()
 
 
 def file_oracle_time(
