@@ -127,9 +127,9 @@ def file_rows() -> Iterator[Row]:
                 limits.get((trip, loss), math.inf),
                 file_rate=UDP_FILE_RATE,
             )
-    # a real one fills the radio with its file: it takes 3.0 s
+    # a real one fills the radio with its file: 3.0 s, and two round trips of 0.15 s to begin and close
     radio = partial(ArduPilotVehicle, burst=1, period=0.025, ftp_rate=5760.0)
-    for loss, bound, limit in ((0.0, 1.25, 3.2), (0.05, 1.25, math.inf), (0.15, 1.4, math.inf)):
+    for loss, bound, limit in ((0.0, 1.25, 3.5), (0.05, 1.25, math.inf), (0.15, 1.4, math.inf)):
         faults = {"loss": loss, "delay": 0.075, "rate": 5760.0, "queue": 1024.0}
         name = f"ArduPilot by FTP radio 57600 {loss:.0%}"
         yield Row(name, radio, 5760 / FILE_FRAME, faults, bound, limit, file_rate=5760.0)
