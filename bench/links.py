@@ -219,6 +219,7 @@ def oracle(row: Row, seed: int) -> float:
                 passes=passes,
                 reads_per_second=row.reads_per_second,
                 reads_beside=reads_beside,
+                asks_version=isinstance(vehicle, ArduPilotVehicle),
             )
         )
     return min(times)

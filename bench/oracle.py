@@ -1,10 +1,11 @@
 """The client that a download is measured against: it is told of each loss, so it never waits in vain.
 
-It begins as a program does, with the first heartbeat of the vehicle, which tells it all that it has to know:
-it needs no AUTOPILOT_VERSION. It sees what no client can see: a frame that the simulated link loses is
-reported to it at the moment when that frame, or the answer to it, would have arrived. So it never waits
-longer than one round trip for anything. It knows the rules by which the vehicle serves, and keeps as many
-requests in flight as the vehicle answers. It cannot make the vehicle or the link faster.
+It begins as a program does, with the first heartbeat of the vehicle. That tells it all that it has to know,
+except whether an ArduPilot serves its parameters as a file: there it waits for AUTOPILOT_VERSION before it
+requests the list, since no file would come beside a list. It sees what no client can see: a frame that the
+simulated link loses is reported to it at the moment when that frame, or the answer to it, would have arrived.
+So it never waits longer than one round trip for anything. It knows the rules by which the vehicle serves, and
+keeps as many requests in flight as the vehicle answers. It cannot make the vehicle or the link faster.
 
 `oracle_time` runs it by list: after as many passes of the list as it is told, it fills the gaps with reads,
 either as soon as it learns of them or once the list is over, since an ArduPilot pauses a list for reads.
@@ -34,6 +35,9 @@ FILE_FRAME: Final = 27 + MOST_DATA
 """Bytes of a frame with a full block of a file."""
 SESSION: Final = 1
 ROUNDING: Final = 1e-9
+VERSION_REQUEST: Final = wire.CommandLong(
+    1, 1, wire.MAV_CMD_REQUEST_MESSAGE, (float(wire.AUTOPILOT_VERSION_ID),) + (0.0,) * 6
+)
 
 
 class TellingLink(FaultyLink):
@@ -157,12 +161,20 @@ class _Oracle(ABC):
 class _ListOracle(_Oracle):
     """By list: reads for the gaps, as soon as they are known or once the last pass is over."""
 
-    understood = frozenset({20, 21, 22})
+    understood = frozenset({20, 21, 22, 76, wire.AUTOPILOT_VERSION_ID})
 
     def __init__(
-        self, air: Air, count: int, *, passes: int, reads_per_second: float, reads_beside: bool
+        self,
+        air: Air,
+        count: int,
+        *,
+        passes: int,
+        reads_per_second: float,
+        reads_beside: bool,
+        asks_version: bool,
     ) -> None:
         super().__init__(air)
+        self.asks_version = asks_version
         self.missing = set(range(count))
         self.count = count
         self.passes = passes
@@ -172,16 +184,20 @@ class _ListOracle(_Oracle):
         self.is_over = False
 
     def begin(self, now: float) -> None:
-        self.send(wire.ParamRequestList(1, 1), now)
+        self.send(VERSION_REQUEST if self.asks_version else wire.ParamRequestList(1, 1), now)
 
     def take(self, message: wire.Message, now: float) -> None:
-        if isinstance(message, wire.ParamValue):
+        if isinstance(message, wire.AutopilotVersion):
+            if self.asks_version:
+                self.asks_version = False
+                self.begin(now)
+        elif isinstance(message, wire.ParamValue):
             self.missing.discard(message.param_index)
             if message.param_index == self.count - 1:
                 self._end_pass(now)
 
     def reported(self, message: wire.Message, now: float) -> None:
-        if isinstance(message, wire.ParamRequestList):
+        if isinstance(message, wire.ParamRequestList | wire.CommandLong | wire.AutopilotVersion):
             self.begin(now)
         elif isinstance(message, wire.ParamValue | wire.ParamRequestRead):
             if message.param_index in self.missing:
@@ -305,7 +321,13 @@ class _FileOracle(_Oracle):
 
 
 def oracle_time(
-    air: Air, count: int, *, passes: int, reads_per_second: float, reads_beside: bool = True
+    air: Air,
+    count: int,
+    *,
+    passes: int,
+    reads_per_second: float,
+    reads_beside: bool,
+    asks_version: bool,
 ) -> float:
     """Seconds that one run of the oracle takes, by list.
 
@@ -315,9 +337,15 @@ def oracle_time(
         passes: times that the list is asked for; reads fill the gaps after the last one.
         reads_per_second: what the vehicle or the link serves.
         reads_beside: read while the list runs, too.
+        asks_version: wait for AUTOPILOT_VERSION before the list is requested.
     """
     return _ListOracle(
-        air, count, passes=passes, reads_per_second=reads_per_second, reads_beside=reads_beside
+        air,
+        count,
+        passes=passes,
+        reads_per_second=reads_per_second,
+        reads_beside=reads_beside,
+        asks_version=asks_version,
     ).run()
 
 

@@ -28,6 +28,7 @@ from __future__ import annotations
 import math
 import re
 import struct
+from bisect import bisect_right
 from collections import defaultdict
 from collections.abc import Collection, Iterable
 from functools import cache
@@ -186,10 +187,12 @@ def differences(
             if [message for _, message in one] != [message for _, message in other]:
                 found.append(f"{key}: other messages: {len(one)} recorded, {len(other)} sent")
                 continue
+            requests = [_request_of(one[0] if key == "list" else each, asked) for each in one]
             for at, (time, message) in enumerate(other):
-                request = _request_of(one[0] if key == "list" else one[at], asked)
-                allowed = max(0.02, 0.2 * (one[at][0] - request))
-                pair = _Pair(one[max(at - slack, 0)][0], one[min(at + slack, len(one) - 1)][0], time)
+                allowed = max(0.02, 0.2 * (one[at][0] - requests[at]))
+                first = max(at - slack, requests.index(requests[at]))
+                last = min(at + slack, bisect_right(requests, requests[at]) - 1)
+                pair = _Pair(one[first][0], one[last][0], time)
                 pairs.append(pair)
                 if not pair.first - allowed <= time <= pair.last + allowed:
                     found.append(f"{key}: recorded at {one[at][0]:.4f}, sent at {time:.4f}: {message}")

@@ -266,6 +266,81 @@ PX4: dict[str, tuple[Callable[[str], PX4Vehicle], float]] = {
 }
 
 
+class TestDifferences:
+    """What a replay is judged by finds what is wrong; the messages are those of the log, changed."""
+
+    NAME = "ardupilot_get_set"
+
+    def found(self, changed: Messages) -> list[str]:
+        return differences(self.NAME, compared(from_vehicle(self.NAME)), changed, burst=10)
+
+    def changed(self, at: int, *instead: tuple[float, wire.Message]) -> Messages:
+        """The log with other messages in the place of one that answers a read or set."""
+        messages = compared(from_vehicle(self.NAME))
+        place = [place for place, (_, each) in enumerate(messages) if isinstance(each, wire.ParamValue)][at]
+        return sorted([*messages[:place], *instead, *messages[place + 1 :]], key=lambda item: item[0])
+
+    def answer(self, at: int) -> tuple[float, wire.ParamValue]:
+        messages = compared(from_vehicle(self.NAME))
+        return [(time, each) for time, each in messages if isinstance(each, wire.ParamValue)][at]
+
+    def test_the_log_itself_is_right(self) -> None:
+        assert self.found(compared(from_vehicle(self.NAME))) == []
+
+    @pytest.mark.parametrize("at", [0, 1, -1])
+    def test_a_message_that_is_missing(self, at: int) -> None:
+        assert self.found(self.changed(at))
+
+    def test_a_message_more(self) -> None:
+        time, value = self.answer(1)
+        assert self.found(self.changed(1, (time, value), (time + 0.001, value)))
+
+    def test_another_value_or_count_or_type(self) -> None:
+        time, value = self.answer(0)
+        for other in (
+            value._replace(raw=b"\0\0\0\0"),
+            value._replace(param_count=1),
+            value._replace(param_type=1),
+        ):
+            assert self.found(self.changed(0, (time, other)))
+
+    def test_a_message_that_is_late_or_early(self) -> None:
+        """The first read was answered 41 ms after its request: 20 ms count, not 20 %."""
+        time, value = self.answer(0)
+        assert self.found(self.changed(0, (time + 0.019, value))) == []
+        assert self.found(self.changed(0, (time - 0.019, value))) == []
+        assert self.found(self.changed(0, (time + 0.021, value)))
+        assert self.found(self.changed(0, (time - 0.021, value)))
+
+    def test_a_list_that_is_slower(self) -> None:
+        """By 25 %; a burst of 10 more or less would not count."""
+        name = "ardupilot_full_download"
+        recorded = compared(from_vehicle(name))
+
+        def slowed(by: float) -> Messages:
+            return [
+                (2.06 + (time - 2.06) * by if isinstance(each, wire.ParamValue) else time, each)
+                for time, each in recorded
+            ]
+
+        assert differences(name, recorded, slowed(1.15), burst=10) == []
+        assert differences(name, recorded, slowed(1.25), burst=10)
+
+    def test_messages_of_two_kinds_in_another_order(self) -> None:
+        """The end of a file comes 0.54 s after its request. 0.1 s more are within 20 %, but out of order."""
+        name = "ardupilot_list_beside_ftp"
+        recorded = compared(from_vehicle(name))
+        ends = max(time for time, each in recorded if isinstance(each, wire.FileTransfer) and time < 1.0)
+
+        def with_end(later: float) -> Messages:
+            moved = [(time + later if time == ends else time, each) for time, each in recorded]
+            return sorted(moved, key=lambda item: item[0])
+
+        assert differences(name, recorded, with_end(0.04), burst=10) == []
+        (found,) = {each.split(",")[-1] for each in differences(name, recorded, with_end(0.1), burst=10)}
+        assert found == " before what came before"
+
+
 class TestReplay:
     """The same messages, in the same order, at the same times; `tests.recordings` says what that means."""
 
