@@ -653,10 +653,14 @@ class ParamClient:
 
     async def _wait_until_closed(self, machine: ComponentMachine) -> None:
         carrier, files = self._carrier, machine.files
+
+        def tell(now: float) -> None:
+            carrier.tell()
+
         self._wake(machine)
         while files.is_closing and not (carrier.is_away or carrier.ended or machine.presence.is_lost):
-            if carrier.tell not in files.on_closed:
-                files.on_closed.append(carrier.tell)
+            if tell not in files.on_closed:
+                files.on_closed.append(tell)
             await carrier.news.wait()
 
     @property

@@ -850,10 +850,10 @@ def test_an_ardupilot_may_first_say_whether_it_serves_the_file() -> None:
     assert not world.sent_of(ParamRequestList)
 
 
-def test_one_that_does_not_say_who_it_is_is_asked_for_its_list_soon() -> None:
+def test_one_that_does_not_say_who_it_is_is_asked_for_its_file() -> None:
     world = Simulation(air=Air.symmetric([ArduPilotVehicle(live=())], delay=0.05))
     world.until(lambda: (1, 1) in world.station.components)
     world.machine.who.version = lambda message, now: False  # type: ignore[method-assign]  # as if it was lost
     result = world.outcome(world.machine.begin_fetch(world.now))
-    assert result.source == "stream"
-    assert 1.0 < result.elapsed < 3.0
+    assert result.source == "ftp"
+    assert result.elapsed < 0.65

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoReply, UsageError
 from paramclient.protocol import pack, wire
 from paramclient.protocol.ftp import DirectoryEntry, FileRead, FileTransfers
-from paramclient.protocol.ftp.jobs import BUSY_PATIENCE, MOST_FAILURES
+from paramclient.protocol.ftp.jobs import BUSY_PATIENCE, MOST_FAILURES, QUIET_TIME
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
 from paramclient.protocol.ftp.reading import MOST_OPENINGS, MOST_RESTARTS, SMALLEST_WINDOW
 from paramclient.protocol.operation import Operation
@@ -62,6 +62,14 @@ class Desk:
         packet = self.take()[0]
         assert packet.opcode == opcode
         return packet
+
+    def opening(self) -> Packet:
+        """The request to open a file, beside copies of it and the burst that need not wait for it."""
+        first, *others = self.take()
+        assert first.opcode == Opcode.OPEN_FILE_RO
+        bursts = [packet for packet in others if packet != first]
+        assert [packet.opcode for packet in bursts] in ([], [Opcode.BURST_READ_FILE])
+        return first
 
     def hear(self, packet: Packet, *, to: tuple[int, int] = OWN) -> None:
         self.transfers.heard(FileTransfer(0, *to, packet.pack().ljust(251, b"\0")), self.now)
@@ -133,7 +141,7 @@ class TestReading:
     def test_open_burst_end_close(self) -> None:
         desk = Desk()
         read = desk.transfers.read("a.txt", desk.now)
-        request = desk.next(Opcode.OPEN_FILE_RO)
+        request = desk.opening()
         assert request.data == b"a.txt"
         assert is_so(read.size is None)
         desk.answer(request, (300).to_bytes(4, "little"), session=9)
@@ -163,7 +171,7 @@ class TestReading:
     def test_a_server_that_gives_no_size(self) -> None:
         desk = Desk()
         read = desk.transfers.read("a", desk.now)
-        desk.answer(desk.next(Opcode.OPEN_FILE_RO), session=9)
+        desk.answer(desk.opening(), session=9)
         assert read.size is None
         burst = desk.next(Opcode.BURST_READ_FILE)
         desk.answer(burst, b"a" * 239)
@@ -362,7 +370,7 @@ class TestWhatIsNotForUs:
     def test_answers_to_others(self) -> None:
         desk = Desk()
         read = desk.transfers.read("a", desk.now)
-        request = desk.next(Opcode.OPEN_FILE_RO)
+        request = desk.opening()
         for to in ((254, 190), (255, 191), (254, 0)):
             desk.hear(Packet(request.sequence + 1, 9, Opcode.ACK, bytes(4), requested=4), to=to)
         assert is_so(read.size is None)
@@ -373,7 +381,7 @@ class TestWhatIsNotForUs:
     def test_answers_to_something_else(self, change: dict[str, Any]) -> None:
         desk = Desk()
         read = desk.transfers.read("a", desk.now)
-        request = desk.next(Opcode.OPEN_FILE_RO)
+        request = desk.opening()
         good = Packet(request.sequence + 1, 9, Opcode.ACK, bytes(4), requested=4)
         desk.hear(good._replace(**change))
         assert read.size is None
@@ -432,7 +440,7 @@ class TestWhatIsNotForUs:
             desk = Desk()
             desk.now = now
             desk.transfers.read("a", now)
-            request = desk.next(Opcode.OPEN_FILE_RO)
+            request = desk.opening()
             assert 1 <= request.session <= 255
             numbers.add((request.sequence, request.session))
         assert len(numbers) == 3
@@ -451,7 +459,7 @@ class TestRefusals:
     def test_a_file_that_cannot_be_opened(self, code: int, errno: bytes, words: str) -> None:
         desk = Desk()
         read = desk.transfers.read("a.txt", desk.now)
-        desk.answer(desk.next(Opcode.OPEN_FILE_RO), errno, code=code)
+        desk.answer(desk.opening(), errno, code=code)
         error = error_of(read)
         assert str(error) == words
         assert (error.path, error.code, error.system, error.component) == ("a.txt", code, 1, 1)
@@ -489,7 +497,7 @@ class TestRefusals:
         desk.answer(burst, code=FileErrorCode.INVALID_SESSION, nth=2)
         assert not read.done
         assert read.received == 0
-        request = desk.next(Opcode.OPEN_FILE_RO)
+        request = desk.opening()
         desk.answer(request, bytes(4), session=9)
         again = desk.next(Opcode.BURST_READ_FILE)
         assert again.offset == 0
@@ -503,37 +511,57 @@ class TestRefusals:
         read, burst = desk.opened()
         for _ in range(MOST_OPENINGS - 1):
             desk.answer(burst, code=FileErrorCode.FILE_NOT_FOUND)
-            desk.answer(desk.next(Opcode.OPEN_FILE_RO), bytes(4), session=9)
+            desk.answer(desk.opening(), bytes(4), session=9)
             burst = desk.next(Opcode.BURST_READ_FILE)
         desk.answer(burst, code=FileErrorCode.FILE_NOT_FOUND)
         desk.closed()
         assert error_of(read).code == FileErrorCode.FILE_NOT_FOUND
 
     @pytest.mark.parametrize("code", [FileErrorCode.INVALID_SESSION, FileErrorCode.NO_SESSIONS_AVAILABLE])
-    def test_while_there_is_no_session_it_is_waited_for_one(self, code: int) -> None:
+    def test_while_another_station_has_a_session_nothing_is_sent(self, code: int) -> None:
         desk = Desk()
         began = desk.now
         read = desk.transfers.read("a", desk.now)
-        desk.answer(desk.next(Opcode.OPEN_FILE_RO), code=code)
-        *resets, request = desk.take()
-        assert {packet.opcode for packet in resets} == {Opcode.RESET_SESSIONS}
+        request = desk.opening()
+        assert is_so(read.blocked_until is None)
         while not read.done:
-            assert request.opcode == Opcode.OPEN_FILE_RO
             desk.answer(request, code=code)
             if not read.done:
+                assert read.blocked_until == pytest.approx(desk.now + QUIET_TIME)
+                desk.pass_time(QUIET_TIME - 0.01)
                 assert desk.take() == []
-                desk.pass_time(0.5)
-                (request,) = desk.take()
+                desk.pass_time(0.02)
+                request = desk.opening()
         assert error_of(read).code == code
-        assert desk.now - began == pytest.approx(BUSY_PATIENCE, abs=0.6)
+        assert BUSY_PATIENCE <= desk.now - began <= BUSY_PATIENCE + 2 * QUIET_TIME
+        assert desk.transfers.is_idle
+
+    def test_whatever_the_server_says_lets_that_session_live_on(self) -> None:
+        desk = Desk()
+        desk.transfers.read("a", desk.now)
+        request = desk.opening()
+        desk.answer(request, code=FileErrorCode.INVALID_SESSION)
+        for to in (OWN, (254, 190)):  # the refusal of a copy, and what another station reads
+            desk.pass_time(2.0)
+            desk.hear(Packet(9, 77, Opcode.ACK, b"x", requested=Opcode.READ_FILE), to=to)
+        desk.pass_time(QUIET_TIME - 0.01)
+        assert desk.take() == []
+        desk.pass_time(0.02)
+        assert desk.opening().session == request.session
+
+    def test_a_session_that_is_waited_for_needs_no_close(self) -> None:
+        desk = Desk()
+        read = desk.transfers.read("a", desk.now)
+        desk.answer(desk.opening(), code=FileErrorCode.INVALID_SESSION)
+        desk.transfers.release(read, desk.now)
+        assert desk.take() == []
         assert desk.transfers.is_idle
 
     def test_an_open_that_fails_without_a_reason_is_tried_again_a_few_times(self) -> None:
         desk = Desk()
         read = desk.transfers.read("a", desk.now)
         for _ in range(MOST_FAILURES + 1):
-            request = desk.take()[-1]
-            assert request.opcode == Opcode.OPEN_FILE_RO
+            request = next(packet for packet in desk.take() if packet.opcode == Opcode.OPEN_FILE_RO)
             desk.answer(request, code=FileErrorCode.FAIL)
         assert error_of(read).code == FileErrorCode.FAIL
         assert desk.take() == []
@@ -556,8 +584,11 @@ class TestSilence:
         desk.transfers.read("a", desk.now)
         desk.pass_time()
         last = [packet for packet in desk.take() if packet.opcode != Opcode.OPEN_FILE_RO]
-        assert {packet.opcode for packet in last} == {Opcode.TERMINATE_SESSION}
-        assert len(last) == 2
+        assert [packet.opcode for packet in last] == [
+            Opcode.BURST_READ_FILE,
+            Opcode.TERMINATE_SESSION,
+            Opcode.TERMINATE_SESSION,
+        ]
 
     def test_a_burst_that_never_comes(self) -> None:
         desk = Desk()
@@ -648,10 +679,10 @@ class TestSilence:
     def test_a_link_that_is_back_is_asked_again(self) -> None:
         desk = Desk()
         read = desk.transfers.read("a", desk.now)
-        first = desk.next(Opcode.OPEN_FILE_RO)
+        first = desk.opening()
         desk.now += 100
         desk.transfers.resume(desk.now)
-        assert desk.next(Opcode.OPEN_FILE_RO) == first
+        assert desk.opening() == first
         desk.answer(first, (5000).to_bytes(4, "little"), session=9)
         burst = desk.take()[-1]
         for block in range(3):
@@ -714,7 +745,7 @@ class TestTurns:
     def test_one_whose_open_is_not_answered_yet_is_closed_too(self) -> None:
         desk = Desk()
         read = desk.transfers.read("a", desk.now)
-        request = desk.next(Opcode.OPEN_FILE_RO)
+        request = desk.opening()
         desk.transfers.release(read, desk.now)
         assert {(packet.opcode, packet.session) for packet in desk.take()} == {
             (Opcode.TERMINATE_SESSION, request.session)
@@ -726,7 +757,7 @@ class TestTurns:
     def test_one_whose_open_is_refused_after_that_needs_no_close(self) -> None:
         desk = Desk()
         read = desk.transfers.read("a", desk.now)
-        request = desk.next(Opcode.OPEN_FILE_RO)
+        request = desk.opening()
         desk.transfers.release(read, desk.now)
         desk.take()
         desk.answer(request, code=FileErrorCode.INVALID_SESSION)
@@ -736,7 +767,7 @@ class TestTurns:
     def test_one_whose_open_is_never_answered_is_closed_blindly(self) -> None:
         desk = Desk()
         read = desk.transfers.read("a", desk.now)
-        request = desk.next(Opcode.OPEN_FILE_RO)
+        request = desk.opening()
         desk.transfers.release(read, desk.now)
         desk.take()
         desk.pass_time()
@@ -1240,8 +1271,7 @@ class TestOnTheAir:
         for vehicle in (ardupilot(), PX4Vehicle(ftp=True)):
             first = Ground(vehicle)
             first.transfers.read(PARAMS, first.now)
-            first.run(0.1)
-            assert vehicle.open_files == [PARAMS]
+            first.until(lambda: vehicle.open_files == [PARAMS])  # noqa: B023 - it is called here
             ground = Ground(vehicle)
             ground.now = first.now
             assert pack.decode(ground.read(PARAMS)).total == len(vehicle.params)

@@ -8,7 +8,7 @@ from itertools import pairwise
 import pytest
 
 from paramclient.protocol.identify import DOUBT_PACE, DOUBT_PATIENCE, TRIES, Identification, judge_encoding
-from paramclient.protocol.timing import INITIAL_TIMEOUT, RoundTrip
+from paramclient.protocol.timing import FIRST_TIMEOUT, RoundTrip
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
     CAPABILITY_PARAM_ENCODE_BYTEWISE,
@@ -165,9 +165,10 @@ def test_it_is_asked_for_its_version_once() -> None:
 def test_both_ways_to_ask_are_tried_in_turn_and_then_it_is_let_be() -> None:
     desk = Desk()
     desk.beat(CAMERA)
-    assert desk.who.next_deadline() == INITIAL_TIMEOUT
+    assert desk.who.next_deadline() == FIRST_TIMEOUT
     desk.let_it_be()
-    assert desk.commands() == [MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES] * (TRIES // 2)
+    both = [MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES]
+    assert desk.commands() == [MAV_CMD_REQUEST_MESSAGE, *both * (TRIES - 1)]
     assert desk.who.settled
     assert desk.who.identity.uid is None
     assert desk.who.identity.key == "system:1@udpin:x"

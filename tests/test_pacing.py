@@ -8,6 +8,7 @@ from paramclient.protocol.pacing import (
     BATCHED_RATE,
     FIRST_RATE,
     LARGEST_RATE,
+    LIST_READS,
     QUEUEING,
     SMALLEST_BURST,
     SMALLEST_RATE,
@@ -146,8 +147,10 @@ def test_it_leaves_most_of_the_link_to_others() -> None:
     assert pace.rate == pytest.approx(37 * 10 * UPSTREAM_SHARE / 16)
     pace.stream_seen(0.0)  # no stream was seen
     assert pace.rate == pytest.approx(37 * 10 * UPSTREAM_SHARE / 16)
-    pace.stream_seen(0.001)
+    pace.stream_seen(0.01)
     assert pace.rate == FIRST_RATE
+    pace.stream_seen(0.001)
+    assert pace.rate == pytest.approx(LIST_READS / 0.001)
 
 
 @pytest.mark.parametrize("gap", [0.125, 0.2, 1.0, 60.0])

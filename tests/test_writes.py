@@ -298,7 +298,7 @@ def test_a_lost_write_is_seen_by_a_read_and_sent_again() -> None:
     desk.knows("A", 1.0)
     write = desk.set("A", 2.0)
     desk.hear("A", 1.0, at=0.1)  # something asked for by others
-    desk.pass_time(1.0)
+    desk.pass_time(0.6)
     assert desk.take() == ["set A 2.0 REAL32", "read A"]
     desk.hear("A", 1.0)
     assert desk.take() == ["set A 2.0 REAL32"]
@@ -311,7 +311,7 @@ def test_a_write_without_an_answer_is_sent_again_after_the_time_out() -> None:
     desk = Desk()
     desk.knows("A", 1.0)
     desk.set("A", 2.0)
-    desk.pass_time(2.5 * INITIAL_TIMEOUT)
+    desk.pass_time(2.2 * INITIAL_TIMEOUT)
     # after the third the vehicle may be silent on just this write
     assert desk.take() == ["set A 2.0 REAL32"] * 3 + ["read A"]
 
@@ -343,9 +343,9 @@ def test_a_value_that_the_vehicle_makes_of_it_twice_is_its_adjustment() -> None:
     desk = Desk()
     desk.knows("A", 1.0)
     write = desk.set("A", 900.0)
-    for _ in range(2):
+    for seconds in (0.6, 0.3):
         desk.hear("A", 100.0)
-        desk.pass_time(0.9)
+        desk.pass_time(seconds)
         desk.hear("A", 100.0)
     assert desk.take() == ["set A 900.0 REAL32", "read A"] * 2
     assert write.result is not None
@@ -357,7 +357,7 @@ def test_another_stations_value_is_not_taken_for_an_adjustment() -> None:
     desk.knows("A", 1.0)
     write = desk.set("A", 3.0)  # is lost
     desk.hear("A", 2.0, at=0.1)  # another station has set it
-    desk.pass_time(0.9)
+    desk.pass_time(0.6)
     desk.hear("A", 2.0)
     assert not write.done
     assert desk.take() == ["set A 3.0 REAL32", "read A", "set A 3.0 REAL32"]

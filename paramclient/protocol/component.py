@@ -659,7 +659,7 @@ class ComponentMachine(Parts):
         name = "" if autopilot is None else autopilot_name(autopilot)
         self.writes.against_non_finite = reason_against_non_finite(name)
         if self.fetch is not None:
-            self.fetch.identified(now)
+            self.fetch.look(now)
         if self.who.settled and self._known_as != self.identity.key:
             self._known_as = self.identity.key
             self._emit(events.ComponentIdentified(self))

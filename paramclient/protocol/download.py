@@ -9,7 +9,7 @@ from typing import Final
 from paramclient.errors import NoReply
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.reads import Read, Reads
-from paramclient.protocol.stream import SHORTEST_QUIET, ListStream
+from paramclient.protocol.stream import REORDER_DEPTH, SHORTEST_QUIET, ListStream
 from paramclient.protocol.table import Table
 from paramclient.protocol.timing import LONGEST_SILENCE, RoundTrip
 from paramclient.protocol.turns import Seen, Turns
@@ -23,6 +23,9 @@ known how fast the list comes."""
 LIST_PATIENCE: Final = 20.0
 """Seconds of silence after which PARAM_REQUEST_LIST counts as not answered: longer than ArduPilot leaves it
 unanswered after a boot."""
+LIST_DELAY: Final = 0.13
+"""Seconds by which the first value of ArduPilot's list may come later than a short answer (measured: up to
+0.09 s). Asking again meanwhile begins it anew."""
 LIST_VARIATION: Final = 3.0
 """How many times longer than the first list another one may take to begin: reads, which wait for each other,
 say less of that."""
@@ -47,8 +50,13 @@ FEW: Final = 24
 """Missing values that are never worth another pass of the list."""
 MOST_ASKED: Final = 256
 """Indices asked for at a time; the pace of the reads says how many of them are in flight."""
-RELIST_GAIN: Final = 1.5
+RELIST_GAIN: Final = 1.2
 """How many times faster another pass of the list must be than single reads, by the rates measured so far."""
+LONGEST_LEAD: Final = 0.2
+"""Seconds before the end of ArduPilot's list from which reads are sent at the earliest: the list pauses only
+0.2 s after the first read (measured)."""
+MOST_LOSS: Final = 0.9
+"""The share of lost exchanges with which is reckoned at most."""
 ASSUMED_LIST: Final = 5.0
 """Seconds that a list is taken to last before its pace was measured: on a cable one, on a radio thirty."""
 DEAD: Final = 1e-3
@@ -84,6 +92,7 @@ class Download(Operation[None]):
         repeated: values that came although they had come before.
         resumed: how many of them were there already.
         lists: how often the list was asked for.
+        gives_way: whether what the list leaves missing comes otherwise, so that it is not asked for again.
         held_up: seconds for which it waited for its turn; with `held_since` while it waits.
         held_since: since when it waits, or None.
     """
@@ -114,6 +123,7 @@ class Download(Operation[None]):
         self.repeated = 0
         self._lost: set[int] = set()
         self.lists = 0
+        self.gives_way = False
         self.held_up = 0.0
         self.held_since: float | None = None
         self._passes = 1
@@ -134,11 +144,12 @@ class Download(Operation[None]):
         self._list_wait = 0.0
         self._list_asked = 0  # times since the turn began
         self._is_heeded = False  # its head has come since
+        self._has_looked = False  # at what it has passed over, as its end is near
         self._list_at = now
         self._patient_since = now
         if listed:
             self.lists = 1
-            self._list_wait = round_trip.prompt_timeout
+            self._list_wait = round_trip.repeat_timeout(1) + LIST_DELAY
             self._list_asked = 1
             self._silent_at = now + self._list_wait
             turns.has_begun(self)
@@ -272,12 +283,17 @@ class Download(Operation[None]):
             self._list_wait = max(self._list_wait, SHORTEST_QUIET)
             self._silent_at = now + self._list_wait
 
+    def go_on(self, now: float) -> None:
+        """What is missing does not come otherwise."""
+        self.gives_way = False
+        self.tick(now)
+
     def tick(self, now: float) -> None:
         """Ask for the list again, or see that the stream is over."""
         if self.done or self.held_since is not None:
             return
         if self.count is None:
-            if self._list_at + self._list_wait <= now:
+            if self._list_at + self._list_wait <= now and not self.gives_way:
                 if self._turns.is_beside_others(self):
                     self._patient_since = now  # it may have no room to answer
                 is_gone = now - self._round_trip.heard_at >= LONGEST_SILENCE
@@ -292,13 +308,20 @@ class Download(Operation[None]):
         self._ask_for_gaps(now)
         self._finish_if_complete(now)
 
+    @property
+    def _end_look_at(self) -> float:
+        """When to see what the list has passed over: once for each pass, as its end comes near."""
+        return math.inf if self._has_looked else self._ending_at
+
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity. The reads have deadlines of their own."""
         if self.done or self.held_since is not None:
             return math.inf
         if self.count is None:
-            return self._list_at + self._list_wait
-        return self._quiet_at if self._is_streaming else math.inf
+            return math.inf if self.gives_way else self._list_at + self._list_wait
+        if not self._is_streaming:
+            return math.inf
+        return self._quiet_at if self._asked or self.gives_way else min(self._quiet_at, self._end_look_at)
 
     def resume(self, now: float) -> None:
         """The link is back: what was not sent while it was away is worth asking for now."""
@@ -322,7 +345,7 @@ class Download(Operation[None]):
         if self._stream.is_awaited and self._passes > 1:
             timeout = min(timeout, self._list_patience)
         stream = self._stream
-        quiet_at = stream.quiet_at(timeout)
+        quiet_at = stream.quiet_at(timeout, (self.count or 0) - 1 - stream.front)
         if stream.is_bursty and self._turns.is_beside_others(self):
             # on a link so fast it is the program that has no time for more, or the vehicle, and pauses
             return max(quiet_at, stream.heard_at + max(SHORTEST_QUIET, timeout))
@@ -361,14 +384,19 @@ class Download(Operation[None]):
     def _ask_for_list(self, now: float) -> None:
         self.lists += 1
         self._list_at = now
-        self._is_heeded = False
-        timeout = self._round_trip.prompt_timeout
+        self._is_heeded = self._has_looked = False
         self._list_asked += 1
+        timeout = self._round_trip.repeat_timeout(self._list_asked)
+        if self._round_trip.smoothed is not None:
+            timeout += LIST_DELAY
         growth = 2 if self._list_asked > EVEN_LISTS else 1
         self._list_wait = max(min(self._list_wait * growth, LONGEST_LIST_WAIT), timeout)
         self._stream.is_awaited = True
         self._reads.is_idle = False
-        for _ in range(1 if self._passes == 1 else self._round_trip.copies(LIST_RISK, MOST_LISTS_AT_ONCE)):
+        copies = self._round_trip.copies(LIST_RISK, MOST_LISTS_AT_ONCE)
+        if self._passes == 1 and not self._reads.pace.is_batched:
+            copies = 1
+        for _ in range(copies):
             self._send(ParamRequestList(*self._target))
 
     def _ask_for_another_pass(self, now: float) -> None:
@@ -376,6 +404,7 @@ class Download(Operation[None]):
         self._vain_passes += 1
         self._vain = 0
         self._is_streaming = self._reads.list_runs_again = True
+        self._next = 0
         self._ask_for_turn(now)
 
     def _follow(self, index: int, is_repeated: bool, now: float) -> None:
@@ -389,7 +418,7 @@ class Download(Operation[None]):
             behind = stream.front + 1
             if not stream.takes(index, now):
                 return
-            if index > behind:
+            if index > behind and not self._reads.pace.is_batched:
                 stream.pass_over(hole for hole in range(behind, index) if hole not in self.names)
         stream.heard_at = now
         count = self.count or 0
@@ -407,6 +436,7 @@ class Download(Operation[None]):
         if stream.is_at_pace:
             came, passed, _, is_bursty = stream.seen()
             loss = 1 - came / passed if passed else 0.0
+            self._round_trip.list_loss = 1.0 - (1.0 - loss) ** 2
             self._reads.pace.stream_seen(stream.gap, loss, BURST_GAIN if is_bursty else 1.0)
 
     def _stream_ends(self, *, is_cut: bool = False) -> None:
@@ -439,9 +469,12 @@ class Download(Operation[None]):
 
     def _ask_for_gaps(self, now: float) -> None:
         count = self.count
-        if self.done or count is None or self._other_count is not None:
+        if self.done or count is None or self._other_count is not None or self.gives_way:
             return
         if self._is_streaming:
+            if self._reads.pace.is_batched:
+                self._read_at_the_end(now)
+                return
             self._learn_pace()
             for index in self._stream.lost():
                 if len(self._asked) >= MOST_ASKED:
@@ -453,20 +486,66 @@ class Download(Operation[None]):
             self._lost.update(self.missing)
             self._ask_for_another_pass(now)
         else:
-            while len(self._asked) < MOST_ASKED and self._next < count:
-                index = self._next
-                self._next += 1
-                if not (index in self.names or index in self.given_up or index in self._asked):
-                    self._ask(index, now)
+            self._ask_in_order(count, now)
+
+    @property
+    def _ending_at(self) -> float:
+        """When a read that is sent reaches the vehicle at the end of its list; infinity where unknown.
+
+        ArduPilot's list comes evenly. Reads beside it take more from it than they bring.
+        """
+        stream, trip = self._stream, self._round_trip.smoothed
+        if not (self._is_streaming and self._reads.pace.is_batched) or stream.is_awaited or trip is None:
+            return math.inf
+        last = (self.count or 0) - 1
+        if stream.front < last // 2:
+            return math.inf  # its pace is not known well enough
+        return stream.ends_at(last) - min(trip, LONGEST_LEAD)
+
+    def _read_at_the_end(self, now: float) -> None:
+        """Ask for what the list has passed over, so that the requests arrive when it is over."""
+        if now < self._ending_at:
+            return
+        self._has_looked = True
+        self._learn_pace()
+        front = self._stream.front - REORDER_DEPTH
+        passed_over = sum(index not in self.names for index in range(front))
+        if self._asked or not self._another_pass_is_faster(passed_over):
+            self._ask_in_order(front, now)
+
+    def _ask_in_order(self, stop: int, now: float) -> None:
+        """Ask for what is missing below an index, and was not asked for."""
+        while len(self._asked) < MOST_ASKED and self._next < stop:
+            index = self._next
+            self._next += 1
+            if not (index in self.names or index in self.given_up or index in self._asked):
+                self._ask(index, now)
 
     def _another_pass_is_faster(self, missing: int) -> bool:
         if self.count is None or self._passes >= MOST_PASSES or missing <= FEW:
             return False
         if self._vain_passes >= MOST_VAIN_PASSES or not self._turns.is_free:
             return False
-        trip = self._round_trip
-        by_reads = missing / (self._reads.pace.prospect * (1 - trip.loss))
-        return by_reads > RELIST_GAIN * (self.count * self._stream.gap + (trip.smoothed or trip.timeout))
+        trip = self._round_trip.smoothed or self._round_trip.timeout
+        by_pass = self.count * self._stream.gap + trip + self._time_to_read(missing * self._stream_loss)
+        return self._time_to_read(missing) > RELIST_GAIN * by_pass
+
+    @property
+    def _stream_loss(self) -> float:
+        """The share of the list's values that are lost, as far as the last pass has shown."""
+        came, passed, _, _ = self._stream.seen()
+        return 1.0 - came / passed if passed else 0.0
+
+    def _time_to_read(self, missing: float) -> float:
+        """Seconds that so many single reads take, by the rate and the loss measured on this link.
+
+        The last one of them to be answered needs about so many tries that all of them would have been lost.
+        """
+        if missing < 1.0:
+            return missing * self._round_trip.timeout
+        loss = min(max(self._round_trip.seen_loss, 1.0 - (1.0 - self._stream_loss) ** 2), MOST_LOSS)
+        tries = math.log(missing) / -math.log(loss) if loss > 0.0 else 0.0
+        return missing / (self._reads.pace.prospect * (1.0 - loss)) + tries * self._round_trip.timeout / 2
 
     def _ask(self, index: int, now: float) -> None:
         self._lost.add(index)
@@ -507,6 +586,8 @@ class Download(Operation[None]):
 
     def _finish_if_complete(self, now: float) -> None:
         if self.done or self.count is None or self._is_streaming or self._asked:
+            return
+        if self.gives_way and len(self.names) < self.count:
             return
         if self._other_count is not None:
             # answers went by another count than the stream: its indices are of the past

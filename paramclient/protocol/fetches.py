@@ -25,7 +25,7 @@ class Fetches:
         means: what each of them works with.
         sync: the component's.
         upkeep: what may be asked.
-        says_file: whether the component says that it serves files; None while that is worth waiting for.
+        says_file: whether the component serves its table as a file, as far as it has said.
         ended: is told of each result in which the vehicle has said something of its table.
 
     Attributes:
@@ -42,7 +42,7 @@ class Fetches:
         sync: Sync,
         upkeep: Upkeep,
         *,
-        says_file: Callable[[], bool | None],
+        says_file: Callable[[], bool],
         ended: Callable[[FetchResult], None],
     ) -> None:
         self.current: Fetch | None = None
@@ -64,7 +64,7 @@ class Fetches:
         """What was not taken from files that others read, in sentences."""
         return () if self.overheard is None else tuple(self.overheard.file.notes)
 
-    def may_use_file(self) -> bool | None:
+    def may_use_file(self) -> bool:
         """Whether the table is worth asking for as a file: it has come as one, or the component says so."""
         return self._says_file() if self.file_works is None else self.file_works
 

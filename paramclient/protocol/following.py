@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Final
 
 from paramclient.protocol.reads import Reads
-from paramclient.protocol.stream import LONGEST_JUMP, QUIET_GAPS, SHORTEST_QUIET
+from paramclient.protocol.stream import LONGEST_JUMP, LONGEST_PAUSE, QUIET_GAPS
 from paramclient.protocol.wire import NO_INDEX, ParamValue
 
 __all__ = ["Following"]
@@ -66,4 +66,4 @@ class Following:
     @property
     def _quiet(self) -> float:
         """Seconds without a value after which it is over."""
-        return max(QUIET_GAPS * self._longest, SHORTEST_QUIET)
+        return max(QUIET_GAPS * self._longest, LONGEST_PAUSE)

@@ -37,6 +37,8 @@ PX4_WITH_FILE: Final = 0x01120000
 TRIES: Final = 4
 """AUTOPILOT_VERSION is asked for so often where nothing is known of the link, or where it was refused; many
 components (cameras, radios) never give one."""
+VERSION_DELAY: Final = 0.1
+"""Seconds by which AUTOPILOT_VERSION may follow the acknowledgement of its request; then it was lost."""
 DOUBT_PATIENCE: Final = 5.0
 """Seconds for which one that has said it before is asked at the least: it may only be starting."""
 DOUBT_PACE: Final = 1.0
@@ -111,6 +113,7 @@ class Identification:
         self._is_asking = False
         self._asks_until = -math.inf  # however often that is
         self._denied_at = math.inf  # when the last way of asking was refused
+        self._lost_at = math.inf  # when the answer counts as lost, as the request was acknowledged
 
     @property
     def has_parameters(self) -> bool:
@@ -118,14 +121,14 @@ class Identification:
         return self.vehicle_type != MAV_TYPE_GCS
 
     @property
-    def says_file(self) -> bool | None:
+    def says_file(self) -> bool:
         """Whether it says that it serves files, and has the packed parameter file among them.
 
-        PX4 says so since long before it had that: 1.17 answers "file not found" (measured). None as long as
-        an ArduPilot, which mostly has it, has not said what it can.
+        PX4 says so since long before it had that: 1.17 answers "file not found" (measured). An ArduPilot,
+        which mostly has it, is believed to have it until its version says otherwise.
         """
-        if self.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and not self.settled:
-            return None
+        if self.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and self.capabilities is None:
+            return True
         has_none = self.autopilot == MAV_AUTOPILOT_PX4 and self.identity.firmware < PX4_WITH_FILE
         return bool((self.capabilities or 0) & CAPABILITY_FTP) and not has_none
 
@@ -227,10 +230,16 @@ class Identification:
             self._is_asking = False
 
     def acknowledged(self, message: CommandAck, now: float) -> None:
-        """Take a COMMAND_ACK: a refusal of one way to ask leads to the other at once."""
+        """Take a COMMAND_ACK: a refusal of one way to ask leads to the other at once.
+
+        What is accepted comes with the acknowledgement, or was lost.
+        """
         asked = (MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
-        if self._is_asking and message.command in asked and message.result != MAV_RESULT_ACCEPTED:
-            self._denied_at = now
+        if self._is_asking and message.command in asked:
+            if message.result != MAV_RESULT_ACCEPTED:
+                self._denied_at = now
+            else:
+                self._lost_at = min(self._lost_at, now + VERSION_DELAY)
 
     def tick(self, now: float) -> None:
         """Ask again, or let it be."""
@@ -241,10 +250,10 @@ class Identification:
         """When `tick` has something to do, or infinity; it follows what other answers tell of the link."""
         if not self._is_asking:
             return math.inf
-        pause = self._round_trip.timeout
+        pause = self._round_trip.repeat_timeout(self._attempts)
         if self._attempts >= self._tries and self._asked_at < self._asks_until:
             pause = max(pause, DOUBT_PACE)
-        return min(self._denied_at, self._asked_at + pause)
+        return min(self._denied_at, self._lost_at, self._asked_at + pause)
 
     @property
     def _tries(self) -> int:
@@ -258,15 +267,21 @@ class Identification:
             self._is_asking = False
             self.settled = True
             return
+        was_refused = self._denied_at < math.inf
         self._attempts += 1
         self._asked_at = now
         self._is_asking = True
-        self._denied_at = math.inf
-        if self._attempts % 2:
-            command, first = MAV_CMD_REQUEST_MESSAGE, float(AUTOPILOT_VERSION_ID)
-        else:
-            command, first = MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0
-        self._send(CommandLong(*self._target, command, (first, *[0.0] * 6)))
+        self._denied_at = self._lost_at = math.inf
+        ways = [
+            (MAV_CMD_REQUEST_MESSAGE, float(AUTOPILOT_VERSION_ID)),
+            (MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0),
+        ]
+        if was_refused:
+            ways = [ways[(self._attempts + 1) % 2]]
+        elif self._attempts == 1:
+            ways = ways[:1]
+        for command, first in ways:  # after silence both: a request or its answer may have been lost
+            self._send(CommandLong(*self._target, command, (first, *[0.0] * 6)))
 
     def _judge(self) -> None:
         self.encoding, self.encoding_reason = judge_encoding(self._chosen, self.capabilities, self.autopilot)

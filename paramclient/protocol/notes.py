@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 __all__ = [
+    "FILE_IN_USE",
     "FROM_MEMORY",
     "MOVED",
     "NOT_ASKED",
@@ -32,6 +33,10 @@ NOT_CONFIRMED = (
     "the values are those last known."
 )
 NO_FILE = "The parameters did not come as a file, so they were listed: {}."
+FILE_IN_USE = (
+    "The parameters were listed: the file could not be opened, as another station reads one, "
+    "or has left one open."
+)
 SAMPLED = "A sample of the cached table agreed with the vehicle; nothing else was asked."
 NOT_SAMPLED = "The sample did not confirm the cached table: {}."
 NOT_REFRESHED = "What the hash leaves out was not read afresh, as the policy is hash-only."

@@ -31,6 +31,9 @@ ENOUGH_SERVED: Final = 0.5
 LOSS_MARGIN: Final = 0.1
 """By how much more exchanges may fail than the list's losses explain before that is the component's doing:
 one that is asked too fast drops requests, and that must not pass for a bad link."""
+LIST_READS: Final = 1 / 3
+"""Requests for each value of its list with which a component is asked at first that does not serve reads in
+batches: PX4 answers reads at once, whatever its list does (measured)."""
 ROUNDING: Final = 1e-9
 """Of a token: without it, what `next_at` promises could be missed by the last bit of a float, for ever."""
 ENOUGH_SERVED_LATE: Final = 0.8
@@ -237,6 +240,8 @@ class Pace:
         if gap > 0:
             self.gap = gap
             self._likely_loss = 1.0 - (1.0 - loss) ** 2 + LOSS_MARGIN
+            if self._rate == FIRST_RATE and not self._is_found:
+                self._rate = max(FIRST_RATE, LIST_READS / gap)
             self._share.stream_seen(self, gain / gap, loss)
 
     def stream_ended(self) -> None:

@@ -91,9 +91,33 @@ class PackFetch(Operation[None]):
         return self._job is None or not self._job.received
 
     @property
+    def asked_at(self) -> float:
+        """When the opening of the file was asked for; infinity while that waits for its turn."""
+        return math.inf if self._job is None else self._job.asked_at
+
+    @property
+    def attempts(self) -> int:
+        """How often the present request was sent."""
+        return 0 if self._job is None else self._job.attempts
+
+    @property
+    def is_served(self) -> bool:
+        """Whether the component has opened the file, so that it will come."""
+        return self._job is not None and self._job.session is not None
+
+    @property
+    def blocked_until(self) -> float | None:
+        """When the file is opened again, while another station has a file open; None where none has."""
+        return None if self._job is None else self._job.blocked_until
+
+    @property
     def silent_at(self) -> float:
         """While nothing has come: when that has lasted too long for others to wait."""
         return self._silent_at if self.is_awaited else math.inf
+
+    def give_way(self) -> None:
+        """Let a list of the same component run beside, as long as nothing comes of the file."""
+        self._turns.give_back(self)
 
     def seen(self) -> Seen:
         """What has come, in messages: a burst that is repaired on its own goes over nothing."""
@@ -130,12 +154,12 @@ class PackFetch(Operation[None]):
         if message.param_count <= MOST_PARAMETERS:
             self._heard_count = message.param_count
 
-    def cancel(self, now: float) -> None:
-        """Nobody wants it any more; the file is closed on board."""
+    def cancel(self, now: float, *, is_served: bool = True) -> None:
+        """Nobody wants it any more; the file is closed on board, where the component serves files."""
         job, self._job = self._job, None
         self._turns.give_back(self)
         if job is not None:
-            self._files.release(job, now)
+            self._files.release(job, now, is_served=is_served)
 
     def _read(self, now: float) -> None:
         self._attempts += 1

@@ -148,7 +148,7 @@ class Reads:
             self._patient.remove(read)
             self._urgent.append(read)
         read.holders += 1
-        self._send_waiting(now)
+        self._send_waiting(now, may_copy=False)  # others may be asked for at the same moment
         return read
 
     def release(self, read: Read) -> None:
@@ -317,7 +317,7 @@ class Reads:
 
     def _due_at(self, read: Read) -> float:
         """When a read in flight times out, or is sent again."""
-        timeout = max(self._round_trip.timeout, read.serving_time)
+        timeout = max(self._round_trip.read_timeout(read.attempts), read.serving_time)
         return min(read.sent_at + timeout, read.ask_again_at)
 
     def _time_to_serve(self) -> float:
@@ -425,7 +425,7 @@ class Reads:
         self.pace.sent(now)
         self._send(ParamRequestRead(*self._target, "", self.control))
 
-    def _send_waiting(self, now: float) -> None:
+    def _send_waiting(self, now: float, *, may_copy: bool = True) -> None:
         """Send what waits, as far as the pace allows; on an idle link ask twice rather than wait."""
         while self._again or self._urgent or self._patient:
             queue = self._urgent or self._again or self._patient
@@ -437,7 +437,11 @@ class Reads:
                 self._transmit(read, now)
             else:
                 return
-        while (read_again := self._copy_wanted()) is not None and self.pace.may_send(now, COPY_RESERVE):
+        while (
+            may_copy
+            and (read_again := self._copy_wanted()) is not None
+            and self.pace.may_send(now, COPY_RESERVE)
+        ):
             read_again.copies += 1
             self.pace.sent(now)
             self._request(read_again, now)

@@ -453,7 +453,7 @@ class Station:
         )
         may_list = self.policy is Policy.AUTO
         is_fresh = refresh or not any(m.can_hit or present_of(m.table, m.reads) for m in machines)
-        has_file = any(machine.fetches.may_use_file() is not False for machine in machines)
+        has_file = any(machine.fetches.may_use_file() for machine in machines)
         if len(machines) > 1 and may_list and is_new and is_fresh and not has_file:
             system = machines[0].system
             known = [m for m in self.components.values() if m.system == system and m.who.has_parameters]

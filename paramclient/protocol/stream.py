@@ -7,7 +7,7 @@ from typing import Final
 
 from paramclient.protocol.turns import Seen
 
-__all__ = ["ENOUGH_ADVANCES", "ListStream"]
+__all__ = ["ENOUGH_ADVANCES", "REORDER_DEPTH", "ListStream"]
 
 REORDER_DEPTH: Final = 3
 """Later values that must have come before a missing one counts as lost, as in TCP's fast retransmit."""
@@ -16,9 +16,16 @@ ENOUGH_ADVANCES: Final = 20
 QUIET_GAPS: Final = 3.0
 """A stream that pauses for so many of its longest gaps is over; a radio's pauses count among its gaps."""
 SHORTEST_QUIET_AT_PACE: Final = 0.06
+"""Seconds without a value after which a stream may be over whose last values are due: PX4 sends every 20 ms,
+ArduPilot every 10."""
+LONGEST_PAUSE: Final = 0.5
+"""Seconds without a value after which a stream may be over that is not near its end: ArduPilot's pauses for
+up to 0.4 s while it serves reads (measured)."""
+TAIL: Final = 24
+"""Values behind the last one that came which may all be lost: a list that is silent there is over, however
+many of its values are lost."""
 SHORTEST_QUIET: Final = 0.25
-"""Seconds without a value after which a stream may be over, at the least: PX4 sends every 20 ms, ArduPilot
-every 10."""
+"""Seconds without a value before the first of them, at the least."""
 LONGEST_JUMP: Final = 40
 """Indices that the stream may pass over at once. A longer jump is believed when the next value goes on from
 there: PX4 pushes changed parameters, with their index, into a running stream."""
@@ -114,11 +121,25 @@ class ListStream:
             found.append(index)
         return found
 
-    def quiet_at(self, timeout: float) -> float:
-        """When it is over if nothing more comes; before its pace is known, after this time-out."""
-        if self._advances < ENOUGH_ADVANCES or self.is_awaited:
+    def quiet_at(self, timeout: float, left: int) -> float:
+        """When it is over if nothing more comes.
+
+        Args:
+            timeout: seconds after which it is over before its pace is known.
+            left: how many values it has behind its front.
+        """
+        if self.is_awaited:
             return self.heard_at + max(SHORTEST_QUIET, timeout)
-        return self.heard_at + max(QUIET_GAPS * self._longest, SHORTEST_QUIET_AT_PACE)
+        if self._advances < ENOUGH_ADVANCES:
+            return self.heard_at + max(SHORTEST_QUIET if left <= TAIL else LONGEST_PAUSE, timeout)
+        shortest = SHORTEST_QUIET_AT_PACE if left <= TAIL else LONGEST_PAUSE
+        return self.heard_at + max(QUIET_GAPS * self._longest, shortest)
+
+    def ends_at(self, last: int) -> float:
+        """When the value of this index comes, at the pace of those that have come."""
+        first, since = self._began
+        gap = (self._front_at - since) / (self.front - first) if self.front > first else 0.0
+        return self._front_at + (last - self.front) * gap
 
     def seen(self) -> Seen:
         """What it has shown since it was asked for."""

@@ -8,7 +8,13 @@ from typing import Final
 __all__ = ["RoundTrip"]
 
 INITIAL_TIMEOUT: Final = 1.0
-"""Seconds before anything was measured (RFC 6298, 2.1)."""
+"""Seconds before anything was measured (RFC 6298, 2.1), for requests that must not be repeated too early."""
+FIRST_TIMEOUT: Final = 0.25
+"""Seconds before anything was measured, for the first of several requests that may be repeated at will; each
+further one waits twice as long. On most links a lost first answer then costs little more than a round trip,
+and a link of 2.5 s sees four requests in the place of one."""
+GUESS_MARGIN: Final = 1.25
+"""How many times longer than the longest round trip that an answer allows its timeout is."""
 SHORTEST_TIMEOUT: Final = 0.1
 """ArduPilot answers reads in batches every 100 ms, PX4 once in its loop: asking sooner gains nothing."""
 SERVING_TIME: Final = 0.22
@@ -49,24 +55,29 @@ class RoundTrip:
     Attributes:
         smoothed: the smoothed round trip in seconds, or None before the first sample.
         variation: how much it varies, in seconds.
+        list_loss: the share of exchanges that would be lost, by what a list has lost; 0 before one came.
         heard_at: when anything at all came from the component last; its receiver keeps that up to date.
     """
 
     __slots__ = (
         "_answered",
         "_backoff",
+        "_early_waits",
+        "_guess",
         "_samples",
         "_silences",
         "_timeout",
         "_unanswered",
         "_was_answered",
         "heard_at",
+        "list_loss",
         "smoothed",
         "variation",
     )
 
     def __init__(self) -> None:
         self.heard_at = math.inf
+        self.list_loss = 0.0
         self.smoothed: float | None = None
         self.variation = 0.0
         self._backoff = 1.0
@@ -76,6 +87,8 @@ class RoundTrip:
         self._unanswered = 0.0
         self._was_answered = False
         self._timeout: float | None = None
+        self._guess = math.inf  # the longest round trip that the answers allow, before one was measured
+        self._early_waits: list[float] = []  # after which requests timed out before that
 
     @property
     def is_guessed(self) -> bool:
@@ -97,6 +110,28 @@ class RoundTrip:
         """The same for what is answered at once, or as soon as the vehicle looks at it."""
         return self._wait(0.0)
 
+    def read_timeout(self, attempts: int) -> float:
+        """Seconds to wait for the answer to a read, which the vehicle may serve in batches.
+
+        Args:
+            attempts: how often the request was sent.
+        """
+        return self.repeat_timeout(attempts) if self.smoothed is None else self.timeout
+
+    def repeat_timeout(self, attempts: int) -> float:
+        """Seconds to wait for the answer to a request that may be repeated at will.
+
+        Once the round trip is measured that is `prompt_timeout`. Before, it starts at `FIRST_TIMEOUT` and
+        doubles.
+
+        Args:
+            attempts: how often the request was sent.
+        """
+        if self.smoothed is not None:
+            return self.prompt_timeout
+        first = FIRST_TIMEOUT if self._guess == math.inf else max(FIRST_TIMEOUT, GUESS_MARGIN * self._guess)
+        return min(first * 2.0 ** (attempts - 1), max(LONGEST_TIMEOUT, first))
+
     def _wait(self, least_at_first: float) -> float:
         base = (
             INITIAL_TIMEOUT if self.smoothed is None else self.smoothed + max(4 * self.variation, GRANULARITY)
@@ -113,8 +148,13 @@ class RoundTrip:
 
     @property
     def seen_loss(self) -> float:
-        """The same as far as it was seen: 0 as long as everything was answered."""
-        return self._unanswered / (self._unanswered + self._answered + 1.0)
+        """The same as far as it was seen: 0 as long as everything was answered.
+
+        Before enough requests were answered, the losses of a list count as well.
+        """
+        seen = self._unanswered + self._answered
+        measured = self._unanswered / (seen + 1.0)
+        return max(measured, self.list_loss) if seen < ENOUGH_SEEN else measured
 
     def copies(self, risk: float, most: int) -> int:
         """How many requests at once bring the chance of no answer below a risk; one without loss."""
@@ -148,6 +188,9 @@ class RoundTrip:
             self._unanswered *= MEMORY
         sample = now - sent_at
         if attempts != 1 or not math.isfinite(sample):
+            if self.smoothed is None and math.isfinite(sample):
+                # it answers the first of them at the earliest
+                self._guess = min(self._guess, sample + FIRST_TIMEOUT * (2.0 ** (attempts - 1) - 1.0))
             if sample >= LIKELY * (self.smoothed or math.inf):
                 # it may well be the answer to the last of them
                 self._silences = 0
@@ -162,6 +205,8 @@ class RoundTrip:
         self._backoff = 1.0
         self._silences = 0
         self._samples += 1
+        if self._early_waits:
+            self._forgive_early_repeats()
 
     def timed_out(self, attempts: int) -> None:
         """A request stayed unanswered for `timeout`, after so many attempts.
@@ -171,6 +216,8 @@ class RoundTrip:
         """
         self._timeout = None
         if attempts <= 2:
+            if self.smoothed is None:
+                self._early_waits.append(self.repeat_timeout(attempts))
             self._unanswered = self._unanswered * MEMORY + 1
             self._answered *= MEMORY
         self._silences += 1
@@ -178,3 +225,9 @@ class RoundTrip:
         if self._silences >= min(max(likely, FEWEST_SILENCES), MOST_SILENCES):
             self._silences = 0
             self._backoff = min(self._backoff * 2, LONGEST_TIMEOUT / SHORTEST_TIMEOUT)
+
+    def _forgive_early_repeats(self) -> None:
+        """The round trip is known now: requests that were repeated before it had passed were not lost."""
+        early = sum(wait < self.prompt_timeout for wait in self._early_waits)
+        self._unanswered = max(self._unanswered - early, 0.0)
+        self._early_waits.clear()

@@ -20,10 +20,11 @@ Result = TypeVar("Result")
 COPY_RISK: Final = 0.01
 """The share of requests without an answer from which on each is sent twice: servers give the same answer to
 the same request, so that costs its few bytes."""
-BUSY_PAUSE: Final = 0.5
-BUSY_PATIENCE: Final = 4.0
-"""Seconds between two attempts to open a file while the server has no session left, and for how long:
-ArduPilot gives one up that was idle for 3 s."""
+QUIET_TIME: Final = 3.2
+"""Seconds for which nothing is sent to a server whose session is in use: ArduPilot ends a session 3 s after
+its last reply to anybody, and the refusal of an open is such a reply (measured)."""
+BUSY_PATIENCE: Final = 30.0
+"""Seconds for which the session of another station is waited for. Its transfer keeps the session alive."""
 MOST_FAILURES: Final = 4
 """How often an open may fail without a reason. ArduPilot says no more when the session is open already, as
 after an open whose answer was lost; it is then closed and opened again at once."""
@@ -32,8 +33,15 @@ CLOSE_ATTEMPTS: Final = 4
 so long ends the session by its own timeout: ArduPilot after 3 s, PX4 after 10 s."""
 MOST_CLOSE_COPIES: Final = 4
 """Requests to close that go out at once on a lossy link: each has 12 bytes of payload."""
-BUSY = frozenset((FileErrorCode.FAIL, FileErrorCode.INVALID_SESSION, FileErrorCode.NO_SESSIONS_AVAILABLE))
-"""What servers say of an open while another file is open."""
+UNHEARD_ATTEMPTS: Final = 16
+"""Requests after which a server that has never answered counts as none: where two exchanges of three are
+lost, all of them are lost once in 700 times."""
+EVEN_ATTEMPTS: Final = 2
+MOST_DOUBLINGS: Final = 4
+"""Requests to a server that has not answered yet which follow each other without a longer wait, and how often
+the wait doubles after that."""
+BUSY = frozenset((FileErrorCode.INVALID_SESSION, FileErrorCode.NO_SESSIONS_AVAILABLE))
+"""What servers say of an open while another station has a file open, or has left one open."""
 
 
 def path_bytes(path: str) -> bytes:
@@ -100,6 +108,7 @@ class Job(Operation[Result]):
 
     Attributes:
         path: of the file or directory.
+        asked_at: when the opening of the file was asked for last, but for repeats; infinity before.
         is_over: whether the job needs the server no longer: nothing was begun, or its session is closed.
         is_of_caller: whether somebody waits for it who is to be told when the component is lost.
         session: the number of the session that is open for it, or None.
@@ -114,6 +123,7 @@ class Job(Operation[Result]):
         self.session: int | None = None
         self.asked_session: int | None = None
         self.is_over = False
+        self.asked_at = math.inf
         self._path_data = path_bytes(path)
         self._tell: Callable[[float], None] | None = None  # what ends it, once its session is closed
         self._request: Packet | None = None
@@ -122,13 +132,22 @@ class Job(Operation[Result]):
         self._sent_at = math.inf
         self._failures = 0
         self._busy_since = math.inf
-        self._open_at = math.inf
-        self._reopen: Callable[[float], None] | None = None
+        self._open_at = math.inf  # when the file is opened again, as the server's session is in use
 
     @property
     def attempts(self) -> int:
         """How often the present request was sent."""
         return self._attempts
+
+    @property
+    def _has_request(self) -> bool:
+        """Whether the answer to a request is awaited."""
+        return self._request is not None
+
+    @property
+    def blocked_until(self) -> float | None:
+        """When the file is opened again, while the server's session is in use; None where it is not."""
+        return None if self._open_at == math.inf else self._open_at
 
     @property
     def is_ended(self) -> bool:
@@ -152,6 +171,13 @@ class Job(Operation[Result]):
             self._send_blind_close()
             self.session = self.asked_session = None
         self._close(lambda at: Operation.fail(self, error, at), now)
+
+    def abandon(self, now: float) -> None:
+        """End, and await nothing more of a component that has no server; nobody is told."""
+        self.on_done.clear()
+        self._send_blind_close()
+        self.session = self.asked_session = None
+        self._close(_nothing, now)
 
     def stop(self, now: float, error: Exception | None = None) -> None:
         """End without waiting for the session's closing, which goes on until `is_over`.
@@ -202,8 +228,13 @@ class Job(Operation[Result]):
             self._line.send(packet)
             self._line.send(packet)
 
+    def server_heard(self, now: float) -> None:
+        """The server has sent something to anybody: a session that is in use lives on."""
+        if self._open_at < math.inf:
+            self._open_at = now + QUIET_TIME
+
     def take(self, packet: Packet, now: float) -> None:
-        """Something came from the server."""
+        """Something came from the server for us."""
         request = self._request
         if request is None or self._then is None:
             return
@@ -218,15 +249,16 @@ class Job(Operation[Result]):
 
     def tick(self, now: float) -> None:
         """Do what is due."""
-        if self._open_at <= now and self._reopen is not None:
+        if self._open_at <= now:
             self._open_at = math.inf
-            self._reopen(now)
+            self.begin(now)
         if self._request is not None and self._deadline() <= now:
-            self._line.round_trip.timed_out(self._attempts)
+            if self._line.heard_at > -math.inf:  # else there may be no server, and the link loses nothing
+                self._line.round_trip.timed_out(self._attempts)
             if self.is_ended and self._attempts >= CLOSE_ATTEMPTS:
                 self._send_blind_close()
                 self._closed(now)
-            elif self._line.round_trip.is_hopeless(self._attempts, now):
+            elif self._is_hopeless(now):
                 self._request = None
                 self.fail(self._no_reply(self._attempts, now), now)
             else:
@@ -278,29 +310,33 @@ class Job(Operation[Result]):
                     then(packet, now)
             elif self.is_ended:
                 self._closed(now)
-            elif code not in BUSY or self._is_patience_over(code, now):
+            elif code == FileErrorCode.FAIL and self._failures < MOST_FAILURES:
+                # what is open may be what an open of ours has opened whose answer was lost
+                self._failures += 1
+                self._line.reset_sessions(number)
+                self.begin(now)
+            elif code in BUSY and now - (since := min(self._busy_since, now)) < BUSY_PATIENCE:
+                self._busy_since = since
+                self._open_at = now + QUIET_TIME
+            else:
                 self.asked_session = None
                 self._refused(packet, "does not open", now)
-            elif code == FileErrorCode.FAIL or self._busy_since == math.inf:
-                # what is open may be what we ourselves, or a program before us, could not close
-                self._busy_since = min(self._busy_since, now)
-                self._line.reset_sessions(number)
-                again(now)
-            else:
-                self._open_at = now + BUSY_PAUSE
-                self._reopen = again
 
-        def again(now: float) -> None:
-            self._ask(opcode, opened, now, data=self._path_data, session=number)
-
+        self.asked_at = now
         number = self._line.next_session() if self.asked_session is None else self.asked_session
         self.asked_session = number
         self._ask(opcode, opened, now, data=self._path_data, session=number, copies=copies)
 
-    def _is_patience_over(self, code: int, now: float) -> bool:
-        if code == FileErrorCode.FAIL:
-            self._failures += 1
-        return self._failures > MOST_FAILURES or now - self._busy_since >= BUSY_PATIENCE
+    def _is_hopeless(self, now: float) -> bool:
+        """Whether the request was sent often enough."""
+        is_unheard = self._line.heard_at == -math.inf  # of what is lost on the way there, nothing is known
+        if (
+            is_unheard
+            and self._attempts < UNHEARD_ATTEMPTS
+            and now - self._line.round_trip.heard_at < LONGEST_SILENCE
+        ):
+            return False
+        return self._line.round_trip.is_hopeless(self._attempts, now)
 
     def _refused(self, packet: Packet, what: str, now: float) -> None:
         """End with the error that a NAK names."""
@@ -337,7 +373,16 @@ class Job(Operation[Result]):
     def _deadline(self) -> float:
         # while a burst comes the server does nothing else
         since = min(max(self._sent_at, self._line.heard_at), self._sent_at + LONGEST_SILENCE)
-        return since + self._line.round_trip.timeout
+        round_trip = self._line.round_trip
+        # what takes long on board is not asked for again at once
+        is_slow = self._request is not None and self._request.opcode == Opcode.CALC_FILE_CRC32
+        if is_slow:
+            return since + round_trip.timeout
+        timeout = round_trip.repeat_timeout(self._attempts)
+        if self._line.heard_at == -math.inf and round_trip.smoothed is not None:
+            # the server may be at work for another station, whose burst nothing interrupts
+            timeout *= 2.0 ** min(max(self._attempts - EVEN_ATTEMPTS, 0), MOST_DOUBLINGS)
+        return since + timeout
 
 
 def _nothing(now: float) -> None:

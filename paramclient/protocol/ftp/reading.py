@@ -21,11 +21,12 @@ MOST_DOUBLINGS: Final = 1
 """How often the time to wait for a burst doubles."""
 BURSTS_KEPT: Final = 4
 """Bursts whose late answers are still taken."""
-FIRST_BLOCK: Final = 0.4
+FIRST_BLOCK: Final = 0.7
 FIRST_BLOCK_TRIPS: Final = 2.5
 """Seconds, and round trips, by which the first block of a burst may come later than a short answer: on 1,200
-bytes a second it takes 0.22 s alone. Asking too early lets the vehicle send everything twice. The messages
-that measured the round trip are almost half as long, so a short one tells that the link is not slow."""
+bytes a second it takes 0.22 s alone, and 0.67 s where the vehicle keeps to a third of that. Asking too early
+lets the vehicle send everything twice. The messages that measured the round trip are almost half as long, so
+a short one tells that the link is not slow."""
 SLOWEST_GAP: Final = 2.0
 """Seconds to wait for the second block of a burst, when nothing is known of its pace."""
 QUIET_BLOCKS: Final = 6
@@ -129,10 +130,10 @@ class FileRead(Job[bytes]):
         return self._blocks.beginning
 
     def begin(self, now: float) -> None:
+        self._start_anew()
         round_trip = self._line.round_trip
-        is_good = round_trip.smoothed is not None and round_trip.seen_loss < COPY_RISK
-        # where the round trip is a guess, what waits for the answer before it may wait for several time-outs
-        if is_good or round_trip.is_guessed:
+        # where the round trip is not measured, what waits for an answer may wait for several timeouts
+        if round_trip.smoothed is None or round_trip.seen_loss < COPY_RISK:
             self._begin_early(now)
         else:
             self._open_file(Opcode.OPEN_FILE_RO, self._opened, now)
@@ -145,6 +146,17 @@ class FileRead(Job[bytes]):
         self._open_file(Opcode.OPEN_FILE_RO, self._opened, now, copies=2)
         self._burst(now)
 
+    def _shows_lost_open(self, packet: Packet) -> bool:
+        """Whether the server says to our burst that no file is open: the open before it did not arrive."""
+        if packet.opcode != Opcode.NAK or packet.requested != Opcode.BURST_READ_FILE:
+            return False
+        is_open_awaited = self._has_request and self.blocked_until is None and self._restarts < MOST_RESTARTS
+        return (
+            is_open_awaited
+            and self._is_of_a_burst(packet)
+            and self._code(packet) == FileErrorCode.FILE_NOT_FOUND
+        )
+
     def _is_unheard(self, packet: Packet) -> bool:
         """Whether this shows that the answer to our open got lost: it comes of the burst behind it."""
         if packet.session != self.asked_session or packet.requested != Opcode.BURST_READ_FILE:
@@ -156,6 +168,9 @@ class FileRead(Job[bytes]):
         super().take(packet, now)
         if self.is_ended:
             return
+        if self.session is None and self._shows_lost_open(packet):
+            self._restarts += 1
+            self._begin_early(now)
         if self.session is None and self._is_unheard(packet):
             # whether the file is ours nobody can tell any more: close it, and begin anew when the burst ends
             self._restarts += 1

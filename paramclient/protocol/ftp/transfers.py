@@ -142,7 +142,7 @@ class FileTransfers:
         send: takes what is to be sent.
 
     Attributes:
-        on_closed: called once, in order, when the session of a job that has ended is closed.
+        on_closed: called once, in order, with the time, when the session of a job that has ended is closed.
     """
 
     def __init__(
@@ -159,7 +159,7 @@ class FileTransfers:
         self._line: Line | None = None
         self._job: Job[Any] | None = None
         self._waiting: deque[Job[Any]] = deque()
-        self.on_closed: list[Callable[[], None]] = []
+        self.on_closed: list[Callable[[float], None]] = []
 
     @property
     def is_idle(self) -> bool:
@@ -170,6 +170,11 @@ class FileTransfers:
     def is_closing(self) -> bool:
         """Whether nobody waits for what is under way any more, and its session is still to be closed."""
         return self._job is not None and self._job.is_ended
+
+    @property
+    def has_idle_session(self) -> bool:
+        """Whether a session is open on board for what nobody waits for any more."""
+        return self._job is not None and self._job.is_ended and self._job.session is not None
 
     def read(
         self, path: str, now: float, *, read_size: int = MOST_DATA, limit: int = LARGEST_FILE
@@ -215,17 +220,25 @@ class FileTransfers:
         """
         return self._begin(FileChecksum(self._line_at(now), path, now), now)
 
-    def release(self, job: Job[Any], now: float) -> None:
-        """Want it no longer: nobody is told of its end, and its session is closed."""
+    def release(self, job: Job[Any], now: float, *, is_served: bool = True) -> None:
+        """Want it no longer: nobody is told of its end, and its session is closed.
+
+        Args:
+            job: what was asked for.
+            now: the time.
+            is_served: whether the component may have a server; else nothing is awaited.
+        """
         if job in self._waiting:
             self._waiting.remove(job)
         elif job is self._job and not job.done:
-            job.stop(now)
+            (job.stop if is_served else job.abandon)(now)
             self._go_on(now)
 
     def heard(self, message: FileTransfer, now: float) -> None:
         """Every FILE_TRANSFER_PROTOCOL of the component passes here."""
         system, component = self._own
+        if self._job is not None:
+            self._job.server_heard(now)
         if message.target_system not in (0, system) or message.target_component not in (0, component):
             return
         if self._job is not None and self._line is not None:
@@ -290,7 +303,7 @@ class FileTransfers:
             self._next(now)
             callbacks, self.on_closed = self.on_closed, []
             for callback in callbacks:
-                callback()
+                callback(now)
 
     def _next(self, now: float) -> None:
         while self._job is None and self._waiting:
