@@ -305,6 +305,7 @@ class Download(Operation[None]):
             return
         if self._is_streaming and self._quiet_at <= now:
             self._stream_ends(is_cut=True)
+        self._has_looked = self._has_looked or self._ending_at <= now
         self._ask_for_gaps(now)
         self._finish_if_complete(now)
 
@@ -506,7 +507,6 @@ class Download(Operation[None]):
         """Ask for what the list has passed over, so that the requests arrive when it is over."""
         if now < self._ending_at:
             return
-        self._has_looked = True
         self._learn_pace()
         front = self._stream.front - REORDER_DEPTH
         passed_over = sum(index not in self.names for index in range(front))

@@ -544,6 +544,8 @@ class Fetch(Operation[FetchResult]):
             return
         if file is not None and not file.done:
             self._file_was_silent = file.is_silent and file.attempts >= ENOUGH_SILENCE
+            if self._file_was_silent and not self._was_in_use:
+                self._notes += (NO_FILE.format(file.silence(download.ended_at)),)
             self._drop_file(download.ended_at)
         if download.missing:
             self._drop_hash_read()  # it can prove nothing

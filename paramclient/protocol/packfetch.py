@@ -100,6 +100,10 @@ class PackFetch(Operation[None]):
         """How often the present request was sent."""
         return 0 if self._job is None else self._job.attempts
 
+    def silence(self, now: float) -> NoReply:
+        """The error of a file of which nothing comes."""
+        return NoReply(PARAMETER_FILE, attempts=self.attempts, waited=now - self.asked_at)
+
     @property
     def is_served(self) -> bool:
         """Whether the component has opened the file, so that it will come."""

@@ -25,9 +25,12 @@ QUIET_TIME: Final = 3.2
 its last reply to anybody, and the refusal of an open is such a reply (measured)."""
 BUSY_PATIENCE: Final = 30.0
 """Seconds for which the session of another station is waited for. Its transfer keeps the session alive."""
-MOST_FAILURES: Final = 4
+MOST_FAILURES: Final = 8
 """How often an open may fail without a reason. ArduPilot says no more when the session is open already, as
 after an open whose answer was lost; it is then closed and opened again at once."""
+FAILURES_IN_LOSS: Final = 16
+"""The same where requests are lost: a closing that is lost, or that an open has overtaken, leaves the session
+open."""
 CLOSE_ATTEMPTS: Final = 4
 """Times that the closing of a session is asked for, or the answer to its open. A server that keeps silent for
 so long ends the session by its own timeout: ArduPilot after 3 s, PX4 after 10 s."""
@@ -253,8 +256,7 @@ class Job(Operation[Result]):
             self._open_at = math.inf
             self.begin(now)
         if self._request is not None and self._deadline() <= now:
-            if self._line.heard_at > -math.inf:  # else there may be no server, and the link loses nothing
-                self._line.round_trip.timed_out(self._attempts)
+            self._line.round_trip.timed_out(self._attempts)
             if self.is_ended and self._attempts >= CLOSE_ATTEMPTS:
                 self._send_blind_close()
                 self._closed(now)
@@ -310,7 +312,7 @@ class Job(Operation[Result]):
                     then(packet, now)
             elif self.is_ended:
                 self._closed(now)
-            elif code == FileErrorCode.FAIL and self._failures < MOST_FAILURES:
+            elif code == FileErrorCode.FAIL and self._failures < self._failures_allowed:
                 # what is open may be what an open of ours has opened whose answer was lost
                 self._failures += 1
                 self._line.reset_sessions(number)
@@ -326,6 +328,15 @@ class Job(Operation[Result]):
         number = self._line.next_session() if self.asked_session is None else self.asked_session
         self.asked_session = number
         self._ask(opcode, opened, now, data=self._path_data, session=number, copies=copies)
+
+    @property
+    def _failures_allowed(self) -> int:
+        return FAILURES_IN_LOSS if self._is_lossy else MOST_FAILURES
+
+    @property
+    def _is_lossy(self) -> bool:
+        """Whether requests are seen to be lost on this link."""
+        return self._line.round_trip.seen_loss >= COPY_RISK
 
     def _is_hopeless(self, now: float) -> bool:
         """Whether the request was sent often enough."""
@@ -367,7 +378,7 @@ class Job(Operation[Result]):
     def _transmit(self, request: Packet, now: float, *, copies: int = 1) -> None:
         self._attempts += 1
         self._sent_at = now
-        for _ in range(max(copies, 2) if self._line.round_trip.seen_loss >= COPY_RISK else copies):
+        for _ in range(max(copies, 2) if self._is_lossy else copies):
             self._line.send(request)
 
     def _deadline(self) -> float:
