@@ -161,10 +161,12 @@ class Reads:
         """Every PARAM_VALUE of the component passes here after it went into the table."""
         name, _, _, count, index = message
         wanted = self._open
+        is_answer = False
         for read in (wanted.get(name), wanted.get(index)) if wanted else ():
             if read is None or wanted.get(read.key) is not read:
                 continue
             if read.attempts:
+                is_answer = True
                 self._count_answer(read, now)
                 self._trace(
                     "%s/%s %s: answered %.3f s after try %s",
@@ -176,26 +178,32 @@ class Reads:
             self._drop(read)
             read.finish(message, now)
             self._send_waiting(now)
-        self._hear_control(index, count, now)
+        self._hear_control(index, count, now, is_answer=is_answer)
 
     def defer(self, message: ParamValue, until: float, now: float) -> None:
         """Take an answer whose value may be older than a set: it ends no read; ask again at `until`."""
+        is_answer = False
         for key in (message.param_id, message.param_index):
             read = self._flying.get(key)
             if read is not None and read.sent_at < math.inf:
+                is_answer = True
                 self._count_answer(read, now)
                 read.sent_at = math.inf
                 read.ask_again_at = until
-        self._hear_control(message.param_index, message.param_count, now)
+        self._hear_control(message.param_index, message.param_count, now, is_answer=is_answer)
 
-    def _hear_control(self, index: int, count: int, now: float) -> None:
-        """Take an index that was answered: it exists, and may be the one asked for to learn of the link."""
+    def _hear_control(self, index: int, count: int, now: float, *, is_answer: bool) -> None:
+        """Take an index that was answered: it exists, and may be the one asked for to learn of the link.
+
+        Where a read of the same parameter was in flight, the message may answer either request: `is_answer`.
+        """
         if index < count <= MOST_PARAMETERS:
             self.control = index  # it exists, and is answered
         if index == self._control_index and self._control_at < math.inf:
             # one that was lost may have nobody left to ask again; then this is not its answer
             is_late = now - self._control_at > 2 * self._round_trip.timeout
-            self._round_trip.answered(self._control_at, now, self._control_attempts + is_late)
+            attempts = self._control_attempts + is_late + is_answer
+            self._round_trip.answered(self._control_at, now, attempts)
             self._control_at = math.inf
             self._not_silent(now)
             if not self.list_runs_again:  # else it may have brought the value
