@@ -36,6 +36,9 @@ LATE: Final = 0.05
 time since: more than a rest and the turns of other links take."""
 READING_TIME: Final = 0.002
 """Seconds that the reader is given for that: it is ready to go on, so one turn of the event loop would do."""
+READING_TURNS: Final = 4
+"""Turns of the event loop that the reader is given before each deadline. A program that was held up until
+shortly after a deadline misses it by less than `HELD_UP`, and what came meanwhile is still unread."""
 MOST_BEHIND: Final = 3.0
 """Seconds for which time-outs wait for what has come to be read, on a link that brings more and more."""
 LINK_PATIENCE: Final = 10.0
@@ -269,6 +272,9 @@ class Carrier:
                 self._held_up_at = now
             if self._behind_since < math.inf or now - due > HELD_UP:
                 await anyio.sleep(READING_TIME)
+            elif now >= due:
+                for _ in range(READING_TURNS):
+                    await anyio.lowlevel.checkpoint()
 
     def send_for_another(self, frame: bytes) -> None:
         """Send a frame of another program to every peer, in its turn; it is lost where too many wait."""

@@ -532,6 +532,7 @@ async def test_equal_reads_share_one_request_and_others_run_beside() -> None:
     async with a_client(air) as client:
         component = await client.component()
         await component.get("PARAM_00")
+        await anyio.sleep(1.0)  # its repeats, sent before the round trip was known, arrive
         vehicle.requests.clear()
         began = anyio.current_time()
         names = ["PARAM_01"] * 5 + ["PARAM_02"] * 5 + [f"PARAM_{number:02}" for number in range(3, 11)]
@@ -547,6 +548,7 @@ async def test_a_cancelled_read_leaves_the_others_their_request() -> None:
     async with a_client(Air.symmetric([vehicle], delay=0.2)) as client:
         component = await client.component()
         await component.get("PARAM_00")
+        await anyio.sleep(1.0)  # its repeats, sent before the round trip was known, arrive
         vehicle.requests.clear()
         first, second = (asyncio.create_task(component.get("PARAM_01")) for _ in range(2))
         await asyncio.sleep(0.1)
@@ -1527,7 +1529,8 @@ async def test_a_program_that_is_held_up_takes_what_has_come_before_it_counts_as
         loop.call_later(0.41, lambda: setattr(loop, "now", loop.now + 0.5))
         result = await vehicle.fetch_all()
     assert result.complete
-    assert (result.lost, result.repeated, px4.requests["PARAM_REQUEST_READ"]) == (0, 0, 0)
+    hash_reads = 1  # goes out with the list request
+    assert (result.lost, result.repeated, px4.requests["PARAM_REQUEST_READ"]) == (0, 0, hash_reads)
 
 
 @swiftly

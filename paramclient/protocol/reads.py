@@ -26,7 +26,7 @@ COPY_RESERVE: Final = 2.0
 COPY_RISK: Final = 0.01
 """The chance of no answer to go below by asking again early."""
 MOST_COPIES: Final = 6
-SILENCES_TO_SPARE: Final = 24
+SILENCES_TO_SPARE: Final = 16
 """Time-outs in a row, with no answer at all between them, after which asking twice cannot be of help."""
 SILENCES_TO_GIVE_UP: Final = 16
 """Time-outs in a row, in twice `LONGEST_SILENCE` at the least, after which a component that is heard is one

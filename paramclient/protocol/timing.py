@@ -150,10 +150,12 @@ class RoundTrip:
     def seen_loss(self) -> float:
         """The same as far as it was seen: 0 as long as everything was answered.
 
-        Before enough requests were answered, the losses of a list count as well.
+        Before enough requests were answered, the losses of a list count as well. Before the round trip is
+        measured, a timeout that was no longer than the longest possible one is no sign of loss.
         """
-        seen = self._unanswered + self._answered
-        measured = self._unanswered / (seen + 1.0)
+        unanswered = max(self._unanswered - sum(wait <= self._guess for wait in self._early_waits), 0.0)
+        seen = unanswered + self._answered
+        measured = unanswered / (seen + 1.0)
         return max(measured, self.list_loss) if seen < ENOUGH_SEEN else measured
 
     def copies(self, risk: float, most: int) -> int:
