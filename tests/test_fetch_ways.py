@@ -185,7 +185,7 @@ def test_a_list_that_has_begun_gives_way_to_a_file_that_is_served() -> None:
     session.air.downlink = FaultyLink(delay=0.05)
     result = session.outcome(fetch)
     assert (result.source, result.notes, bits(result.params)) == ("ftp", (), bits(vehicle.params))
-    assert len(times_of(session, ParamRequestList)) == 1
+    assert len(set(times_of(session, ParamRequestList))) == 1, "asked for once, in copies as files are lost"
     assert times_of(session, ParamRequestRead) == []
     assert not vehicle.open_files
 

@@ -256,6 +256,21 @@ class TestReading:
         desk.closed()
         assert read.result == b"a" * 239
 
+    @given(st.floats(5.0, 1e6), st.floats(1e-9, 1e-6))
+    def test_blocks_that_are_nanoseconds_apart_set_no_pace_that_the_clock_cannot_tell(
+        self, start: float, gap: float
+    ) -> None:
+        desk = Desk()
+        desk.now = start
+        _, burst = desk.opened(size=48 * 200, read_size=48)
+        desk.answer(burst, bytes(48), offset=48 * 10, nth=11)
+        desk.now += gap
+        desk.answer(burst, bytes(48), offset=48 * 11, nth=12)
+        for _ in range(20):
+            desk.now = max(desk.transfers.next_deadline(), desk.now)
+            desk.transfers.tick(desk.now)
+            assert desk.transfers.next_deadline() > desk.now, "else it is due again and again"
+
     def test_a_burst_that_ends_early_is_followed_by_another(self) -> None:
         desk = Desk()
         read, burst = desk.opened(size=5000)

@@ -122,15 +122,16 @@ class RoundTrip:
         """Seconds to wait for the answer to a request that may be repeated at will.
 
         Once the round trip is measured that is `prompt_timeout`. Before, it starts at `FIRST_TIMEOUT` and
-        doubles.
+        doubles up to `LONGEST_TIMEOUT`, or as far as the longest round trip that the answers allow.
 
         Args:
             attempts: how often the request was sent.
         """
         if self.smoothed is not None:
             return self.prompt_timeout
-        first = FIRST_TIMEOUT if self._guess == math.inf else max(FIRST_TIMEOUT, GUESS_MARGIN * self._guess)
-        return min(first * 2.0 ** (attempts - 1), max(LONGEST_TIMEOUT, first))
+        longest = 0.0 if self._guess == math.inf else GUESS_MARGIN * self._guess
+        first = min(max(FIRST_TIMEOUT, longest), LONGEST_TIMEOUT)
+        return min(first * 2.0 ** (attempts - 1), max(LONGEST_TIMEOUT, longest))
 
     def _wait(self, least_at_first: float) -> float:
         base = (
@@ -151,9 +152,10 @@ class RoundTrip:
         """The same as far as it was seen: 0 as long as everything was answered.
 
         Before enough requests were answered, the losses of a list count as well. Before the round trip is
-        measured, a timeout that was no longer than the longest possible one is no sign of loss.
+        measured, a request that was unanswered after `FIRST_TIMEOUT` only is no sign of loss.
         """
-        unanswered = max(self._unanswered - sum(wait <= self._guess for wait in self._early_waits), 0.0)
+        bound = min(self._guess, FIRST_TIMEOUT)
+        unanswered = max(self._unanswered - sum(wait <= bound for wait in self._early_waits), 0.0)
         seen = unanswered + self._answered
         measured = unanswered / (seen + 1.0)
         return max(measured, self.list_loss) if seen < ENOUGH_SEEN else measured
@@ -192,7 +194,8 @@ class RoundTrip:
         if attempts != 1 or not math.isfinite(sample):
             if self.smoothed is None and math.isfinite(sample):
                 # it answers the first of them at the earliest
-                self._guess = min(self._guess, sample + FIRST_TIMEOUT * (2.0 ** (attempts - 1) - 1.0))
+                waits = (min(FIRST_TIMEOUT * 2.0**nth, LONGEST_TIMEOUT) for nth in range(attempts - 1))
+                self._guess = min(self._guess, sample + sum(waits))
             if sample >= LIKELY * (self.smoothed or math.inf):
                 # it may well be the answer to the last of them
                 self._silences = 0

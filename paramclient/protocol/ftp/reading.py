@@ -11,7 +11,7 @@ from paramclient.protocol.ftp.blocks import Blocks
 from paramclient.protocol.ftp.jobs import Job, Line
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
 
-__all__ = ["FileRead"]
+__all__ = ["LARGEST_FILE", "MOST_OPENINGS", "SESSION_LOST", "FileRead"]
 
 LARGEST_FILE: Final = 64 * 1024 * 1024
 """Bytes that a file may have unless it is said otherwise: more than any log of a flight, less than memory."""
@@ -42,6 +42,9 @@ SEND_BURST: Final = 3.0
 """Reads that may go out at one time, so that they do not overflow ArduPilot's queue."""
 UNKNOWN_GAP: Final = 0.01
 """Seconds from one block to the next before any was seen."""
+SHORTEST_GAP: Final = 1e-5
+"""Seconds from one block to the next that are reckoned with at the least. Two blocks taken in one turn can be
+nanoseconds apart, and a pace by them has deadlines that no clock can tell from now."""
 OVERTAKEN: Final = 2
 """Later reads that must be answered for one to count as lost."""
 COPY_RISK: Final = 0.01
@@ -59,7 +62,6 @@ MOST_RESTARTS: Final = 2
 can tell whether it is open."""
 SESSION_LOST = frozenset((FileErrorCode.INVALID_SESSION, FileErrorCode.FILE_NOT_FOUND))
 """What servers say to a read in a session that is not open."""
-ROUNDING: Final = 1e-9
 SMALLEST_SHARE: Final = 4
 SPARE_PIECES: Final = 1_000
 """A file may come in so many times as many pieces as its largest size has blocks, and some more: each piece
@@ -211,7 +213,7 @@ class FileRead(Job[bytes]):
         elif self._flights:
             earliest = min(earliest, *map(self._flight_deadline, self._flights.values()))
         if self._next_wanted() is not None:
-            earliest = min(earliest, self._tokens_at + max(1.0 - self._tokens, 0.0) * self._interval)
+            earliest = min(earliest, self._next_read_at)
         return earliest
 
     def resume(self, now: float) -> None:
@@ -300,7 +302,7 @@ class FileRead(Job[bytes]):
         began_at, offset = self._first_block
         blocks = (packet.offset - offset) / self._read_size
         if blocks > 0 and now > began_at:
-            self._gap = (now - began_at) / blocks
+            self._gap = max((now - began_at) / blocks, SHORTEST_GAP)
 
     def _end_of_burst(self, packet: Packet, is_latest: bool, now: float) -> None:
         code = self._code(packet)
@@ -408,6 +410,11 @@ class FileRead(Job[bytes]):
         """Seconds from one request to the next: the burst takes a third of the link, reads may take more."""
         return self._gap / 2
 
+    @property
+    def _next_read_at(self) -> float:
+        """When the pace allows another read."""
+        return self._tokens_at + max(1.0 - self._tokens, 0.0) * self._interval
+
     def _wanted(self) -> Iterator[int]:
         """What to read singly, the most useful first."""
         yield from self._blocks.missing(self._read_size)
@@ -502,11 +509,14 @@ class FileRead(Job[bytes]):
             return
         if self._may_burst and self._has_bursts and not self._burst_runs and self._is_worth_a_burst():
             self._burst(now)
+        is_due = now >= self._next_read_at
         if now > self._tokens_at:
             elapsed = now - self._tokens_at
             self._tokens = min(self._tokens + elapsed / self._interval, SEND_BURST)
             self._tokens_at = now
-        while self._tokens >= 1.0 - ROUNDING and (offset := self._next_wanted()) is not None:
+        if is_due:
+            self._tokens = max(self._tokens, 1.0)  # else rounding could make it due again and again
+        while self._tokens >= 1.0 and (offset := self._next_wanted()) is not None:
             self._read(offset, now)
 
     def _is_worth_a_burst(self) -> bool:

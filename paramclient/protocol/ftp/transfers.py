@@ -14,7 +14,7 @@ from typing import Any, Final, NamedTuple, TypeVar
 from paramclient.errors import FileErrorCode, NoReply, UsageError
 from paramclient.protocol.ftp.jobs import Job, Line
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
-from paramclient.protocol.ftp.reading import LARGEST_FILE, FileRead
+from paramclient.protocol.ftp.reading import LARGEST_FILE, MOST_OPENINGS, SESSION_LOST, FileRead
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.wire import FileTransfer, Message
 
@@ -51,8 +51,10 @@ class FileWrite(Job[None]):
         self.written = 0
         self._data = data
         self._write_size = write_size
+        self._openings = 1
 
     def begin(self, now: float) -> None:
+        self.written = 0
         self._open_file(Opcode.CREATE_FILE, lambda _, now: self._write(now), now)
 
     def _write(self, now: float) -> None:
@@ -65,12 +67,21 @@ class FileWrite(Job[None]):
 
         def answered(packet: Packet, now: float) -> None:
             if packet.opcode == Opcode.NAK:
-                self._refused(packet, "does not write", now)
+                self._does_not_write(packet, now)
             else:
                 self.written += len(piece)
                 self._write(now)
 
         self._ask(Opcode.WRITE_FILE, answered, now, data=piece, session=session, offset=self.written)
+
+    def _does_not_write(self, packet: Packet, now: float) -> None:
+        """The server refuses; where it has given up the session, as after a long silence, begin anew."""
+        self._openings += 1
+        if self._code(packet) not in SESSION_LOST or self._openings > MOST_OPENINGS:
+            self._refused(packet, "does not write", now)
+        else:
+            self.session = None
+            self.begin(now)
 
     def _taken(self, packet: Packet, now: float) -> None:
         was_closed_before = self._code(packet) == FileErrorCode.INVALID_SESSION and self._attempts > 1
