@@ -1241,7 +1241,7 @@ class TestOnTheAir:
         rows = [
             PackedParam(name, ParamType.INT32, 5)
             for name, param in vehicle.params.items()
-            if param.type == ParamType.INT32
+            if param.type == ParamType.INT32 and not name.startswith("BARO")  # BARO*_DEVID are read-only
         ]
         ground.outcome(ground.transfers.write(PARAMS, pack.encode_upload(rows), ground.now))
         assert {vehicle.param(row.name).value for row in rows} == {5}
