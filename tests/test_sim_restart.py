@@ -195,7 +195,7 @@ def test_a_table_of_ones_own_says_the_system_id_too() -> None:
 
 
 def test_sys_autoconfig_resets_what_it_does_not_keep() -> None:
-    vehicle = PX4Vehicle(system=3)
+    vehicle = PX4Vehicle(first_start_only=(), system=3)
     desk = Desk(vehicle)
     before = vehicle.values
     kept = {"SYS_AUTOSTART": 4001, "CAL_ACC0_PRIO": 75, "COM_FLTMODE1": 2, "RC1_MIN": 1100}
@@ -218,6 +218,19 @@ def test_sys_autoconfig_resets_what_it_does_not_keep() -> None:
     desk.command()
     desk.run(15.0)
     assert vehicle.param("SYS_HAS_MAG").value == 0  # once only
+
+
+def test_px4_no_longer_uses_from_its_second_start_on_what_it_has_stored() -> None:
+    px4 = PX4Vehicle()
+    count, announced = len(px4.params), px4.announced_hash()
+    px4.reboot(5.0, down=1.0)
+    assert len(px4.params) == count - 3
+    assert px4.announced_hash() != announced
+    second = px4.announced_hash()
+    px4.reboot(10.0, down=1.0)
+    assert (len(px4.params), px4.announced_hash()) == (count - 3, second)
+    with pytest.raises(UsageError, match="not in the table: NO_SUCH"):
+        PX4Vehicle(first_start_only=["NO_SUCH"])
 
 
 @pytest.mark.parametrize("by_file", [True, False])

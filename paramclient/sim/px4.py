@@ -72,6 +72,9 @@ class PX4Vehicle(BytewiseVehicle):
         uid: the hardware id that it reports; by default its own for every system.
         hash_check: whether it has `_HASH_CHECK` at all; the parameter MAV_HASH_CHK_EN at 0 also turns it off.
         not_in_use: names in the table that nothing in the firmware has used yet.
+        first_start_only: names that nothing uses any more from the second start on, when the firmware has
+            stored what it found at the first. None: with the table of the real quad, CAL_BARO1_ID to
+            CAL_BARO3_ID (a real one had 908 parameters, then 905); with another table, nothing.
         late_use: by the name of one parameter, those that come into use 10 ms after it changes. Until then
             they are not in use. None: with the table of the real quad, CAL_MAG2_ID brings 16 more of
             CAL_MAG2_*; with another table, nothing.
@@ -105,6 +108,7 @@ class PX4Vehicle(BytewiseVehicle):
         table: Table | None = None,
         hash_check: bool = True,
         not_in_use: Iterable[str] = (),
+        first_start_only: Iterable[str] | None = None,
         late_use: Mapping[str, Iterable[str]] | None = None,
         unsaved: Iterable[str] = (),
         autosave: float = 0.3,
@@ -123,8 +127,12 @@ class PX4Vehicle(BytewiseVehicle):
             rows += compass
         self._late_use = {name: frozenset(more) for name, more in (late_use or {}).items()}
         self._first_unused = frozenset(not_in_use).union(*self._late_use.values())
+        if first_start_only is None:
+            first_start_only = _FIRST_START_ONLY if table is None else ()
+        self._first_start_only = frozenset(first_start_only)
+        self._has_stored = False  # what it found at its first start
         self._first_unsaved = frozenset(unsaved)
-        unknown = self._first_unused | self._first_unsaved | self._late_use.keys()
+        unknown = self._first_unused | self._first_start_only | self._first_unsaved | self._late_use.keys()
         if unknown := unknown.difference(row.name for row in rows):
             raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
         if not autosave >= 0.0:
@@ -247,6 +255,7 @@ class PX4Vehicle(BytewiseVehicle):
 
     def _end_all(self) -> None:
         super()._end_all()
+        self._has_stored = True
         autoconfig = self._find("SYS_AUTOCONFIG")
         if autoconfig is not None and autoconfig.bits != 0:
             for entry in self._entries:
@@ -259,6 +268,8 @@ class PX4Vehicle(BytewiseVehicle):
 
     def _switch_on(self, at: float) -> None:
         self._unused = set(self._first_unused)
+        if self._has_stored:
+            self._unused |= self._first_start_only
         self._unsaved = set(self._first_unsaved)
         self._waking: frozenset[str] = frozenset()
         self._hash_next = False
@@ -324,6 +335,7 @@ class PX4Vehicle(BytewiseVehicle):
 _LIMITED = frozenset(
     name for pair in (*UPPER_LIMITS, *LOWER_LIMITS) for name in pair if isinstance(name, str)
 )
+_FIRST_START_ONLY = ("CAL_BARO1_ID", "CAL_BARO2_ID", "CAL_BARO3_ID")
 _SYSTEM_ID = "MAV_SYS_ID"
 _QUADROTOR = 2
 _RELEASE = 17891392  # 1.17.0
