@@ -860,6 +860,16 @@ class TestArduPilot:
         vehicle.set_param("RTL_ALT", 8)
         assert vehicle.values["RTL_ALT"] == 8
 
+    def test_a_name_that_does_not_exist_takes_its_time_and_no_place(self) -> None:
+        vehicle = ArduPilotVehicle()
+        unknown = [read(f"NO_SUCH_{number}") for number in range(19)]
+        station = Station(vehicle).send(*unknown, *[read("RTL_ALT")] * 3).wait(0.5)
+        assert (
+            len(station.heard(wire.ParamValue)) == 2
+        )  # one looked up, 20 that wait: the last one is dropped
+        station = Station(ArduPilotVehicle()).send(*unknown[:14], *[read("RTL_ALT")] * 5).wait(0.11)
+        assert len(station.heard(wire.ParamValue)) == 5
+
     def test_errors_of_newer_firmware_for_reads(self) -> None:
         station = (
             Station(ArduPilotVehicle(param_error=True)).send(read("NO_SUCH"), read(index=5000)).wait(0.5)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Final
 
 from paramclient.errors import LinkError, NoReply, UsageError
@@ -14,6 +14,7 @@ from paramclient.protocol import events
 from paramclient.protocol.change import Change
 from paramclient.protocol.events import ParamChanged
 from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.name_search import NameSearch
 from paramclient.protocol.parts import Parts
 from paramclient.protocol.reads import Key, Read
 from paramclient.protocol.restart import SAVING_TIME, Restart
@@ -79,6 +80,7 @@ class ComponentMachine(Parts):
         sync: whether the table is still the vehicle's.
         files: its files.
         descriptions: where it says that what it has to say of itself lies.
+        name_searches: the search for names that may not exist.
         commands: what it is told to do.
         clock_requests: the requests for its time since boot.
         start_values: the reading of what it measures at each start.
@@ -132,6 +134,7 @@ class ComponentMachine(Parts):
             addressee = (message.target_system, message.target_component)
             if addressee in (self._own, (0, 0)) and not self.writes.refused(message, now):
                 self.reads.refused(message, now)
+                self.name_searches.refused(message, now)
         elif isinstance(message, CommandAck):
             self.who.acknowledged(message, now)
             self.descriptions.acknowledged(message, now)
@@ -217,6 +220,8 @@ class ComponentMachine(Parts):
         if writes.queues:
             writes.heard(message, now)
         self._value_heard(message, now)
+        if self.name_searches:
+            self.name_searches.heard(message, now)
 
     def boot_clock(self, message_id: int, boot_ms: int, now: float) -> None:
         """Take `time_boot_ms` of a message of telemetry that it sent."""
@@ -327,6 +332,15 @@ class ComponentMachine(Parts):
         read = self.reads.ask(self.spelling(key) if isinstance(key, str) else key, now)
         read.is_of_caller = True
         return read
+
+    def search(self, names: Iterable[str], now: float) -> NameSearch:
+        """Search for parameters that may not exist; give it back with `name_searches.cancel`.
+
+        Raises:
+            NoReply: the component is lost. Nothing was sent.
+        """
+        self.check_present(f"names of {self.system}/{self.component}", now)
+        return self.name_searches.begin(names, now)
 
     def write(
         self,
@@ -452,6 +466,7 @@ class ComponentMachine(Parts):
         if self.presence.lost_at() <= now:
             self._lose(now)
         self.reads.tick(now)
+        self.name_searches.tick(now)
         self.writes.tick(now)
         self.files.tick(now)
         if self.fetches.overheard is not None:
@@ -483,6 +498,8 @@ class ComponentMachine(Parts):
             first = min(first, self.restart.next_deadline())
         if len(self.reads):
             first = min(first, self.reads.next_deadline())
+        if self.name_searches:
+            first = min(first, self.name_searches.next_deadline())
         if self.writes.queues:
             first = min(first, self.writes.next_deadline())
         if len(self.commands):
@@ -510,6 +527,7 @@ class ComponentMachine(Parts):
                 self.sync.check(now)
             self._was_silent(silence, now)
         self.reads.resume(now)
+        self.name_searches.resume(now)
         self.writes.resume(now)
         self.files.resume(now)
         self.descriptions.resume(now)
@@ -533,6 +551,7 @@ class ComponentMachine(Parts):
         self.start_values.stop()
         self.writes.fail_all(error, now)
         self.reads.fail_all(error, now)
+        self.name_searches.fail_all(error, now)
         self.sync.stop()
         self._authors.clear()
         self._checks.clear()
@@ -548,6 +567,7 @@ class ComponentMachine(Parts):
         if self.restart is not None:
             self.restart.another(now)
         self.commands.lose(now, ": another vehicle answers there now")
+        self.name_searches.lose(now)
         what = f"writes to {self.system}/{self.component}: another vehicle answers there now"
         self.writes.fail_all(NoReply(what, attempts=0, waited=0.0), now)
         if self.fetch is not None:
@@ -588,6 +608,7 @@ class ComponentMachine(Parts):
         self._emit(events.ComponentLost(self, now - presence.heard_at))
         self.writes.lose(now)
         self.reads.lose(now)
+        self.name_searches.lose(now)
         self.files.lose(now)
         self.descriptions.lose(now)
         self.commands.lose(now)

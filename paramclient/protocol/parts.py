@@ -18,6 +18,7 @@ from paramclient.protocol.fetches import Fetches
 from paramclient.protocol.following import Following
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.identify import Identification
+from paramclient.protocol.name_search import NameSearches
 from paramclient.protocol.presence import Presence
 from paramclient.protocol.reads import Key, Reads
 from paramclient.protocol.refresh import Refresh
@@ -140,6 +141,14 @@ class Parts(ABC):
             says_file=lambda: self.who.says_file,
             ended=self._fetched,
         )
+        self.name_searches = NameSearches(
+            target,
+            self.round_trip,
+            self.reads,
+            send,
+            count=lambda: self.table.count,
+            is_listing=self._is_listing,
+        )
         # where nothing is asked there are no reads: what others ask for is heard in their place
         overheard = self.fetches.overheard
         self._value_heard = self.reads.heard if overheard is None else overheard.heard
@@ -221,7 +230,7 @@ class Parts(ABC):
         """Whether anything is awaited: an answer, a fetch, a file, or who it is."""
         is_asked = len(self.reads) > 0 or len(self.writes) > 0 or not self.files.is_idle
         is_asked = is_asked or len(self.commands) > 0 or self.restart is not None
-        is_asked = is_asked or self.descriptions.is_asking
+        is_asked = is_asked or self.descriptions.is_asking or len(self.name_searches) > 0
         return is_asked or self.fetch is not None or self.who.is_asking
 
     @property
@@ -239,6 +248,12 @@ class Parts(ABC):
     def _may_read_start_values(self) -> bool:
         """Whether what is measured at each start is to be read again without being asked."""
         return self._is_kept_up and not self.sync.expects_hash and not self._is_spared
+
+    def _is_listing(self, now: float) -> bool:
+        """Whether a list comes, for us or for another station."""
+        reads = self.reads
+        is_ours = reads.list_runs_again or not reads.is_idle or now < reads.list_until
+        return is_ours or self.following.is_running(now)
 
     def _is_known(self, key: Key) -> bool:
         """Whether anything speaks for such a parameter."""

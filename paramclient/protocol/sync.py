@@ -133,6 +133,7 @@ class Sync:
         announced: the last hash that was heard, or None.
         synced: whether the table was brought up to date on this link and no sign came since that it moved.
         refresh: the reading of what a hash that confirmed the table does not cover, or None.
+        holds: how many set-ups are under way, which read the table themselves: no check is begun meanwhile.
     """
 
     def __init__(
@@ -168,6 +169,7 @@ class Sync:
         self.announced: Announcement | None = None
         self.synced = False
         self.refresh: Refresh | None = None
+        self.holds = 0
         self._was_synced = False  # at any time on this link: only then is there something to keep up
         self._has_no_hash = False
         self._moved_by_us_alone = False
@@ -372,7 +374,7 @@ class Sync:
 
     def _check(self, now: float) -> None:
         """See whether the table still is the vehicle's, if there is room for that on the link."""
-        if self._is_busy():
+        if self.holds or self._is_busy():
             self._check_at = now + BUSY_WAIT
             return
         self._check_at = now + self._upkeep.interval if self._is_kept_up else math.inf

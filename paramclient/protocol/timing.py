@@ -166,14 +166,19 @@ class RoundTrip:
         return 1 if loss < risk else min(math.ceil(math.log(risk) / math.log(loss)), most)
 
     @property
+    def feared_loss(self) -> float:
+        """The same on a link that is as much worse than it looks as it may be, measured on few."""
+        seen = self._unanswered + self._answered + 2.0
+        loss = self.loss
+        return min(loss + 2 * math.sqrt(loss * (1 - loss) / seen), 0.99) if seen > ENOUGH_SEEN else loss
+
+    @property
     def tries(self) -> int:
         """How often to ask before silence can no longer be bad luck on this link (one in a million)."""
-        seen = self._unanswered + self._answered + 2.0
-        chance = self.loss
-        if seen > ENOUGH_SEEN:
-            # the share is measured on few: reckon with a link that is worse than it looks
-            chance = min(chance + 2 * math.sqrt(chance * (1 - chance) / seen), 0.99)
-        return min(max(math.ceil(math.log(_CHANCE_OF_BAD_LUCK) / math.log(chance)), FEWEST_TRIES), MOST_TRIES)
+        return min(
+            max(math.ceil(math.log(_CHANCE_OF_BAD_LUCK) / math.log(self.feared_loss)), FEWEST_TRIES),
+            MOST_TRIES,
+        )
 
     def is_hopeless(self, attempts: int, now: float) -> bool:
         """Whether something was asked for often enough: `tries` times, or the component is gone."""

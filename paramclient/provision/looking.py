@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Collection, Iterable, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from typing import Final
 
 import anyio
 
 from paramclient.component import Component
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
-from paramclient.paramset import ParamSet
+from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.protocol.result import FetchResult
+from paramclient.protocol.wire import HASH_CHECK
 from paramclient.provision.planning import ParamInfo, Plan, check_component, plan
-from paramclient.values import Param, Trust
+from paramclient.values import Param, Trust, check_name
 
-__all__ = ["LOOKING_PACE", "Seen", "identified", "look", "plan_for", "prepare", "verify"]
+__all__ = ["LOOKING_PACE", "Seen", "identified", "look", "look_for", "plan_for", "prepare", "verify"]
 
 IDENTITY_PATIENCE: Final = 10.0
 """Seconds for a vehicle to say who it is. It is asked a few times, and mostly given up sooner."""
@@ -91,6 +93,25 @@ async def look(
         fetched.hash,
         (absent | unknown).difference(table),
     )
+
+
+async def look_for(component: Component, seen: Seen, names: Iterable[str]) -> Seen:
+    """Ask by name for what may have appeared, and take what has been heard of the others meanwhile.
+
+    Args:
+        component: the vehicle.
+        seen: what it had when it was looked at.
+        names: param_ids.
+
+    Raises:
+        NoReply: it did not answer.
+        LinkError: the link failed, or the client was closed.
+    """
+    found, unknown = await _ask(component, names, ())
+    heard = {name: component.params[name] for name in seen.table if name in component.params}
+    params = {name: WrittenParam.of(param) for name, param in (heard | found).items()}
+    table = replace(seen.table, params={**seen.table.params, **params}, at=time.time())
+    return Seen(table, seen.complete, seen.hash, (seen.absent | unknown).difference(found))
 
 
 async def identified(component: Component) -> None:
@@ -184,8 +205,8 @@ async def _ask(
 
     Of `given_up`, which were asked for already, no answer is one; else it ends the asking.
     """
-    found: dict[str, Param] = {}
-    unknown: set[str] = set()
+    names = tuple(names)
+    found, unknown = await _search(component, [name for name in names if name not in component.params])
     failed: list[NoReply | LinkError] = []
 
     async def ask(name: str) -> None:
@@ -202,7 +223,42 @@ async def _ask(
 
     async with anyio.create_task_group() as asking:
         for name in names:
-            asking.start_soon(ask, name)
+            if name not in found and name not in unknown:
+                asking.start_soon(ask, name)
     if failed:
         raise failed[0]
     return found, frozenset(unknown)
+
+
+async def _search(component: Component, names: Iterable[str]) -> tuple[dict[str, Param], set[str]]:
+    """Read parameters of which nothing has been heard, all at once: those that are there, and that are not.
+
+    What is in neither needs to be asked for one by one: the link loses much, or the names cannot be.
+
+    Raises:
+        NoReply: the vehicle is lost.
+        LinkError: the link failed, or the client was closed.
+    """
+    machine = component._machine
+    spelled = {name: machine.spelling(name) for name in names if _is_name(name)}
+    search = machine.search(spelled.values(), anyio.current_time())
+    try:
+        await component._wait(search, None, lambda: ("names", search.attempts))
+    finally:
+        machine.name_searches.cancel(search, anyio.current_time())
+    found: dict[str, Param] = {}
+    unknown: set[str] = set()
+    for name, spelling in spelled.items():
+        param = component.params.get(spelling)
+        if param is not None and param.trust is Trust.LIVE:
+            found[name] = param
+        elif spelling in search.unknown:
+            unknown.add(name)
+    return found, unknown
+
+
+def _is_name(name: str) -> bool:
+    """Whether a parameter can have this name."""
+    with suppress(UsageError):
+        return check_name(name) != HASH_CHECK
+    return False

@@ -28,7 +28,7 @@ from paramclient.identity import SHARED_UIDS, Identity
 from paramclient.paramset import ParamSet
 from paramclient.protocol.authors import check_asker
 from paramclient.provision.cautions import READ_ONLY, cautions_for
-from paramclient.provision.looking import LOOKING_PACE, Seen, identified, look, plan_for
+from paramclient.provision.looking import LOOKING_PACE, Seen, identified, look, look_for, plan_for
 from paramclient.provision.outcome import ApplyProgress, ApplyResult, ApplyRow, ApplyStatus
 from paramclient.provision.planning import (
     MISSING,
@@ -156,6 +156,8 @@ class Run:
 
     async def work(self) -> None:
         """Write and prove until there is nothing left to do. Failures end it; see `result`."""
+        sync = self._component._machine.sync
+        sync.holds += 1  # a moved count leads to no download beside those of the run
         try:
             while True:
                 stages = self._to_do()
@@ -164,15 +166,20 @@ class Run:
                     await self._write_stage(stage)
                 if self._has_to_start(stages):
                     await self._restart()
-                elif not stages and self._looked_at >= self._written_at + LASTING_TIME:
-                    return
-                elif not self._may_reveal(stages):
+                    await self._look()
+                elif self._may_reveal(stages):
+                    await self._look_for_more(stages[-1])
+                elif stages or self._looked_at < self._written_at + LASTING_TIME:
                     await anyio.sleep_until(self._written_at + LASTING_TIME)
-                await self._look()
+                    await self._look()
+                else:
+                    return
         except ParamClientError as error:
             if not self.sent:
                 raise
             self._error = error
+        finally:
+            sync.holds -= 1
 
     def result(self) -> ApplyResult:
         """What came of it."""
@@ -258,6 +265,19 @@ class Run:
             self._component, self.seen.table, self._wanted, self._include, self._info, force=self._force
         )
         self._is_proven = True
+
+    async def _look_for_more(self, done: Stage) -> None:
+        """See by name what may have appeared after a stage. Nothing that was written is proven by that."""
+        self._tell("reading")
+        names = [row.name for row in self.plan.of(PlanStatus.LATER)]
+        if self._component.autopilot == "ardupilot":  # a switch shows its own group, and all begin alike
+            groups = tuple(step.name.rpartition("_")[0] for step in done.steps)
+            names = [name for name in names if name.startswith(groups)]
+        self.seen = await look_for(self._component, self.seen, names)
+        self._check_it_is_the_same()
+        self.plan = plan_for(
+            self._component, self.seen.table, self._wanted, self._include, self._info, force=self._force
+        )
 
     async def _write_stage(self, stage: Stage) -> None:
         """Write its values, side by side but for what may end the conversation."""

@@ -36,7 +36,8 @@ class ArduPilotVehicle(Vehicle):
       goes on with the list. So the list runs for 130 of every 300 ms. The first time in a list, up to 10
       waiting reads do not make it pause.
     - Reads wait for the next slot, which serves 5; 20 more can wait, what comes on top is dropped without a
-      word. By name the answer has index 65535 and the spelling that was asked for; case does not matter.
+      word. One of a name that does not exist takes 5 ms, and no place in a slot. By name the answer
+      has index 65535 and the spelling that was asked for; case does not matter.
     - A set converts the value to the parameter's own type (cut to whole numbers, kept within its range) and
       is answered within 6 ms, index 65535, even if nothing changed; sets of one name meanwhile share one
       answer. NaN, infinity and unknown names are met with silence. Of a read-only parameter the old value
@@ -160,7 +161,8 @@ class ArduPilotVehicle(Vehicle):
         return self._was_on[switch] if switch in self._late_switches else self._entry(switch).bits != 0
 
     def _timers(self) -> tuple[float, ...]:
-        return self._read_at, self._answer_at, self._live_at, self._system_id_at, self._window_at
+        times = (self._read_at, self._look_at, self._answer_at, self._live_at)
+        return *times, self._system_id_at, self._window_at
 
     def _take(self, frame: wire.Frame) -> None:
         if self._window_at == math.inf:
@@ -245,6 +247,7 @@ class ArduPilotVehicle(Vehicle):
         self._answers: dict[str, Entry] = {}
         self._untyped: set[str] = set()
         self._read_at = math.inf
+        self._look_at = math.inf
         self._answer_at = math.inf
         self._system_id_at = math.inf
         self._live_at = at + self._live_period if self._live_period else math.inf
@@ -265,6 +268,11 @@ class ArduPilotVehicle(Vehicle):
             if self._live_at <= now:
                 self._live_at = now + self._live_period
             self._change_live()
+        if self._look_at <= now:
+            self._look_at = math.inf
+            self._look_up()
+            if self._ready and self._read_at == math.inf and self._window_at == math.inf:
+                self._read_at = self._next(_SLOT)
         while self._read_at <= now:
             self._answer_reads()
             self._read_at = self._read_at + _SLOT if self._ready else math.inf
@@ -375,7 +383,7 @@ class ArduPilotVehicle(Vehicle):
 
         A value is taken at this moment, so an answer may be older than a set that came before it is sent.
         """
-        while self._waiting and len(self._ready) < _READS_PER_SLOT:
+        while self._waiting and len(self._ready) < _READS_PER_SLOT and self._look_at == math.inf:
             request, sender = self._waiting.popleft()
             if request.param_index == -1:
                 entry, name, index = self._find(request.param_id), request.param_id, wire.NO_INDEX
@@ -384,6 +392,7 @@ class ArduPilotVehicle(Vehicle):
                 name, index = ("" if entry is None else entry.name), request.param_index
             if entry is None:
                 self._refuse(ParamErrorCode.DOES_NOT_EXIST, request, sender)
+                self._look_at = self._now + _LOOK
             elif not self._is_dead(entry):
                 self._ready.append(wire.ParamValue(name, entry.raw, entry.type, len(self._listed), index))
 
@@ -409,6 +418,7 @@ _WARNING = 4
 _LOOP = 0.0058  # seconds from one turn of the main loop to the next, which answers sets
 _SLOT = 0.1  # seconds from one turn of the parameter task to the next, which answers reads
 _ROUNDING = 1e-6  # a turn that begins at `now` may come out a little less than whole
+_LOOK = 0.005  # seconds from one request that is looked up to the next; boards take a millisecond
 _READS_PER_SLOT = 5
 _READ_QUEUE = 20
 _NOT_IN_GROUPS = 57  # parameters of the real quad's table
