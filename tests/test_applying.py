@@ -27,6 +27,7 @@ from paramclient.errors import (
     VehicleArmed,
 )
 from paramclient.identity import Identity
+from paramclient.metadata import ParamInfo
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
@@ -865,6 +866,32 @@ async def test_a_reboot_follows_where_values_count_only_then() -> None:
     assert (result.reboots, result.reboot_required) == (1, ())
     assert list(dict.fromkeys(told)) == ["reading", "rebooting", "writing"]
     assert vehicle.param("EK2_ALT_M_NSE").value == 1.5
+
+
+@swiftly
+async def test_a_change_too_small_for_px4_is_told_and_its_value_after_the_start() -> None:
+    vehicle = px4(table=SETTINGS | {"SYS_HITL": 0}, not_in_use=(), late_use={})
+    near = from_bits(bits_of(0.25, ParamType.REAL32) + 1, ParamType.REAL32)
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        told = await apply(component, written({"TUNE_01": near}))
+        assert told.complete
+        assert told.rows["TUNE_01"].reason == (
+            "PX4 takes a change of at most 1.19e-07 for none: its next start may bring 0.25 back"
+        )
+        result = await apply(component, written({"TUNE_01": near, "SYS_HITL": 1}), reboot=True)
+        assert result.reboots == 1
+        assert statuses(result) == {"TUNE_01": "unchanged", "SYS_HITL": "set"}  # all were saved with SYS_HITL
+        for value in (0.5, 0.25):
+            vehicle.set_param("TUNE_01", value)
+            await anyio.sleep(1.0)
+        info = {"TUNE_01": ParamInfo("TUNE_01", reboot_required=True)}
+        result = await apply(component, written({"TUNE_01": near}), reboot=True, info=info)
+    assert result.reboots == 1
+    row = result.rows["TUNE_01"]
+    assert (row.status, row.actual) == (ApplyStatus.ADJUSTED, 0.25)
+    assert row.reason == "the vehicle acknowledged it, and has another value since it has started again"
+    assert vehicle.requests["PARAM_SET"] == 3  # what the next start takes back is not set again
 
 
 @swiftly

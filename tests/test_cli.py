@@ -434,6 +434,17 @@ def test_a_set_that_fails_tells_why(
     assert done.err == f"paramclient: {name}: {reason}\n"
 
 
+def test_a_change_too_small_for_px4_is_told(command: Command, put: Callable[[Endpoint], str]) -> None:
+    link = put(PX4Vehicle(table={"A": 0.5}))
+    done = command("set", link, "A", 0.50000006, "--no-cache")
+    assert done.code == 0
+    note = "PX4 takes a change of at most 1.19e-07 for none: its next start may bring 0.5 back"
+    assert f"A: {note}\n" in done.err
+    [result] = command("set", link, "A", 0.5, "--json", "--no-cache").json["results"]
+    assert result["note"] == note.replace("0.5 back", "0.50000006 back")
+    assert "note" not in command("set", link, "A", 0.75, "--json", "--no-cache").json["results"][0]
+
+
 def test_all_sets_are_tried_and_the_worst_counts(command: Command, put: Callable[[Endpoint], str]) -> None:
     vehicle = GenericVehicle([SimParam("A", ParamType.UINT8, 1), SimParam("B", 6, 1)], param_error=True)
     done = command("set", put(vehicle), "NOPE", 1, "A", 300, "B", 2, "--json", "--no-cache")

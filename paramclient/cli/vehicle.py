@@ -218,6 +218,8 @@ async def set_(
     if late:
         say(printable(f"to count when the vehicle has started again: {', '.join(late)}"))
     for outcome in outcomes:
+        if outcome.note:
+            say(printable(f"{outcome.name}: {outcome.note}"))
         if outcome.reason:
             report(f"{outcome.name}: {outcome.reason}")
     return max(outcome.code for outcome in outcomes)
@@ -403,7 +405,10 @@ def _report_all(errors: Iterable[ParamClientError]) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Written:
-    """What became of one set; `reason` is empty where it was done, and `param` is what was acknowledged."""
+    """What became of one set; `reason` is empty where it was done, and `param` is what was acknowledged.
+
+    `note` says what else is to be known of it.
+    """
 
     name: str
     type: ParamType | int
@@ -413,6 +418,7 @@ class _Written:
     reason: str = ""
     code: ExitCode = ExitCode.DONE
     param: Param | None = None
+    note: str = ""
 
     def document(self, metadata: Metadata | None) -> SetDoneDoc:
         """The same for programs."""
@@ -425,6 +431,7 @@ class _Written:
             self.actual,
             status=self.status,
             reason=self.reason,
+            note=self.note,
             info=info_of(metadata, self.name),
         )
 
@@ -449,7 +456,13 @@ async def _write(session: Session, name: str, value: int | float, *, force: bool
             code=code_of(error),
         )
     return _Written(
-        name, done.param.type, requested=value, actual=done.actual, status=done.status, param=done.param
+        name,
+        done.param.type,
+        requested=value,
+        actual=done.actual,
+        status=done.status,
+        param=done.param,
+        note=done.note,
     )
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from paramclient.documents.base import Document, Scalar
+from paramclient.documents.base import Document, Maybe, Scalar
 from paramclient.documents.param import ParamDoc
 from paramclient.documents.problem import Problem
 from paramclient.notation import hash_text, rounded, value_json
@@ -105,6 +105,7 @@ class SetResultDoc(Document):
     actual: Scalar
     attempts: int
     param: ParamDoc
+    note: Maybe[str] = None
 
     @classmethod
     def of(cls, result: SetResult) -> SetResultDoc:
@@ -118,6 +119,7 @@ class SetResultDoc(Document):
             actual=value_json(result.actual, result.param.type),
             attempts=result.attempts,
             param=ParamDoc.kept(result.param),
+            note=result.note or None,
         )
 
 

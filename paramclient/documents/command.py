@@ -121,13 +121,14 @@ class FetchedDoc(Document):
 
 
 class SetDoneDoc(Document):
-    """What became of one value that was set; `reason` says why it was not."""
+    """What became of one value that was set; `reason` says why it was not, `note` what there is to know."""
 
     name: str
     requested: Scalar
     actual: Scalar | None
     status: str
     reason: Maybe[str] = None
+    note: Maybe[str] = None
     text: Maybe[str] = None
     reboot_required: Maybe[bool] = None
 
@@ -141,6 +142,7 @@ class SetDoneDoc(Document):
         *,
         status: str,
         reason: str = "",
+        note: str = "",
         info: ParamInfo | None = None,
     ) -> SetDoneDoc:
         """A value of this type, and what is known of the parameter."""
@@ -150,6 +152,7 @@ class SetDoneDoc(Document):
             actual=None if actual is None else value_json(actual, kind),
             status=status,
             reason=reason or None,
+            note=note or None,
             text=None if info is None or actual is None else info.text(actual) or None,
             reboot_required=(info is not None and info.reboot_required) or None,
         )

@@ -679,6 +679,7 @@ class ComponentMachine(Parts):
         self.reads.pace.is_batched = autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
         name = "" if autopilot is None else autopilot_name(autopilot)
         self.writes.against_non_finite = reason_against_non_finite(name)
+        self.writes.is_px4 = autopilot == MAV_AUTOPILOT_PX4
         if self.fetch is not None:
             self.fetch.look(now)
         if self.who.settled and self._known_as != self.identity.key:

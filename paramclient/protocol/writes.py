@@ -11,6 +11,7 @@ from paramclient.errors import NoReply, ParamErrorCode, TypeMismatch, UsageError
 from paramclient.protocol.authors import by_us
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.reads import Read, Reads
+from paramclient.protocol.small_change import note_on_small_change
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.trace import Trace, silent
 from paramclient.protocol.wire import Message, ParamError, ParamSet, ParamValue
@@ -42,6 +43,7 @@ class SetResult:
         actual: the value that the vehicle reports.
         param: the parameter as it is now.
         attempts: how many PARAM_SETs were sent.
+        note: what else is to be known, in a sentence: that PX4 does not keep a change as small as this one.
     """
 
     name: str
@@ -50,6 +52,7 @@ class SetResult:
     actual: Value
     param: Param
     attempts: int
+    note: str = ""
 
     @property
     def adjusted(self) -> bool:
@@ -122,6 +125,7 @@ class Writes:
         is_held: whether one waits for that.
         asked, retries: writes so far, and PARAM_SETs that were sent for another time.
         against_non_finite: why the vehicle must not be sent NaN and infinity; "" where it may be.
+        is_px4: whether it is a PX4, which does not keep small changes.
         left_open: is told the name and the author of a write of which nobody learns any more whether the
             vehicle takes it.
     """
@@ -148,6 +152,7 @@ class Writes:
         self.asked = self.retries = 0
         self.is_held = False
         self.against_non_finite = ""
+        self.is_px4 = False
         self.queues: dict[str, deque[Write]] = {}
         self.left_open: Callable[[str, str, float], None] = _nobody
 
@@ -423,7 +428,9 @@ class Writes:
         if exact and actual.type != ParamType.REAL32 and not isinstance(write.value, bytes):
             exact = actual.value == write.value
         status = "accepted" if exact else "adjusted"
-        result = SetResult(write.name, status, write.value, actual.value, actual, write.attempts)
+        before = write.before if self.is_px4 else None
+        note = "" if before is None else note_on_small_change(before, actual)
+        result = SetResult(write.name, status, write.value, actual.value, actual, write.attempts, note)
         self._trace("%s/%s %s: %s after try %s", *self._target, write.name, status, write.attempts)
         if write.settle > 0.0:
             if write.read is not None:

@@ -127,8 +127,10 @@ class Run:
         self._is_proven = True  # nothing was written since it was looked at
         self._written_at = -math.inf  # when the last write ended
         self._looked_at = -math.inf  # when the vehicle began to be looked at
+        self._notes: dict[str, str] = {}  # of what was written, what else is to be known
         self._reboot_for: dict[str, None] = {}
         self._reboots = 0
+        self._kept_over: set[str] = set()  # what was written before the last start, and should be there
         self._new_system: int | None = None  # its id from the next start on
         self._silent = 0
         self._error: ParamClientError | None = None
@@ -167,6 +169,7 @@ class Run:
                 if self._has_to_start(stages):
                     await self._restart()
                     await self._look()
+                    self._settle_lost()
                 elif self._may_reveal(stages):
                     await self._look_for_more(stages[-1])
                 elif stages or self._looked_at < self._written_at + LASTING_TIME:
@@ -331,12 +334,13 @@ class Run:
             self._written_at = anyio.current_time()
         self._silent = 0
         self._note_written(step)
+        self._notes[step.name] = done.note
         if self._is_action(step.name) and self._cautions.resets(step.name):
             self._new_system = RESET_SYSTEM
         if done.adjusted:
             self._settle(step, ApplyStatus.ADJUSTED, done.actual, "the vehicle made another value of it")
         else:
-            self._tell("writing", self._row_of(step, ApplyStatus.SET, done.actual))
+            self._tell("writing", self._row_of(step, ApplyStatus.SET, done.actual, done.note))
 
     async def _write_system_id(self, step: Step) -> None:
         """Set the system id, and go on with the vehicle under its new one."""
@@ -389,7 +393,21 @@ class Run:
         self._component = await self._component.reboot(system=system)
         self._new_system = None
         self._reboots += 1
+        # what such a start takes back is set again
+        takes_back = any(self._cautions.resets(name) for name in self._reboot_for)
+        self._kept_over = set() if takes_back else set(self.written)
+        self._notes.clear()  # what they say has happened, or has not
         self._reboot_for.clear()
+
+    def _settle_lost(self) -> None:
+        """Tell of what the vehicle had taken, and has another value of since it has started again.
+
+        It is not set again: the next start would do the same to it.
+        """
+        for step in self.plan.steps:
+            if step.name in self._kept_over and step.name not in self.rows:
+                reason = "the vehicle acknowledged it, and has another value since it has started again"
+                self._settle(step, ApplyStatus.ADJUSTED, step.before, reason)
 
     def _check_it_is_the_same(self) -> None:
         found = self._component.identity
@@ -498,7 +516,8 @@ class Run:
             )
 
         if planned.status is PlanStatus.UNCHANGED:
-            return row(ApplyStatus.SET if name in self.sent else ApplyStatus.UNCHANGED)
+            is_set = name in self.sent
+            return row(ApplyStatus.SET, self._notes.get(name, "")) if is_set else row(ApplyStatus.UNCHANGED)
         if (settled := self.rows.get(name)) is not None:
             return replace(settled, actual=actual) if self._is_proven else settled
         answered = "acknowledged" if name in self.written else "sent, not acknowledged"

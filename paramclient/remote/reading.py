@@ -151,6 +151,7 @@ def set_result_of(document: Document, requested: Value) -> SetResult:
         value_of(document["actual"], param.type),
         param,
         document["attempts"],
+        document.get("note", ""),
     )
 
 

@@ -12,9 +12,9 @@ from paramclient.protocol import wire
 from paramclient.sim.ftp import FileServer
 from paramclient.sim.generic import BytewiseVehicle
 from paramclient.sim.metadata import GENERAL_FILE, metadata_files
-from paramclient.sim.table import Entry, SimParam, Table, as_table, px4_table, with_system_id
+from paramclient.sim.table import FLT_EPSILON, Entry, SimParam, Table, as_table, px4_table, with_system_id
 from paramclient.sim.vehicle import VehicleOptions
-from paramclient.values import Encoding, ParamType, bits_of, crc32_px4, px4_hash
+from paramclient.values import Encoding, ParamType, bits_of, crc32_px4, from_bits, px4_hash
 
 __all__ = ["PX4Vehicle"]
 
@@ -53,6 +53,9 @@ class PX4Vehicle(BytewiseVehicle):
     - Its position controller looks at its own parameters 0.4 s after one of them has changed, and sets those
       to their limit that are beyond it (see `UPPER_LIMITS`); a real one takes 10 ms to 1.1 s. These changes
       are sent as any other.
+    - A change of a float by at most 1.19e-7 counts as none: the value is not sent again and not saved by
+      itself. With the start the value of before is back, unless another change had all saved. A value that
+      close to the default is never saved.
     - A wrong type, an unknown name and an unknown index are met with silence.
     - A parameter that is not in use can be read and set by name (index 65535) and is neither in the list
       nor in the hash.
@@ -235,9 +238,14 @@ class PX4Vehicle(BytewiseVehicle):
     def _write(self, entry: Entry, bits: int) -> None:
         if bits == entry.bits:
             return
+        before = entry.bits
         super()._write(entry, bits)
         self._hash = None
         self._unsaved.add(entry.name)
+        if _is_near(entry, before):
+            self._unkept.setdefault(entry.name, before)
+            return
+        self._unkept.pop(entry.name, None)
         self._waking |= self._late_use.get(entry.name, frozenset())
         if entry.name in _LIMITED and self._clamp_delay is not None:
             self._clamp_at = min(self._clamp_at, self._now + self._clamp_delay)
@@ -256,6 +264,11 @@ class PX4Vehicle(BytewiseVehicle):
     def _end_all(self) -> None:
         super()._end_all()
         self._has_stored = True
+        for name, bits in self._unkept.items():
+            self._entry(name).store(bits)
+        for entry in self._entries:
+            if entry.default is not None and _is_near(entry, bits_of(entry.default, entry.type)):
+                entry.store(bits_of(entry.default, entry.type))
         autoconfig = self._find("SYS_AUTOCONFIG")
         if autoconfig is not None and autoconfig.bits != 0:
             for entry in self._entries:
@@ -271,6 +284,7 @@ class PX4Vehicle(BytewiseVehicle):
         if self._has_stored:
             self._unused |= self._first_start_only
         self._unsaved = set(self._first_unsaved)
+        self._unkept: dict[str, int] = {}  # what is saved of those that have changed too little since
         self._waking: frozenset[str] = frozenset()
         self._hash_next = False
         self._push_from: int | None = None
@@ -304,6 +318,7 @@ class PX4Vehicle(BytewiseVehicle):
         if self._save_at <= now:
             self._save_at = math.inf
             self._unsaved.clear()
+            self._unkept.clear()
 
     def _send_next(self) -> bool:
         if self._hash_next:
@@ -330,6 +345,14 @@ class PX4Vehicle(BytewiseVehicle):
             self._send(
                 wire.ParamValue(wire.HASH_CHECK, raw, ParamType.UINT32, len(self._listed), wire.NO_INDEX)
             )
+
+
+def _is_near(entry: Entry, bits: int) -> bool:
+    """Whether it is a float that PX4 takes for the same as another one."""
+    value, other = entry.value, from_bits(bits, entry.type)
+    if not isinstance(value, float) or not isinstance(other, float):
+        return False
+    return entry.bits != bits and abs(value - other) <= FLT_EPSILON
 
 
 _LIMITED = frozenset(
