@@ -42,7 +42,8 @@ ARDUPILOT_TABLE = {
     "RC16_OPTION": (ParamType.INT16, 300),
     "RC15_OPTION": (ParamType.INT16, 0),
 }
-GROUP = {"GRIP_ENABLE": {"GRIP_GRAB": (ParamType.INT16, 1900), "GRIP_RELEASE": (ParamType.INT16, 1100)}}
+GROUP: dict[str, dict[str, Value | tuple[ParamType, Value]]]
+GROUP = {"GRIP_ENABLE": {"GRIP_GRAB": (ParamType.INT16, 1900), "GRIP_REGRAB": 1.5}}
 
 
 def px4(*, armed: bool = False) -> PX4Vehicle:
@@ -78,12 +79,22 @@ EVERYWHERE = (
 )
 
 
+SET_UPS = ("verify, 15 unknown names", "restore, the state before", "apply with a restart")
+
+
 def test_it_passes_on_a_simulated_px4(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     vehicle = px4()
     before = vehicle.values
-    having(monkeypatch, *EVERYWHERE, "fetch in a new session, cached", "a group shown and hidden")
+    having(
+        monkeypatch,
+        *EVERYWHERE,
+        *SET_UPS,
+        "fetch in a new session, cached",
+        "a group shown and hidden",
+        "set, a change too small to save",
+    )
     with flying(vehicle) as link:
         code = suite.main([link, "--kind", "px4"])
     printed = capsys.readouterr().out
@@ -104,8 +115,10 @@ def test_it_passes_on_a_simulated_ardupilot(
     having(
         monkeypatch,
         *EVERYWHERE,
+        *SET_UPS,
         "set, a fraction for an integer",
         "a group shown and hidden",
+        "apply, a group that is hidden",
         "fetch by list, 5% loss, 100 ms",
     )
     with flying(vehicle) as link:
@@ -113,7 +126,7 @@ def test_it_passes_on_a_simulated_ardupilot(
     printed = capsys.readouterr().out
     found = results(printed)
     assert set(found.values()) <= {"ok", "slower"}, printed
-    assert len(found) == len(EVERYWHERE) + 4
+    assert len(found) == len(EVERYWHERE) + len(SET_UPS) + 5
     assert code == 0
     assert f"GRIP_ENABLE: {len(before)}, {len(before) + 2}, {len(before)} parameters" in printed
     assert vehicle.values == before

@@ -24,15 +24,24 @@ from paramclient.errors import (
     ValueNotApplied,
 )
 from paramclient.logs import import_log
+from paramclient.metadata import ParamInfo
+from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.protocol.small_change import CHANGE_MIN
 from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, message_name
-from paramclient.values import Param, ParamType, type_name
+from paramclient.provision import MISSING, ApplyStatus, apply, restore, verify
+from paramclient.values import Param, ParamType, from_bits, type_name
 from tests.live.choice import another_value
+from tests.live.journal import check_disarmed
 from tests.live.relay import FILE_TRANSFER_ID, LIST_REQUEST_ID, Conditions
 from tests.live.session import HEARING_TIMEOUT, Check, CheckFailed, Measured, Session, Skip
 
 __all__ = ["checks"]
 
 NO_SUCH_NAME: Final = "NO_SUCH_PARAM"
+MANY_UNKNOWN: Final = 15
+"""Names that no vehicle has, in a set-up."""
+RESTORED: Final = 5
+"""Parameters that are changed before an earlier state is brought back."""
 READS: Final = 10
 """Single reads of which the median counts."""
 FRACTION: Final = 0.1
@@ -113,6 +122,35 @@ def checks(*, reboots: bool) -> Iterator[Check]:
         writes=True,
         kinds=("ardupilot",),
     )
+    yield Check(
+        "set, a change too small to save",
+        set_small,
+        "accepted, with a note",
+        writes=True,
+        kinds=("px4",),
+    )
+    yield Check(
+        f"verify, {MANY_UNKNOWN} unknown names",
+        verify_unknown,
+        "all missing; what they cost",
+        {"ardupilot": 0.5, "px4": 0.5},
+    )
+    yield Check(
+        "apply, a group that is hidden",
+        apply_hidden,
+        "the switch and its members in one run",
+        {"ardupilot": 3.0},
+        writes=True,
+        kinds=("ardupilot",),
+    )
+    yield Check(
+        "restore, the state before",
+        restore_before,
+        "complete, without what the vehicle measures",
+        {"ardupilot": 3.0, "px4": 4.0},
+        writes=True,
+        kinds=("ardupilot", "px4"),
+    )
     yield Check("MAVFTP, list of the root", list_root, "its entries")
     yield Check(
         "MAVFTP, parameter file three times", read_file, "one time like the other", kinds=("ardupilot",)
@@ -146,6 +184,9 @@ def checks(*, reboots: bool) -> Iterator[Check]:
     yield from lossy_checks()
     if reboots:
         yield Check("reboot", reboot, "the same vehicle is back, with the value that was set", writes=True)
+        yield Check(
+            "apply with a restart", apply_restarting, "the value that the vehicle has after it", writes=True
+        )
 
 
 def lossy_checks() -> Iterator[Check]:
@@ -489,6 +530,93 @@ async def show_group(session: Session) -> Measured:
     raise Skip(f"none of these shows a group: {', '.join(tried)}" if tried else "no switch of a group is off")
 
 
+async def set_small(session: Session) -> Measured:
+    name = session.choice.by_type.get(ParamType.REAL32)
+    if name is None:
+        raise Skip("no harmless float")
+    async with session.client() as vehicle:
+        param = await vehicle.get(name)
+        wanted = from_bits(param.bits + 1, ParamType.REAL32)
+        assert not isinstance(wanted, bytes)
+        assert not isinstance(param.value, bytes)
+        if not abs(wanted - param.value) <= CHANGE_MIN:
+            raise Skip(f"{name} is {param.value!r}, too large for such a change")
+        done = await session.journal.set(vehicle, name, wanted)
+        await put_back(session, vehicle)
+    if not done.note:
+        raise CheckFailed(f"{name} to {wanted}: {done}, and no note")
+    return Measured(done.note)
+
+
+# Set-ups
+
+
+async def verify_unknown(session: Session) -> Measured:
+    name, param = next(iter(session.journal.before.items()))
+    known = {name: WrittenParam.of(param)}
+    unknown = {each: WrittenParam(each, 1) for each in (f"NO_SUCH_{n}" for n in range(MANY_UNKNOWN))}
+    async with session.client() as vehicle:
+        await verify(vehicle, ParamSet(known))
+        seconds = []
+        for wanted in (known, known | unknown):
+            began = time.monotonic()
+            plan = await verify(vehicle, ParamSet(wanted))
+            seconds.append(time.monotonic() - began)
+    missing = [row.name for row in plan.rows.values() if row.category == MISSING]
+    if missing != list(unknown):
+        raise CheckFailed(f"missing are {', '.join(missing)}")
+    cost = seconds[1] - seconds[0]
+    return Measured(f"{len(missing)} missing, {cost:.2f} s more than without", cost)
+
+
+async def apply_hidden(session: Session) -> Measured:
+    async with session.client() as vehicle:
+        whole = await vehicle.fetch_all(timeout=SLOWEST_FETCH)
+        for switch in session.choice.groups:
+            await session.journal.set(vehicle, switch, 1)
+            shown = await vehicle.fetch_all(refresh=True, timeout=SLOWEST_FETCH)
+            await put_back(session, vehicle)
+            members = [shown.params[name] for name in shown.params.keys() - whole.params.keys()]
+            floats = sorted(
+                each.name for each in members if each.type == ParamType.REAL32 and not each.is_raw
+            )
+            if not floats:
+                continue
+            member = shown.params[floats[0]]
+            session.journal.note({switch: whole.params[switch], member.name: member})
+            await check_disarmed(vehicle)
+            values = {switch: 1, member.name: another_value(member)}
+            wanted = ParamSet({name: WrittenParam(name, value) for name, value in values.items()})
+            done = await apply(vehicle, wanted)
+            back = await restore(vehicle, done.before)
+            await put_back(session, vehicle)
+            for result in (done, back):
+                if not result.complete or result.counts[ApplyStatus.SET] != len(values):
+                    raise CheckFailed(f"{result}: {'; '.join(map(str, result.news))}")
+            return Measured(f"{switch} and {member.name} in {done.elapsed:.2f} s", done.elapsed)
+    raise Skip("no switch of a group with a float is off")
+
+
+async def restore_before(session: Session) -> Measured:
+    names = session.choice.many[:RESTORED]
+    if not names:
+        raise Skip("no harmless parameters")
+    async with session.client() as vehicle:
+        await vehicle.fetch_all(timeout=SLOWEST_FETCH)
+        state = ParamSet.of(
+            session.journal.before.values(), component=vehicle.component, identity=vehicle.identity
+        )
+        for name in names:
+            await session.journal.set(vehicle, name, another_value(session.journal.before[name]))
+        done = await restore(vehicle, state)
+        left_out = [row.name for row in done.news if row.status is ApplyStatus.SKIPPED]
+        await put_back(session, vehicle)
+    if not done.complete or any(done.rows[name].status is not ApplyStatus.SET for name in names):
+        raise CheckFailed(f"{done}: {'; '.join(map(str, done.news[:5]))}")
+    told = f", left out {', '.join(left_out)}" if left_out else ""
+    return Measured(f"{done.counts[ApplyStatus.SET]} set in {done.elapsed:.2f} s{told}", done.elapsed)
+
+
 async def put_back(session: Session, vehicle: Component) -> None:
     """Put back what this check has changed. What fails here is tried again at the end of the suite."""
     if problems := await session.journal.put_back(vehicle):
@@ -613,3 +741,22 @@ async def reboot(session: Session) -> Measured:
     if held.value != value:
         raise CheckFailed(f"{name} was set to {value} before the restart, and is {held.value!r}")
     return Measured(f"back after {seconds:.1f} s, {name} is {value}")
+
+
+async def apply_restarting(session: Session) -> Measured:
+    name = next(iter(session.choice.many), None)
+    if name is None:
+        raise Skip("no harmless parameter")
+    async with session.client() as vehicle:
+        param = await vehicle.get(name)
+        session.journal.note({name: param})
+        await check_disarmed(vehicle)
+        value = another_value(param)
+        info = {name: ParamInfo(name, reboot_required=True)}
+        done = await apply(vehicle, ParamSet({name: WrittenParam(name, value)}), reboot=True, info=info)
+        held = await vehicle.get(name)
+        await put_back(session, vehicle)
+    row = done.rows[name]
+    if not done.complete or done.reboots != 1 or row.actual != held.value:
+        raise CheckFailed(f"{done}: {row}, and the vehicle holds {held.value!r}")
+    return Measured(f"{row} after {done.elapsed:.1f} s")

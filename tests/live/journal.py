@@ -135,9 +135,10 @@ class Journal:
     def moves_by_itself(self, name: str) -> bool:
         """Whether a vehicle of this kind may give the parameter another value without being asked.
 
-        Counters and calibration do, by the list that the set-up of vehicles uses.
+        Counters, calibration and what is measured or written by the vehicle alone do, by the list that the
+        set-up of vehicles uses.
         """
-        return self._category(name) in ("counter", "calibration")
+        return self._category(name) in _MOVING
 
     def comes_and_goes(self, name: str) -> bool:
         """Whether a vehicle of this kind may list the parameter or not, without being asked.
@@ -145,7 +146,7 @@ class Journal:
         PX4 lists what its firmware has used since the start: the ids of sensors that are not there are listed
         after some starts, and not after others (measured).
         """
-        return self.kind == "px4" and self._category(name) in ("counter", "calibration", "hardware")
+        return self.kind == "px4" and self._category(name) in (*_MOVING, "hardware")
 
     def _category(self, name: str) -> str:
         caution = cautions_for(self.kind).left_out(name)
@@ -165,6 +166,9 @@ class Journal:
             except ParamClientError as error:
                 problem = str(error)
         problems.append(f"{param.name} could not be put back to {param.value!r}: {problem}")
+
+
+_MOVING = ("counter", "calibration", "measured", "read-only")
 
 
 def _is_switch(name: str) -> bool:
