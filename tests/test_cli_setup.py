@@ -348,6 +348,31 @@ def test_restore_goes_back_behind_the_last_apply(
     assert vehicle.values == copter().values, "a restore is no apply that restore goes back behind"
 
 
+def test_restore_says_what_it_leaves_out_and_ends_well(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    vehicle = ArduPilotVehicle(
+        table={"RTL_ALT": 1500, "BARO1_GND_PRESS": 94500.0, "INS_GYROFFS_X": 0.25}, live_period=0.0
+    )
+    command("apply", put(vehicle), file("RTL_ALT,2500\n"))
+    vehicle.set_param("BARO1_GND_PRESS", 94600.0)
+    vehicle.set_param("INS_GYROFFS_X", 0.5)
+    back = command("restore", put(vehicle))
+    assert back.code == 0
+    assert {tuple(row) for row in back.rows[1:]} == {
+        ("RTL_ALT", "2500", "1500", "1500", "set"),
+        (
+            *("BARO1_GND_PRESS", "94600.0", "94500.0", "94600.0", "skipped"),
+            "left out: it can only be read: the vehicle writes it",
+        ),
+        (
+            *("INS_GYROFFS_X", "0.5", "0.25", "0.5", "skipped"),
+            "left out: it is measured by the vehicle at each start",
+        ),
+    }
+    assert vehicle.values == {"RTL_ALT": 1500, "BARO1_GND_PRESS": 94600.0, "INS_GYROFFS_X": 0.5}
+
+
 def test_restore_takes_a_moment_or_a_snapshot(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], cache: Path
 ) -> None:
