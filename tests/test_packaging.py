@@ -110,7 +110,8 @@ def test_the_sdist_can_be_built_and_tested(sdist: set[str]) -> None:
         "Makefile",
         "docs/conf.py",
     }
-    assert sdist >= {path.relative_to(ROOT).as_posix() for path in (ROOT / "tests/data").iterdir()}
+    data = (path for path in (ROOT / "tests/data").rglob("*") if path.is_file())
+    assert sdist >= {path.relative_to(ROOT).as_posix() for path in data}
     assert not {name for name in sdist if "__pycache__" in name or name.startswith((".venv", "docs/_build"))}
 
 

@@ -205,6 +205,8 @@ class Station:
         for frame in frames:
             number, system, component, _, payload, version = frame
             machine = self.components.get((system, component))
+            if number == PARAM_VALUE_ID and component == COMP_ID_MISSIONPLANNER and self._is_made_up(machine):
+                continue
             if number == PARAM_VALUE_ID and machine is not None:  # the short way for what comes in thousands
                 self._peers[system] = peer
                 self._touched[machine] = None
@@ -525,6 +527,19 @@ class Station:
         self._skipped += framer.skipped
         self._damaged += framer.damaged
 
+    def _is_made_up(self, machine: ComponentMachine | None) -> bool:
+        """Whether a PARAM_VALUE of component 190 comes from no component that has parameters.
+
+        After MAVProxy has read a parameter file, it writes a PARAM_VALUE of each parameter into its log, with
+        the vehicle's system id, component 190 and the type REAL32 (measured with 1.8.75). Nothing sends
+        heartbeats from that address, unless a ground station has the system id of the vehicle. On a link on
+        which requests are sent, a ground station is believed to have the parameters that it sends.
+
+        Args:
+            machine: the component with the address, or None where none is known.
+        """
+        return machine is None or (self.listens_only and not machine.who.has_parameters)
+
     def _receive_other(self, frame: Frame, peer: Peer, now: float, moment: float | None) -> None:
         """Take a frame that is no value of a known component."""
         sender = (frame.system, frame.component)
@@ -558,15 +573,9 @@ class Station:
             framer.takes_occasional = takes
 
     def _meet(self, sender: Address, message: Message, now: float) -> ComponentMachine | None:
-        """A component that was not heard before; only what shows that it has parameters makes it one.
-
-        A PARAM_VALUE of component 190 is no such sign. When it has read a parameter file, MAVProxy writes one
-        of each parameter into its log, with the vehicle's system id, this component and the type REAL32.
-        """
-        is_sign = isinstance(message, Heartbeat | HighLatency2)
-        is_sign = is_sign or (isinstance(message, ParamValue) and sender[1] != COMP_ID_MISSIONPLANNER)
-        is_sign = is_sign or self._is_awaited_file(message, sender)
-        if not is_sign or not self._has_room(now):
+        """A component that was not heard before; only what shows that it has parameters makes it one."""
+        is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue)
+        if not (is_sign or self._is_awaited_file(message, sender)) or not self._has_room(now):
             return None
         system, component = sender
         machine: ComponentMachine | None = None
