@@ -422,9 +422,10 @@ class ParamClient:
     ) -> Component:
         """The same component of the same vehicle under another system id, as soon as it speaks under that.
 
-        For a vehicle whose system id was set: ArduPilot takes it at once (SYSID_THISMAV), PX4 when it starts
-        again (MAV_SYS_ID, see `Component.reboot`). That it is the same one is shown by its hardware id; where
-        there is none, by its autopilot and type, and by its silence under the id of before.
+        For a vehicle whose system id was set: ArduPlane and Rover take it at once (SYSID_THISMAV), ArduCopter
+        and PX4 (MAV_SYS_ID) when they start again (see `Component.reboot`). That it is the same one is shown
+        by its hardware id; where there is none, by its autopilot and type, and by its silence under the id of
+        before.
 
         Args:
             component: what it was before.

@@ -360,17 +360,17 @@ class Component:
         """Let the vehicle start again, and wait until the same one is back.
 
         It is told to when what was written through this client has had the time to be saved (2.5 s after the
-        last write). That it has started again is seen by its clock, its heartbeat or its silence, so an
-        acknowledgement may be lost. Then its hardware id is asked for, or where it has none, its heartbeat
-        must name the same autopilot and type. Its table is *cached* afterwards until it is confirmed, as
-        after any start; parameters may be others now.
+        last write). That it has started again is seen by its clock, its heartbeat, the sequence numbers of
+        its frames or its silence, so an acknowledgement may be lost. Then its hardware id is asked for, or
+        where it has none, its heartbeat must name the same autopilot and type. Its table is *cached*
+        afterwards until it is confirmed, as after any start; parameters may be others now.
 
         Calls at the same time share one restart. When the call is cancelled, the vehicle may start again all
         the same.
 
         Args:
-            system: the system id that it takes with the start, where another one was set (MAV_SYS_ID of PX4);
-                then `ParamClient.successor` finds it there.
+            system: the system id that it takes with the start, where another one was set (MAV_SYS_ID of PX4,
+                SYSID_THISMAV of ArduCopter); then `ParamClient.successor` finds it there.
             timeout: seconds until giving up; None for `REBOOT_PATIENCE`.
 
         Returns:

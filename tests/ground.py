@@ -20,7 +20,7 @@ SMALL: dict[str, Value | tuple[ParamType | int, Value]] = {
 }
 LIST = wire.ParamRequestList(1, 1)
 SIGNS_OF_LIFE = (wire.Heartbeat, wire.SystemTime)
-"""What a vehicle sends each second from the first call on."""
+"""What a generic vehicle sends each second from the first call on."""
 
 M = TypeVar("M")
 

@@ -121,7 +121,8 @@ def replay(
     phase: float = 0.0,
     on_board: Iterable[tuple[float, str, Value]] = (),
 ) -> Messages:
-    """Let the vehicle hear the ground station of a log at the recorded times; what it sent meanwhile.
+    """Let the vehicle hear the ground station of a log at the recorded times; what it sent meanwhile, as far
+    as `wire` decodes it.
 
     Args:
         phase: seconds into the log at which the vehicle's heartbeats, and with them the slots of ArduPilot,
@@ -139,9 +140,8 @@ def replay(
     def collect(now: float) -> None:
         for data in vehicle.data_to_send():
             (frame,) = framer.receive(data)
-            message = wire.decode(frame)
-            assert message is not None
-            sent.append((now, message))
+            if (message := wire.decode(frame)) is not None:
+                sent.append((now, message))
 
     vehicle.tick(phase - 1.0)
     collect(phase - 1.0)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import itertools
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -118,9 +119,9 @@ CLAMPED: dict[str, Value | tuple[ParamType, Value]] = {
 """What PX4's position controller sets to limits."""
 
 
-def ardupilot(kind: type[ArduPilotVehicle] = ArduPilotVehicle, **options: Any) -> ArduPilotVehicle:
+def ardupilot(make: type[ArduPilotVehicle] = ArduPilotVehicle, **options: Any) -> ArduPilotVehicle:
     defaults: dict[str, Any] = {"table": SETTINGS | OTHERS, "groups": {"EK2_ENABLE": GROUP}, "live": ()}
-    return kind(**defaults | options)
+    return make(**defaults | options)
 
 
 def px4(kind: type[PX4Vehicle] = PX4Vehicle, **options: Any) -> PX4Vehicle:
@@ -849,7 +850,7 @@ async def test_a_vehicle_that_is_armed_meanwhile_ends_it() -> None:
 
 @swiftly
 async def test_a_reboot_follows_where_values_count_only_then() -> None:
-    vehicle = ardupilot(reboot_groups=["EK2_ENABLE"], kind=Hiding)
+    vehicle = ardupilot(reboot_groups=["EK2_ENABLE"], make=Hiding)
     tap = Tap(vehicle)
     wanted = written(another("TUNE_01") | {"EK2_ALT_M_NSE": 1.5, "EK2_ENABLE": 1, "FRAME_CLASS": 2})
     async with a_client(tap) as client:
@@ -896,7 +897,7 @@ async def test_a_change_too_small_for_px4_is_told_and_its_value_after_the_start(
 
 @swiftly
 async def test_a_group_that_comes_with_a_start_is_set_after_it() -> None:
-    vehicle = ardupilot(reboot_groups=["EK2_ENABLE"], kind=Hiding)
+    vehicle = ardupilot(reboot_groups=["EK2_ENABLE"], make=Hiding)
     tap = Tap(vehicle)
     async with a_client(tap) as client:
         result = await apply(
@@ -911,7 +912,7 @@ async def test_a_group_that_comes_with_a_start_is_set_after_it() -> None:
 
 @swiftly
 async def test_names_that_no_start_brings_cost_one_start_at_most() -> None:
-    async with a_client(ardupilot(kind=Hiding)) as client:
+    async with a_client(ardupilot(make=Hiding)) as client:
         component = await client.component()
         wanted = written({"EK2_NO_SUCH": 1.5, "EK2_ENABLE": 1})
         assert (await apply(component, wanted, reboot=True)).reboots == 1
@@ -969,13 +970,52 @@ async def test_a_changed_system_id_is_followed(make: Callable[..., Any]) -> None
         assert (result.system, result.component) == (7, 1)
         assert (vehicle.system, vehicle.param(name).value) == (7, 7)
         assert sets(tap)[-1] == name
-        assert result.reboots == (0 if make is ardupilot else 1)
+        assert result.reboots == 1
         assert client.components[7, 1].state == "synced"
+        await anyio.sleep(5.0)  # what is measured at a start is read again
         assert residue(component) == []
         # and back again, although it was just heard under that id
         undone = await restore(client.components[7, 1], result.before, reboot=True)
     assert undone.complete
     assert (undone.system, vehicle.system) == (1, 1)
+
+
+@swiftly
+async def test_plane_and_rover_take_their_system_id_without_a_reboot() -> None:
+    vehicle = ardupilot(kind="plane")
+    async with a_client(vehicle) as client:
+        result = await apply(
+            await client.component(), written({"SYSID_THISMAV": 7}), include="identity", reboot=True
+        )
+    assert result.complete
+    assert (result.reboots, result.reboot_required, result.plan.reboot_for) == (0, (), ())
+    assert (result.system, vehicle.system) == (7, 7)
+
+
+@swiftly
+async def test_copter_keeps_its_system_id_until_it_starts_again() -> None:
+    """Which is known beforehand, and seen: another firmware may take it at once."""
+    vehicle = ardupilot()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        result = await apply(component, written({"SYSID_THISMAV": 7}), include="identity")
+        assert (result.system, vehicle.system) == (1, 1)
+        assert result.plan.reboot_for == result.reboot_required == ("SYSID_THISMAV",)
+        assert statuses(result) == {"SYSID_THISMAV": "set"}
+        started = await apply(component, written({"SYSID_THISMAV": 7}), include="identity", reboot=True)
+    assert (started.reboots, started.system, vehicle.system) == (1, 7, 7)
+
+
+@swiftly
+async def test_a_copter_that_takes_its_system_id_at_once_is_followed() -> None:
+    vehicle = ardupilot(kind="plane")
+    vehicle._heartbeat = dataclasses.replace(vehicle._heartbeat, type=2)
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        result = await apply(component, written({"SYSID_THISMAV": 7}), include="identity", reboot=True)
+    assert result.plan.reboot_for == ("SYSID_THISMAV",)
+    assert (result.reboots, result.reboot_required) == (0, ())
+    assert (result.system, vehicle.system) == (7, 7)
 
 
 @swiftly

@@ -126,9 +126,6 @@ class TestDecoding:
 
 # What a replay leaves out, and why
 
-NOT_IN_LOGS = (wire.SystemTime,)
-"""The simulated vehicles send it so that a restart can be seen; the recorded ArduCopter does not stream it,
-and PX4 only once its clock is set."""
 OTHER_TEXTS = ("GPS 1:", "EKF", "Field Elevation", "[logger]")
 """How texts begin that other parts of the firmware send; no client of parameters reads them."""
 UNASKED = (
@@ -145,8 +142,6 @@ def compared(messages: Messages) -> Messages:
     """
     kept: Messages = []
     for time, message in messages:
-        if isinstance(message, NOT_IN_LOGS):
-            continue
         if isinstance(message, wire.StatusText) and message.text.startswith(OTHER_TEXTS):
             continue
         if isinstance(message, wire.Heartbeat) and message.system_status == 0:

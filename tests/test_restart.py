@@ -37,10 +37,14 @@ def px4(**options: Any) -> PX4Vehicle:
 
 
 def ardupilot(**options: Any) -> ArduPilotVehicle:
+    """A Copter, unless another kind is chosen."""
     return ArduPilotVehicle(**{"table": {"A": 1, "SYSID_THISMAV": options.get("system", 1)}} | options)
 
 
-MAKES = pytest.mark.parametrize("make", [px4, ardupilot, generic])
+plane = partial(ardupilot, kind="plane")
+MAKES = pytest.mark.parametrize(
+    "make", [px4, ardupilot, plane, generic], ids=["px4", "copter", "plane", "generic"]
+)
 
 
 def counted(vehicle: Vehicle) -> list[float]:
@@ -63,16 +67,17 @@ async def known(client: ParamClient, uptime: float = 10.0) -> Component:
     return component
 
 
+def tells_clock(data: bytes) -> bool:
+    """Whether a datagram has the time since boot in it."""
+    frames = wire.Framer(stream=False).receive(data)
+    return any(frame.message_id in wire.BOOT_CLOCK_OFFSETS for frame in frames)
+
+
 class Clockless(Tap):
-    """An endpoint of which no SYSTEM_TIME is heard, as of an ArduPilot that nobody asked for it."""
+    """An endpoint whose time since boot is never heard."""
 
     def data_to_send(self) -> list[bytes]:
-        framer = wire.Framer(wire.UNDERSTOOD, stream=False)
-        return [
-            data
-            for data in super().data_to_send()
-            if not any(isinstance(wire.decode(frame), wire.SystemTime) for frame in framer.receive(data))
-        ]
+        return [data for data in super().data_to_send() if not tells_clock(data)]
 
 
 class Exchanged(Tap):
@@ -83,7 +88,7 @@ class Exchanged(Tap):
 
 
 class LateClock(Tap):
-    """An endpoint whose SYSTEM_TIME takes a longer way than all else.
+    """An endpoint whose time since boot takes a longer way than all else.
 
     Attributes:
         by: seconds by which it is late.
@@ -104,8 +109,7 @@ class LateClock(Tap):
         now = anyio.current_time()
         sent: list[bytes] = []
         for data in super().data_to_send():
-            is_clock = wire.decode(wire.Framer(wire.UNDERSTOOD, stream=False).receive(data)[0])
-            if isinstance(is_clock, wire.SystemTime):
+            if tells_clock(data):
                 self._late.append((now + self.by, data))
             else:
                 sent.append(data)
@@ -479,8 +483,8 @@ async def test_one_that_does_not_take_the_new_id() -> None:
 
 
 @swiftly
-async def test_ardupilot_takes_it_at_once() -> None:
-    vehicle = ardupilot()
+async def test_plane_and_rover_take_it_at_once() -> None:
+    vehicle = ardupilot(kind="plane")
     async with a_client(vehicle) as client:
         component = await known(client)
         await component.fetch_all()
@@ -492,6 +496,57 @@ async def test_ardupilot_takes_it_at_once() -> None:
         assert moved.identity.uid == component.identity.uid
         result = await moved.fetch_all()
         assert result.complete
+
+
+@swiftly
+async def test_copter_takes_it_with_the_next_start() -> None:
+    vehicle = ardupilot()
+    async with a_client(vehicle) as client:
+        component = await known(client)
+        await component.set("SYSID_THISMAV", 9)
+        await asyncio.sleep(5.0)
+        assert set(client.components) == {(1, 1)}
+        moved = await component.reboot(system=9)
+        assert moved.system == 9
+        assert (await moved.get("SYSID_THISMAV")).value == 9
+
+
+@pytest.mark.parametrize("seed", range(6))
+@swiftly
+async def test_a_copter_whose_acknowledgement_is_lost_starts_once(seed: int) -> None:
+    """It is heard again 1.2 s later, and tells its clock 1.4 s after that: it is not told again meanwhile."""
+    vehicle = ardupilot(reboot_down=0.8 + 0.1 * seed, reboot_ack=False)
+    starts = counted(vehicle)
+    async with a_client(vehicle) as client:
+        component = await known(client)
+        await component.reboot()
+        await asyncio.sleep(10.0)
+        assert len(starts) == 1
+
+
+@swiftly
+async def test_a_copter_is_back_as_soon_as_it_is_heard() -> None:
+    """Its first frame has number 0; its clock comes 1.4 s later."""
+    vehicle = ardupilot()
+    starts = counted(vehicle)
+    async with a_client(vehicle) as client:
+        component = await known(client)
+        await component.reboot()
+        assert anyio.current_time() - starts[0] < 0.1
+
+
+@MAKES
+@swiftly
+async def test_a_restart_by_somebody_else_is_noticed(make: Make) -> None:
+    vehicle = make()
+    async with a_client(vehicle) as client:
+        await known(client)
+        events = client.events()
+        vehicle.reboot(down=1.0)
+        await asyncio.sleep(1.0 + 1.4 + 1.1)
+        assert [type(event) for event in events._waiting] == [Rebooted]
+        await asyncio.sleep(30.0)
+        assert len(events._waiting) == 1
 
 
 @swiftly
@@ -534,7 +589,7 @@ async def test_a_successor_that_never_speaks() -> None:
 
 @swiftly
 async def test_a_successor_that_does_not_say_who_it_is_is_asked_again() -> None:
-    vehicle = ardupilot()
+    vehicle = ardupilot(kind="plane")
     tap = Tap(vehicle)
     async with a_client(tap) as client:
         component = await known(client)

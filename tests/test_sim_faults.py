@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 
 import pytest
 
@@ -26,6 +27,7 @@ from tests.simulation import Simulation
 
 NO_INDEX = wire.NO_INDEX
 TEN = {f"P{number}": number for number in range(10)}
+CLOCK_REQUEST = wire.CommandLong(1, 1, wire.MAV_CMD_REQUEST_MESSAGE, (float(wire.SYSTEM_TIME_ID), *[0.0] * 6))
 EVERY_KIND = pytest.mark.parametrize("kind", [GenericVehicle, PX4Vehicle, ArduPilotVehicle])
 
 
@@ -193,21 +195,45 @@ class TestWhenListed:
         vehicle.when_listed(6, lambda: vehicle.reboot(down=down))
         station = Station(vehicle).wait(1.5).send(LIST).wait(0.5)
         assert max(value.param_index for value in station.values() if value.param_index < 10) == 4
-        clock = [time.time_boot_ms for time in station.wait(4.0).heard(wire.SystemTime)]
-        assert len(clock) == {0.0: 4, 2.0: 3, math.inf: 0}[down]
+        beats = station.wait(4.0).heard(wire.Heartbeat)
+        assert len(beats) == {0.0: 4, 2.0: 3, math.inf: 0}[down]
         assert (len(listed(station)) == 10) == (down < math.inf)
 
 
 @EVERY_KIND
 class TestSwitchingOn:
-    def test_the_clock_starts_with_the_vehicle(self, kind: Callable[..., Vehicle]) -> None:
+    def test_the_heartbeat_starts_with_the_vehicle(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN)
+        station = Station(vehicle, start=100.0).wait(2.5)
+        assert len(station.heard(wire.Heartbeat)) == 3
+        vehicle.reboot(station.now, down=0.7)
+        assert len(station.wait(2.0).heard(wire.Heartbeat)) == 2
+
+    def test_the_heartbeat_says_that_it_boots(self, kind: Callable[..., Vehicle]) -> None:
+        vehicle = kind(table=TEN, boot_time=2.5)
+        station = Station(vehicle).wait(4.5)
+        beats = station.heard(wire.Heartbeat)
+        ready = beats[-1].system_status
+        assert ready in (3, 4)
+        assert [beat.system_status for beat in beats] == [1, 1, 1, ready, ready]
+        vehicle.reboot(station.now)
+        assert station.wait(0.5).heard(wire.Heartbeat)[0].system_status == 1
+
+    def test_without_a_boot_time_it_is_ready_at_once(self, kind: Callable[..., Vehicle]) -> None:
+        beats = Station(kind(table=TEN)).heard(wire.Heartbeat)
+        assert beats[0].system_status != wire.MAV_STATE_BOOT
+
+
+class TestClock:
+    def test_system_time_starts_with_the_vehicle(self) -> None:
+        vehicle = GenericVehicle(table=TEN)
         station = Station(vehicle, start=100.0).wait(2.5)
         assert [time.time_boot_ms for time in station.heard(wire.SystemTime)] == [0, 1000, 2000]
         vehicle.reboot(station.now, down=0.7)
         times = station.wait(2.0).heard(wire.SystemTime)
         assert times == [wire.SystemTime(0, 0), wire.SystemTime(0, 1000)]
 
+    @pytest.mark.parametrize("kind", [GenericVehicle, ArduPilotVehicle])
     def test_telemetry_carries_it(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN, telemetry=10.0)
         vehicle.tick(5.0)
@@ -225,25 +251,57 @@ class TestSwitchingOn:
         assert len(falls) == 1
         assert clock[falls[0]] == pytest.approx(100, abs=1)
 
-    def test_the_clock_has_32_bits(self, kind: Callable[..., Vehicle]) -> None:
-        station = Station(kind(table=TEN, telemetry=1.0))
+    def test_it_has_32_bits(self) -> None:
+        station = Station(GenericVehicle(table=TEN, telemetry=1.0))
         station.now = 2.0**32 / 1000 + 5.0
         (time,) = station.wait(0.0).heard(wire.SystemTime)[1:]
         assert time.time_boot_ms == 5000
 
-    def test_the_heartbeat_says_that_it_boots(self, kind: Callable[..., Vehicle]) -> None:
-        vehicle = kind(table=TEN, boot_time=2.5)
-        station = Station(vehicle).wait(4.5)
-        beats = station.heard(wire.Heartbeat)
-        ready = beats[-1].system_status
-        assert ready in (3, 4)
-        assert [beat.system_status for beat in beats] == [1, 1, 1, ready, ready]
-        vehicle.reboot(station.now)
-        assert station.wait(0.5).heard(wire.Heartbeat)[0].system_status == 1
+    @pytest.mark.parametrize(("kind", "asked"), [("copter", [True]), ("plane", []), ("rover", [])])
+    def test_ardupilot_tells_it_when_its_main_loop_runs(self, kind: str, asked: list[bool]) -> None:
+        """A Copter on request alone; what is requested earlier is acknowledged, and sent then."""
+        vehicle = ArduPilotVehicle(table=TEN, kind=kind)
+        station = Station(vehicle).wait(5.5)
+        unasked = [time.time_boot_ms for time in station.heard(wire.SystemTime)]
+        assert unasked == ([] if asked else [2000, 3000, 4000, 5000])
+        vehicle.reboot(station.now, down=1.0)
+        station.wait(1.2)
+        station.log.clear()
+        station.send(CLOCK_REQUEST).wait(1.1)
+        assert [message.result for message in station.heard(wire.CommandAck)] == [wire.MAV_RESULT_ACCEPTED]
+        assert [time.time_boot_ms for time in station.wait(0.2).heard(wire.SystemTime)] == [1400]
+        station.send(CLOCK_REQUEST).wait(0.001)
+        assert [time.time_boot_ms for time in station.heard(wire.SystemTime)] == [1500]
 
-    def test_without_a_boot_time_it_is_ready_at_once(self, kind: Callable[..., Vehicle]) -> None:
-        beats = Station(kind(table=TEN)).heard(wire.Heartbeat)
-        assert beats[0].system_status != wire.MAV_STATE_BOOT
+    def test_px4_tells_it_with_its_telemetry(self) -> None:
+        vehicle = PX4Vehicle(table=TEN)
+        vehicle.tick(10.0)
+        vehicle.receive(wire.encode(CLOCK_REQUEST, system=255, component=190, sequence=0), 10.1)
+        for second in (11.0, 12.0, 12.5):
+            vehicle.tick(second)
+        frames = [frame for data in vehicle.data_to_send() for frame in wire.Framer().receive(data)]
+        clocks = [int.from_bytes(frame.payload[:4], "little") for frame in frames if frame.message_id == 30]
+        assert clocks == [300, 1300, 2300]
+        assert wire.SYSTEM_TIME_ID not in {frame.message_id for frame in frames}
+
+    @pytest.mark.parametrize(
+        ("make", "first", "then"),
+        [
+            (PX4Vehicle, 0, 3),
+            (ArduPilotVehicle, 4, 3),
+            (partial(ArduPilotVehicle, kind="plane"), 2, 3),
+            (partial(ArduPilotVehicle, kind="rover"), 2, 4),
+        ],
+    )
+    def test_the_state_after_a_restart(self, make: Callable[..., Vehicle], first: int, then: int) -> None:
+        vehicle = make(table=TEN)
+        station = Station(vehicle).wait(3.5)
+        assert {beat.system_status for beat in station.heard(wire.Heartbeat)} == {then}
+        vehicle.reboot(station.now)
+        states = [beat.system_status for beat in station.wait(5.0).heard(wire.Heartbeat)]
+        assert states[0] == first
+        assert states[-1] == then
+        assert states == sorted(states, key=[first, then].index)
 
 
 def test_after_a_reboot_in_mid_stream_px4_counts_anew() -> None:

@@ -86,9 +86,7 @@ def test_it_acknowledges_goes_off_and_comes_back(make: Any, delay: float) -> Non
     desk.run(30.0)
     on_at = 10.25 + delay + 5.0
     assert desk.silence(10.25 + delay, on_at)
-    [started_at] = [
-        when for when, _, each in desk.heard if isinstance(each, wire.SystemTime) and each.time_boot_ms == 0
-    ]
+    started_at = [when for when, frame, _ in desk.heard if frame.sequence == 0][-1]
     assert started_at == pytest.approx(on_at)
     assert desk.vehicle._version == version
     assert [each for _, each, _ in desk.heard if each.sequence == 0][-1].message_id == 0
@@ -234,8 +232,8 @@ def test_px4_no_longer_uses_from_its_second_start_on_what_it_has_stored() -> Non
 
 
 @pytest.mark.parametrize("by_file", [True, False])
-def test_ardupilot_takes_its_system_id_within_a_second(by_file: bool) -> None:
-    desk = Desk(ArduPilotVehicle())
+def test_plane_and_rover_take_their_system_id_within_a_second(by_file: bool) -> None:
+    desk = Desk(ArduPilotVehicle(kind="plane"))
     desk.run(10.25)
     if by_file:
         desk.vehicle._apply_packed([PackedParam("SYSID_THISMAV", ParamType.INT16, 9)])
@@ -249,6 +247,16 @@ def test_ardupilot_takes_its_system_id_within_a_second(by_file: bool) -> None:
     assert desk.vehicle._version.uid2 == ArduPilotVehicle()._version.uid2
     desk.command()
     desk.run(20.0)
+    assert desk.vehicle.system == 9
+
+
+def test_copter_takes_its_system_id_with_the_next_start() -> None:
+    desk = Desk(ArduPilotVehicle())
+    desk.set("SYSID_THISMAV", 9, ParamType.INT16, Encoding.C_CAST)
+    desk.run(5.0)
+    assert desk.vehicle.system == 1
+    desk.command()
+    desk.run(10.0)
     assert desk.vehicle.system == 9
 
 
@@ -282,6 +290,8 @@ def test_a_late_call_does_not_change_when_it_is_back() -> None:
 
 
 def test_arguments_that_cannot_be() -> None:
+    with pytest.raises(UsageError, match="copter, plane, rover"):
+        ArduPilotVehicle(kind="blimp")
     with pytest.raises(UsageError, match="reboot_down"):
         generic(reboot_down=-1.0)
     with pytest.raises(UsageError, match="A_ENABLE"):

@@ -400,6 +400,7 @@ class ComponentMachine(Parts):
                 now=now,
             )
         self._read_clock(now)
+        self.start_values.stop()
         self.restart.waiters += 1
         return self.restart
 

@@ -100,6 +100,7 @@ class Restart(Operation[None]):
         self._started_before: float | None = None
         self._accepted_at: float | None = None
         self._heard_again_at: float | None = None  # after a silence of which it is open what it was
+        self._numbering_began_at = -math.inf  # where that proves nothing
         self._back_at: float | None = None
         self._ask_at = -math.inf
 
@@ -134,9 +135,12 @@ class Restart(Operation[None]):
         its clock meanwhile. ArduPilot sends its clock only 1.4 s after its first heartbeat.
         """
         accepted_at = self._accepted_at
-        if self.done or accepted_at is None or self._back_at is not None:
+        if self.done or self._back_at is not None:
             return False
-        if now < accepted_at + DOWN_DELAY or now < self._presence.clock_at + CLOCK_SILENCE:
+        self._numbering_began_at = now
+        if accepted_at is None or now < accepted_at + DOWN_DELAY:
+            return False
+        if now < self._presence.clock_at + CLOCK_SILENCE:
             return False
         self._restarted(now)
         return True
@@ -190,6 +194,8 @@ class Restart(Operation[None]):
             return (math.inf if presence.is_lost else due), self._restarted
         if presence.beat_at >= command.sent_at + STILL_THERE:
             due = max(presence.beat_at + GRACE, command.sent_at + self._round_trip.timeout)
+            if self._numbering_began_at >= max(command.sent_at, presence.clock_at):
+                due = max(due, self._numbering_began_at + CLOCK_PATIENCE)  # it may have obeyed
             return due, self._repeat
         return math.inf, self._repeat
 

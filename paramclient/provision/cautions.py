@@ -35,6 +35,7 @@ class Caution:
         autopilot: "px4" or "ardupilot".
         unless: other parameters with values; the entry does not count while one of them has its value.
         elsewhere: by glob, where those belong that the tables of the simulated vehicles do not have.
+        vehicle_types: the MAV_TYPEs for which it holds; empty for all.
     """
 
     names: tuple[str, ...]
@@ -43,6 +44,7 @@ class Caution:
     autopilot: str
     unless: Mapping[str, int]
     elsewhere: Mapping[str, str]
+    vehicle_types: tuple[int, ...] = ()
 
 
 class Cautions:
@@ -91,9 +93,17 @@ class Cautions:
     def is_system_id(self, name: str) -> bool:
         return self._first("system_id", name) is not None
 
-    def needs_reboot(self, name: str) -> bool:
-        """Whether it is known to count from the next start on; metadata may know better."""
-        return self._first("reboot", name) is not None
+    def needs_reboot(self, name: str, vehicle_type: int | None = None) -> bool:
+        """Whether it is known to take effect after a reboot; metadata may know better.
+
+        Args:
+            name: of the parameter.
+            vehicle_type: MAV_TYPE of the vehicle; None where it is not known.
+        """
+        return any(
+            pattern.match(name) and (not caution.vehicle_types or vehicle_type in caution.vehicle_types)
+            for pattern, caution in self._patterns["reboot"]
+        )
 
     def _first(self, section: str, name: str) -> Caution | None:
         for pattern, caution in self._patterns[section]:
@@ -146,6 +156,7 @@ def cautions_for(autopilot: str) -> Cautions:
                 autopilot=entry["autopilot"],
                 unless=entry.get("unless", {}),
                 elsewhere=entry.get("elsewhere", {}),
+                vehicle_types=tuple(entry.get("vehicle_types", ())),
             )
             for entry in entries
             if not known or entry["autopilot"] == autopilot

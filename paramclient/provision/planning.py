@@ -288,7 +288,15 @@ def plan(
         encoding = Encoding.C_CAST if autopilot == "ardupilot" else Encoding.BYTEWISE
     cautions = cautions_for(autopilot or "")
     planner = _Planner(
-        current, wanted, cautions, Choice(given), info or {}, encoding, autopilot or "", force=force
+        current,
+        wanted,
+        cautions,
+        Choice(given),
+        info or {},
+        encoding,
+        autopilot or "",
+        vehicle_type=None if identity is None else identity.vehicle_type,
+        force=force,
     )
     rows = {name: planner.row(each) for name, each in wanted.items()}
     stages = planner.stages(rows)
@@ -355,10 +363,12 @@ class _Planner:
         encoding: Encoding,
         autopilot: str,
         *,
+        vehicle_type: int | None,
         force: bool,
     ) -> None:
         self._current = current
         self._wanted = wanted
+        self._vehicle_type = vehicle_type
         self._cautions = cautions
         self._choice = choice
         self._info = info
@@ -494,7 +504,9 @@ class _Planner:
 
     def _needs_reboot(self, name: str) -> bool:
         info = self._info.get(name)
-        return (info is not None and info.reboot_required) or self._cautions.needs_reboot(name)
+        if info is not None and info.reboot_required:
+            return True
+        return self._cautions.needs_reboot(name, self._vehicle_type)
 
 
 def _taken(steps: list[Step], fits: Callable[[Step], bool]) -> list[Step]:

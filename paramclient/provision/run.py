@@ -63,6 +63,11 @@ HEARTBEAT_PATIENCE: Final = 3.0
 FOLLOW_PATIENCE: Final = 10.0
 """Seconds for a vehicle to be heard under its new system id; ArduPilot sends its next heartbeat under it."""
 
+ID_CHANGE_TIME: Final = 2.5
+"""Seconds after the acknowledgement of SYSID_THISMAV: a vehicle whose heartbeats have the old id then takes
+the new one with the next start, as ArduCopter does. ArduPlane and Rover take it within a second (measured
+with 4.6-dev)."""
+
 
 class Run:
     """One `apply`.
@@ -350,7 +355,7 @@ class Run:
             reason = f"another one on this link is system {system}"
             self._settle(step, ApplyStatus.SKIPPED, step.before, reason, WRONG)
             return
-        if step.needs_reboot:
+        if self._cautions.needs_reboot(step.name):
             await self._write(step)
             if step.name in self.written:
                 self._new_system = system
@@ -358,14 +363,25 @@ class Run:
         self._is_proven = False
         self.sent.add(step.name)
         failure: ParamClientError | None = None
+        keeps_id = False
+
+        async def stop_if_it_keeps_its_id() -> None:
+            nonlocal keeps_id
+            await self._set_and_see_it_keep_its_id(step)
+            keeps_id = True
+            sending.cancel_scope.cancel()
+
         async with anyio.create_task_group() as sending:
-            sending.start_soon(self._send_and_leave, step)
+            sending.start_soon(stop_if_it_keeps_its_id)
             try:
                 self._component = await client.successor(self._component, system, timeout=FOLLOW_PATIENCE)
             except ParamClientError as error:  # raised in here, it would come out in a group
                 failure = error
             sending.cancel_scope.cancel()
         self._written_at = anyio.current_time()
+        step = replace(step, needs_reboot=keeps_id)
+        if keeps_id:
+            self._new_system = system
         if failure is None:
             self._note_written(step)
             self._tell("writing", self._row_of(step, ApplyStatus.SET, step.value))
@@ -380,10 +396,19 @@ class Run:
         is_ours = uid is not None and uid not in SHARED_UIDS and known.identity.uid == uid
         return known.system == system and known.state != "lost" and not is_ours
 
-    async def _send_and_leave(self, step: Step) -> None:
-        """Write what may not be acknowledged: whether it was taken shows where the vehicle is heard then."""
+    async def _set_and_see_it_keep_its_id(self, step: Step) -> None:
+        """Set the system id, and return when the vehicle has acknowledged that and still has the old one.
+
+        ArduPlane and Rover may take the new one before they have answered. This then never returns.
+        """
+        component = self._component
         with suppress(ParamClientError):
-            await self._component.set(step.name, step.value, asker=self._asker)
+            await component.set(step.name, step.value, asker=self._asker)
+            acknowledged_at = anyio.current_time()
+            while component._machine.presence.beat_at < acknowledged_at + ID_CHANGE_TIME:  # noqa: ASYNC110 - nobody tells
+                await anyio.sleep(LOOKING_PACE)
+            return
+        await anyio.sleep_forever()
 
     async def _restart(self) -> None:
         """Start the vehicle again, and go on with it; under its new system id if it has been given one."""

@@ -49,13 +49,19 @@ class ArduPilotVehicle(Vehicle):
       Hidden parameters can be read and set by name.
     - MAVFTP serves `@PARAM/param.pck` and `files`: one session, 5 requests waiting, bursts paced to a third
       of the link (see `FileServer`). A param.pck that is written sets parameters, and nothing tells of it.
-    - SYSID_THISMAV takes effect with the next full second, and nothing is said of it.
-    - Told to start again it acknowledges, and goes off 0.2 s later; armed it answers FAILED.
+    - SYSID_THISMAV takes effect with the next full second, of a Copter with the next start; nothing is said
+      of it.
+    - Told to start again it acknowledges, and goes off 0.2 s later; armed it answers FAILED. After it the
+      heartbeat has another MAV_STATE for a while: a Copter says ACTIVE for 2 s, the others CALIBRATING.
+    - SYSTEM_TIME is sent once a second by Plane and Rover, as streams to a station are set there; by a Copter
+      on request alone. It is not sent before the main loop runs, 1.4 s after the first heartbeat; what is
+      requested before that is acknowledged, and sent then.
     - Some values change by themselves and are sent unasked, index 65535.
 
     Args:
         table: its parameters (see `Table`), in the order of their indices; None for those of a real quad,
             `ardupilot_table()`. SYSID_THISMAV, where it is among them, says `system`.
+        kind: "copter", "plane" or "rover".
         system, component: its own ids, 1 to 255.
         uid2: the hardware id that it reports, up to 18 bytes; by default its own for every system.
         groups: by the name of a switch in the table, the parameters that follow it while it is not 0.
@@ -77,6 +83,7 @@ class ArduPilotVehicle(Vehicle):
     """
 
     _restart_delay = 0.2
+    _clock_delay = 1.4
     _armed_result = wire.MAV_RESULT_FAILED
     _read_at: float
     _answer_at: float
@@ -84,6 +91,7 @@ class ArduPilotVehicle(Vehicle):
     def __init__(
         self,
         *,
+        kind: str = "copter",
         system: int = 1,
         component: int = 1,
         uid2: bytes | None = None,
@@ -99,6 +107,10 @@ class ArduPilotVehicle(Vehicle):
         ftp_rate: float = 48_500.0,
         **options: Unpack[VehicleOptions],
     ) -> None:
+        if kind not in _KINDS:
+            raise UsageError(f"kind is one of {', '.join(_KINDS)}, not {kind!r}")
+        self._is_copter = kind == "copter"
+        vehicle_type, state, self._start_state = _KINDS[kind]
         if groups is None:
             groups = {"EK2_ENABLE": ek2_group()} if table is None else {}
         rows = with_system_id(ardupilot_table() if table is None else as_table(table), _SYSTEM_ID, system)
@@ -137,7 +149,7 @@ class ArduPilotVehicle(Vehicle):
             component=component,
             encoding=Encoding.C_CAST,
             heartbeat=wire.Heartbeat(
-                _QUADROTOR, wire.MAV_AUTOPILOT_ARDUPILOTMEGA, base_mode=81, system_status=_STANDBY
+                vehicle_type, wire.MAV_AUTOPILOT_ARDUPILOTMEGA, base_mode=81, system_status=state
             ),
             version=wire.AutopilotVersion(
                 64495 if ftp else 64495 & ~wire.CAPABILITY_FTP,
@@ -233,8 +245,12 @@ class ArduPilotVehicle(Vehicle):
         entry.store(bits)
         if entry.name in self._switches:
             self._relist()
-        if entry.name == _SYSTEM_ID:
+        if entry.name == _SYSTEM_ID and not self._is_copter:
             self._system_id_at = self._next(1.0)
+
+    def _send_clock(self, now: float) -> None:
+        if not self._is_copter and now >= self._on_at + self._clock_delay:
+            self._send_system_time(now)
 
     def _end_all(self) -> None:
         super()._end_all()
@@ -409,8 +425,14 @@ class ArduPilotVehicle(Vehicle):
 
 _INTERNAL = re.compile(r"MIS_TOTAL|BARO\d_(GND_PRESS|DEVID)|ARSPD\d?_DEVID|MNT\d_DEVID")
 _SYSTEM_ID = "SYSID_THISMAV"
-_QUADROTOR = 2
 _STANDBY = 3
+_CALIBRATING = 2
+_KINDS: dict[str, tuple[int, int, tuple[int, float]]] = {
+    "copter": (2, _STANDBY, (wire.MAV_STATE_ACTIVE, 2.0)),
+    "plane": (1, _STANDBY, (_CALIBRATING, 0.7)),
+    "rover": (10, wire.MAV_STATE_ACTIVE, (_CALIBRATING, 1.3)),
+}
+"""MAV_TYPE, MAV_STATE while disarmed, MAV_STATE after a start and the seconds for which it is sent."""
 _UID2 = b"3d1219c7c4c5404aa\0"
 _BANNER = ("ArduCopter V4.6.0-dev (fbb78585)", "3d1219c7c4c5404aaa1f6d2a48adfda4", "Frame: QUAD/PLUS")
 _INFO = 6

@@ -27,6 +27,8 @@ class Device(ABC):
     _ack_first = True  # whether COMMAND_ACK comes before what the command asked for
     _restart_delay = 0.3  # seconds from accepting to start again until it is off
     _armed_result = wire.MAV_RESULT_DENIED  # what becomes of a restart while it is armed
+    _clock_delay = 0.0  # seconds from the first heartbeat until SYSTEM_TIME is sent, also where requested
+    _start_state: tuple[int, float] | None = None  # MAV_STATE after a start that follows on another, seconds
     _next_telemetry: float
 
     def __init__(
@@ -78,6 +80,7 @@ class Device(ABC):
         self._sequence = 0
         self._out: list[bytes] = []
         self._started = False
+        self._is_first_run = True
         self._now = -math.inf
         self._switch_on(math.inf)
         self._take_key(signing_key, signing_timestamp)
@@ -117,6 +120,7 @@ class Device(ABC):
         if now is None:
             now = self._now
         self._started = True
+        self._is_first_run = False
         self._end_all()
         self._switch_on(now + down)
         self.tick(now)
@@ -147,7 +151,7 @@ class Device(ABC):
         """When `tick` is wanted next; None before the first call and when switched off for good."""
         if self._now < self._on_at:
             return None if self._on_at == math.inf else self._on_at
-        due = [self._next_heartbeat, self._restart_at, *self._timers()]
+        due = [self._next_heartbeat, self._restart_at, self._clock_due, *self._timers()]
         return min(due) if self._high_latency else min(self._next_transmission(), *due)
 
     def data_to_send(self) -> list[bytes]:
@@ -192,12 +196,16 @@ class Device(ABC):
         self._on_at = at
         self._sequence = 0
         self._restart_at = math.inf
+        self._clock_due = math.inf
         self._next_heartbeat = at
         self._next_telemetry = at + self._telemetry_period
         self._forget_streams()
 
     def _work(self, now: float) -> None:
         """Do what is due, each thing at its own pace; of what repeats for ever, a late call skips some."""
+        if self._clock_due <= now:
+            self._clock_due = math.inf
+            self._send_system_time(now)
         if self._next_heartbeat <= now:
             pause = _HIGH_LATENCY_PAUSE if self._high_latency else 1.0
             self._send_signs_of_life(now)
@@ -247,6 +255,13 @@ class Device(ABC):
             self._send(wire.HighLatency2(self._heartbeat.type, self._heartbeat.autopilot))
             return
         self._send(self._beat)
+        self._send_clock(now)
+
+    def _send_clock(self, now: float) -> None:
+        """Send what tells the time since boot once a second."""
+        self._send_system_time(now)
+
+    def _send_system_time(self, now: float) -> None:
         self._send(wire.SystemTime(0, self._time_boot_ms(now)))
 
     def _time_boot_ms(self, now: float) -> int:
@@ -257,6 +272,10 @@ class Device(ABC):
     def _beat(self) -> wire.Heartbeat:
         """The heartbeat as it is sent now."""
         beat = self._heartbeat
+        if self._start_state is not None and not self._is_first_run:
+            state, seconds = self._start_state
+            if self._now < self._on_at + seconds:
+                beat = replace(beat, system_status=state)
         if self._now < self._on_at + self._boot_time:
             beat = replace(beat, system_status=wire.MAV_STATE_BOOT)
         if self.armed:
@@ -323,11 +342,20 @@ class Device(ABC):
                 wire.HEARTBEAT_ID: self._beat,
             }
             wanted = known.get(request.params[0])  # a float, and perhaps no number
+            if request.params[0] == wire.SYSTEM_TIME_ID:
+                self._on_clock_request(sender)
+                return
         result = wire.MAV_RESULT_UNSUPPORTED if wanted is None else wire.MAV_RESULT_ACCEPTED
         ack = wire.CommandAck(request.command, result, sender.system, sender.component)
         answers: list[wire.Message] = [ack] if wanted is None else [ack, wanted]
         for answer in answers if self._ack_first else reversed(answers):
             self._send(answer)
+
+    def _on_clock_request(self, sender: wire.Frame) -> None:
+        """SYSTEM_TIME is requested: acknowledge that, and send it as soon as the main loop runs."""
+        number, result = wire.MAV_CMD_REQUEST_MESSAGE, wire.MAV_RESULT_ACCEPTED
+        self._send(wire.CommandAck(number, result, sender.system, sender.component))
+        self._clock_due = max(self._now, self._on_at + self._clock_delay)
 
     def _on_restart_command(self, mode: int, sender: wire.Frame) -> None:
         result = self._may_restart(mode)

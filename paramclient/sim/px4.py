@@ -18,6 +18,8 @@ from paramclient.values import Encoding, ParamType, bits_of, crc32_px4, from_bit
 
 __all__ = ["PX4Vehicle"]
 
+_UNINIT: Final = 0  # MAV_STATE
+
 UPPER_LIMITS: Final[tuple[tuple[str, str | float], ...]] = (
     ("MPC_TILTMAX_AIR", 89.0),
     ("MPC_TILTMAX_LND", "MPC_TILTMAX_AIR"),
@@ -63,6 +65,8 @@ class PX4Vehicle(BytewiseVehicle):
       of the parameters.
     - MAVFTP serves `files` and, if `ftp` is on as in the newest ones, `@PARAM/param.pck` (see `FileServer`).
     - It answers to its own system only, and to component 0.
+    - Its time since boot comes with ATTITUDE, once a second and with `telemetry`. SYSTEM_TIME is not sent
+      before its clock is set, which it never is. After a restart MAV_STATE is UNINIT for 3 s.
     - Told to start again it acknowledges, and goes off 0.4 s later; armed it denies that. With the start,
       MAV_SYS_ID takes effect, and SYS_AUTOCONFIG above 0 has brought what it resets (see `RESET_KEEPS`) to
       the values of the table, MAV_SYS_ID to 1. Values that it has not saved are not lost, as they may be with
@@ -98,6 +102,7 @@ class PX4Vehicle(BytewiseVehicle):
 
     _ack_first = False
     _restart_delay = 0.4
+    _start_state = (_UNINIT, 3.0)
     _push_at: float
     _save_at: float
     _clamp_at: float
@@ -192,6 +197,15 @@ class PX4Vehicle(BytewiseVehicle):
         """
         self._unused.difference_update([self._entry(name).name for name in names])
         self._relist()
+
+    def _send_clock(self, now: float) -> None:
+        self._send_attitude(now)
+
+    def _send_system_time(self, now: float) -> None:
+        pass
+
+    def _time_boot_ms(self, now: float) -> int:
+        return super()._time_boot_ms(now + _CLOCK_LEAD)
 
     def _answers_system(self, target: int) -> bool:
         return target == self.system
@@ -364,6 +378,7 @@ _QUADROTOR = 2
 _RELEASE = 17891392  # 1.17.0
 _MAIN = 0x01120000  # 1.18
 _STANDBY = 3
+_CLOCK_LEAD = 0.3  # seconds for which the clock has run when the first message comes
 _UID = 5283920058631409231
 _PUSH_DELAY = 0.010
 _TURN = 0.0002  # seconds in which what has been received is looked at

@@ -13,7 +13,7 @@ from typing import Final
 
 import anyio
 
-from paramclient import Component, FetchResult, Ftp, ParamCache, ParamClient
+from paramclient import Component, FetchResult, Ftp, ParamCache, ParamClient, Rebooted
 from paramclient.errors import (
     FileTransferError,
     NoReply,
@@ -23,9 +23,11 @@ from paramclient.errors import (
     UsageError,
     ValueNotApplied,
 )
+from paramclient.events import Events
 from paramclient.logs import import_log
 from paramclient.metadata import ParamInfo
 from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.protocol.restart import SAVING_TIME
 from paramclient.protocol.small_change import CHANGE_MIN
 from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, message_name
 from paramclient.provision import MISSING, ApplyStatus, apply, restore, verify
@@ -69,6 +71,9 @@ LOSSY_FETCH: Final[Mapping[tuple[str, float], float]] = {
 """Seconds that a fetch takes at most with a round trip of 100 ms, by autopilot and share lost."""
 LOSSY_LIST: Final[Mapping[float, float]] = {0.05: 3.5, 0.20: 6.0}
 """The same by list, of ArduPilot."""
+
+NOTICING_TIME: Final = 6.0
+"""Seconds after a restart in which it shows, and in which it could show a second time."""
 
 spawn = multiprocessing.get_context("spawn")
 
@@ -183,7 +188,18 @@ def checks(*, reboots: bool) -> Iterator[Check]:
     )
     yield from lossy_checks()
     if reboots:
-        yield Check("reboot", reboot, "the same vehicle is back, with the value that was set", writes=True)
+        yield Check(
+            "reboot",
+            reboot,
+            "the same vehicle is back, with the value that was set; noticed once",
+            writes=True,
+        )
+        yield Check(
+            "reboot by another session",
+            reboot_by_another,
+            "noticed once, and the table is right afterwards",
+            writes=True,
+        )
         yield Check(
             "apply with a restart", apply_restarting, "the value that the vehicle has after it", writes=True
         )
@@ -733,13 +749,18 @@ async def reboot(session: Session) -> Measured:
     async with session.client() as vehicle:
         value = another_value(await vehicle.get(name))
         await session.journal.set(vehicle, name, value)
+        await anyio.sleep(SAVING_TIME)
+        events = vehicle._client.events()
         began = time.monotonic()
         vehicle = await vehicle.reboot()
         seconds = time.monotonic() - began
         held = await vehicle.get(name)
+        noticed = await count_reboots(events)
         await put_back(session, vehicle)
     if held.value != value:
         raise CheckFailed(f"{name} was set to {value} before the restart, and is {held.value!r}")
+    if noticed != 1:
+        raise CheckFailed(f"one restart was noticed {noticed} times")
     return Measured(f"back after {seconds:.1f} s, {name} is {value}")
 
 
@@ -760,3 +781,27 @@ async def apply_restarting(session: Session) -> Measured:
     if not done.complete or done.reboots != 1 or row.actual != held.value:
         raise CheckFailed(f"{done}: {row}, and the vehicle holds {held.value!r}")
     return Measured(f"{row} after {done.elapsed:.1f} s")
+
+
+async def reboot_by_another(session: Session) -> Measured:
+    async with session.client() as watching, second_client(session) as other:
+        await watching.fetch_all()
+        await check_disarmed(watching)
+        events = watching._client.events()
+        began = time.monotonic()
+        await other.reboot()
+        back = time.monotonic() - began
+        noticed = await count_reboots(events)
+        result = await fetch(session, watching)
+    if noticed != 1:
+        raise CheckFailed(f"one restart was noticed {noticed} times")
+    return Measured(f"noticed; back after {back:.1f} s; {result.text}")
+
+
+async def count_reboots(events: Events) -> int:
+    """Return how often a restart is noticed until 6 s after now: ArduPilot tells its clock late."""
+    count = 0
+    with anyio.move_on_after(NOTICING_TIME):
+        async for event in events:
+            count += isinstance(event, Rebooted)
+    return count
