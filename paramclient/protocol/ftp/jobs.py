@@ -85,9 +85,12 @@ class Line:
     def send(self, packet: Packet) -> None:
         self._send(FileTransfer(0, *self.target, packet.pack()))
 
-    def reset_sessions(self, session: int) -> None:
-        """Ask for all our sessions to be closed, and do not wait for it; twice, as one may get lost."""
-        packet = Packet(self.next_sequence(), session, Opcode.RESET_SESSIONS)
+    def close_session(self, session: int) -> None:
+        """Request the closing of one session, and do not wait for it; twice, as one may get lost.
+
+        A reset of all sessions would close those of other stations too (measured with PX4).
+        """
+        packet = Packet(self.next_sequence(), session, Opcode.TERMINATE_SESSION)
         self.send(packet)
         self.send(packet)
 
@@ -227,9 +230,7 @@ class Job(Operation[Result]):
         """Ask for the session to be closed, and do not wait for it; twice, as one may get lost."""
         session = self.asked_session if self.session is None else self.session
         if session is not None:
-            packet = Packet(self._line.next_sequence(), session, Opcode.TERMINATE_SESSION)
-            self._line.send(packet)
-            self._line.send(packet)
+            self._line.close_session(session)
 
     def server_heard(self, now: float) -> None:
         """The server has sent something to anybody: a session that is in use lives on."""
@@ -315,7 +316,7 @@ class Job(Operation[Result]):
             elif code == FileErrorCode.FAIL and self._failures < self._failures_allowed:
                 # what is open may be what an open of ours has opened whose answer was lost
                 self._failures += 1
-                self._line.reset_sessions(number)
+                self._line.close_session(number)
                 self.begin(now)
             elif code in BUSY and now - (since := min(self._busy_since, now)) < BUSY_PATIENCE:
                 self._busy_since = since

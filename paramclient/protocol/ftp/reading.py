@@ -52,8 +52,13 @@ MOST_COPIES: Final = 6
 """The chance of no answer to go below by asking again early, and how often that may be done."""
 TAIL_BLOCKS: Final = 4
 TAIL_SHARE: Final = 0.15
-"""What may be left of a file, in blocks and as a share of its size, for reads to be better than a new burst.
-ArduPilot's estimate for param.pck is a tenth too large."""
+"""What may be left of a file, in blocks and as a share of an estimated size, for reads to be better than a new
+burst. ArduPilot's estimate for param.pck is a tenth too large."""
+MADE_AT_READING: Final = b"@"
+"""How the paths begin of what a server makes when it is read, such as param.pck: their size is an estimate."""
+BURST_DELAY: Final = 0.03
+"""Seconds by which the first block of a burst may come later than the answer to a read that was sent behind
+it: PX4 answers reads at once, and begins a burst up to 20 ms later (measured)."""
 LATE_KEPT: Final = 256
 """Reads that count as lost and whose answers are taken all the same, should they still come."""
 MOST_OPENINGS: Final = 3
@@ -81,7 +86,8 @@ class FileRead(Job[bytes]):
     """The content of a file. See `FileTransfers.read`.
 
     Attributes:
-        size: what the server says the file has; an estimate for ArduPilot's param.pck. None at first.
+        size: bytes that the server says the file has; an estimate for what is made at reading, such as
+            ArduPilot's param.pck. None at first.
     """
 
     def __init__(self, line: Line, path: str, now: float, *, read_size: int, limit: int) -> None:
@@ -114,6 +120,7 @@ class FileRead(Job[bytes]):
         self._burst_sent_at = math.inf
         self._opened_at = math.inf
         self._block_at = math.inf  # the last block of the burst that runs
+        self._overtaken_at = math.inf  # the first read behind that burst was answered before any block of it
         self._first_block: tuple[float, int] | None = None
         self._flights: dict[int, _Flight] = {}  # by the number of the request
         self._late: dict[int, _Flight] = {}
@@ -176,7 +183,7 @@ class FileRead(Job[bytes]):
         if self.session is None and self._is_unheard(packet):
             # whether the file is ours nobody can tell any more: close it, and begin anew when the burst ends
             self._restarts += 1
-            self._line.reset_sessions(packet.session)
+            self._line.close_session(packet.session)
             self._start_anew()
             self._begin_early(now)
         if self.is_ended or self.session is None or packet.session != self.session:
@@ -250,7 +257,7 @@ class FileRead(Job[bytes]):
         self._may_burst = False
         self._burst_attempts += 1
         self._burst_sent_at = now
-        self._block_at = math.inf
+        self._block_at = self._overtaken_at = math.inf
         self._first_block = None
         session = self.asked_session if self.session is None else self.session
         self._burst_session = session or 0
@@ -334,17 +341,20 @@ class FileRead(Job[bytes]):
             if self._has_early_burst:
                 return self._opened_at + longer
             backoff = 2.0 ** min(max(self._burst_attempts - 2, 0), MOST_DOUBLINGS)
-            return self._burst_sent_at + (round_trip.timeout + longer) * backoff
+            begins_by = self._burst_sent_at + (round_trip.timeout + longer) * backoff
+            return min(begins_by, self._overtaken_at + BURST_DELAY)
         if self._gap == UNKNOWN_GAP:
             return self._block_at + SLOWEST_GAP
         return self._block_at + max(QUIET_BLOCKS * self._gap, SHORTEST_QUIET)
 
     def _burst_is_silent(self, now: float) -> None:
-        if self._block_at == math.inf:
+        was_heard = self._block_at < math.inf or self._overtaken_at < math.inf
+        if was_heard:
+            self._may_burst = self._may_burst or self._block_at == math.inf
+            self._stop_burst(now)
+        else:
             self._line.round_trip.timed_out(self._burst_attempts)
             self._burst(now)
-        else:
-            self._stop_burst(now)
 
     # Single reads
 
@@ -358,8 +368,8 @@ class FileRead(Job[bytes]):
         if packet.opcode == Opcode.ACK and packet.data:
             is_ahead = flight.offset >= self._blocks.reached
             self._keep(packet, flight.offset, now)
-            if is_ahead and self._burst_runs and self._block_at == math.inf:
-                self._stop_burst(now)
+            if is_ahead and self._burst_runs:
+                self._overtaken_at = min(self._overtaken_at, now)
             self._may_burst = self._may_burst or (is_ahead and not self._burst_runs)
         elif packet.opcode == Opcode.ACK or self._code(packet) == FileErrorCode.EOF:
             self._ends_at(flight.offset)
@@ -424,7 +434,14 @@ class FileRead(Job[bytes]):
             if self.size is not None:
                 left = (self.size - reached) // self._read_size
                 ahead = 1 if self._has_bursts and self._is_worth_a_burst() else max(min(ahead, left + 1), 1)
-            yield from range(reached, reached + ahead * self._read_size, self._read_size)
+            end = reached + ahead * self._read_size
+            yield from range(reached, min(end, self._exact_size), self._read_size)
+
+    @property
+    def _exact_size(self) -> float:
+        """Bytes that the file has; infinity where the server only estimates that, or says 0 of what it makes."""
+        is_estimate = not self.size or self._path_data.startswith(MADE_AT_READING)
+        return math.inf if is_estimate or self.size is None else self.size
 
     def _next_wanted(self) -> int | None:
         """What to read now: what is not asked for yet, else once more what is, if that is worth it."""
@@ -457,9 +474,9 @@ class FileRead(Job[bytes]):
         self._number += 1
         self._flights[sequence] = _Flight(offset, self._number, now, len(self._flights), is_only)
         self._tokens -= 1.0
-        self._line.send(
-            Packet(sequence, self.session or 0, Opcode.READ_FILE, size=self._read_size, offset=offset)
-        )
+        # MAVSDK's server refuses to read beyond the end
+        size = int(min(self._read_size, self._exact_size - offset))
+        self._line.send(Packet(sequence, self.session or 0, Opcode.READ_FILE, size=size, offset=offset))
 
     # Both
 
@@ -504,6 +521,8 @@ class FileRead(Job[bytes]):
         """Ask for what is wanted, as far as the pace allows; end when all is there."""
         if self.is_ended or self.session is None:
             return
+        if self._blocks.end is None and not self._burst_runs and self._blocks.reached >= self._exact_size:
+            self._ends_at(self._blocks.reached)
         if self._blocks.is_complete:
             self.finish(self._blocks.content, now)
             return
@@ -524,4 +543,5 @@ class FileRead(Job[bytes]):
         if self._blocks.end is not None or self.size is None:
             return False
         left = self.size - self._blocks.reached
-        return left > max(TAIL_BLOCKS * self._read_size, TAIL_SHARE * self.size)
+        share = TAIL_SHARE * self.size if self._exact_size == math.inf else 0.0
+        return left > max(TAIL_BLOCKS * self._read_size, share)
