@@ -611,6 +611,60 @@ class TestPX4:
         assert [len(list(group)) for _, group in itertools.groupby(times)] == [20, 20, 10]
         assert names(station.values()) == changed
 
+    def test_a_change_behind_the_place_of_a_running_push_is_told_to_nobody(self) -> None:
+        vehicle = PX4Vehicle(autosave=60.0)
+        changed = [row.name for row in px4_table() if row.type is ParamType.INT32][:50]
+        station = Station(vehicle)
+        for name in changed[5:]:
+            vehicle.set_param(name, 77)
+        station.wait(0.03)
+        assert names(station.values()) == changed[5:25]
+        vehicle.set_param(changed[0], 78)
+        vehicle.set_param(changed[49], 78)
+        station.wait(1.0)
+        assert names(station.values()) == changed[25:]
+        vehicle.set_param(changed[20], 79)
+        station.wait(1.0)
+        assert names(station.values()) == [changed[0], *changed[5:]], "with the next change it is"
+
+    def test_what_is_saved_is_not_pushed(self) -> None:
+        """Saved 0.3 s after a change, and 2 s after the last time."""
+        vehicle = PX4Vehicle()
+        changed = [row.name for row in px4_table() if row.type is ParamType.INT32][:400]
+        station = Station(vehicle)
+        for name in changed:
+            vehicle.set_param(name, 77)
+        station.wait(0.4)
+        assert names(station.values()) == changed[:300]
+        vehicle.set_param(changed[0], 78)
+        station.wait(1.0)
+        vehicle.set_param(changed[1], 78)
+        station.wait(0.5)
+        assert names(station.values()) == [changed[0], changed[0], changed[1]]
+        station.wait(1.0)
+        vehicle.set_param(changed[2], 78)
+        station.wait(0.5)
+        assert names(station.values()) == [changed[2]]
+
+    def test_what_is_loaded_or_reset_is_told_to_nobody(self) -> None:
+        vehicle = PX4Vehicle(table=SMALL)
+        station = Station(vehicle)
+        before, bits = vehicle.announced_hash(), {name: each.bits for name, each in vehicle.params.items()}
+        vehicle.load({"B_INT": 8})
+        station.wait(1.0)
+        assert station.values() == []
+        assert vehicle.values["B_INT"] == 8
+        assert vehicle.announced_hash() != before
+        station.ask(write("B_INT", 9, ParamType.INT32))
+        command = wire.CommandLong(1, 1, wire.MAV_CMD_PREFLIGHT_STORAGE, (2.0, *[0.0] * 6))
+        station.send(command).wait(1.0)
+        assert station.times() == []
+        assert [each.result for each in station.heard(wire.CommandAck)] == [wire.MAV_RESULT_ACCEPTED]
+        assert {name: each.bits for name, each in vehicle.params.items()} == bits
+        assert vehicle.announced_hash() == before
+        with pytest.raises(UsageError):
+            vehicle.load({"NO_SUCH": 1})
+
     def test_a_change_on_board_is_pushed(self) -> None:
         vehicle = PX4Vehicle()
         station = Station(vehicle)

@@ -14,7 +14,7 @@ from paramclient.sim.generic import BytewiseVehicle
 from paramclient.sim.metadata import GENERAL_FILE, metadata_files
 from paramclient.sim.table import FLT_EPSILON, Entry, SimParam, Table, as_table, px4_table, with_system_id
 from paramclient.sim.vehicle import VehicleOptions
-from paramclient.values import Encoding, ParamType, bits_of, crc32_px4, from_bits, px4_hash
+from paramclient.values import Encoding, ParamType, Value, bits_of, crc32_px4, from_bits, px4_hash
 
 __all__ = ["PX4Vehicle"]
 
@@ -51,7 +51,12 @@ class PX4Vehicle(BytewiseVehicle):
     - A read of `_HASH_CHECK` gives the hash alone; a set of it, to any value, stops the list.
     - A set with exactly the right type is acknowledged at once, whatever the value. If it changed the
       value, 10 ms later that value is sent again, and with it every other one that is not yet saved; both
-      wait for the end of a list.
+      wait for the end of a list. These are sent in the order of the list, 20 every 20 ms. A change meanwhile
+      begins no second round: where its place is behind, nothing is sent of it. Once saved, 0.3 s after a
+      change and 2 s after the last time, no value is sent any more. So of many changes in a short time some
+      are told to nobody.
+    - What `load` changes, and MAV_CMD_PREFLIGHT_STORAGE with 2, which brings all values of the table back, is
+      told to nobody at all.
     - Its position controller looks at its own parameters 0.4 s after one of them has changed, and sets those
       to their limit that are beyond it (see `UPPER_LIMITS`); a real one takes 10 ms to 1.1 s. These changes
       are sent as any other.
@@ -86,7 +91,8 @@ class PX4Vehicle(BytewiseVehicle):
             they are not in use. None: with the table of the real quad, CAL_MAG2_ID brings 16 more of
             CAL_MAG2_*; with another table, nothing.
         unsaved: names that the firmware itself has changed while it booted and not saved.
-        autosave: seconds from a change until all that was unsaved is saved.
+        autosave: seconds from a change until all that was unsaved is saved, if it was not saved in the
+            last 2 s. With 0 nothing is ever unsaved for long enough to be sent.
         clamp_delay: seconds from a change until the position controller sets values to their limits; None for
             never.
         burst, period: by default UDP and USB. A serial port has a burst of 3, the low-bandwidth mode 1
@@ -104,6 +110,7 @@ class PX4Vehicle(BytewiseVehicle):
     _restart_delay = 0.4
     _start_state = (_UNINIT, 3.0)
     _push_at: float
+    _wake_at: float
     _save_at: float
     _clamp_at: float
 
@@ -198,6 +205,22 @@ class PX4Vehicle(BytewiseVehicle):
         self._unused.difference_update([self._entry(name).name for name in names])
         self._relist()
 
+    def load(self, values: Mapping[str, Value]) -> None:
+        """Change values as `param load`, `param reset` and `param set-default` do: nothing is sent.
+
+        Raises:
+            UsageError: it has no parameter of such a name, or a value does not fit its type.
+        """
+        bits = {name: bits_of(value, self._entry(name).type) for name, value in values.items()}
+        self._load_bits(bits)
+
+    def _load_bits(self, bits: Mapping[str, int]) -> None:
+        for name, each in bits.items():
+            self._entry(name).store(each)
+            self._unsaved.discard(name)
+            self._unkept.pop(name, None)
+        self._hash = None
+
     def _send_clock(self, now: float) -> None:
         self._send_attitude(now)
 
@@ -214,7 +237,7 @@ class PX4Vehicle(BytewiseVehicle):
         return entry.name not in self._unused
 
     def _timers(self) -> tuple[float, ...]:
-        return self._push_at, self._save_at, self._clamp_at
+        return self._push_at, self._wake_at, self._save_at, self._clamp_at
 
     def _on_list(self) -> None:
         is_running = self._position is not None
@@ -223,6 +246,12 @@ class PX4Vehicle(BytewiseVehicle):
         self._start_list(soon if is_running else self._now)
 
     def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
+        if request.command == wire.MAV_CMD_PREFLIGHT_STORAGE and request.params[0] == _RESET_ALL:
+            self._load_bits(self._first_bits)
+            self._send(
+                wire.CommandAck(request.command, wire.MAV_RESULT_ACCEPTED, sender.system, sender.component)
+            )
+            return
         general = self.files.get(GENERAL_FILE) if self._has_metadata else None
         is_message = request.command == wire.MAV_CMD_REQUEST_MESSAGE
         if general is None or not is_message or request.params[0] != wire.COMPONENT_METADATA_ID:
@@ -260,11 +289,16 @@ class PX4Vehicle(BytewiseVehicle):
             self._unkept.setdefault(entry.name, before)
             return
         self._unkept.pop(entry.name, None)
-        self._waking |= self._late_use.get(entry.name, frozenset())
+        if late := self._late_use.get(entry.name):
+            self._waking |= late
+            self._wake_at = min(self._wake_at, self._now + _PUSH_DELAY)
         if entry.name in _LIMITED and self._clamp_delay is not None:
             self._clamp_at = min(self._clamp_at, self._now + self._clamp_delay)
-        self._push_at = min(self._push_at, self._now + _PUSH_DELAY)
-        self._save_at = min(self._save_at, self._now + self._autosave)
+        if self._push_at == math.inf and self._push_from is None:
+            self._push_at = self._now + _PUSH_DELAY
+        if self._save_at == math.inf:
+            earliest = self._saved_at + _SAVE_INTERVAL if self._autosave else -math.inf
+            self._save_at = max(self._now + self._autosave, earliest)
 
     def _relist(self) -> None:
         super()._relist()
@@ -303,7 +337,8 @@ class PX4Vehicle(BytewiseVehicle):
         self._hash_next = False
         self._push_from: int | None = None
         self._push_at = math.inf
-        self._save_at = self._clamp_at = math.inf
+        self._wake_at = self._save_at = self._clamp_at = math.inf
+        self._saved_at = -math.inf
         super()._switch_on(at)
 
     def _clamp(self) -> None:
@@ -322,15 +357,18 @@ class PX4Vehicle(BytewiseVehicle):
         if self._clamp_at <= now:
             self._clamp_at = math.inf
             self._clamp()
-        if self._push_at <= now:
-            self._push_at = math.inf
+        if self._wake_at <= now:
+            self._wake_at = math.inf
             if self._waking & self._unused:
                 self.use(*self._waking)
+        if self._push_at <= now:
+            self._push_at = math.inf
             self._push_from = 0
             self._next_burst = min(self._next_burst, now)
         super()._work(now)
         if self._save_at <= now:
             self._save_at = math.inf
+            self._saved_at = now
             self._unsaved.clear()
             self._unkept.clear()
 
@@ -382,6 +420,8 @@ _CLOCK_LEAD = 0.3  # seconds for which the clock has run when the first message 
 _UID = 5283920058631409231
 _PUSH_DELAY = 0.010
 _TURN = 0.0002  # seconds in which what has been received is looked at
+_SAVE_INTERVAL = 2.0
+_RESET_ALL = 2.0  # of MAV_CMD_PREFLIGHT_STORAGE
 
 
 def _third_compass(rows: tuple[SimParam, ...]) -> tuple[SimParam, ...]:
