@@ -93,8 +93,9 @@ class ParamClient:
         watch_interval: seconds after which it is looked again whether a table that was fetched still is the
             vehicle's, while the link is idle. An update is sent once, and lost with its frame: so it is found
             within one interval. None: every 30 seconds where the vehicle has a hash, which costs two small
-            messages, or gives its table as a file in at most 1.5 s, and never elsewhere. A number goes for
-            every vehicle, the whole table of those without a hash. 0 for never. See `Component.sync_state`.
+            messages and what the hash leaves out, or gives its table as a file, less often where that takes
+            more than 1.5 s, and never elsewhere. A number goes for every vehicle, the whole table of those
+            without a hash. 0 for never. See `Component.sync_state`.
         policy: what may be asked of vehicles to bring tables up to date, see `Policy`: "auto", "hash-only"
             or "cache-only". Anything but "auto" also ends the watch. Single reads and writes go out all the
             same.

@@ -617,7 +617,7 @@ class TestPX4:
         station = Station(vehicle)
         for name in changed[5:]:
             vehicle.set_param(name, 77)
-        station.wait(0.03)
+        station.wait(0.025)
         assert names(station.values()) == changed[5:25]
         vehicle.set_param(changed[0], 78)
         vehicle.set_param(changed[49], 78)

@@ -13,7 +13,7 @@ from paramclient.params import parts_of
 from paramclient.protocol import events
 from paramclient.protocol.change import Change
 from paramclient.protocol.events import ParamChanged
-from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.fetch import Check, Fetch
 from paramclient.protocol.name_search import NameSearch
 from paramclient.protocol.parts import Parts
 from paramclient.protocol.reads import Key, Read
@@ -208,7 +208,7 @@ class ComponentMachine(Parts):
         if change is not None:
             authors.changed(name, now, is_ours)
             self._note_replaced(change, message, now)
-            self.sync.changed(name, by)
+            self.sync.changed(name, by, now)
             self._tell(change)
         elif name not in table.params:
             return  # more names than there can be
@@ -266,7 +266,8 @@ class ComponentMachine(Parts):
         self._authors.foreign_set(self.spelling(name), station, now)
 
     def foreign_file_request(self, message: FileTransfer, station: tuple[int, int], now: float) -> None:
-        """Another station was heard asking for a file of this component, where we only listen."""
+        """Another station was heard asking for a file of this component."""
+        self.files.foreign_at = now
         if self.fetches.overheard is not None:
             self.fetches.overheard.file.request_heard(message, station, now)
 
@@ -419,6 +420,7 @@ class ComponentMachine(Parts):
         refresh: bool = False,
         listed: bool = False,
         by_list: bool = False,
+        check: Check | None = None,
         sampled: Sampled | None = None,
     ) -> Fetch:
         """Begin a fetch, or join the one under way; give it back with `end_fetch`.
@@ -428,6 +430,7 @@ class ComponentMachine(Parts):
             refresh: download even if the vehicle's hash would confirm the cached table.
             listed: the list has been asked for already, of all components at once.
             by_list: download by list also where the vehicle serves the file.
+            check: how, where nobody waits for it but the watch.
             sampled: the sample that may settle it where there is no hash, or None.
 
         Raises:
@@ -435,7 +438,9 @@ class ComponentMachine(Parts):
         """
         if self.fetch is None and self._policy is not Policy.CACHE_ONLY:
             self.check_present(f"the parameters of {self.system}/{self.component}", now)
-        return self.fetches.begin(now, refresh=refresh, listed=listed, by_list=by_list, sampled=sampled)
+        return self.fetches.begin(
+            now, refresh=refresh, listed=listed, by_list=by_list, check=check, sampled=sampled
+        )
 
     def end_fetch(self, fetch: Fetch, now: float) -> None:
         """Wait for it no longer. The last one who waited cancels it."""

@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 from paramclient.errors import CacheError, LinkError, NoReply, UnknownParameter
 from paramclient.protocol.download import Download, present_of
@@ -33,7 +33,7 @@ from paramclient.protocol.result import Announcement, FetchResult, Means, Policy
 from paramclient.protocol.sampling import Sampling
 from paramclient.protocol.wire import HASH_CHECK, ParamRequestRead, ParamValue
 
-__all__ = ["Fetch"]
+__all__ = ["Check", "Fetch"]
 
 FILE_PATIENCE: Final = 1.0
 FILE_TIMEOUTS: Final = 4.0
@@ -49,6 +49,18 @@ QUICK_FILE: Final = 0.4
 """Seconds in which the file comes on a link that is no limit (measured)."""
 MOST_RESTARTS: Final = 8
 """Times that a vehicle may start again, or turn out to be another one, before a fetch is given up."""
+
+
+class Check(NamedTuple):
+    """How the table of a vehicle without a hash is fetched only to see whether it has moved.
+
+    While another station has a file open, such a fetch ends with the server's refusal.
+
+    Attributes:
+        may_list: whether the list is downloaded where the file does not come for another reason.
+    """
+
+    may_list: bool
 
 
 class Fetch(Operation[FetchResult]):
@@ -74,6 +86,7 @@ class Fetch(Operation[FetchResult]):
         file: the download as a file, while that is tried and when it has come.
         file_failed: whether the component has no such file, once that is known: None before, and where it may
             be bad luck.
+        check: how it is done where only the watch wants it; None where somebody waits for the table.
         first_value_at: when the first value came of a download by list; infinity before.
     """
 
@@ -88,6 +101,7 @@ class Fetch(Operation[FetchResult]):
         by_list: bool = False,
         policy: Policy,
         may_use_file: Callable[[], bool],
+        check: Check | None = None,
         sampled: Sampled | None,
     ) -> None:
         super().__init__(now)
@@ -114,6 +128,7 @@ class Fetch(Operation[FetchResult]):
         self._held_before = 0.0  # by a download that was begun anew
         self._listed = listed
         self._by_list = by_list
+        self.check = check
         self._policy = policy
         self._restarts = 0
         self.holders = 0
@@ -183,6 +198,8 @@ class Fetch(Operation[FetchResult]):
             if self.download is not None and not self.download.done:
                 self.download.gives_way = True
             self._drop_list_pace()
+        elif self._is_file_check:
+            return
         elif file.is_awaited and not self._may_use_file():
             self._drop_file(now, is_served=False)
             self._had_no_file = True
@@ -389,16 +406,23 @@ class Fetch(Operation[FetchResult]):
         self._has_begun = True
         self._present = present
         means.doubt(now)
-        may_use_file = not (self._listed or self._by_list or self._had_no_file) and self._may_use_file()
-        if not may_use_file:
+        may_use_file = self._is_file_check or self._may_use_file()
+        if self._listed or self._by_list or self._had_no_file or not may_use_file:
             self._begin_list(now)
             return
         means.trace("%s/%s: the file is wanted, %s there", *self._target, len(present or ()))
         if self._expects_hash():
             # once, and before the file: so the answer is of the time before it
             means.send(ParamRequestRead(*self._target, HASH_CHECK, -1))
-        file = self.file = PackFetch(means.files, means.turns, means.table, means.changed, now)
+        file = self.file = PackFetch(
+            means.files, means.turns, means.table, means.changed, now, yields=self.check is not None
+        )
         file.on_done.append(partial(self._file_ended, file))
+
+    @property
+    def _is_file_check(self) -> bool:
+        """Whether it ends without a list when the file does not come."""
+        return self.check is not None and not self.check.may_list
 
     @property
     def _list_due_at(self) -> float:
@@ -406,7 +430,7 @@ class Fetch(Operation[FetchResult]):
         file, trip = self.file, self._round_trip
         if file is None or file.done or file.is_served or not file.is_awaited or self._list_error is not None:
             return math.inf
-        if file.blocked_until is not None or self.download is not None:
+        if file.blocked_until is not None or self.download is not None or self._is_file_check:
             return math.inf
         if trip.smoothed is None:
             return file.asked_at + BLIND_PATIENCE
@@ -495,7 +519,8 @@ class Fetch(Operation[FetchResult]):
             return
         self.file = None
         self._held_before += file.held_up
-        if isinstance(file.error, LinkError):
+        is_over = self._is_file_check or (self.check is not None and file.is_in_use and not self.download)
+        if file.error is not None and (is_over or isinstance(file.error, LinkError)):
             self.fail(file.error, now)
             return
         self._had_no_file = True

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Final
 
-from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.check_pace import CheckPace
+from paramclient.protocol.fetch import Check, Fetch
 from paramclient.protocol.overhear import Overheard, Overhearing
 from paramclient.protocol.result import FetchResult, Means, Policy, Sampled
 from paramclient.protocol.sync import Sync, Upkeep
 
 __all__ = ["Fetches"]
-
-CHEAP_SHARE: Final = 0.05
-"""The share of the time between two looks at a vehicle without a hash that the fetch of its parameter file
-may take up: 1.5 s of 30 s, which it takes on cables and not on radios."""
 
 
 class Fetches:
@@ -25,6 +21,7 @@ class Fetches:
         means: what each of them works with.
         sync: the component's.
         upkeep: what may be asked.
+        check_pace: is told how long fetches take.
         says_file: whether the component serves its table as a file, as far as it has said.
         ended: is told of each result in which the vehicle has said something of its table.
 
@@ -41,6 +38,7 @@ class Fetches:
         means: Means,
         sync: Sync,
         upkeep: Upkeep,
+        check_pace: CheckPace,
         *,
         says_file: Callable[[], bool],
         ended: Callable[[FetchResult], None],
@@ -57,7 +55,7 @@ class Fetches:
             self.overheard = Overheard(means, sync, whole=self._overheard_whole, is_log=upkeep.is_log)
         self._says_file = says_file
         self._ended = ended
-        self._file_took: float | None = None
+        self._check_pace = check_pace
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -68,10 +66,6 @@ class Fetches:
         """Whether the table is worth asking for as a file: it has come as one, or the component says so."""
         return self._says_file() if self.file_works is None else self.file_works
 
-    def file_is_cheap(self, interval: float) -> bool:
-        """Whether the file comes so quickly that it can be read once in every such interval."""
-        return self._file_took is not None and self._file_took <= CHEAP_SHARE * interval
-
     def begin(
         self,
         now: float,
@@ -79,6 +73,7 @@ class Fetches:
         refresh: bool = False,
         listed: bool = False,
         by_list: bool = False,
+        check: Check | None = None,
         sampled: Sampled | None = None,
     ) -> Fetch:
         """Begin one, or join the one under way; give it back with `end`.
@@ -88,9 +83,12 @@ class Fetches:
             refresh: fetch even if the vehicle's hash would confirm the cached table.
             listed: the list has been asked for already, of all components at once.
             by_list: download by list also where the vehicle serves the file.
+            check: how, where nobody waits for it but the watch; joined by a caller it is no check any more.
             sampled: the sample that may settle it where there is no hash, or None.
         """
         fetch = self.current
+        if fetch is not None and check is None:
+            fetch.check = None
         if fetch is not None and (
             (refresh and fetch.is_about_the_cache) or (sampled is None and fetch.is_sampling)
         ):
@@ -112,6 +110,7 @@ class Fetches:
                 by_list=by_list,
                 policy=self._policy,
                 may_use_file=self.may_use_file,
+                check=check,
                 sampled=sampled if may_sample else None,
             )
             if fetch.done:
@@ -139,7 +138,8 @@ class Fetches:
         if self.overheard is not None:
             self.overheard.file.forget()
             self.overheard.forget()
-        self.file_works = self._file_took = None
+        self.file_works = None
+        self._check_pace.forget()
         self.is_same_firmware = False
 
     def updated(self, now: float) -> None:
@@ -178,7 +178,6 @@ class Fetches:
         if result is None:
             return
         self.last = result
-        if result.source == "ftp":
-            self._file_took = result.elapsed
+        self._check_pace.fetched(result, fetch.held_up(fetch.ended_at))
         if self._sync.fetched(result, fetch.ended_at):
             self._ended(result)

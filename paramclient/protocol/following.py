@@ -15,6 +15,9 @@ __all__ = ["Following"]
 ENOUGH_TO_FOLLOW: Final = 10
 """Values by rising index that are a list: PX4 pushes up to a few changed parameters with their index, and
 another station may read some one by one."""
+FEWEST_HEARD: Final = 0.5
+"""The share of the indices passed that a list brings, at the least. When another station sets many parameters
+at once, PX4 pushes these by rising index too: 200 of 905."""
 
 
 class Following:
@@ -54,7 +57,11 @@ class Following:
 
     def is_running(self, now: float) -> bool:
         """Whether a list comes, and has not come to its end."""
-        is_list = len(self._names) >= ENOUGH_TO_FOLLOW and self._front < self._count - 1
+        came = len(self._names)
+        if came < ENOUGH_TO_FOLLOW or self._front >= self._count - 1:
+            return False
+        passed = self._front - next(iter(self._names)) + 1
+        is_list = came >= FEWEST_HEARD * passed
         return is_list and now - self._heard_at <= self._quiet
 
     def hand_over(self, reads: Reads) -> tuple[Mapping[int, str], int]:

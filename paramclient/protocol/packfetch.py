@@ -9,7 +9,7 @@ from typing import Final
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError
 from paramclient.protocol.change import Change
-from paramclient.protocol.ftp import FileRead, FileTransfers
+from paramclient.protocol.ftp import BUSY, FileRead, FileTransfers
 from paramclient.protocol.ftp.packets import MOST_DATA
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.pack import LARGEST_FILE, Pack, decode, total_of
@@ -44,9 +44,11 @@ class PackFetch(Operation[None]):
         table: where the parameters go.
         changed: is told of the changes.
         now: the time.
+        yields: whether to give up at once when another station has a file open.
 
     Attributes:
         held_up: seconds for which it waited for its turn.
+        is_in_use: whether it ended as another station has a file open.
         is_useless: whether the component does not have the file, or one that cannot be read: with this
             firmware that will not change.
         is_unheard: whether it ended as nothing at all came of it, though the component was there.
@@ -59,8 +61,11 @@ class PackFetch(Operation[None]):
         table: Table,
         changed: Callable[[list[Change]], None],
         now: float,
+        *,
+        yields: bool = False,
     ) -> None:
         super().__init__(now)
+        self._yields = yields
         self._files = files
         self._turns = turns
         self._table = table
@@ -75,6 +80,7 @@ class PackFetch(Operation[None]):
         self._asked_at = now
         self.held_up = 0.0
         self.is_useless = False
+        self.is_in_use = False
         self.is_unheard = False
         self._count: int | None = None
         self._waits_since: float | None = now
@@ -173,6 +179,7 @@ class PackFetch(Operation[None]):
         self._heard.clear()
         self._heard_count = None
         job = self._job = self._files.read(PARAMETER_FILE + self._query, now, limit=LARGEST_FILE)
+        job.yields = self._yields
         job.on_done.append(partial(self._came, job))
 
     def _came(self, job: FileRead) -> None:
@@ -189,6 +196,7 @@ class PackFetch(Operation[None]):
             else:
                 assert job.error is not None
                 self.is_useless = may_be_the_query or _is_unknown(job.error)
+                self.is_in_use = isinstance(job.error, FileTransferError) and job.error.code in BUSY
                 is_there = self._doubts == self._table.doubts
                 self.is_unheard = is_there and isinstance(job.error, NoReply) and not job.received
                 self._turns.give_back(self)

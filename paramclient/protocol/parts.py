@@ -9,11 +9,12 @@ from collections.abc import Callable
 from paramclient.identity import Identity
 from paramclient.protocol.authors import Authors
 from paramclient.protocol.change import Change
+from paramclient.protocol.check_pace import CheckPace
 from paramclient.protocol.clock_requests import ClockRequests
 from paramclient.protocol.commands import Commands
 from paramclient.protocol.descriptions import Descriptions
 from paramclient.protocol.events import Event
-from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.fetch import Check, Fetch
 from paramclient.protocol.fetches import Fetches
 from paramclient.protocol.following import Following
 from paramclient.protocol.ftp import FileTransfers
@@ -85,18 +86,22 @@ class Parts(ABC):
             trace=trace,
         )
         self.presence = Presence()
+        self.files = FileTransfers(target, own, self.round_trip, send)
+        check_pace = CheckPace(upkeep.interval, is_chosen=upkeep.without_hash)
         self.sync = Sync(
             self.reads,
             self.table,
             upkeep,
+            check_pace,
             is_px4=lambda: self.who.autopilot == MAV_AUTOPILOT_PX4,
             is_writing=lambda: len(self.writes) > 0,
             is_fetching=lambda: self.fetch is not None,
             is_busy=is_link_busy,
-            file_is_cheap=lambda interval: self.fetches.file_is_cheap(interval),
+            may_use_file=lambda: self.fetches.may_use_file(),
+            file_is_in_use=self.files.is_in_use,
             is_spared=lambda: self._is_spared,
             is_doubted=lambda: self.who.is_doubted,
-            begin_fetch=lambda now, refresh: self.begin_fetch(now, refresh=refresh),
+            begin_fetch=lambda now, check: self.begin_fetch(now, refresh=check is not None, check=check),
             end_fetch=self.end_fetch,
             resynced=self._resynced,
         )
@@ -116,10 +121,9 @@ class Parts(ABC):
             self.table,
             is_wanted=lambda: self._may_read_start_values,
             is_fetching=lambda: self.fetch is not None,
-            fetch_file=self.sync.fetch_cheap_file,
+            fetch_file=self.sync.fetch_quick_file,
         )
         self.restart: Restart | None = None
-        self.files = FileTransfers(target, own, self.round_trip, send)
         self.following = Following()
         self.fetches = Fetches(
             Means(
@@ -138,6 +142,7 @@ class Parts(ABC):
             ),
             self.sync,
             upkeep,
+            check_pace,
             says_file=lambda: self.who.says_file,
             ended=self._fetched,
         )
@@ -170,7 +175,13 @@ class Parts(ABC):
 
     @abstractmethod
     def begin_fetch(
-        self, now: float, *, refresh: bool = False, listed: bool = False, sampled: Sampled | None = None
+        self,
+        now: float,
+        *,
+        refresh: bool = False,
+        listed: bool = False,
+        check: Check | None = None,
+        sampled: Sampled | None = None,
     ) -> Fetch:
         """Begin a fetch, or join the one under way; give it back with `end_fetch`."""
 
@@ -228,7 +239,13 @@ class Parts(ABC):
     @property
     def is_waiting(self) -> bool:
         """Whether anything is awaited: an answer, a fetch, a file, or who it is."""
-        is_asked = len(self.reads) > 0 or len(self.writes) > 0 or not self.files.is_idle
+        return len(self.reads) > 0 or self.is_busy
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether anything is awaited but the values that are read after the hash has agreed."""
+        in_background = 0 if self.refresh is None else self.refresh.in_flight
+        is_asked = len(self.reads) > in_background or len(self.writes) > 0 or not self.files.is_idle
         is_asked = is_asked or len(self.commands) > 0 or self.restart is not None
         is_asked = is_asked or self.descriptions.is_asking or len(self.name_searches) > 0
         return is_asked or self.fetch is not None or self.who.is_asking

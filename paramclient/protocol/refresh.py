@@ -33,12 +33,24 @@ class Refresh(Operation[None]):
         reads: the component's.
         table: what is refreshed.
         confirmed: the hash that the vehicle has just announced for the table.
+        again: whether to read all that count as volatile once more, also those heard on this link, and to
+            learn nothing from it.
         is_writing: whether a write of ours is under way, which moves the table too.
         now: the time.
+
+    Attributes:
+        in_flight: reads that are under way for it.
     """
 
     def __init__(
-        self, reads: Reads, table: Table, confirmed: int, is_writing: Callable[[], bool], now: float
+        self,
+        reads: Reads,
+        table: Table,
+        confirmed: int,
+        is_writing: Callable[[], bool],
+        now: float,
+        *,
+        again: bool = False,
     ) -> None:
         super().__init__(now)
         self._reads = reads
@@ -46,30 +58,31 @@ class Refresh(Operation[None]):
         self._confirmed = confirmed
         self._is_writing = is_writing
         params = table.params
-        names = [name for name in table.unhashed() if name in params]
-        self._before = {name: params[name] for name in names if params[name].trust is not Trust.LIVE}
+        self._again = again
+        names = [name for name in (table.volatile if again else table.unhashed()) if name in params]
+        self._before = {name: params[name] for name in names if again or params[name].trust is not Trust.LIVE}
         self._waiting = deque(sorted(self._before))
-        self._open = 0
+        self.in_flight = 0
         self._ask(now)
-        if not self._open:
+        if not self.in_flight:
             self.finish(None, now)
 
     def _ask(self, now: float) -> None:
-        while self._waiting and self._open < MOST_AT_ONCE:
+        while self._waiting and self.in_flight < MOST_AT_ONCE:
             name = self._waiting.popleft()
             if name in self._table.params:
-                self._open += 1
+                self.in_flight += 1
                 read = self._reads.ask(name, now, urgent=False)
                 read.on_done.append(partial(self._one_ended, read))
 
     def _one_ended(self, read: Read) -> None:
-        self._open -= 1
+        self.in_flight -= 1
         if isinstance(read.error, LinkError):
             self._waiting.clear()  # nothing can be asked any more
         self._ask(read.ended_at)
-        if self._open:
+        if self.in_flight:
             return
-        if not (self._table.volatile_known or isinstance(read.error, LinkError)):
+        if not (self._again or self._table.volatile_known or isinstance(read.error, LinkError)):
             again = self._reads.ask(HASH_CHECK, read.ended_at)
             again.on_done.append(partial(self._learn, again))
         self.finish(None, read.ended_at)

@@ -164,6 +164,7 @@ class Station:
         self._turns = Turns()
         self._of_system: dict[int, list[ComponentMachine]] = {}
         self._last_waiting: ComponentMachine | None = None
+        self._last_busy: ComponentMachine | None = None
         self._touched: dict[ComponentMachine, None] = {}  # whose deadline may be another than was noted
         self._deadlines: dict[ComponentMachine, float] = {}  # as noted
         self._order: list[tuple[float, int, int]] = []  # a heap of these, with some that are of the past
@@ -390,6 +391,14 @@ class Station:
             self._last_waiting = next((each for each in self.components.values() if each.is_waiting), None)
         return self._last_waiting is not None
 
+    @property
+    def _is_busy(self) -> bool:
+        """Whether anything is awaited that a check would be in the way of."""
+        last = self._last_busy
+        if last is None or not last.is_busy:
+            self._last_busy = next((each for each in self.components.values() if each.is_busy), None)
+        return self._last_busy is not None
+
     def fail_all(self, error: LinkError, now: float) -> None:
         """The link is gone for good: everyone who waits gets its error."""
         for machine in list(self.components.values()):
@@ -551,7 +560,7 @@ class Station:
         if isinstance(message, ParamSet):
             self._receive_foreign_set(message, sender, now)
             return
-        if isinstance(message, FileTransfer) and self.listens_only:
+        if isinstance(message, FileTransfer):
             self._receive_foreign_file_request(message, sender, now)
         machine = self.components.get(sender) or self._meet(sender, message, now)
         if machine is not None:
@@ -594,7 +603,7 @@ class Station:
             emit=self._events.append,
             encoding=self._encoding,
             upkeep=self._upkeep,
-            is_link_busy=lambda: self.is_waiting,
+            is_link_busy=lambda: self._is_busy,
             is_vehicle_doubted=lambda: self._autopilot_is_doubted(system),
             another=lambda now: self._become_another(system, now),
             read_clock=lambda now: self._clock_sampling.open(sender, now),
@@ -635,7 +644,7 @@ class Station:
         self._clock_sampling.close(address)
         self._touched.pop(machine, None)
         self._deadlines.pop(machine, None)
-        self._last_waiting = None
+        self._last_waiting = self._last_busy = None
         self._order = [each for each in self._order if each[1:] != address]
         heapify(self._order)
         machine.reads.pace.idle()
@@ -659,9 +668,9 @@ class Station:
                 machine.foreign_set(message.param_id, station, now)
 
     def _receive_foreign_file_request(self, message: FileTransfer, sender: Address, now: float) -> None:
-        """Take what another station asks for over MAVFTP, where we only listen."""
+        """Take what another station asks for over MAVFTP."""
         target = (message.target_system, message.target_component)
-        if target not in self.components and opens_parameter_file(message):
+        if self.listens_only and target not in self.components and opens_parameter_file(message):
             self._early_requests.append((message, sender))
         for machine in self._of_system.get(message.target_system, ()):
             if message.target_component in (machine.component, COMP_ID_ALL):

@@ -9,9 +9,11 @@ from enum import StrEnum
 from functools import partial
 from typing import Final
 
-from paramclient.errors import UnknownParameter, UsageError
+from paramclient.errors import FileTransferError, UnknownParameter, UsageError
 from paramclient.protocol.authors import is_ours
-from paramclient.protocol.fetch import Fetch
+from paramclient.protocol.check_pace import CheckPace
+from paramclient.protocol.fetch import Check, Fetch
+from paramclient.protocol.ftp import BUSY
 from paramclient.protocol.reads import Read, Reads
 from paramclient.protocol.refresh import Refresh
 from paramclient.protocol.result import Announcement, FetchResult, Policy
@@ -28,10 +30,21 @@ SHORTEST_INTERVAL: Final = 1.0
 SETTLING_TIME: Final = 0.06
 """Seconds from the last of our writes until the hash is asked for: what PX4 changed with it, it pushes 10 to
 24 ms later."""
+FOREIGN_SETTLING_TIME: Final = 0.5
+"""Seconds from the last value that the vehicle or another station has changed until the hash is asked for. Of
+200 values that another station set at full speed, PX4 told this one 73 to 178; the others it had passed or
+saved before their turn came (measured)."""
+FOREIGN_CHECK_INTERVAL: Final = 2.0
+"""Seconds between two such questions, at the least: values may change for ever."""
+VOLATILE_SHARE: Final = 0.05
+"""The share of the time that may be taken by reading again what the hash leaves out."""
 BUSY_WAIT: Final = 0.1
 """Seconds until it is looked again whether the link is idle."""
 GAPS_INTERVAL: Final = 5.0
 """Seconds between two checks that gaps in the heartbeats bring about: they are many on a bad link."""
+SKIPPED_TURN_WAIT: Final = 5.0
+"""Seconds until a check is made that was skipped as another station has a file open. ArduPilot ends a session
+3 s after its last reply to anybody, so asking more often would keep open what nobody uses any more."""
 LOW_BANDWIDTH_GAP: Final = 0.1
 """Seconds from one value of the list to the next that tell of a low-bandwidth mode: PX4's sends 8 a second, a
 57600-baud radio carries 40."""
@@ -64,7 +77,7 @@ class Upkeep:
     Attributes:
         interval: seconds after which the vehicle is asked again whether it has moved; infinity for never.
         without_hash: whether that goes for every vehicle without a hash too: its whole table is then fetched.
-            It goes anyway for those that give it as a file in no time.
+            It goes anyway for those that give it as a file, as often as that costs little.
         policy: what may be asked.
         listens_only: nothing is sent at all, for whatever reason; the policy is then "cache-only".
         is_log: the link is a log, in which nobody can be asked and which ends.
@@ -109,23 +122,28 @@ class Upkeep:
 class Sync:
     """Follows the hashes that one component announces, and asks for them when there is a reason to.
 
-    Reasons are a write of ours, which moves the hash; a silence, in which an update may have been lost; and
-    the interval of the upkeep, as PARAM_VALUEs of changes are sent once and never repeated. The interval and
-    the silences count only for a table that was brought up to date on this link. Nothing is asked for while
-    anything else goes on, in high-latency mode, or on a link that is measured to be a low-bandwidth one.
+    Reasons are a write of ours, which moves the hash; values that others have changed, of which the vehicle
+    may not have told all; a silence, in which an update may have been lost; and the interval of the upkeep,
+    as PARAM_VALUEs of changes are sent once and never repeated. All but the first count only for a table that
+    was brought up to date on this link. Nothing is asked for in high-latency mode, or on a link that is
+    measured to be a low-bandwidth one, nor, but after changes, while anything else goes on.
+
+    With each interval, the values that the hash leaves out are read again. Of a component without a hash the
+    file, or the list, is fetched, as often as `check_pace` says.
 
     Args:
         reads, table: the component's.
         upkeep: what is done without being asked.
+        check_pace: how often a table without a hash is fetched again.
         is_px4: whether its heartbeat says that it has a hash.
         is_writing: whether a write of ours is under way.
         is_fetching: whether a fetch of the component is under way.
         is_busy: whether anything at all is, on the link.
-        file_is_cheap: whether a component without a hash gives its table as a file, which comes so quickly
-            that it can be read once in every interval.
+        may_use_file: whether the component says that it serves its table as a file, or has done so.
+        file_is_in_use: whether another station may have a file open.
         is_spared: whether the component is in a mode in which it is asked for nothing.
         is_doubted: whether it is open who it is.
-        begin_fetch: begins a fetch (with `refresh`, of everything), which `end_fetch` gives back.
+        begin_fetch: begins a fetch (with a check, of everything), which `end_fetch` gives back.
         end_fetch: as it says.
         resynced: is told when the table agrees with the vehicle's again, of what had moved, and its hash.
 
@@ -141,26 +159,30 @@ class Sync:
         reads: Reads,
         table: Table,
         upkeep: Upkeep,
+        check_pace: CheckPace,
         *,
         is_px4: Callable[[], bool],
         is_writing: Callable[[], bool],
         is_fetching: Callable[[], bool],
         is_busy: Callable[[], bool],
-        file_is_cheap: Callable[[float], bool],
+        may_use_file: Callable[[], bool],
+        file_is_in_use: Callable[[float], bool],
         is_spared: Callable[[], bool],
         is_doubted: Callable[[], bool],
-        begin_fetch: Callable[[float, bool], Fetch],
+        begin_fetch: Callable[[float, Check | None], Fetch],
         end_fetch: Callable[[Fetch, float], None],
         resynced: Callable[[tuple[str, ...], int | None], None],
     ) -> None:
         self._reads = reads
         self._table = table
         self._upkeep = upkeep
+        self._check_pace = check_pace
         self._is_px4 = is_px4
         self._is_writing = is_writing
         self._is_fetching = is_fetching
         self._is_busy = is_busy
-        self._file_is_cheap = file_is_cheap
+        self._may_use_file = may_use_file
+        self._file_is_in_use = file_is_in_use
         self._is_spared = is_spared
         self._is_doubted = is_doubted
         self._begin_fetch = begin_fetch
@@ -174,9 +196,13 @@ class Sync:
         self._has_no_hash = False
         self._moved_by_us_alone = False
         self._settle_at = math.inf  # when to ask for the hash after our writes
+        self._foreign_check_at = math.inf  # when to ask for the hash after changes by others
+        self._foreign_checked_at = -math.inf
         self._check_at = math.inf
         self._checked_at = -math.inf
         self._is_checking = False
+        self._volatile_at = -math.inf  # when what the hash leaves out may be read again
+        self._reads_volatile = False  # once the hash that is being asked for agrees
         self._resync: Fetch | None = None
         self._has_fallen = False  # it was synced, and is not
         self._moved: dict[str, None] = {}  # what has changed since then
@@ -213,11 +239,19 @@ class Sync:
         self._has_no_hash = False
         return self.announced
 
-    def changed(self, name: str, by: str) -> None:
-        """A parameter has changed: the hash that was announced is of the past, unless that leaves it out."""
+    def changed(self, name: str, by: str, now: float | None = None) -> None:
+        """A parameter has changed: the hash that was announced is of the past, unless that leaves it out.
+
+        Args:
+            name: param_id.
+            by: who has changed it.
+            now: the time; None where a fetch has found it out, which brings the others too.
+        """
         if name not in self._table.volatile:
             if not is_ours(by):
                 self._moved_by_us_alone = False
+                if now is not None:
+                    self._foreign_changed(now)
             self.expire_hash()
         if (self._has_fallen or self._resync is not None) and len(self._moved) < MOST_NAMES:
             self._moved[name] = None
@@ -232,7 +266,8 @@ class Sync:
         """Another number of parameters was heard: the table is not what it was."""
         self._fall()
         if self._is_kept_up:
-            self._check_at = min(self._check_at, now)
+            pause = 0.0 if self.expects_hash else self._check_pace.shortest_pause
+            self._check_at = min(self._check_at, max(now, self._checked_at + pause))
 
     def silence(self, now: float) -> None:
         """The component is heard again after a silence in which something may have been missed.
@@ -300,11 +335,12 @@ class Sync:
             read = self._reads.ask(HASH_CHECK, now)
             read.on_done.append(lambda: self._hash_came(read))
 
-    def fetch_cheap_file(self, now: float) -> bool:
+    def fetch_quick_file(self, now: float) -> bool:
         """Fetch the table anew where it comes as a file in no time; false where it does not, or may not."""
-        if not self._is_kept_up or self._is_spared() or not self._file_is_cheap(self._upkeep.interval):
+        may_fetch = self._is_kept_up and not self._is_spared() and not self._file_is_in_use(now)
+        if not may_fetch or not self._check_pace.file_is_quick:
             return False
-        self._begin_resync(now, refresh=True)
+        self._begin_resync(now, Check(may_list=True))
         return True
 
     def compare(self, now: float) -> bool:
@@ -323,17 +359,20 @@ class Sync:
         if self._settle_at <= now:
             self._settle_at = math.inf
             self.ask(now)
+        if self._foreign_check_at <= now:
+            self._foreign_check_at = math.inf
+            self._check_after_foreign(now)
         if self._check_at <= now:
             self._check(now)
 
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity."""
-        return min(self._settle_at, self._check_at)
+        return min(self._settle_at, self._foreign_check_at, self._check_at)
 
     def stop(self) -> None:
         """Ask for nothing any more, unless there is a new reason to."""
-        self._settle_at = self._check_at = math.inf
-        self._is_checking = False
+        self._settle_at = self._foreign_check_at = self._check_at = math.inf
+        self._is_checking = self._reads_volatile = False
 
     @property
     def may_resync(self) -> bool:
@@ -359,36 +398,64 @@ class Sync:
         self._fall()
         self._table.doubt(Trust.VERIFIED)
 
-    def _read_unhashed(self, confirmed: int, now: float) -> None:
-        """Read what the hash says nothing about."""
+    def _read_unhashed(self, confirmed: int, now: float, *, again: bool = False) -> None:
+        """Read what the hash says nothing about; `again` is as in `Refresh`."""
         if self._upkeep.policy is not Policy.AUTO:
             return
-        refresh = Refresh(self._reads, self._table, confirmed, self._is_writing, now)
+        refresh = Refresh(self._reads, self._table, confirmed, self._is_writing, now, again=again)
         if not refresh.done:
             self.refresh = refresh
             refresh.on_done.append(partial(self._refresh_ended, refresh))
 
     def _refresh_ended(self, refresh: Refresh) -> None:
+        took = refresh.ended_at - refresh.begun_at
+        self._volatile_at = refresh.ended_at + took * (1.0 / VOLATILE_SHARE - 1.0)
         if self.refresh is refresh:
             self.refresh = None
+
+    def _foreign_changed(self, now: float) -> None:
+        """The vehicle or another station has changed a value. A fetch under way brings the others too."""
+        if self._is_kept_up and self.expects_hash and not self._is_fetching():
+            earliest = self._foreign_checked_at + FOREIGN_CHECK_INTERVAL
+            self._foreign_check_at = max(now + FOREIGN_SETTLING_TIME, earliest)
+
+    def _check_after_foreign(self, now: float) -> None:
+        """Values of others have stopped: ask for the hash where it can prove the present values."""
+        if self._table.is_provable and not (self._is_fetching() or self._is_spared()):
+            self._foreign_checked_at = now
+            self.ask(now)
 
     def _check(self, now: float) -> None:
         """See whether the table still is the vehicle's, if there is room for that on the link."""
         if self.holds or self._is_busy():
             self._check_at = now + BUSY_WAIT
             return
-        self._check_at = now + self._upkeep.interval if self._is_kept_up else math.inf
-        self._checked_at = now
+        self._plan_check(now)
         if self._is_spared():
             self._is_checking = False
         elif self.expects_hash:
+            self._reads_volatile = self._is_kept_up
             self.ask(now)
-        elif self._is_kept_up and (self._upkeep.without_hash or self._file_is_cheap(self._upkeep.interval)):
-            self._begin_resync(now, refresh=True)
+        elif self._check_at < math.inf:
+            if self._file_is_in_use(now):
+                self._check_at = min(self._check_at, now + SKIPPED_TURN_WAIT)
+            else:
+                self._begin_resync(now, Check(may_list=self._check_pace.may_list))
+
+    def _plan_check(self, now: float) -> None:
+        """Make the next check an interval from now."""
+        self._checked_at = now
+        self._check_at = math.inf
+        if self._is_kept_up:
+            interval = self._upkeep.interval
+            if not self.expects_hash:
+                interval = self._check_pace.interval(may_use_file=self._may_use_file())
+            self._check_at = now + interval
 
     def _hash_came(self, read: Read) -> None:
         """A hash has come, or will not come, for which nobody but us waits."""
         table, now = self._table, read.ended_at
+        reads_volatile, self._reads_volatile = self._reads_volatile, False
         if read.result is None:
             self._has_no_hash = isinstance(read.error, UnknownParameter) and self.announced is None
             self._is_checking = False
@@ -403,6 +470,8 @@ class Sync:
             if self._has_fallen:
                 self.synced = True
                 self._read_unhashed(announced, now)
+            if reads_volatile and now >= self._volatile_at:
+                self._read_unhashed(announced, now, again=True)
             self._settled(now)
         elif self._is_writing() or self._is_fetching():
             return
@@ -413,14 +482,16 @@ class Sync:
             self._not_confirmed()
             self._is_checking = False
             if self._is_kept_up and not self._is_spared():
-                self._begin_resync(now, refresh=False)
+                self._begin_resync(now, None)
 
-    def _begin_resync(self, now: float, *, refresh: bool) -> None:
-        fetch = self._resync = self._begin_fetch(now, refresh)
+    def _begin_resync(self, now: float, check: Check | None) -> None:
+        fetch = self._resync = self._begin_fetch(now, check)
 
         def ended() -> None:
             self._resync = None
             self._end_fetch(fetch, fetch.ended_at)
+            if isinstance(fetch.error, FileTransferError) and fetch.error.code in BUSY:
+                self._check_at = min(self._check_at, fetch.ended_at + SKIPPED_TURN_WAIT)
 
         if fetch.done:
             ended()
@@ -430,8 +501,7 @@ class Sync:
     def _settled(self, now: float) -> None:
         """It is known how the table stands: say so, if it was in doubt."""
         self._is_checking = False
-        self._check_at = now + self._upkeep.interval if self._is_kept_up else math.inf
-        self._checked_at = now
+        self._plan_check(now)
         if not self.synced:
             return
         if self._has_fallen or self._moved:

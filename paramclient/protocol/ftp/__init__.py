@@ -5,6 +5,7 @@ from __future__ import annotations
 from paramclient.protocol.ftp.observed import ObservedRead, ObservedReads
 from paramclient.protocol.ftp.reading import LARGEST_FILE, FileRead
 from paramclient.protocol.ftp.transfers import (
+    BUSY,
     DirectoryEntry,
     FileChecksum,
     FileList,
@@ -13,6 +14,7 @@ from paramclient.protocol.ftp.transfers import (
 )
 
 __all__ = [
+    "BUSY",
     "LARGEST_FILE",
     "DirectoryEntry",
     "FileChecksum",

@@ -13,7 +13,7 @@ from paramclient.protocol.operation import Operation
 from paramclient.protocol.timing import LONGEST_SILENCE, RoundTrip
 from paramclient.protocol.wire import FileTransfer, Message
 
-__all__ = ["Job", "Line", "path_bytes"]
+__all__ = ["BUSY", "Job", "Line", "path_bytes"]
 
 Result = TypeVar("Result")
 
@@ -117,6 +117,8 @@ class Job(Operation[Result]):
         asked_at: when the opening of the file was asked for last, but for repeats; infinity before.
         is_over: whether the job needs the server no longer: nothing was begun, or its session is closed.
         is_of_caller: whether somebody waits for it who is to be told when the component is lost.
+        yields: whether it ends with the server's refusal while another station has a file open, and does not
+            wait for that; to be set before any answer comes.
         session: the number of the session that is open for it, or None.
         asked_session: the one that was asked for when it is not known whether that is open, or None.
     """
@@ -126,6 +128,7 @@ class Job(Operation[Result]):
         self._line = line
         self.path = path
         self.is_of_caller = False
+        self.yields = False
         self.session: int | None = None
         self.asked_session: int | None = None
         self.is_over = False
@@ -313,12 +316,21 @@ class Job(Operation[Result]):
                     then(packet, now)
             elif self.is_ended:
                 self._closed(now)
+            elif self.yields and code == FileErrorCode.FAIL and self._attempts == 1 and not self._failures:
+                # no answer was lost, so it is another station's session that has this number
+                self._failures = 1
+                self.asked_session = None
+                self.begin(now)
             elif code == FileErrorCode.FAIL and self._failures < self._failures_allowed:
                 # what is open may be what an open of ours has opened whose answer was lost
                 self._failures += 1
                 self._line.close_session(number)
                 self.begin(now)
-            elif code in BUSY and now - (since := min(self._busy_since, now)) < BUSY_PATIENCE:
+            elif (
+                code in BUSY
+                and not self.yields
+                and now - (since := min(self._busy_since, now)) < BUSY_PATIENCE
+            ):
                 self._busy_since = since
                 self._open_at = now + QUIET_TIME
             else:

@@ -12,18 +12,21 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeVar
 
 from paramclient.errors import FileErrorCode, NoReply, UsageError
-from paramclient.protocol.ftp.jobs import Job, Line
+from paramclient.protocol.ftp.jobs import BUSY, Job, Line
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
 from paramclient.protocol.ftp.reading import LARGEST_FILE, MOST_OPENINGS, SESSION_LOST, FileRead
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.wire import FileTransfer, Message
 
-__all__ = ["DirectoryEntry", "FileChecksum", "FileList", "FileRead", "FileTransfers", "FileWrite"]
+__all__ = ["BUSY", "DirectoryEntry", "FileChecksum", "FileList", "FileRead", "FileTransfers", "FileWrite"]
 
 AnyJob = TypeVar("AnyJob", bound=Job[Any])
 
 MOST_ENTRIES: Final = 65_536
 """Entries of a directory that are taken: more than a card of FAT can hold in one."""
+SESSION_TIMEOUT: Final = 3.3
+"""Seconds after the last message to another station for which its session may still be open: ArduPilot ends
+one 3 s after its last reply (measured)."""
 
 
 class DirectoryEntry(NamedTuple):
@@ -154,6 +157,7 @@ class FileTransfers:
 
     Attributes:
         on_closed: called once, in order, with the time, when the session of a job that has ended is closed.
+        foreign_at: when something between the server and another station was heard last.
     """
 
     def __init__(
@@ -171,6 +175,11 @@ class FileTransfers:
         self._job: Job[Any] | None = None
         self._waiting: deque[Job[Any]] = deque()
         self.on_closed: list[Callable[[float], None]] = []
+        self.foreign_at = -math.inf
+
+    def is_in_use(self, now: float) -> bool:
+        """Whether another station was heard to read or write files, so that its session may be open."""
+        return now < self.foreign_at + SESSION_TIMEOUT
 
     @property
     def is_idle(self) -> bool:
@@ -251,6 +260,7 @@ class FileTransfers:
         if self._job is not None:
             self._job.server_heard(now)
         if message.target_system not in (0, system) or message.target_component not in (0, component):
+            self.foreign_at = now
             return
         if self._job is not None and self._line is not None:
             self._line.heard_at = now
