@@ -85,6 +85,8 @@ NO_LIMITS: Final = (
     "_PIN",
 )
 """Ends of names of members that choose something, instead of limiting it."""
+GETS: Final = 100
+"""Values that are read one after the other."""
 COMMAND_TIMEOUT: Final = 30.0
 """Seconds for one call of the command."""
 ATTITUDE_ID: Final = 30
@@ -201,6 +203,7 @@ def rows() -> Iterator[Row]:
         yield Row(
             f"PX4, {loss:.0%} lost", "px4", partial(time_fetch, conditions=conditions), median, worst, 0.0
         )
+    yield Row(f"PX4, {GETS} gets one after the other", "px4", time_gets, 0.2, 0.4, 0.0)
     for kind, title in (("ardupilot", "ArduPilot"), ("px4", "PX4")):
         yield Row(f"{title}, command: start to the value of one get", kind, time_command, 0.6, 0.9, 0.0)
 
@@ -214,6 +217,21 @@ async def time_fetch(vehicle: Vehicle, seed: int, *, conditions: Conditions) -> 
         result = await component.fetch_all(timeout=FETCH_TIMEOUT)
         seconds = time.monotonic() - began
     vehicle.check(result)
+    return seconds
+
+
+async def time_gets(vehicle: Vehicle, seed: int) -> float:
+    """Read values one after the other in a new session, each when the one before has come."""
+    vehicle.relay.change(replace(CLEAN, seed=seed))
+    names = sorted(name for name, param in vehicle.journal.before.items() if isinstance(param.value, int))
+    async with ParamClient(vehicle.relay.link, cache=vehicle.new_cache()) as client:
+        component = await client.component(vehicle.system, timeout=HEARING_TIMEOUT)
+        began = time.monotonic()
+        read = [await component.get(name) for name in names[:GETS]]
+        seconds = time.monotonic() - began
+    wrong = [param.name for param in read if param.value != vehicle.journal.before[param.name].value]
+    if wrong or len(read) < GETS:
+        raise WrongResult(f"of {len(read)} values differ: {', '.join(wrong[:3])}")
     return seconds
 
 

@@ -635,3 +635,34 @@ def test_the_timeout_of_a_read_covers_the_batches_ahead_of_it() -> None:
     assert [read.attempts for read in reads] == [1] * BURST
     desk.pass_time(0.02)
     assert [read.attempts for read in reads] == [2] * 5 + [1] * 5  # the others are behind the first batch
+
+
+def test_whoever_asks_for_one_value_after_the_other_is_as_quick_as_the_vehicle() -> None:
+    desk = Desk()
+    for number in range(100):
+        desk.ask(f"P{number}")
+        assert desk.take() == [f"P{number}"]
+        desk.now += 0.0003
+        desk.hear(f"P{number}")
+    assert desk.now < 0.2
+    others = [desk.ask(f"Q{number}") for number in range(20)]
+    assert len(desk.take()) == 1, "those that wait for no answer keep to the pace"
+    desk.pass_time(1.0)
+    assert len([each for each in others if each.attempts]) == 20
+
+
+def test_reads_that_are_given_up_at_once_keep_to_the_pace() -> None:
+    desk = Desk()
+    for number in range(100):
+        desk.reads.release(desk.ask(f"P{number}"))
+        desk.now += 0.0003
+    assert len(desk.take()) <= 12
+
+
+def test_what_is_read_in_the_background_keeps_to_the_pace() -> None:
+    desk = Desk()
+    for number in range(100):
+        desk.ask(f"P{number}", urgent=False)
+        desk.now += 0.0003
+        desk.hear(f"P{number}")
+    assert len(desk.take()) <= 12

@@ -210,10 +210,15 @@ class Pace:
         short = 1.0 + reserve - self._tokens
         return self._tokens_at + short / self.rate if short > 0 else self._tokens_at
 
-    def sent(self, now: float) -> None:
-        """A request went out."""
+    def sent(self, now: float, *, is_charged: bool = True) -> None:
+        """A request went out.
+
+        Args:
+            now: the time.
+            is_charged: whether it counts; not where it has waited for the answer to the one before.
+        """
         self._fill(now)
-        self._tokens -= 1.0
+        self._tokens -= is_charged
         self._sent += 1
         if self._epoch_at == math.inf:
             self._share.join(self)

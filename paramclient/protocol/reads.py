@@ -396,14 +396,19 @@ class Reads:
         what = key if isinstance(key, str) else f"parameter {key}"
         return f"{what} of {self._target[0]}/{self._target[1]}"
 
-    def _transmit(self, read: Read, now: float) -> None:
+    @property
+    def _is_answered(self) -> bool:
+        """Whether everything that was sent has been answered: one more request cannot make a queue."""
+        return not self._flying and self.answered_at >= self.sent_at
+
+    def _transmit(self, read: Read, now: float, *, is_charged: bool = True) -> None:
         read.attempts += 1
         self.retries += read.attempts > 1
         read.copies = 0
         read.sent_at = now
         read.serving_time = self._time_to_serve() if self.pace.is_batched else 0.0
         self._silent_since = min(self._silent_since, now)
-        self.pace.sent(now)
+        self.pace.sent(now, is_charged=is_charged)
         self._request(read, now)
         if read.key != self.control and read.attempts > (2 if self._is_known(read.key) else 1):
             self._send_control(now)
@@ -434,17 +439,22 @@ class Reads:
         self._send(ParamRequestRead(*self._target, "", self.control))
 
     def _send_waiting(self, now: float, *, may_copy: bool = True) -> None:
-        """Send what waits, as far as the pace allows; on an idle link ask twice rather than wait."""
+        """Send what waits, as far as the pace allows; on an idle link ask twice rather than wait.
+
+        A caller's read goes out whatever the pace when nothing is in flight and the last request was
+        answered: whoever asks for one value after the other is as quick as the vehicle.
+        """
         while self._again or self._urgent or self._patient:
             queue = self._urgent or self._again or self._patient
             if self._open.get(queue[0].key) is not queue[0]:
                 queue.popleft()
-            elif self.pace.may_send(now):
-                read = queue.popleft()
-                self._flying[read.key] = read
-                self._transmit(read, now)
-            else:
+                continue
+            has_token = self.pace.may_send(now)
+            if not has_token and not (queue is self._urgent and self._is_answered):
                 return
+            read = queue.popleft()
+            self._flying[read.key] = read
+            self._transmit(read, now, is_charged=has_token)
         while (
             may_copy
             and (read_again := self._copy_wanted()) is not None
