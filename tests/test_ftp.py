@@ -267,8 +267,8 @@ class TestReading:
         self, start: float, gap: float
     ) -> None:
         desk = Desk()
-        desk.now = start
         _, burst = desk.opened(size=48 * 200, read_size=48)
+        desk.now = start
         desk.answer(burst, bytes(48), offset=48 * 10, nth=11)
         desk.now += gap
         desk.answer(burst, bytes(48), offset=48 * 11, nth=12)
@@ -1298,7 +1298,7 @@ class TestOnTheAir:
         ground.air.receive(data, ground.now)
         read = ground.transfers.read("log/2.ulg", ground.now)
         ground.run(9.0)
-        assert (vehicle._ftp.open_files, read.done) == (["log/1.ulg"], False)
+        assert (vehicle.open_files, read.done) == (["log/1.ulg"], False)
         assert ground.outcome(read) == b"b" * 1000
         assert 11.0 < ground.now < 16.0  # PX4 closes what is not used for 11 s
 

@@ -119,7 +119,7 @@ def test_every_parameter_has_its_default() -> None:
     assert all(param.default is not None for param in params.values())
     changed = {name for name, param in params.items() if param.is_changed}
     assert len(changed) == 41, "the vehicle gives 42, and one of them is the same as the value"
-    name = min(changed)
+    name = min(name for name in changed if not name.startswith("BARO"))  # BARO*_DEVID are read-only
     before = params[name]
     session.set(name, before.default if before.default is not None else 0)
     now = session.machine.table.params[name]

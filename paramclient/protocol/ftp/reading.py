@@ -52,10 +52,12 @@ MOST_COPIES: Final = 6
 """The chance of no answer to go below by asking again early, and how often that may be done."""
 TAIL_BLOCKS: Final = 4
 TAIL_SHARE: Final = 0.15
-"""What may be left of a file, in blocks and as a share of an estimated size, for reads to be better than a new
-burst. ArduPilot's estimate for param.pck is a tenth too large."""
+"""What may be left of a file, in blocks and as a share of an estimated size, for reads to be better than a
+new burst. ArduPilot's estimate for param.pck is a tenth too large."""
 MADE_AT_READING: Final = b"@"
-"""How the paths begin of what a server makes when it is read, such as param.pck: their size is an estimate."""
+"""How the paths begin of what a server makes at reading, such as param.pck: their size is an estimate."""
+UNKNOWN_SIZE: Final = 1 << 32
+"""Bytes that no file has: an offset has 32 bits."""
 BURST_DELAY: Final = 0.03
 """Seconds by which the first block of a burst may come later than the answer to a read that was sent behind
 it: PX4 answers reads at once, and begins a burst up to 20 ms later (measured)."""
@@ -438,10 +440,10 @@ class FileRead(Job[bytes]):
             yield from range(reached, min(end, self._exact_size), self._read_size)
 
     @property
-    def _exact_size(self) -> float:
-        """Bytes that the file has; infinity where the server only estimates that, or says 0 of what it makes."""
-        is_estimate = not self.size or self._path_data.startswith(MADE_AT_READING)
-        return math.inf if is_estimate or self.size is None else self.size
+    def _exact_size(self) -> int:
+        """Bytes of the file; `UNKNOWN_SIZE` where the server estimates them, or says 0 of what it makes."""
+        is_estimate = self._path_data.startswith(MADE_AT_READING)
+        return UNKNOWN_SIZE if is_estimate or not self.size else self.size
 
     def _next_wanted(self) -> int | None:
         """What to read now: what is not asked for yet, else once more what is, if that is worth it."""
@@ -475,7 +477,7 @@ class FileRead(Job[bytes]):
         self._flights[sequence] = _Flight(offset, self._number, now, len(self._flights), is_only)
         self._tokens -= 1.0
         # MAVSDK's server refuses to read beyond the end
-        size = int(min(self._read_size, self._exact_size - offset))
+        size = min(self._read_size, self._exact_size - offset)
         self._line.send(Packet(sequence, self.session or 0, Opcode.READ_FILE, size=size, offset=offset))
 
     # Both
@@ -543,5 +545,5 @@ class FileRead(Job[bytes]):
         if self._blocks.end is not None or self.size is None:
             return False
         left = self.size - self._blocks.reached
-        share = TAIL_SHARE * self.size if self._exact_size == math.inf else 0.0
+        share = 0.0 if self._exact_size == self.size else TAIL_SHARE * self.size
         return left > max(TAIL_BLOCKS * self._read_size, share)
