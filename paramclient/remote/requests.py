@@ -23,7 +23,7 @@ from paramclient.version import __version__
 __all__ = ["Answer", "Place", "Requests", "Unreached"]
 
 PREFIX: Final = "/api/v1"
-OPEN_TIMEOUT: Final = 5.0
+OPEN_TIMEOUT: Final = 10.0
 """Seconds for finding a name, connecting and beginning to answer an event stream, as for other links."""
 SILENCE: Final = 6.0
 """Seconds without a word on the event stream after which the service counts as away: it says something every

@@ -70,18 +70,18 @@ class FileWrite(Job[None]):
 
         def answered(packet: Packet, now: float) -> None:
             if packet.opcode == Opcode.NAK:
-                self._does_not_write(packet, now)
+                self._refused_or_lost(packet, "does not write", now)
             else:
                 self.written += len(piece)
                 self._write(now)
 
         self._ask(Opcode.WRITE_FILE, answered, now, data=piece, session=session, offset=self.written)
 
-    def _does_not_write(self, packet: Packet, now: float) -> None:
+    def _refused_or_lost(self, packet: Packet, what: str, now: float) -> None:
         """The server refuses; where it has given up the session, as after a long silence, begin anew."""
         self._openings += 1
         if self._code(packet) not in SESSION_LOST or self._openings > MOST_OPENINGS:
-            self._refused(packet, "does not write", now)
+            self._refused(packet, what, now)
         else:
             self.session = None
             self.begin(now)
@@ -90,7 +90,7 @@ class FileWrite(Job[None]):
         was_closed_before = self._code(packet) == FileErrorCode.INVALID_SESSION and self._attempts > 1
         self.session = None
         if packet.opcode == Opcode.NAK and not was_closed_before:
-            self._refused(packet, "does not take", now)
+            self._refused_or_lost(packet, "does not take", now)
         else:
             self.finish(None, now)
 
