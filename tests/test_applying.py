@@ -885,7 +885,7 @@ async def test_a_change_too_small_for_px4_is_told_and_its_value_after_the_start(
         assert statuses(result) == {"TUNE_01": "unchanged", "SYS_HITL": "set"}  # all were saved with SYS_HITL
         for value in (0.5, 0.25):
             vehicle.set_param("TUNE_01", value)
-            await anyio.sleep(1.0)
+            await anyio.sleep(2.5)  # it saves at most every 2 s
         info = {"TUNE_01": ParamInfo("TUNE_01", reboot_required=True)}
         result = await apply(component, written({"TUNE_01": near}), reboot=True, info=info)
     assert result.reboots == 1
