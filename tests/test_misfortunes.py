@@ -25,6 +25,12 @@ LOSSES = pytest.mark.parametrize("loss", [0.0, 0.1], ids=["clean", "10 %"])
 UPTIME = 12.0
 """Seconds that a vehicle runs before it is asked for anything: longer than it takes to know it."""
 
+MEASURED = {
+    *(f"INS_{sensor}OFFS_{axis}" for sensor in ("GYR", "GYR2") for axis in "XYZ"),
+    *("INS_GYR1_CALTEMP", "INS_GYR2_CALTEMP", "BARO1_GND_PRESS", "BARO2_GND_PRESS"),
+}
+"""What the simulated ArduPilot measures with each start."""
+
 
 def px4(**options: object) -> PX4Vehicle:
     return PX4Vehicle(**options)  # type: ignore[arg-type]  # those of every vehicle
@@ -68,6 +74,12 @@ def check(world: Simulation, vehicle: Vehicle, result: FetchResult, *missing: in
     assert result.complete == world.machine.table.complete == world.machine.sync.synced == (not missing)
     if isinstance(vehicle, PX4Vehicle) and not missing:
         assert result.hash == vehicle.announced_hash()
+
+
+def differing(world: Simulation, vehicle: Vehicle) -> set[str]:
+    """The names of parameters of which the table has another value than the vehicle."""
+    values = vehicle.values
+    return {name for name, param in world.machine.table.params.items() if param.value != values[name]}
 
 
 def nothing_is_asked_any_more(world: Simulation, seconds: float = 20.0) -> None:
@@ -244,6 +256,59 @@ class TestTheCountMoves:
         check(world, vehicle, world.fetch(limit=20.0))
 
 
+class TestArduPilotStartsAgainInAFetch:
+    """It is off for 1.04 s, and tells its clock 1.4 s after its first heartbeat (measured)."""
+
+    @pytest.mark.parametrize(
+        ("kind", "at"), [("copter", 30), ("copter", 1350), ("plane", 400), ("rover", 1000)]
+    )
+    def test_in_mid_list(self, kind: str, at: int) -> None:
+        vehicle = ardupilot(kind=kind)
+        name = vehicle.listed[2].name
+
+        def reboot() -> None:
+            entry = vehicle._entry(name)  # it has come before: only a new list can bring it
+            entry.store(entry.bits ^ 1)
+            vehicle.reboot(down=1.04)
+
+        vehicle.when_listed(at, reboot)
+        world = world_of(vehicle, loss=0.0)
+        self.check_then_and_later(world, vehicle, world.fetch(limit=4.0))
+
+    @pytest.mark.parametrize("after", [0.03, 0.2, 0.4])
+    def test_in_mid_file(self, after: float) -> None:
+        vehicle = ArduPilotVehicle(live_period=0.0)
+        world = world_of(vehicle, loss=0.0)
+        fetch = world.machine.begin_fetch(world.now)
+        world.run(after)
+        vehicle.reboot(world.now, down=1.04)
+        result = world.outcome(fetch, limit=4.0)
+        world.machine.end_fetch(fetch, world.now)
+        self.check_then_and_later(world, vehicle, result)
+
+    def check_then_and_later(self, world: Simulation, vehicle: Vehicle, result: FetchResult) -> None:
+        """The table is of the new run; what is measured after that is read again."""
+        assert result.complete
+        assert differing(world, vehicle) <= MEASURED
+        world.run(1.5)
+        assert len([event for event in world.events if isinstance(event, ComponentRebooted)]) == 1
+        assert world.machine.state == "synced", "the clock has shown a start before the fetch"
+        assert differing(world, vehicle) == MEASURED
+        world.run(6.0)  # 3 s after the clock, at 5 reads in each 100 ms
+        assert differing(world, vehicle) == set()
+
+    def test_a_long_list_waits_for_the_clock(self) -> None:
+        """On a radio more would be repeated than the clock takes, where the numbers tell of no restart."""
+        vehicle = ardupilot(burst=1, period=0.025)
+        vehicle.when_listed(400, lambda: vehicle.reboot(down=1.04))
+        world = world_of(vehicle, loss=0.0)
+        fetch = world.machine.begin_fetch(world.now)
+        world.until(lambda: any(isinstance(event, ComponentRebooted) for event in world.events))
+        assert fetch.begun_anew_at == -math.inf
+        check(world, vehicle, world.outcome(fetch))
+        world.machine.end_fetch(fetch, world.now)
+
+
 @LOSSES
 class TestAReboot:
     @EVERY_KIND
@@ -260,8 +325,13 @@ class TestAReboot:
         vehicle.when_listed(150, reboot)
         world = world_of(vehicle, loss=loss)
         result = world.fetch(limit=down + 20.0)
+        if kind is ardupilot:
+            assert result.complete
+            assert differing(world, vehicle) <= MEASURED
+            world.run(3.0)  # its clock shows the restart later than the list is over
+        else:
+            check(world, vehicle, result)
         assert any(isinstance(event, ComponentRebooted) for event in world.events)
-        check(world, vehicle, result)
 
     @BOTH_AUTOPILOTS
     def test_that_says_that_it_boots(self, kind: Make, loss: float) -> None:

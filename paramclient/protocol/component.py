@@ -47,6 +47,9 @@ MOST_DOUBTED: Final = 256
 """Reads that may be open for a value to be asked for that changed twice: each takes its share of the link."""
 CHECK_PAUSE: Final = 0.1
 """Seconds until a value is read again for which there is no room among the reads."""
+RESTART_SILENCE: Final = 0.25
+"""Seconds of silence behind which a new numbering of frames has a fetch begun anew: an ArduPilot that starts
+again says nothing for that long at least (measured: 0.31 s with a station that talks to it, else 1.0 s)."""
 FRESH_IDENTITY: Final = 1.0
 """Seconds for which an AUTOPILOT_VERSION needs no other."""
 
@@ -110,9 +113,10 @@ class ComponentMachine(Parts):
         if isinstance(message, ParamValue):
             self.receive_value(message, now, version, moment)
             return
+        silent_since = self.presence.heard_at
         self._heard(now, version)
         if sequence is not None and self.presence.numbering_begins(sequence):
-            self._numbering_began(now)
+            self._numbering_began(silent_since, now)
         if isinstance(message, Heartbeat):
             self.who.heartbeat(message)
             state = self.presence.state
@@ -234,10 +238,17 @@ class ComponentMachine(Parts):
         if started_at is not None and self.presence.clock_at == now:
             self.start_values.clock_told(now - started_at, now)
 
-    def _numbering_began(self, now: float) -> None:
-        """Its frames may be numbered from 0 again, as after a start: its clock tells whether it is one."""
-        if self.restart is None or not self.restart.numbering_began(now):
-            self.clock_requests.want(now)
+    def _numbering_began(self, silent_since: float, now: float) -> None:
+        """Its frames may be numbered from 0 again, as after a start: its clock tells whether it is one.
+
+        A fetch that was held up meanwhile does not wait for that.
+        """
+        if self.restart is not None and self.restart.numbering_began(now):
+            return
+        self.clock_requests.want(now)
+        if now - silent_since >= RESTART_SILENCE and self.fetches.seems_restarted(silent_since, now):
+            self.following.forget()
+            self._doubt()
 
     def _note_replaced(self, change: Change, message: ParamValue, now: float) -> None:
         """Remember the value before a change. PX4 has none on the way: it answers with the value of now."""
@@ -665,7 +676,10 @@ class ComponentMachine(Parts):
         self._emit(events.ComponentRebooted(self))
         self.fetches.interrupt(now)
         self.start_values.restarted(now, by_clock=by_clock)
-        self._doubt()
+        started_at = self.presence.started_at if by_clock else None
+        is_of_this_run = started_at is not None and self.fetches.are_since(started_at)
+        if not is_of_this_run:
+            self._doubt()
         self.following.forget()
         self._authors.clear()
         self._checks.clear()
@@ -675,7 +689,7 @@ class ComponentMachine(Parts):
             self.restart.rebooted(now)
         if not by_clock:
             self.clock_requests.want(now)
-        if self.fetch is not None and self.fetch.is_under_way:
+        if self.fetch is not None and self.fetch.is_under_way and not is_of_this_run:
             self.fetch.restart(now)
 
     def _follow_identity(self, now: float) -> None:

@@ -47,6 +47,9 @@ FILE_SHARE: Final = 0.1
 """The time in which the file comes, as a share of the list's: 3.07 s of 34.6 s at 57600 baud (measured)."""
 QUICK_FILE: Final = 0.4
 """Seconds in which the file comes on a link that is no limit (measured)."""
+MOST_TO_REPEAT: Final = 1.5
+"""Seconds of a download that are repeated where the component seems to have started again: ArduPilot's clock
+shows that 1.4 s later (measured)."""
 MOST_RESTARTS: Final = 8
 """Times that a vehicle may start again, or turn out to be another one, before a fetch is given up."""
 
@@ -88,6 +91,8 @@ class Fetch(Operation[FetchResult]):
             be bad luck.
         check: how it is done where only the watch wants it; None where somebody waits for the table.
         first_value_at: when the first value came of a download by list; infinity before.
+        begun_anew_at: when it was begun anew because the component seemed to have started again; minus
+            infinity where it was not.
     """
 
     def __init__(
@@ -131,6 +136,8 @@ class Fetch(Operation[FetchResult]):
         self.check = check
         self._policy = policy
         self._restarts = 0
+        self._download_begun_at = now
+        self.begun_anew_at = -math.inf
         self.holders = 0
         self.download: Download | None = None
         self.file: PackFetch | None = None
@@ -255,6 +262,21 @@ class Fetch(Operation[FetchResult]):
         self._was_asked_meanwhile = False
         self._listed = False
         self._begin_download(now)
+
+    def seems_restarted(self, silent_since: float, now: float) -> bool:
+        """Begin anew where the component may have started again; gives whether that was done.
+
+        It is not where that would repeat more than the component's clock takes to show a restart.
+
+        Args:
+            silent_since: when the component was heard last.
+            now: the time.
+        """
+        if self.done or not self._has_begun or silent_since - self._download_begun_at > MOST_TO_REPEAT:
+            return False
+        self.begun_anew_at = now
+        self.restart(now)
+        return True
 
     def finish(self, result: FetchResult, now: float) -> None:
         """End with a result as soon as no session of a file is open on board that nobody wants."""
@@ -404,6 +426,7 @@ class Fetch(Operation[FetchResult]):
             return
         means = self._means
         self._has_begun = True
+        self._download_begun_at = now
         self._present = present
         means.doubt(now)
         may_use_file = self._is_file_check or self._may_use_file()

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from functools import partial
+from typing import Final
 
 from paramclient.protocol.check_pace import CheckPace
 from paramclient.protocol.fetch import Check, Fetch
@@ -12,6 +14,10 @@ from paramclient.protocol.result import FetchResult, Means, Policy, Sampled
 from paramclient.protocol.sync import Sync, Upkeep
 
 __all__ = ["Fetches"]
+
+EARLY: Final = 0.25
+"""Seconds by which a start may seem to be later than the first frame that shows it: messages are not equally
+long on their way."""
 
 
 class Fetches:
@@ -56,6 +62,7 @@ class Fetches:
         self._says_file = says_file
         self._ended = ended
         self._check_pace = check_pace
+        self._begun_anew_at = -math.inf  # of the last one
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -133,6 +140,18 @@ class Fetches:
         if self.overheard is not None:
             self.overheard.file.close(now)
 
+    def seems_restarted(self, silent_since: float, now: float) -> bool:
+        """The component may have started again, which its clock shows later; see `Fetch.seems_restarted`."""
+        return self.current is not None and self.current.seems_restarted(silent_since, now)
+
+    def are_since(self, started_at: float) -> bool:
+        """Whether the table is of the run of the component that began then: wholly fetched since, or about to
+        be.
+        """
+        fetch = self.current
+        begun_anew_at = self._begun_anew_at if fetch is None else fetch.begun_anew_at
+        return begun_anew_at >= started_at - EARLY
+
     def forget(self) -> None:
         """Another vehicle has taken the address."""
         if self.overheard is not None:
@@ -175,6 +194,8 @@ class Fetches:
         if fetch.file_failed is not None:
             self.file_works = not fetch.file_failed
         result = fetch.result
+        is_whole = result is not None and result.complete
+        self._begun_anew_at = fetch.begun_anew_at if is_whole else -math.inf
         if result is None:
             return
         self.last = result

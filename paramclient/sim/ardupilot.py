@@ -56,6 +56,9 @@ class ArduPilotVehicle(Vehicle):
     - SYSTEM_TIME is sent once a second by Plane and Rover, as streams to a station are set there; by a Copter
       on request alone. It is not sent before the main loop runs, 1.4 s after the first heartbeat; what is
       requested before that is acknowledged, and sent then.
+    - With each start after the first one it measures gyroscopes and barometers anew (INS_GYR*OFFS_*,
+      INS_GYR*_CALTEMP, BARO*_GND_PRESS of sensors that are there), until its main loop runs; nothing is said
+      of it.
     - Some values change by themselves and are sent unasked, index 65535.
 
     Args:
@@ -174,7 +177,7 @@ class ArduPilotVehicle(Vehicle):
 
     def _timers(self) -> tuple[float, ...]:
         times = (self._read_at, self._look_at, self._answer_at, self._live_at)
-        return *times, self._system_id_at, self._window_at
+        return *times, self._system_id_at, self._window_at, self._measured_at
 
     def _take(self, frame: wire.Frame) -> None:
         if self._window_at == math.inf:
@@ -266,6 +269,7 @@ class ArduPilotVehicle(Vehicle):
         self._look_at = math.inf
         self._answer_at = math.inf
         self._system_id_at = math.inf
+        self._measured_at = math.inf if self._is_first_run else at + self._clock_delay
         self._live_at = at + self._live_period if self._live_period else math.inf
         self._list_count = 0
         self._has_answered_in_list = False
@@ -279,6 +283,9 @@ class ArduPilotVehicle(Vehicle):
         if self._system_id_at <= now:
             self._system_id_at = math.inf
             self._take_system_id(self._find(_SYSTEM_ID))
+        if self._measured_at <= now:
+            self._measured_at = math.inf
+            self._measure()
         if self._live_at <= now:
             self._live_at += self._live_period
             if self._live_at <= now:
@@ -301,6 +308,17 @@ class ArduPilotVehicle(Vehicle):
                 self._send_value(entry, index=wire.NO_INDEX, kind=kind)
             self._answers.clear()
             self._untyped.clear()
+
+    def _measure(self) -> None:
+        """Set what is measured at a start, a thousandth above the last time."""
+        for entry in self._entries:
+            value = from_bits(entry.bits, entry.type)
+            if (
+                _MEASURED.fullmatch(entry.name)
+                and isinstance(value, float)
+                and value not in (0.0, _NO_SENSOR)
+            ):
+                entry.store(bits_of(1.001 * float(value), entry.type))
 
     def _send_list(self, now: float) -> None:
         starts_at = self._next_burst
@@ -424,6 +442,8 @@ class ArduPilotVehicle(Vehicle):
 
 
 _INTERNAL = re.compile(r"MIS_TOTAL|BARO\d_(GND_PRESS|DEVID)|ARSPD\d?_DEVID|MNT\d_DEVID")
+_MEASURED = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|BARO\d_GND_PRESS")
+_NO_SENSOR = -300.0  # degrees
 _SYSTEM_ID = "SYSID_THISMAV"
 _STANDBY = 3
 _CALIBRATING = 2
