@@ -278,6 +278,43 @@ def test_in_whatever_order_values_come_the_latest_are_kept_and_lines_make_a_chai
         assert all(old != new for old, new in pairwise(known))
 
 
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_of_two_that_fetch_at_different_times_the_later_writer_makes_no_false_line(
+    data: st.DataObject,
+) -> None:
+    """One writes and tells every value, the other hears of it and tells the latest at each of its writes."""
+    moments = [10.0, 20.0, 30.0]  # of the changes to 17, 18 and 19, in seconds behind NOW
+    truth = [(0.0, 200), *zip(moments, (17, 18, 19), strict=True)]
+    fetched = data.draw(st.sampled_from((0.0, 5.0, 15.0, 25.0, 35.0)), label="when the other fetches")
+    heard = [each for each in truth if each[0] >= fetched] or truth[-1:]
+    current = max(each for each in truth if each[0] <= fetched)
+    others = [(fetched, current[1]), *((moment + 0.5, value) for moment, value in heard if moment > fetched)]
+    streams: list[list[TableUpdate]] = []
+    for observed, tells_all in ((truth, True), (others, False)):
+        cuts = data.draw(st.sets(st.integers(1, len(observed))), label="how many each write has seen")
+        stream: list[TableUpdate] = []
+        begin = 0
+        for end in sorted({*cuts, len(observed)}):
+            part = observed[begin:end] if tells_all else observed[end - 1 : end]
+            begin = end
+            whole: dict[str, Any] = {}
+            if not stream:
+                state = TableState(None, 1, complete=True, synced_at=NOW + observed[0][0])
+                whole = {"replace": True, "whole_at": NOW + observed[0][0], "table": state}
+            items = [stored("PARAM_0", value, index=0, at=NOW + moment) for moment, value in part]
+            stream.append(update(*items, at=NOW + part[-1][0] + 1.0, **whole))
+        streams.append(stream)
+    mixed: list[TableUpdate] = []
+    while any(streams):
+        mixed.append(data.draw(st.sampled_from([stream for stream in streams if stream])).pop(0))
+    with TemporaryDirectory() as folder, ParamCache(Path(folder) / "cache.sqlite3") as cache:
+        for each in mixed:
+            cache.save(each, clock=lambda: NOW + 60.0)
+        lines = [(line.old.value, line.new and line.new.value) for line in cache.history(PX4.key)]
+    assert lines == [(200, 17), (17, 18), (18, 19)]
+
+
 def test_whatever_two_programs_write_to_a_database_was_so(path: str, tmp_path: Path) -> None:
     interleaved(
         lambda: (ParamCache(path, local=tmp_path / "a"), ParamCache(path, local=tmp_path / "b")), examples=15

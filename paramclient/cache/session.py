@@ -315,12 +315,17 @@ class Session(ABC):
             )
 
     def add_births(self, owner: int, births: Iterable[tuple[str, float]]) -> None:
-        """Note names that appeared behind the last line, where the states of the table are known."""
+        """Note names that appeared behind the last line, where the states of the table are known.
+
+        The earlier time counts where one is noted there already.
+        """
         _, _, known_since = self.described(owner)
         if known_since is not None:
             self._many(
                 "INSERT INTO birth (owner, name, line, at)"
-                " VALUES (?, ?, coalesce((SELECT max(id) FROM history WHERE owner = ?), 0), ?)",
+                " VALUES (?, ?, coalesce((SELECT max(id) FROM history WHERE owner = ?), 0), ?)"
+                " ON CONFLICT (owner, name, line) DO UPDATE"
+                " SET at = CASE WHEN excluded.at < birth.at THEN excluded.at ELSE birth.at END",
                 [(owner, name, owner, at) for name, at in births],
             )
 

@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 from paramclient.cache import tables
 from paramclient.cache.earlier import CLOCK_SLACK
@@ -56,12 +56,15 @@ class Past:
     Attributes:
         lines: in their order, with the numbers that they have; None for a new one.
         known_since: since when the states of the table are known.
-        new_names: that have appeared later than the observations that come.
+        births: by name, when it appeared, or, of one that was in the first table and has changed since, when
+            the value that it had there was observed; the earliest of these times.
+        new_births: those that the observations bring.
     """
 
     lines: list[tuple[int | None, Line]]
     known_since: float | None = None
-    new_names: frozenset[str] = frozenset()
+    births: Mapping[str, float] = field(default_factory=dict)
+    new_births: dict[str, float] = field(default_factory=dict)
 
     def observe(self, name: str, seen: Row, by: str, kept: Row | None, *, has_changed: bool = False) -> None:
         """Put in what was observed at a time after which the value was heard again.
@@ -75,18 +78,26 @@ class Past:
         """
         at = seen.heard_at
         place = next((n for n, (_, line) in enumerate(self.lines) if line[1] == name and line[0] > at), None)
+        is_known = has_changed or any(line[1] == name for _, line in self.lines[:place])
         if place is None:
             if kept is None or seen.same_value(kept):
                 return
-            is_known = has_changed or any(line[1] == name for _, line in self.lines)
-            is_new = self.known_since is None or at < self.known_since or name in self.new_names
+            since = self._born(name)
+            is_new = self.known_since is None or at < (self.known_since if since is None else since)
             if is_known or not is_new:
                 self._insert((at, name, by, *kept.value, *seen.value))
+            elif self.known_since is not None:
+                self.new_births[name] = at
             self._insert((kept.heard_at, name, BY_VEHICLE, *seen.value, *kept.value))
             return
         number, (later, _, later_by, *values) = self.lines[place]
         old, new = tuple(values[:3]), tuple(values[3:])
         if _same(seen, old):
+            return
+        born = self._born(name)
+        if born is not None and at < born <= later and not is_known:  # it was `old` at `born`
+            self.new_births[name] = at
+            self._insert((born, name, BY_VEHICLE, *seen.value, *old), before=place)
             return
         if _same(seen, new):
             if later - at > SAME_CHANGE:  # it was so earlier than anybody knew
@@ -96,13 +107,19 @@ class Past:
         self.lines[place] = (number, (later, name, later_by, *seen.value, *new))
         self._insert((at, name, by, *old, *seen.value))
 
+    def _born(self, name: str) -> float | None:
+        """The time before which nothing is known of a name; None where that is `known_since`."""
+        at = min(self.new_births.get(name, math.inf), self.births.get(name, math.inf))
+        return None if at == math.inf else at
+
     def add(self, line: Line) -> None:
         """Put in a line."""
         self._insert(line)
 
-    def _insert(self, line: Line) -> None:
+    def _insert(self, line: Line, *, before: int | None = None) -> None:
+        """Put in a line by its time, and ahead of the line in a place, should they be of one time."""
         place = next((n for n, (_, each) in enumerate(self.lines) if each[0] > line[0]), len(self.lines))
-        self.lines.insert(place, (None, line))
+        self.lines.insert(place if before is None else min(place, before), (None, line))
 
 
 def _settle(session: Session, update: TableUpdate, present: float) -> None:
@@ -171,6 +188,7 @@ def _write_values(
     if len(after) != len(before) or after != before:
         session.put_table(owner, before, after)
     session.add_births(owner, births)
+    session.add_births(owner, _first_changes(session, owner, before, lines))
     _write_past(session, owner, older, lines, seen)
     return after, agrees, not (stays and update.replace)
 
@@ -198,6 +216,21 @@ def _divided(
     if is_late and table is not None and (count is None or table.count not in (None, count)):
         newer = [_placeless(item) for item in newer]  # the places may be those of another count
     return replace(update, params=newer), older, agrees
+
+
+def _first_changes(
+    session: Session, owner: int, before: Mapping[str, Row], lines: Sequence[Line]
+) -> list[tuple[str, float]]:
+    """Return when the values of a first table were observed that change now: their rows say it no more."""
+    if not lines:
+        return []
+    _, _, known_since = session.described(owner)
+    if known_since is None:
+        return []
+    changed = {line[1] for line in lines if line[1] in before and before[line[1]].heard_at < known_since}
+    if changed:
+        changed -= {name for name, _, _ in session.births(owner)}
+    return [(name, before[name].heard_at) for name in sorted(changed)]
 
 
 @dataclass
@@ -259,7 +292,10 @@ def _write_past(
     kept: list[NumberedLine] = session.lines_from(owner, since)
     ahead = max((place for place, (_, line) in enumerate(kept, 1) if line[0] > seen.horizon), default=0)
     kept = kept[ahead:]
-    past = Past(list(kept), known_since, frozenset(name for _, name in session.births_after(owner, since)))
+    births: dict[str, float] = {}
+    for name, _, at in session.births(owner):
+        births[name] = min(at, births.get(name, math.inf))
+    past = Past(list(kept), known_since, births)
     for item in older:
         name = item.param.name
         row = Row.of(item.param, None, False, item.heard_at)
@@ -267,6 +303,7 @@ def _write_past(
         past.observe(name, row, item.by, seen.rows.get(name), has_changed=has_changed)
     for line in lines:  # after the others: up to here it was as the row says
         past.add(line)
+    session.add_births(owner, past.new_births.items())
     if past.lines == kept:
         return
     if past.lines[: len(kept)] == kept:
