@@ -1227,7 +1227,7 @@ def test_sim_with_dead_indices_and_lists_that_stop() -> None:
         dead = PX4Vehicle().param("ATT_EN").index
         far.ask(wire.ParamRequestList(1, 1))
         for _ in range(2):
-            found = far.until(lambda _, message: isinstance(message, wire.SystemTime))
+            found = far.until(lambda _, message: isinstance(message, wire.Heartbeat))
             listed = [each.param_index for each in found if isinstance(each, wire.ParamValue)][1:]
             if listed:
                 break

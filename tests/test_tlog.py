@@ -220,7 +220,8 @@ async def test_no_key_and_no_signature_is_in_the_log(tmp_path: Path) -> None:
     assert any(isinstance(message, wire.SetupSigning) for _, _, message in vehicle.heard)
     written = records(path.read_bytes())
     assert {each.data[2] for each in written} == {0}, "no frame says that it is signed"
-    assert len(messages(path)) == len(written)
+    framer = wire.Framer(stream=False)
+    assert [len(framer.receive(each.data)) for each in written] == [1] * len(written)
     assert not any(isinstance(each, wire.SetupSigning) for each in messages(path))
     assert any(isinstance(each, wire.ParamValue) for each in messages(path))
     assert bytes(range(1, 33)) not in path.read_bytes()

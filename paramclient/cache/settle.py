@@ -82,8 +82,8 @@ class Past:
         if place is None:
             if kept is None or seen.same_value(kept):
                 return
-            since = self._born(name)
-            is_new = self.known_since is None or at < (self.known_since if since is None else since)
+            since = self.known_since if (born := self._born(name)) is None else born
+            is_new = since is None or at < since
             if is_known or not is_new:
                 self._insert((at, name, by, *kept.value, *seen.value))
             elif self.known_since is not None:
@@ -293,8 +293,8 @@ def _write_past(
     ahead = max((place for place, (_, line) in enumerate(kept, 1) if line[0] > seen.horizon), default=0)
     kept = kept[ahead:]
     births: dict[str, float] = {}
-    for name, _, at in session.births(owner):
-        births[name] = min(at, births.get(name, math.inf))
+    for name, _, born in session.births(owner):
+        births[name] = min(born, births.get(name, math.inf))
     past = Past(list(kept), known_since, births)
     for item in older:
         name = item.param.name

@@ -10,6 +10,7 @@ from paramclient.errors import FileErrorCode, FileTransferError, UsageError
 from paramclient.protocol.ftp.blocks import Blocks
 from paramclient.protocol.ftp.jobs import Job, Line
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.timing import MOST_TRIES
 
 __all__ = ["LARGEST_FILE", "MOST_OPENINGS", "SESSION_LOST", "FileRead"]
 
@@ -395,7 +396,8 @@ class FileRead(Job[bytes]):
         if not (is_silence and self._is_silent):  # of a silence that all share one tells enough
             self._line.round_trip.timed_out(attempts)
         self._is_silent = is_silence
-        if self._line.round_trip.is_hopeless(attempts, now):
+        # a server that answers other requests meanwhile is there, and the link is worse than it looks
+        if attempts >= MOST_TRIES or (is_silence and self._line.round_trip.is_hopeless(attempts, now)):
             self.fail(self._no_reply(attempts, now), now)
 
     def _flight_deadline(self, flight: _Flight) -> float:
