@@ -348,6 +348,18 @@ class TestReading:
             reads = [packet for packet in desk.take() if packet.opcode == Opcode.READ_FILE]
             assert (max(packet.offset + packet.size for packet in reads) == 1000) is is_exact
 
+    def test_a_block_that_a_growing_file_has_behind_its_first_size_is_read_again(self) -> None:
+        desk = Desk()
+        read, burst = desk.opened("log/1.BIN", size=300)
+        for block in (0, 1, 3):
+            desk.answer(burst, b"x" * 239, offset=239 * block, nth=block + 1)
+        desk.answer(burst, code=FileErrorCode.EOF, offset=956, nth=5)
+        gap = next(packet for packet in desk.take() if packet.opcode == Opcode.READ_FILE)
+        assert (gap.offset, gap.size) == (478, 239)
+        desk.answer(gap, b"x" * 239, offset=478)
+        desk.closed()
+        assert read.result == b"x" * 956
+
     def test_a_file_of_an_exact_size_ends_with_its_last_byte(self) -> None:
         desk = Desk()
         read, burst = desk.opened("log/1.ulg", size=300)

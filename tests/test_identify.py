@@ -225,6 +225,32 @@ def settled(uid: int) -> Desk:
     return desk
 
 
+def test_a_version_that_tells_no_encoding_waits_for_a_heartbeat() -> None:
+    """ArduPilot's version before its heartbeat: the standard's encoding would write a wrong value."""
+    for heartbeat, encoding in ((ARDUPILOT, Encoding.C_CAST), (None, Encoding.BYTEWISE)):
+        desk = Desk()
+        desk.who.heard(10.0)
+        desk.who.version(AutopilotVersion(ARDUPILOT_BITS), 10.1)
+        assert is_so(not desk.who.may_be_written)
+        if heartbeat is None:  # one that never sends any keeps to the standard
+            desk.who.tick(13.0)
+            assert is_so(not desk.who.may_be_written)
+            assert desk.who.next_deadline() == 13.1
+            desk.who.tick(13.1)
+        else:
+            desk.who.heartbeat(heartbeat)
+        assert is_so(desk.who.may_be_written)
+        assert desk.who.encoding is encoding
+        assert desk.who.next_deadline() == math.inf
+
+
+def test_a_version_that_tells_the_encoding_waits_for_no_heartbeat() -> None:
+    desk = Desk()
+    desk.who.heard(10.0)
+    desk.who.version(AutopilotVersion(CAPABILITY_PARAM_ENCODE_BYTEWISE), 10.1)
+    assert desk.who.may_be_written
+
+
 def test_where_it_is_doubted_it_is_asked_again_who_it_is() -> None:
     desk = settled(7)
     desk.beat(PX4, 20.0)

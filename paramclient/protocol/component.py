@@ -697,7 +697,7 @@ class ComponentMachine(Parts):
         self._report(self.table.use_encoding(self.who.encoding))
         autopilot = self.who.autopilot
         self.reads.pace.is_batched = autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
-        name = "" if autopilot is None else autopilot_name(autopilot)
+        name = autopilot_name(MAV_AUTOPILOT_PX4 if autopilot is None else autopilot)  # it may be one
         self.writes.against_non_finite = reason_against_non_finite(name)
         self.writes.is_px4 = autopilot == MAV_AUTOPILOT_PX4
         if self.fetch is not None:

@@ -284,7 +284,13 @@ class Fetch(Operation[FetchResult]):
         if not files.has_idle_session:
             super().finish(result, now)
         else:
-            files.on_closed.append(lambda at: None if self._is_cancelled else self.finish(result, at))
+            restarts = self._restarts  # a result of the run before a restart is none
+
+            def closed(at: float) -> None:
+                if not self._is_cancelled and self._restarts == restarts:
+                    self.finish(result, at)
+
+            files.on_closed.append(closed)
 
     def cancel(self, now: float) -> None:
         """Nobody waits any more. What is on its way still goes into the table."""

@@ -37,6 +37,10 @@ PX4_WITH_FILE: Final = 0x01120000
 TRIES: Final = 4
 """AUTOPILOT_VERSION is asked for so often where nothing is known of the link, or where it was refused; many
 components (cameras, radios) never give one."""
+HEARTBEAT_PATIENCE: Final = 3.0
+"""Seconds for which the encoding is open after a version that does not tell it, where no heartbeat came yet:
+autopilots send one every second."""
+ENCODING_CAPABILITIES: Final = CAPABILITY_PARAM_ENCODE_BYTEWISE | CAPABILITY_PARAM_ENCODE_C_CAST
 VERSION_DELAY: Final = 0.1
 """Seconds by which AUTOPILOT_VERSION may follow the acknowledgement of its request; then it was lost."""
 DOUBT_PATIENCE: Final = 5.0
@@ -114,6 +118,7 @@ class Identification:
         self._asks_until = -math.inf  # however often that is
         self._denied_at = math.inf  # when the last way of asking was refused
         self._lost_at = math.inf  # when the answer counts as lost, as the request was acknowledged
+        self._beat_awaited_until = math.inf  # while a heartbeat may still tell the encoding
 
     @property
     def has_parameters(self) -> bool:
@@ -141,7 +146,8 @@ class Identification:
     def encoding_is_certain(self) -> bool:
         """Whether nothing that is still to come can tell otherwise."""
         has_said = self.autopilot in (MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4)
-        return self._chosen is not None or has_said or self.settled or not self.has_parameters
+        is_known = self.settled and self._beat_awaited_until == math.inf
+        return self._chosen is not None or has_said or is_known or not self.has_parameters
 
     @property
     def is_doubted(self) -> bool:
@@ -170,6 +176,7 @@ class Identification:
 
     def heartbeat(self, message: Heartbeat | HighLatency2) -> None:
         """Take a heartbeat, or what stands for it."""
+        self._beat_awaited_until = math.inf
         if (message.autopilot, message.type) != (self.autopilot, self.vehicle_type):
             self.autopilot = message.autopilot
             self.vehicle_type = message.type
@@ -213,6 +220,8 @@ class Identification:
         )
         self.capabilities = message.capabilities
         self._judge()
+        if self.autopilot is None and not message.capabilities & ENCODING_CAPABILITIES:
+            self._beat_awaited_until = now + HEARTBEAT_PATIENCE
         is_another = self.settled and before.uid is not None and before.key != self.identity.key
         self.settled = True
         self.known_at = now
@@ -243,11 +252,17 @@ class Identification:
 
     def tick(self, now: float) -> None:
         """Ask again, or let it be."""
-        if self.next_deadline() <= now:
+        if self._beat_awaited_until <= now:
+            self._beat_awaited_until = math.inf
+        if self._next_request_at() <= now:
             self._ask(now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity; it follows what other answers tell of the link."""
+        """When `tick` has something to do, or infinity."""
+        return min(self._next_request_at(), self._beat_awaited_until)
+
+    def _next_request_at(self) -> float:
+        """When to ask again, or infinity; that follows what other answers tell of the link."""
         if not self._is_asking:
             return math.inf
         pause = self._round_trip.repeat_timeout(self._attempts)

@@ -325,7 +325,7 @@ class Table:
         self._set_default(name, initial)
         is_raw = isinstance(from_bits(bits, number), bytes)
         seen_at = self._moments.get(name, moment)
-        self._moments[name] = moment
+        self._moments[name] = max(moment, seen_at)
         self._latest = max(self._latest, moment)
         new = self._held[name] = to_hold(bits, number, is_raw, LIVE, index)
         self._wire[name] = raw

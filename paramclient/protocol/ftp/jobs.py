@@ -314,9 +314,11 @@ class Job(Operation[Result]):
                     self._terminate(packet.session, now)
                 else:
                     then(packet, now)
+            elif self.is_ended and code == FileErrorCode.FAIL:
+                self._terminate(number, now)  # it is open already, by an open of ours whose answer was lost
             elif self.is_ended:
                 self._closed(now)
-            elif self.yields and code == FileErrorCode.FAIL and self._attempts == 1 and not self._failures:
+            elif is_first and code == FileErrorCode.FAIL and self._attempts == 1 and not self._failures:
                 # no answer was lost, so it is another station's session that has this number
                 self._failures = 1
                 self.asked_session = None
@@ -337,6 +339,7 @@ class Job(Operation[Result]):
                 self.asked_session = None
                 self._refused(packet, "does not open", now)
 
+        is_first = self.asked_at == math.inf
         self.asked_at = now
         number = self._line.next_session() if self.asked_session is None else self.asked_session
         self.asked_session = number

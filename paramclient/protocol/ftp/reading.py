@@ -478,8 +478,9 @@ class FileRead(Job[bytes]):
         self._number += 1
         self._flights[sequence] = _Flight(offset, self._number, now, len(self._flights), is_only)
         self._tokens -= 1.0
-        # MAVSDK's server refuses to read beyond the end
-        size = min(self._read_size, self._exact_size - offset)
+        # MAVSDK's server refuses to read beyond the end; a file that grows has more by now
+        left = self._exact_size - offset
+        size = min(self._read_size, left) if left > 0 else self._read_size
         self._line.send(Packet(sequence, self.session or 0, Opcode.READ_FILE, size=size, offset=offset))
 
     # Both
