@@ -315,19 +315,23 @@ class Session(ABC):
             )
 
     def add_births(self, owner: int, births: Iterable[tuple[str, float]]) -> None:
-        """Note names that appeared behind the last line, where the states of the table are known.
+        """Note names that appeared behind the last line, where the states of the table are known."""
+        _, _, known_since = self.described(owner)
+        if known_since is not None:
+            self.add_first_times(owner, births)
+
+    def add_first_times(self, owner: int, times: Iterable[tuple[str, float]]) -> None:
+        """Note names and since when they are known, behind the last line.
 
         The earlier time counts where one is noted there already.
         """
-        _, _, known_since = self.described(owner)
-        if known_since is not None:
-            self._many(
-                "INSERT INTO birth (owner, name, line, at)"
-                " VALUES (?, ?, coalesce((SELECT max(id) FROM history WHERE owner = ?), 0), ?)"
-                " ON CONFLICT (owner, name, line) DO UPDATE"
-                " SET at = CASE WHEN excluded.at < birth.at THEN excluded.at ELSE birth.at END",
-                [(owner, name, owner, at) for name, at in births],
-            )
+        self._many(
+            "INSERT INTO birth (owner, name, line, at)"
+            " VALUES (?, ?, coalesce((SELECT max(id) FROM history WHERE owner = ?), 0), ?)"
+            " ON CONFLICT (owner, name, line) DO UPDATE"
+            " SET at = CASE WHEN excluded.at < birth.at THEN excluded.at ELSE birth.at END",
+            [(owner, name, owner, at) for name, at in times],
+        )
 
     def births(self, owner: int) -> list[tuple[str, int, float]]:
         """Every name that has appeared, behind which line, and when."""

@@ -86,7 +86,7 @@ class Past:
             is_new = since is None or at < since
             if is_known or not is_new:
                 self._insert((at, name, by, *kept.value, *seen.value))
-            elif self.known_since is not None:
+            else:
                 self.new_births[name] = at
             self._insert((kept.heard_at, name, BY_VEHICLE, *seen.value, *kept.value))
             return
@@ -188,7 +188,7 @@ def _write_values(
     if len(after) != len(before) or after != before:
         session.put_table(owner, before, after)
     session.add_births(owner, births)
-    session.add_births(owner, _first_changes(session, owner, before, lines))
+    session.add_first_times(owner, _first_changes(session, owner, before, dict(births), lines))
     _write_past(session, owner, older, lines, seen)
     return after, agrees, not (stays and update.replace)
 
@@ -219,18 +219,32 @@ def _divided(
 
 
 def _first_changes(
-    session: Session, owner: int, before: Mapping[str, Row], lines: Sequence[Line]
+    session: Session,
+    owner: int,
+    before: Mapping[str, Row],
+    births: Mapping[str, float],
+    lines: Sequence[Line],
 ) -> list[tuple[str, float]]:
-    """Return when the values of a first table were observed that change now: their rows say it no more."""
+    """Return when the values of a first table were observed that change now: their rows say it no more.
+
+    Args:
+        session, owner: where the table is.
+        before: its rows.
+        births: the names that appear now, and when they were observed first.
+        lines: the changes.
+    """
     if not lines:
         return []
     _, _, known_since = session.described(owner)
-    if known_since is None:
-        return []
-    changed = {line[1] for line in lines if line[1] in before and before[line[1]].heard_at < known_since}
+    until = math.inf if known_since is None else known_since
+    first = {
+        name: before[name].heard_at if name in before else births.get(name, math.inf)
+        for name in {line[1] for line in lines}
+    }
+    changed = {name for name, at in first.items() if at < until}
     if changed:
         changed -= {name for name, _, _ in session.births(owner)}
-    return [(name, before[name].heard_at) for name in sorted(changed)]
+    return [(name, first[name]) for name in sorted(changed)]
 
 
 @dataclass
@@ -303,7 +317,7 @@ def _write_past(
         past.observe(name, row, item.by, seen.rows.get(name), has_changed=has_changed)
     for line in lines:  # after the others: up to here it was as the row says
         past.add(line)
-    session.add_births(owner, past.new_births.items())
+    session.add_first_times(owner, past.new_births.items())
     if past.lines == kept:
         return
     if past.lines[: len(kept)] == kept:
