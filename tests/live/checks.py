@@ -72,6 +72,8 @@ LOSSY_FETCH: Final[Mapping[tuple[str, float], float]] = {
 LOSSY_LIST: Final[Mapping[float, float]] = {0.05: 3.5, 0.20: 6.0}
 """The same by list, of ArduPilot."""
 
+BASELINE_TIME: Final = 2.5
+"""Seconds until the clock of a vehicle that does not send it was requested; a restart may not show before."""
 NOTICING_TIME: Final = 6.0
 """Seconds after a restart in which it shows, and in which it could show a second time."""
 
@@ -788,6 +790,7 @@ async def reboot_by_another(session: Session) -> Measured:
         await watching.fetch_all()
         await check_disarmed(watching)
         events = watching._client.events()
+        await anyio.sleep(BASELINE_TIME)
         began = time.monotonic()
         await other.reboot()
         back = time.monotonic() - began
