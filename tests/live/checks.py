@@ -164,17 +164,17 @@ def checks(*, reboots: bool) -> Iterator[Check]:
     )
     yield Check("MAVFTP, a file that is not there", read_missing, "FileTransferError, and is_not_found")
     yield Check(
-        "fetch after a program was killed in a transfer",
-        fetch_after_kill,
-        "by list at once, or by file when the session has ended",
-        {"ardupilot": 4.0},
-        kinds=("ardupilot",),
-    )
-    yield Check(
         "fetch after a session was cancelled in a transfer",
         fetch_after_cancellation,
         "as quick as the first, the file was closed",
         {"ardupilot": 0.6},
+        kinds=("ardupilot",),
+    )
+    yield Check(
+        "fetch after a program was killed in a transfer",
+        fetch_after_kill,
+        "by list at once, or by file when the session has ended",
+        {"ardupilot": 4.0},
         kinds=("ardupilot",),
     )
     yield Check(
