@@ -1301,6 +1301,22 @@ class TestOnTheAir:
             assert ground.read("log/1.ulg") == vehicle.files["log/1.ulg"]
             assert ground.now < 2.0
 
+    @pytest.mark.parametrize("job", ["list", "checksum"])
+    def test_a_list_and_a_checksum_wait_for_the_session_of_another_station(self, job: str) -> None:
+        vehicle = ardupilot()
+        vehicle.files["d/log"] = b"a" * 1000
+        ground = Ground(vehicle)
+        opening = Packet(7, 99, Opcode.OPEN_FILE_RO, b"d/log")
+        data = wire.encode(FileTransfer(0, 1, 1, opening.pack()), system=254, component=190, sequence=0)
+        ground.air.receive(data, ground.now)
+        ground.run(0.5)
+        if job == "list":
+            listed = ground.outcome(ground.transfers.list("d", ground.now))
+            assert [entry.name for entry in listed or ()] == ["log"]
+        else:
+            assert ground.outcome(ground.transfers.checksum("d/log", ground.now)) == crc32_px4(b"a" * 1000)
+        assert 3.0 < ground.now < 5.0  # ArduPilot gives a session up after 3 s without a reply
+
     def test_the_session_of_another_station_on_px4_is_left_alone(self) -> None:
         vehicle = PX4Vehicle()
         vehicle.files.update({"log/1.ulg": b"a" * 1000, "log/2.ulg": b"b" * 1000})

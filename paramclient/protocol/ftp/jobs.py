@@ -328,13 +328,8 @@ class Job(Operation[Result]):
                 self._failures += 1
                 self._line.close_session(number)
                 self.begin(now)
-            elif (
-                code in BUSY
-                and not self.yields
-                and now - (since := min(self._busy_since, now)) < BUSY_PATIENCE
-            ):
-                self._busy_since = since
-                self._open_at = now + QUIET_TIME
+            elif self._waits_for_others(code, now):
+                pass
             else:
                 self.asked_session = None
                 self._refused(packet, "does not open", now)
@@ -344,6 +339,14 @@ class Job(Operation[Result]):
         number = self._line.next_session() if self.asked_session is None else self.asked_session
         self.asked_session = number
         self._ask(opcode, opened, now, data=self._path_data, session=number, copies=copies)
+
+    def _waits_for_others(self, code: int, now: float) -> bool:
+        """Begin again later where the server's session is in use; gives whether that is so."""
+        if code not in BUSY or self.yields or now - min(self._busy_since, now) >= BUSY_PATIENCE:
+            return False
+        self._busy_since = min(self._busy_since, now)
+        self._open_at = now + QUIET_TIME
+        return True
 
     @property
     def _failures_allowed(self) -> int:

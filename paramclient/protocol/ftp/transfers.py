@@ -109,7 +109,8 @@ class FileList(Job[tuple[DirectoryEntry, ...]]):
     def _answered(self, packet: Packet, now: float) -> None:
         is_end = packet.opcode == Opcode.NAK and self._code(packet) == FileErrorCode.EOF
         if packet.opcode == Opcode.NAK and not is_end:
-            self._refused(packet, "does not list", now)
+            if not self._waits_for_others(self._code(packet), now):
+                self._refused(packet, "does not list", now)
             return
         items = [] if is_end else [item for item in packet.data.split(b"\0") if item]
         for item in items:
@@ -137,7 +138,8 @@ class FileChecksum(Job[int]):
 
     def _answered(self, packet: Packet, now: float) -> None:
         if packet.opcode == Opcode.NAK:
-            self._refused(packet, "gives no checksum of", now)
+            if not self._waits_for_others(self._code(packet), now):
+                self._refused(packet, "gives no checksum of", now)
         else:
             self.finish(int.from_bytes(packet.data[:4], "little"), now)
 
