@@ -24,7 +24,7 @@ __all__ = ["Answer", "Place", "Requests", "Unreached"]
 
 PREFIX: Final = "/api/v1"
 OPEN_TIMEOUT: Final = 10.0
-"""Seconds for finding a name, connecting and beginning to answer an event stream, as for other links."""
+"""Seconds for finding a name, connecting over TLS and beginning to answer an event stream."""
 SILENCE: Final = 6.0
 """Seconds without a word on the event stream after which the service counts as away: it says something every
 two. A vehicle counts as lost after five."""
