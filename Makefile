@@ -33,6 +33,12 @@ MEASURED = 'protocol/*' 'sim/*' 'cache/*' 'files/*' values.py errors.py identity
 # they start programs of their own, which are not measured, are about rooms that are not, or go where others have been
 UNMEASURED = $(addprefix --ignore=tests/test_,bench.py cli.py docs.py examples.py links.py machine.py packaging.py)
 
+# many tests wait, for a process, a socket or a time limit, and leave their core to the others meanwhile
+WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)')
+
+# the tests start some hundred processes; without bytecode each would compile paramclient anew, and each worker the tests
+unexport PYTHONDONTWRITEBYTECODE
+
 .PHONY: demo test coverage soak live fuzz lint docs screenshots bench cost scale peers dist clean
 .NOTPARALLEL:
 
@@ -40,10 +46,10 @@ demo: $(VENV)/with-cli
 	@$(BIN)/python examples/demo.py
 
 test: $(VENV)/with-test
-	$(BIN)/python -m pytest --numprocesses auto $(TESTS)
+	$(BIN)/python -m pytest --numprocesses $(WORKERS) $(TESTS)
 
 coverage: $(VENV)/with-test
-	$(BIN)/python -m pytest --numprocesses auto --cov --cov-report= $(TESTS) $(UNMEASURED)
+	$(BIN)/python -m pytest --numprocesses $(WORKERS) --cov --cov-report= $(TESTS) $(UNMEASURED)
 	@failed=; for room in $(MEASURED); do \
 		echo "== paramclient/$$room"; \
 		$(BIN)/coverage report --include="paramclient/$$room" --fail-under=95 || failed=1; \

@@ -38,13 +38,21 @@ from paramclient.sim import (
     SimParam,
 )
 from paramclient.values import Encoding, ParamType
-from tests.commands import Command, Put, behind, in_process
+from tests.commands import Command, Put, behind, in_process, leaping
 
 UID = "0002000000003338470e3034"
 
 
 @pytest.fixture
-def command(capsys: pytest.CaptureFixture[str]) -> Command:
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Runs the command in this process, on a clock that leaps."""
+    leaping(monkeypatch)
+    return in_process(capsys)
+
+
+@pytest.fixture
+def live_command(capsys: pytest.CaptureFixture[str]) -> Command:
+    """Runs the command in this process in real time."""
     return in_process(capsys)
 
 
@@ -202,8 +210,8 @@ def test_nothing_is_changed(command: Command, put: Put, tmp_path: Path) -> None:
 # what is printed
 
 
-def test_people_see_a_table(command: Command, put: Put) -> None:
-    done = command("check", put(PX4Vehicle(uid=0x1234567890)))
+def test_people_see_a_table(live_command: Command, put: Put) -> None:
+    done = live_command("check", put(PX4Vehicle(uid=0x1234567890)))
     rows = {row[0]: row[1:] for row in done.rows if row}
     assert done.code == ExitCode.DONE
     assert rows["vehicle"] == ["1/1 px4 quadrotor, disarmed"]

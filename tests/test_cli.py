@@ -35,7 +35,7 @@ from paramclient.notation import hash_text
 from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
 from paramclient.sim.table import Entry
-from tests.commands import Command, Outcome, Put, behind, in_process, strict
+from tests.commands import Command, Outcome, Put, behind, in_process, leaping, strict
 from tests.flying import flying
 from tests.shell import swiftly
 
@@ -54,8 +54,15 @@ HASH = "cf579589"
 
 
 @pytest.fixture
-def command(capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs the command in this process."""
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Runs the command in this process, on a clock that leaps."""
+    leaping(monkeypatch)
+    return in_process(capsys)
+
+
+@pytest.fixture
+def live_command(capsys: pytest.CaptureFixture[str]) -> Command:
+    """Runs the command in this process in real time, for sockets with another process at the far end."""
     return in_process(capsys)
 
 
@@ -624,14 +631,15 @@ def test_a_sample_needs_to_be_accepted(command: Command) -> None:
 # watch
 
 
-def test_watch_prints_lines_of_json_as_values_change(command: Command, tmp_path: Path) -> None:
+def test_watch_prints_lines_of_json_as_values_change(live_command: Command, tmp_path: Path) -> None:
     with (
         simulated("px4") as url,
         process("watch", url, "MC_ROLL_P", "--json", "--no-cache") as watching,
     ):
         assert line_of(watching.stderr) == "watching MC_ROLL_P of 1/1 px4\n"
         before = datetime.now(UTC)
-        assert command("set", url, "MC_PITCH_P", 7, "MC_ROLL_P", "nan", "--force", "--no-cache").code == 0
+        done = live_command("set", url, "MC_PITCH_P", 7, "MC_ROLL_P", "nan", "--force", "--no-cache")
+        assert done.code == 0
         change = strict(line_of(watching.stdout))
         assert list(change) == ["time", "name", "old", "new", "by"]
         at = datetime.fromisoformat(change.pop("time"))
@@ -643,17 +651,17 @@ def test_watch_prints_lines_of_json_as_values_change(command: Command, tmp_path:
     assert (outcome.code, outcome.out, outcome.err) == (130, "", "")
 
 
-def test_watch_without_names_brings_the_table_first(command: Command, tmp_path: Path) -> None:
+def test_watch_without_names_brings_the_table_first(live_command: Command, tmp_path: Path) -> None:
     cache = tmp_path / "cache.sqlite3"
     with simulated("px4", "--system", "3") as url, process("watch", url, "--cache", cache) as watching:
         assert line_of(watching.stderr) == "watching 903 parameters of 3/1 px4\n"
-        assert command("set", url, "MC_ROLL_P", 6.1, "--no-cache").code == 0
+        assert live_command("set", url, "MC_ROLL_P", 6.1, "--no-cache").code == 0
         line = line_of(watching.stdout)
         assert re.fullmatch(r"[0-9T:.-]+Z  MC_ROLL_P  4\.0 -> 6\.1  \(vehicle\)\n", line)
         watching.send_signal(signal.SIGTERM)
         assert ended(watching) == Outcome(143, "", "")
     # what it had learnt by then was kept
-    [kept] = command("show", "3", "--json", "--cache", cache).json["components"]
+    [kept] = live_command("show", "3", "--json", "--cache", cache).json["components"]
     assert kept["params"]["MC_ROLL_P"]["value"] == 6.1
     assert len(kept["params"]) == 903
 
@@ -787,9 +795,9 @@ HEARD_KEYS = [
 ]
 
 
-def test_link_prints_one_object_with_exactly_these_keys(command: Command) -> None:
+def test_link_prints_one_object_with_exactly_these_keys(live_command: Command) -> None:
     with simulated("px4", "--system", "7", "--delay", "0.02", "--bit-errors", "0.0001") as url:
-        heard = command("link", url, "--json", "--seconds", 3)
+        heard = live_command("link", url, "--json", "--seconds", 3)
     assert (heard.code, heard.err) == (0, "")
     assert list(heard.json) == LINK_KEYS
     assert heard.json["link"] == url
@@ -844,8 +852,8 @@ def test_people_see_what_is_heard(command: Command, put: Callable[[Endpoint], st
     assert len(lines) == 10
 
 
-def test_a_link_on_which_nothing_is_heard_is_code_3(command: Command, put: Callable[..., str]) -> None:
-    silent = command("link", "udpin:127.0.0.1:0", "--seconds", 0.3, "--json")
+def test_a_link_on_which_nothing_is_heard_is_code_3(live_command: Command, put: Callable[..., str]) -> None:
+    silent = live_command("link", "udpin:127.0.0.1:0", "--seconds", 0.3, "--json")
     assert (silent.code, silent.out) == (3, "")
     assert re.fullmatch(r"paramclient: no reply: anything on udpin:127\.0\.0\.1:0 in [0-9.]+ s\n", silent.err)
 
@@ -853,7 +861,7 @@ def test_a_link_on_which_nothing_is_heard_is_code_3(command: Command, put: Calla
         async def receive(self) -> list[tuple[Peer, bytes]]:
             return [(peer, b"x" * len(data)) for peer, data in await super().receive()]
 
-    noisy = command("link", put(Noise(PX4Vehicle())), "--seconds", 0.3)
+    noisy = live_command("link", put(Noise(PX4Vehicle())), "--seconds", 0.3)
     assert (noisy.code, noisy.out) == (3, "")
     assert re.search(r"anything on sim:custom \(but [0-9,]+ other bytes\) in", noisy.err)
 
@@ -1063,8 +1071,8 @@ def test_a_bad_link_name_tells_the_forms(command: Command) -> None:
     assert "\n  udpin:HOST:PORT " in outcome.err
 
 
-def test_a_vehicle_that_is_not_there_is_code_3(command: Command) -> None:
-    outcome = command("fetch", "udpin:127.0.0.1:0", "--timeout", 0.1, "--no-cache", "--json")
+def test_a_vehicle_that_is_not_there_is_code_3(live_command: Command) -> None:
+    outcome = live_command("fetch", "udpin:127.0.0.1:0", "--timeout", 0.1, "--no-cache", "--json")
     assert (outcome.code, outcome.out) == (3, "")
     assert outcome.err == "paramclient: no reply: an autopilot in 0.1 s\n"
 
@@ -1078,11 +1086,11 @@ def test_a_vehicle_that_does_not_answer_is_code_3(command: Command, put: Callabl
     assert (outcome.code, outcome.out) == (3, "")
 
 
-def test_a_link_that_fails_is_code_4(command: Command, put: Callable[..., str]) -> None:
+def test_a_link_that_fails_is_code_4(live_command: Command, put: Callable[..., str]) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
-        outcome = command("fetch", f"tcp:127.0.0.1:{port}", "--no-cache")
+        outcome = live_command("fetch", f"tcp:127.0.0.1:{port}", "--no-cache")
     assert (outcome.code, outcome.out) == (4, "")
     assert "connection refused" in outcome.err
     assert outcome.err.count("\n") == 1
@@ -1094,7 +1102,9 @@ def test_a_link_that_fails_is_code_4(command: Command, put: Callable[..., str]) 
                 raise LinkError(f"{self.name}: gone", link=self.name)
             return data
 
-    done = command("set", put(Dropping(GenericVehicle({"A": 1}))), "A", 2, "A", 3, "--json", "--no-cache")
+    done = live_command(
+        "set", put(Dropping(GenericVehicle({"A": 1}))), "A", 2, "A", 3, "--json", "--no-cache"
+    )
     assert done.code == 4
     assert [result["status"] for result in done.json["results"]] == ["link", "link"]
 
@@ -1169,12 +1179,12 @@ def test_a_fetch_that_is_interrupted_in_a_file_has_it_closed_on_board() -> None:
         assert again.json["elapsed_s"] < 2.0, "a session that stays open is closed on board after 3 s"
 
 
-def test_a_second_signal_does_not_wait(command: Command, warm: Path) -> None:
+def test_a_second_signal_does_not_wait(live_command: Command, warm: Path) -> None:
     with simulated("px4") as url, process("watch", url, "MC_ROLL_P", "--cache", warm) as watching:
         line_of(watching.stderr)
         with sqlite3.connect(warm) as other:
             other.execute("BEGIN IMMEDIATE")  # closing has to wait: the change cannot be written
-            assert command("set", url, "MC_ROLL_P", 6, "--no-cache").code == 0
+            assert live_command("set", url, "MC_ROLL_P", 6, "--no-cache").code == 0
             line_of(watching.stdout)
             deadline = time.monotonic() + PATIENCE
             while watching.poll() is None and time.monotonic() < deadline:
@@ -1466,24 +1476,24 @@ def test_a_pipe_gets_no_escape_codes(tmp_path: Path) -> None:
 # sim
 
 
-def test_sim_serves_other_processes_through_a_faulty_link(command: Command) -> None:
+def test_sim_serves_other_processes_through_a_faulty_link(live_command: Command) -> None:
     arguments = ["px4", "--loss", "0.05", "--delay", "0.01", "--jitter", "0.005", "--seed", "1"]
     with simulated(*arguments, "--system", "42", "--bit-errors", "0.00001", "--duplicate", "0.01") as url:
-        fetched = command("fetch", url, "--json", "--no-cache")
+        fetched = live_command("fetch", url, "--json", "--no-cache")
     assert fetched.code == 0
     assert (fetched.json["system"], fetched.json["received"], fetched.json["missing"]) == (42, 903, [])
     with simulated("px4", "--loss", "1") as url:
-        assert command("get", url, "MC_ROLL_P", "--timeout", 1, "--no-cache").code == 3
+        assert live_command("get", url, "MC_ROLL_P", "--timeout", 1, "--no-cache").code == 3
 
 
-def test_sim_answers_with_param_error_where_asked(command: Command) -> None:
+def test_sim_answers_with_param_error_where_asked(live_command: Command) -> None:
     with simulated("ardupilot", "--param-error") as url:
-        got = command("get", url, "NOPE", "--json", "--no-cache")
+        got = live_command("get", url, "NOPE", "--json", "--no-cache")
     assert got.code == 1
     assert "silent" not in got.json["errors"]["NOPE"]
 
 
-def test_sim_speaks_first_on_udpout(command: Command) -> None:
+def test_sim_speaks_first_on_udpout() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         free.settimeout(PATIENCE)

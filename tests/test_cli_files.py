@@ -11,7 +11,7 @@ import pytest
 from paramclient import FileForm, ParamCache, ParamType, read_file
 from paramclient.cli.sources import names_vehicle
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
-from tests.commands import Command, Put, behind, in_process
+from tests.commands import Command, Put, behind, in_process, leaping
 
 ODD = [
     SimParam("BIG", ParamType.INT32, 16777217),
@@ -21,8 +21,9 @@ ODD = [
 
 
 @pytest.fixture
-def command(capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs the command in this process."""
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Runs the command in this process, on a clock that leaps."""
+    leaping(monkeypatch)
     return in_process(capsys)
 
 

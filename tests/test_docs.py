@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import shlex
 import subprocess
 import sys
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from functools import cache
 from pathlib import Path
 from types import ModuleType
+from unittest import mock
 
 import pytest
 
@@ -21,6 +24,8 @@ import paramclient.provision
 import paramclient.remote
 import paramclient.sim
 import paramclient.testing
+from paramclient import cli
+from paramclient.cli.outcome import ExitCode
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
@@ -167,7 +172,11 @@ def test_make_knows_what_the_pages_say() -> None:
 
 @cache
 def help_of(*words: str) -> str:
-    return run("-m", "paramclient", *words, "--help", COLUMNS="200")
+    """What the command prints about one of its own, in this process."""
+    printed = io.StringIO()
+    with mock.patch.dict(os.environ, COLUMNS="200"), redirect_stdout(printed):
+        assert cli.run([*words, "--help"]) == ExitCode.DONE
+    return printed.getvalue()
 
 
 def subcommand(words: list[str]) -> list[str]:

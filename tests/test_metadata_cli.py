@@ -12,15 +12,16 @@ from paramclient.metadata import MetadataStore
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
 from paramclient.sim.metadata import PARAMETER_FILE
 from paramclient.values import ParamType
-from tests.commands import Command, Put, behind, in_process
+from tests.commands import Command, Put, behind, in_process, leaping
 
 DATA = Path(__file__).parent / "data"
 XML = DATA / "apm.pdef.xml"
 
 
 @pytest.fixture
-def command(capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs the command in this process."""
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Runs the command in this process, on a clock that leaps."""
+    leaping(monkeypatch)
     return in_process(capsys)
 
 

@@ -13,7 +13,7 @@ from paramclient.cache.lookup import LISTED_MAX, find_vehicle, is_vehicle_name
 from paramclient.identity import Identity
 from paramclient.sim import PX4Vehicle
 from tests.caches import NOW, PX4, stored, update
-from tests.commands import Command, Put, behind, in_process
+from tests.commands import Command, Put, behind, in_process, leaping
 
 FOUR = "4a00000000000011"
 """The hardware id of system 3: it begins with the number of another system."""
@@ -160,8 +160,9 @@ def cache(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def command(cache: Path, capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs the command in this process, with this cache."""
+def command(cache: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Runs the command in this process, on a clock that leaps, with this cache."""
+    leaping(monkeypatch)
     return in_process(capsys, "--cache", str(cache))
 
 
