@@ -575,6 +575,27 @@ def test_a_name_that_was_found_missing_before_it_was_heard_is_not_gone(path: Pat
         assert values(one).keys() == {"PARAM_0", "PARAM_3"}, "it appeared after the whole table"
 
 
+@pytest.mark.parametrize("seen_before", [True, False])
+def test_what_is_observed_late_of_a_name_that_came_back_is_no_change_of_what_it_was_before(
+    path: Path, seen_before: bool
+) -> None:
+    with ParamCache(path) as one, ParamCache(path) as other:
+        one.save(whole_table(2))
+        one.save(update(removed=["PARAM_0"], removed_at={"PARAM_0": NOW + 1}, at=NOW + 1))
+        late = update(stored("PARAM_0", 5, at=NOW + 2), at=NOW + 6)
+        if seen_before:
+            other.save(late)
+        one.save(update(stored("PARAM_0", 7, index=0, at=NOW + 3), at=NOW + 3))
+        if not seen_before:
+            other.save(late)
+        assert lines_of(one) == [(1, "PARAM_0", 0, None), (3, "PARAM_0", 5, 7)]
+        one.save(update(stored("PARAM_0", 8, index=0, at=NOW + 7), at=NOW + 7))
+        other.save(update(stored("PARAM_0", 6, at=NOW + 2.5), at=NOW + 8))
+        told = [(at, new) for at, _, _, new in lines_of(one)]
+        assert {(1, None), (3, 7), (7, 8)} <= set(told), "each was so at its time"
+        assert values(one) == {"PARAM_0": 8, "PARAM_1": 1}
+
+
 def test_a_part_that_a_fresh_file_has_of_a_whole_table_takes_the_rest(path: Path) -> None:
     with ParamCache(path) as cache:
         state = TableState(7, 2, complete=True, synced_at=NOW + 3)

@@ -4,7 +4,8 @@ A state is worked backwards from the present table. Each line of history takes b
 no line when it appears, so from the moment on when a table was first complete, every new name is noted with
 its time (`birth`). That moment is `known_since`; it moves on as lines of history are dropped. Before it,
 nothing is claimed. Nor is anything of a time that the clock of this computer went through twice, because it
-was set back in between (`setback`).
+was set back in between (`setback`). Of a name in the first table, `birth` has when its value there was
+observed, once that has changed.
 
 Each function works inside its caller's transaction.
 """

@@ -275,6 +275,15 @@ class Session(ABC):
             (owner, name, after, until),
         )
 
+    def last_became(self, owner: int, name: str, until: float) -> tuple[Any, ...] | None:
+        """What the last line of a parameter up to a time made of it, as in `became`; None without a line."""
+        found = self._all(
+            "SELECT new_type, new_bits, new_is_raw FROM history"
+            " WHERE owner = ? AND name = ? AND at <= ? ORDER BY id DESC LIMIT 1",
+            (owner, name, until),
+        )
+        return found[0] if found else None
+
     def last_line_at(self, owner: int) -> float:
         """The time of the last line of a table; minus infinity where it has none."""
         found = self._all("SELECT at FROM history WHERE owner = ? ORDER BY id DESC LIMIT 1", (owner,))
@@ -332,6 +341,11 @@ class Session(ABC):
             " SET at = CASE WHEN excluded.at < birth.at THEN excluded.at ELSE birth.at END",
             [(owner, name, owner, at) for name, at in times],
         )
+
+    def first_times(self, owner: int) -> dict[str, float]:
+        """By name, the earliest time that is noted, of those that have one."""
+        found = self._all("SELECT name, min(at) FROM birth WHERE owner = ? GROUP BY name", (owner,))
+        return dict(cells(row, "sf") for row in found)
 
     def births(self, owner: int) -> list[tuple[str, int, float]]:
         """Every name that has appeared, behind which line, and when."""

@@ -66,7 +66,9 @@ class Past:
     births: Mapping[str, float] = field(default_factory=dict)
     new_births: dict[str, float] = field(default_factory=dict)
 
-    def observe(self, name: str, seen: Row, by: str, kept: Row | None, *, has_changed: bool = False) -> None:
+    def observe(
+        self, name: str, seen: Row, by: str, kept: Row | None, *, ahead: Sequence[int | None] | None = None
+    ) -> None:
         """Put in what was observed at a time after which the value was heard again.
 
         Args:
@@ -74,15 +76,22 @@ class Past:
             seen: the value and its time.
             by: who caused it, should it be a change.
             kept: what the table has now, heard later; None where it has no such name.
-            has_changed: whether there is a line of it ahead of `lines`.
+            ahead: what the last line of it ahead of `lines` made of it; None where there is none.
         """
         at = seen.heard_at
         place = next((n for n, (_, line) in enumerate(self.lines) if line[1] == name and line[0] > at), None)
-        is_known = has_changed or any(line[1] == name for _, line in self.lines[:place])
+        for _, line in self.lines[:place]:
+            if line[1] == name:
+                ahead = line[6:]
+        is_known = ahead is not None
+        has_come_back = ahead is not None and ahead[0] is None  # with this value, or one that is older still
         if place is None:
             if kept is None or seen.same_value(kept):
                 return
-            since = self.known_since if (born := self._born(name)) is None else born
+            if has_come_back:
+                self._insert((kept.heard_at, name, BY_VEHICLE, *seen.value, *kept.value))
+                return
+            since = self._born(name, self.known_since)
             is_new = since is None or at < since
             if is_known or not is_new:
                 self._insert((at, name, by, *kept.value, *seen.value))
@@ -92,7 +101,7 @@ class Past:
             return
         number, (later, _, later_by, *values) = self.lines[place]
         old, new = tuple(values[:3]), tuple(values[3:])
-        if _same(seen, old):
+        if _same(seen, old) or has_come_back:  # when it became `old` is not known
             return
         born = self._born(name)
         if born is not None and at < born <= later and not is_known:  # it was `old` at `born`
@@ -107,10 +116,9 @@ class Past:
         self.lines[place] = (number, (later, name, later_by, *seen.value, *new))
         self._insert((at, name, by, *old, *seen.value))
 
-    def _born(self, name: str) -> float | None:
-        """The time before which nothing is known of a name; None where that is `known_since`."""
-        at = min(self.new_births.get(name, math.inf), self.births.get(name, math.inf))
-        return None if at == math.inf else at
+    def _born(self, name: str, default: float | None = None) -> float | None:
+        """The time before which nothing is known of a name, as noted for it; a new one is the earlier."""
+        return self.new_births.get(name, self.births.get(name, default))
 
     def add(self, line: Line) -> None:
         """Put in a line."""
@@ -188,7 +196,8 @@ def _write_values(
     if len(after) != len(before) or after != before:
         session.put_table(owner, before, after)
     session.add_births(owner, births)
-    session.add_first_times(owner, _first_changes(session, owner, before, dict(births), lines))
+    if lines:
+        session.add_first_times(owner, _first_changes(session, owner, before, dict(births), lines))
     _write_past(session, owner, older, lines, seen)
     return after, agrees, not (stays and update.replace)
 
@@ -233,8 +242,6 @@ def _first_changes(
         births: the names that appear now, and when they were observed first.
         lines: the changes.
     """
-    if not lines:
-        return []
     _, _, known_since = session.described(owner)
     until = math.inf if known_since is None else known_since
     first = {
@@ -243,7 +250,7 @@ def _first_changes(
     }
     changed = {name for name, at in first.items() if at < until}
     if changed:
-        changed -= {name for name, _, _ in session.births(owner)}
+        changed -= session.first_times(owner).keys()
     return [(name, first[name]) for name in sorted(changed)]
 
 
@@ -306,15 +313,12 @@ def _write_past(
     kept: list[NumberedLine] = session.lines_from(owner, since)
     ahead = max((place for place, (_, line) in enumerate(kept, 1) if line[0] > seen.horizon), default=0)
     kept = kept[ahead:]
-    births: dict[str, float] = {}
-    for name, _, born in session.births(owner):
-        births[name] = min(born, births.get(name, math.inf))
-    past = Past(list(kept), known_since, births)
+    past = Past(list(kept), known_since, session.first_times(owner))
     for item in older:
         name = item.param.name
         row = Row.of(item.param, None, False, item.heard_at)
-        has_changed = bool(session.became(owner, name, -1.0, since))
-        past.observe(name, row, item.by, seen.rows.get(name), has_changed=has_changed)
+        became = session.last_became(owner, name, since)
+        past.observe(name, row, item.by, seen.rows.get(name), ahead=became)
     for line in lines:  # after the others: up to here it was as the row says
         past.add(line)
     session.add_first_times(owner, past.new_births.items())
