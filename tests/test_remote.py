@@ -15,7 +15,7 @@ from typing import Any
 import anyio
 import httpx
 import pytest
-from hypothesis import Phase, given, settings
+from hypothesis import Phase, example, given, settings
 from hypothesis import strategies as st
 from starlette.types import ASGIApp, Receive, Scope, Send
 
@@ -675,6 +675,25 @@ STEPS = ["change", "change", "set", "get", "fetch", "cut", "down", "up", "restar
 
 @settings(max_examples=15, deadline=None, phases=[Phase.explicit, Phase.reuse, Phase.generate])
 @given(st.lists(st.sampled_from(STEPS), min_size=3, max_size=25), st.integers(0, 2**32))
+@example(  # a value is read, set and listed while the answer to the read is on its way
+    [
+        "get",
+        "restart",
+        "set",
+        "change",
+        "fetch",
+        "change",
+        "cut",
+        "set",
+        "set",
+        "cut",
+        "cut",
+        "change",
+        "wait",
+        "down",
+    ],
+    241,
+)
 def test_a_mirror_equals_the_table_of_the_service_after_anything(steps: list[str], seed: int) -> None:
     swiftly(follow)(steps, random.Random(seed))
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import weakref
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
 from itertools import pairwise
@@ -204,6 +205,26 @@ async def test_many_listeners_are_woken_seldom_and_one_at_once() -> None:
 
     assert await count(1) == 100
     assert await count(200) <= 200 * 12
+
+
+@swiftly
+async def test_an_event_that_was_sent_releases_what_it_was_written_from() -> None:
+    class Members:
+        def __call__(self) -> str:
+            return '"value":1'
+
+    members = Members()
+    released = weakref.ref(members)
+    async with a_feed() as feed:
+        listener = feed.listen()
+        feed.publish("change", members)
+        del members
+        assert released() is not None
+        for each in (listener, feed.listen(Place(feed.run, 0))):  # the second one gets the same text
+            news = await each.next(1)
+            assert news is not None
+            assert json.loads(news[0].texts[0][1])["value"] == 1
+        assert released() is None
 
 
 @swiftly

@@ -82,15 +82,20 @@ class Followed:
         )
 
     def text_of(self, param: Param) -> str:
-        """A parameter of its table as JSON; that of a value that has not moved is made once."""
+        """A parameter as JSON; that of a value of its table that has not moved is made once."""
         name = param.name
-        shown = self._shown
-        if shown.held.get(name) != held_of(param) or shown.defaults.get(name) != param.default:
+        if not self._is_shown(param):
             self._look_at_values()
+            if not self._is_shown(param):  # an answer that is overtaken: the table has another value by now
+                return param_text(param, self._heard_at.get(name))
         text = self._texts.get(name)
         if text is None:
             text = self._texts[name] = param_text(param, self._heard_at.get(name))
         return text
+
+    def _is_shown(self, param: Param) -> bool:
+        shown, name = self._shown, param.name
+        return shown.held.get(name) == held_of(param) and shown.defaults.get(name) == param.default
 
     def texts(self, params: Iterable[Param]) -> str:
         """Parameters as one JSON object, by name."""
