@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -358,7 +359,7 @@ def test_a_change_by_our_own_write() -> None:
 def test_a_change_by_another_station() -> None:
     desk = Desk(ARDUPILOT)
     desk.hear("A", 1.0)
-    desk.machine.foreign_set("a", "station 254/190", desk.now)
+    desk.machine.foreign_set("a", struct.pack("<f", 2.0), "station 254/190", desk.now)
     desk.hear("A", 2.0)
     desk.hear("B", 2.0)
     assert [change.by for change in desk.changes] == ["vehicle", "station 254/190", "vehicle"]
@@ -367,10 +368,37 @@ def test_a_change_by_another_station() -> None:
     assert desk.changes[-1].by == "vehicle"
 
 
+@pytest.mark.parametrize(
+    ("heard", "by"),
+    [
+        pytest.param(3.0, "station 254/190", id="its value"),
+        pytest.param(2.0, "us", id="our value"),
+        pytest.param(2.5, "us", id="an adjustment"),
+    ],
+)
+def test_a_change_while_our_write_and_another_stations_are_under_way(heard: float, by: str) -> None:
+    desk = Desk()
+    desk.hear("A", 1.0)
+    desk.machine.write("A", 2.0, desk.now)
+    desk.machine.foreign_set("A", struct.pack("<f", 3.0), "station 254/190", desk.now)
+    desk.hear("A", heard)
+    assert [change.by for change in desk.changes] == ["vehicle", by]
+
+
+def test_an_old_set_of_another_station_is_not_the_author_of_what_comes_of_our_write() -> None:
+    desk = Desk()
+    desk.hear("A", 1.0)
+    desk.machine.foreign_set("A", struct.pack("<f", 3.0), "station 254/190", desk.now)
+    desk.now += FOREIGN_SET_MEMORY + 0.1
+    desk.machine.write("A", 2.0, desk.now)
+    desk.hear("A", 3.0)
+    assert desk.changes[-1].by == "us"
+
+
 def test_the_memory_of_other_stations_is_bounded() -> None:
     desk = Desk()
     for number in range(3 * MOST_FOREIGN_SETS):
-        desk.machine.foreign_set(f"N{number}", "station 2/2", desk.now)
+        desk.machine.foreign_set(f"N{number}", bytes(4), "station 2/2", desk.now)
     assert len(desk.machine._authors.foreign_sets) == MOST_FOREIGN_SETS
     desk.hear("N0")
     desk.hear(f"N{3 * MOST_FOREIGN_SETS - 1}")

@@ -24,6 +24,8 @@ DOUBT: Final = 2.0
 """Seconds within which a second change of one value may be an old answer that came late: ArduPilot takes the
 values for a batch of answers up to 100 ms before it sends them, and what was set meanwhile overtakes them."""
 
+_NO_SET: Final = ("", -math.inf, b"")
+
 
 def check_asker(asker: str | None) -> str | None:
     """Who wants a change, as it will stand in the history.
@@ -55,28 +57,39 @@ class Authors:
     """What is remembered for a few seconds of the changes of one component's values.
 
     Attributes:
-        foreign_sets: by name, the station that was heard setting it last, and when; ourselves, where a write
-            was given up before its value had come.
+        foreign_sets: by name, the station that was heard setting it last, when, and the four bytes of the
+            value; ourselves, where a write was given up before its value had come, with no bytes.
     """
 
     __slots__ = ("_changed_at", "_doubts", "foreign_sets")
 
     def __init__(self) -> None:
-        self.foreign_sets: dict[str, tuple[str, float]] = {}
+        self.foreign_sets: dict[str, tuple[str, float, bytes]] = {}
         self._changed_at: dict[str, float] = {}
         self._doubts: dict[str, float] = {}  # what changed again: when to ask for it
 
-    def foreign_set(self, name: str, station: str, now: float) -> None:
+    def foreign_set(self, name: str, station: str, now: float, raw: bytes = b"") -> None:
         """Another station was heard setting a parameter; or ours has, and nobody waits for it any more."""
         self.foreign_sets.pop(name, None)
-        self.foreign_sets[name] = (station, now)
+        self.foreign_sets[name] = (station, now, raw)
         if len(self.foreign_sets) > MOST_FOREIGN_SETS:
             del self.foreign_sets[next(iter(self.foreign_sets))]
 
     def of(self, name: str, now: float) -> str:
         """Who has changed a parameter that no write of ours is about."""
-        station, at = self.foreign_sets.get(name, ("", -math.inf))
+        station, at, _ = self.foreign_sets.get(name, _NO_SET)
         return station if now - at <= FOREIGN_SET_MEMORY else "vehicle"
+
+    def setter_of(self, name: str, raw: bytes, now: float) -> str | None:
+        """Return the station that was heard setting a parameter to just this value, or None.
+
+        Args:
+            name: the parameter.
+            raw: the four bytes of the value as the vehicle sends it.
+            now: the time.
+        """
+        station, at, its_raw = self.foreign_sets.get(name, _NO_SET)
+        return station if its_raw == raw and now - at <= FOREIGN_SET_MEMORY else None
 
     def changed(self, name: str, now: float, is_written: bool) -> None:
         """A value changed: the second time in a short while, the one that came last may be the older one."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Sequence
 from statistics import median_low
 from typing import Final
 
@@ -73,8 +74,17 @@ class CheckPace:
         """Whether the file comes so quickly that it can be read in every interval."""
         return self.has_file and self._time <= FILE_SHARE * self._interval
 
+    @property
+    def hash_interval(self) -> float:
+        """Seconds from one answer with the hash to the next question, so early that the fetch which may
+        follow ends within the interval, where that takes no more than a small share of it."""
+        times = self._times.get("ftp") or self._times.get("stream") or (0.0,)
+        return self._interval - min(median_low(times), FILE_SHARE * self._interval)
+
     def interval(self, *, may_use_file: bool) -> float:
-        """Return the seconds from one check to the next; infinity where there is nothing to check with.
+        """Return the seconds from the start of one check to that of the next: it ends within the interval.
+
+        Infinity where there is nothing to check with.
 
         Args:
             may_use_file: whether the vehicle says that it serves the file.
@@ -84,10 +94,10 @@ class CheckPace:
         return self._stretched(FILE_SHARE) if self.has_file or may_use_file else math.inf
 
     def _stretched(self, share: float) -> float:
-        """The interval, or a longer one in which a check takes no more than that share of the time."""
-        times = self._last_times
+        """The interval less the time of a check, or longer: checks take no more than that share of it."""
+        times, took = self._last_times, self._time
         longest = UNCONFIRMED_INTERVALS * self._interval if len(times) == 1 else math.inf
-        return max(self._interval, min(self._time / share, longest))
+        return max(self._interval - took, min(took / share, longest))
 
     @property
     def shortest_pause(self) -> float:
@@ -101,11 +111,10 @@ class CheckPace:
         return median_low(times) if times else 0.0
 
     @property
-    def _last_times(self) -> deque[float]:
+    def _last_times(self) -> Sequence[float]:
         """The times of the last fetches of the kind that checks are."""
         kind = "ftp" if self.has_file or not self._is_chosen else "stream"
-        return self._times.get(kind, _NO_TIMES)
+        return self._times.get(kind, ())
 
 
 _KINDS = frozenset(("ftp", "stream"))
-_NO_TIMES: deque[float] = deque(maxlen=0)

@@ -202,6 +202,8 @@ class ComponentMachine(Parts):
         if by is None:
             by = authors.of(name, now) if authors.foreign_sets else "vehicle"
         is_wanted = is_ours and writes.wants(message)
+        if is_ours and not is_wanted and authors.foreign_sets:
+            by = authors.setter_of(name, message.raw, now) or by
         if self._checks:
             until = self._checks.ambiguous_until(message, now, is_wanted=is_wanted)
             if until > now:
@@ -272,9 +274,9 @@ class ComponentMachine(Parts):
             self.fetches.overheard.heard(message, now)
         self.reads.defer(message, until, now)
 
-    def foreign_set(self, name: str, station: str, now: float) -> None:
-        """Another station was heard setting a parameter of this component."""
-        self._authors.foreign_set(self.spelling(name), station, now)
+    def foreign_set(self, name: str, raw: bytes, station: str, now: float) -> None:
+        """Another station was heard setting a parameter of this component to these four bytes."""
+        self._authors.foreign_set(self.spelling(name), station, now, raw)
 
     def foreign_file_request(self, message: FileTransfer, station: tuple[int, int], now: float) -> None:
         """Another station was heard asking for a file of this component."""

@@ -665,7 +665,7 @@ class Station:
             is_target = message.target_component in (machine.component, COMP_ID_ALL)
             if is_target and message.target_system in (machine.system, 0):
                 self._touched[machine] = None
-                machine.foreign_set(message.param_id, station, now)
+                machine.foreign_set(message.param_id, message.raw, station, now)
 
     def _receive_foreign_file_request(self, message: FileTransfer, sender: Address, now: float) -> None:
         """Take what another station asks for over MAVFTP."""

@@ -309,7 +309,7 @@ class Sync:
         self.synced = complete
         self._was_synced |= complete or result.has_moved
         self._moved_by_us_alone = result.hash is not None
-        self._settled(now)
+        self._settled(now, now if result.hash is not None else now - result.elapsed)
         if result.has_moved and self._is_kept_up:
             self._check_at = now + GAPS_INTERVAL
         if result.hash is not None:
@@ -430,7 +430,7 @@ class Sync:
         if self.holds or self._is_busy():
             self._check_at = now + BUSY_WAIT
             return
-        self._plan_check(now)
+        self._plan_check(now, now)
         if self._is_spared():
             self._is_checking = False
         elif self.expects_hash:
@@ -442,15 +442,17 @@ class Sync:
             else:
                 self._begin_resync(now, Check(may_list=self._check_pace.may_list))
 
-    def _plan_check(self, now: float) -> None:
-        """Make the next check an interval from now."""
+    def _plan_check(self, now: float, known_at: float) -> None:
+        """Plan the next check so that it ends an interval after the moment of which the table is known."""
         self._checked_at = now
         self._check_at = math.inf
         if self._is_kept_up:
-            interval = self._upkeep.interval
-            if not self.expects_hash:
-                interval = self._check_pace.interval(may_use_file=self._may_use_file())
-            self._check_at = now + interval
+            pace = self._check_pace
+            if self.expects_hash:
+                self._check_at = max(known_at + pace.hash_interval, now)
+            else:
+                interval = pace.interval(may_use_file=self._may_use_file())
+                self._check_at = max(known_at + interval, now + pace.shortest_pause)
 
     def _hash_came(self, read: Read) -> None:
         """A hash has come, or will not come, for which nobody but us waits."""
@@ -472,7 +474,7 @@ class Sync:
                 self._read_unhashed(announced, now)
             if reads_volatile and now >= self._volatile_at:
                 self._read_unhashed(announced, now, again=True)
-            self._settled(now)
+            self._settled(now, now)
         elif self._is_writing() or self._is_fetching():
             return
         elif table.hash is None and self._moved_by_us_alone and not self._is_kept_up:
@@ -498,10 +500,15 @@ class Sync:
         else:
             fetch.on_done.append(ended)
 
-    def _settled(self, now: float) -> None:
-        """It is known how the table stands: say so, if it was in doubt."""
+    def _settled(self, now: float, known_at: float) -> None:
+        """It is known how the table stands: say so, if it was in doubt.
+
+        Args:
+            now: the time.
+            known_at: the moment of the vehicle's table that is known: what changed later may be missing.
+        """
         self._is_checking = False
-        self._plan_check(now)
+        self._plan_check(now, known_at)
         if not self.synced:
             return
         if self._has_fallen or self._moved:
