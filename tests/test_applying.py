@@ -339,6 +339,40 @@ async def test_two_downloads_are_enough_for_any_file(ftp: bool) -> None:
         assert anyio.current_time() - began < plain + 0.5
 
 
+@pytest.mark.parametrize(
+    ("listed", "ftp", "is_beside"),
+    [(6, True, True), (7, True, False), (6, False, False)],
+    ids=["few", "too many", "a list, which reads slow down"],
+)
+@swiftly
+async def test_members_of_a_group_that_is_to_be_shown_are_requested_beside_the_file(
+    listed: int, ftp: bool, is_beside: bool
+) -> None:
+    hidden: dict[str, Value | tuple[ParamType, Value]] = {f"GRIP_{number}": 1.0 for number in range(30)}
+    fence: dict[str, Value | tuple[ParamType, Value]] = {f"FENCE_{number}": 1.0 for number in range(listed)}
+    switches: dict[str, Value | tuple[ParamType, Value]] = dict.fromkeys(
+        ("GRIP_ENABLE", "FENCE_ENABLE"), (ParamType.INT8, 0)
+    )
+    table = SETTINGS | OTHERS | switches | fence
+    tap = Tap(ArduPilotVehicle(table=table, groups={"GRIP_ENABLE": hidden}, ftp=ftp))
+    wanted = dict.fromkeys(switches, 1) | dict.fromkeys((*fence, *hidden), 2.0)
+    async with a_client(tap) as client:
+        component = await client.component()
+        await anyio.sleep(10.0)  # what it measures at its start has been read
+        tap.heard.clear()
+        result = await apply(component, written(wanted))
+    assert result.complete
+    assert statuses(result) == dict.fromkeys(wanted, "set")
+    assert downloads(tap) == 2
+    way = wire.FileTransfer if ftp else wire.ParamRequestList
+    sent = [message for _, _, message in tap.heard]
+    sent = sent[: next(at for at, message in enumerate(sent) if isinstance(message, wire.ParamSet))]
+    reads = [each for each in sent if isinstance(each, wire.ParamRequestRead) and each.param_index < 0]
+    last_of_table = max(at for at, message in enumerate(sent) if isinstance(message, way))
+    assert (sent.index(reads[0]) < last_of_table) is is_beside
+    assert {each.param_id for each in reads} >= hidden.keys()
+
+
 @swiftly
 async def test_a_group_that_cannot_be_asked_by_name_is_set_once_it_is_there() -> None:
     vehicle = ardupilot(Hiding)
@@ -1371,3 +1405,119 @@ async def test_what_px4_cannot_save_is_only_set_when_forced(value: float) -> Non
         assert statuses(result)["TUNE_01"] == "skipped"
         assert "cannot save NaN" in result.rows["TUNE_01"].reason
         assert statuses(await restore(component, state, force=True))["TUNE_01"] == "set"
+
+
+# On a radio
+
+
+def on_a_radio(vehicle: ArduPilotVehicle | PX4Vehicle) -> Tap:
+    """A vehicle on a serial port of 57600 baud."""
+    return Tap(Air.symmetric([vehicle], rate=5760.0, delay=0.02))
+
+
+def ardupilot_on_a_serial_port(**options: Any) -> ArduPilotVehicle:
+    return ArduPilotVehicle(live=(), burst=1, period=0.025, ftp_rate=5760.0, **options)
+
+
+def tuned(vehicle: ArduPilotVehicle, count: int) -> ParamSet:
+    """Other values of so many floats that the vehicle has, one above."""
+    values = {
+        name: param.value
+        for name, param in vehicle.params.items()
+        if name.startswith(("ATC_", "LOIT_", "PSC_", "WPNAV_")) and isinstance(param.value, float)
+    }
+    return written({name: values[name] + 1.0 for name in [*values][:count]})
+
+
+def reads_behind_the_last_set(tap: Tap) -> list[str]:
+    """The names that were asked for by name after the last write."""
+    messages = [message for _, _, message in tap.heard]
+    last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSet))
+    return [each.param_id for each in messages[last + 1 :] if isinstance(each, wire.ParamRequestRead)]
+
+
+@swiftly
+async def test_twenty_values_over_a_radio_take_one_download_and_are_proven_by_name() -> None:
+    tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
+    wanted = tuned(vehicle, 21)
+    first, *changed = wanted
+    assert len(changed) == 20
+    as_it_is = vehicle.params[first].value
+    wanted = written({first: as_it_is, **{name: wanted[name].value for name in changed}})
+    async with a_client(tap) as client:
+        component = await client.component()
+        result = await apply(component, wanted)
+    assert result.complete
+    assert statuses(result) == {**dict.fromkeys(changed, "set"), first: "unchanged"}
+    assert result.elapsed <= 6.5
+    assert downloads(tap) == 1
+    assert sorted(reads_behind_the_last_set(tap)) == sorted(wanted)
+
+
+@swiftly
+async def test_switches_of_groups_take_one_download_over_a_radio_too() -> None:
+    tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
+    hidden = {"EK2_ENABLE": 1, "EK2_ALT_M_NSE": 4.0, "EK2_GPS_TYPE": 2}
+    async with a_client(tap) as client:
+        result = await apply(await client.component(), written(hidden))
+    assert result.complete
+    assert {name: vehicle.param(name).value for name in hidden} == hidden
+    assert result.elapsed <= 6.5
+    assert downloads(tap) == 1
+
+
+@swiftly
+async def test_a_value_that_changes_behind_its_acknowledgement_is_seen_over_a_radio() -> None:
+    tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
+    wanted = tuned(vehicle, 4)
+    one, other, dead, *_ = wanted
+
+    def change(progress: ApplyProgress) -> None:
+        if progress.row is not None and progress.row.name == one:  # on board, without a word
+            vehicle._entry(one).store(bits_of(77.0, ParamType.REAL32))
+            vehicle._dead.add(dead)
+
+    async with a_client(tap) as client:
+        result = await apply(await client.component(), wanted, progress=change)
+    assert (statuses(result)[one], statuses(result)[other]) == ("adjusted", "set")
+    assert result.rows[one].actual == 77.0
+    assert statuses(result)[dead] == "unproven"
+    assert "does not tell" in str(result.rows[dead])
+    assert not result.complete
+    assert downloads(tap) == 1
+
+
+@swiftly
+async def test_a_vehicle_that_falls_silent_before_the_proof_over_a_radio_ends_it() -> None:
+    tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
+    wanted = tuned(vehicle, 3)
+
+    def go_deaf(progress: ApplyProgress) -> None:
+        tap.is_deaf = progress.phase == "reading" and vehicle.requests["PARAM_SET"] > 0
+
+    async with a_client(tap) as client:
+        result = await apply(await client.component(), wanted, progress=go_deaf)
+    assert isinstance(result.error, NoReply)
+    assert set(statuses(result).values()) == {"unproven"}
+
+
+@swiftly
+async def test_a_large_file_is_proven_by_a_download_over_a_radio_too() -> None:
+    tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
+    wanted = ParamSet.of(vehicle.params.values())
+    wanted = ParamSet({**wanted.params, **tuned(vehicle, 5).params})
+    async with a_client(tap) as client:
+        result = await apply(await client.component(), wanted)
+    assert result.complete
+    assert downloads(tap) == 2
+    assert reads_behind_the_last_set(tap) == []
+
+
+@swiftly
+async def test_a_hash_proves_all_of_it_over_a_radio_too() -> None:
+    tap = on_a_radio(PX4Vehicle(burst=3, period=0.025))
+    async with a_client(tap) as client:
+        result = await apply(await client.component(), written({"MC_ROLL_P": 6.25, "MC_PITCH_P": 6.25}))
+    assert result.complete
+    assert set(reads_behind_the_last_set(tap)) == {wire.HASH_CHECK}
+    assert downloads(tap) == 1

@@ -263,6 +263,17 @@ def test_the_pace_of_the_stream_bounds_that_of_the_reads(lost: set[int]) -> None
     assert desk.reads.pace.rate < before
 
 
+def test_ardupilot_is_asked_for_as_many_values_as_its_list_brings_over_a_radio() -> None:
+    """Its list leaves two thirds of the port free, and its reads are answered from there."""
+    desk = Desk()
+    desk.reads.pace.is_batched = True
+    for index in range(100):
+        desk.now += 0.025
+        if index % 10:
+            desk.hear(index)
+    assert desk.reads.pace.rate == pytest.approx(40.0, rel=0.01)
+
+
 def test_what_comes_in_another_order_is_not_asked_for() -> None:
     desk = Desk()
     desk.stream([0, 2, 1, 4, 5, 3])
@@ -632,6 +643,40 @@ def test_when_the_list_was_asked_for_often_enough_another_count_is_settled_by_re
     desk.pass_time(0.5)
     desk.answer(count=104)
     assert desk.download.missing == ()
+
+
+@pytest.mark.parametrize("seed", range(4))  # with the next one no round trip is measured before
+def test_another_pass_of_ardupilot_is_requested_so_that_it_follows_the_one_before(seed: int) -> None:
+    vehicle = listing_ardupilot()
+    session = Simulation(air=Air.symmetric([vehicle], delay=0.05, loss=0.2, seed=seed))
+    session.meet()
+    session.run(3.0)
+    ends: list[float] = []
+
+    def listed() -> None:
+        ends.append(session.now)
+        vehicle.when_listed(len(vehicle.listed), listed)
+
+    vehicle.when_listed(len(vehicle.listed), listed)
+    assert session.fetch().complete
+    arrived = [at + 0.05 for at, message in session.sent if isinstance(message, ParamRequestList)]
+    assert len(ends) >= 2
+    for end in ends[:-1]:
+        assert any(end - 0.05 < at < end + 0.06 for at in arrived), "it arrives when the pass before is over"
+
+
+def test_reads_that_wait_for_their_answers_hold_another_pass_up() -> None:
+    """ArduPilot sends nothing of its list until they are served (measured)."""
+    for passed_over, sends_again in (((), True), (range(0, 870, 29), False)):
+        desk = Desk(round_trip=0.1)
+        desk.reads.pace.is_batched = True
+        desk.pass_time(0.1)
+        desk.stream((index for index in range(930) if index not in passed_over), count=1000)
+        desk.pass_time(0.0)
+        assert desk.take().count("list") == 1
+        desk.stream(range(990, 1000), count=1000)
+        desk.pass_time(0.02)
+        assert ("list" in desk.take()) is sends_again, len(passed_over)
 
 
 def test_what_is_asked_for_already_is_not_asked_for_again_by_the_next_pass() -> None:

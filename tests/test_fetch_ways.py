@@ -190,6 +190,23 @@ def test_a_list_that_has_begun_gives_way_to_a_file_that_is_served() -> None:
     assert not vehicle.open_files
 
 
+def test_a_late_version_that_says_that_no_file_will_come_lets_the_list_begin() -> None:
+    vehicle = ardupilot()
+    assert vehicle._ftp is not None
+    vehicle._ftp.params = lambda: None
+    uplink = Uplink(vehicle)
+    session = Simulation(air=Air.symmetric([uplink], delay=0.05))
+    uplink.loses = LosesFirst(1, CommandLong)
+    fetch = begin_at_heartbeat(session)
+    session.run(0.11)
+    uplink.loses = lambda message: isinstance(message, FileTransfer)  # the opening without the defaults
+    result = session.outcome(fetch)
+    assert (result.source, bits(result.params)) == ("stream", bits(vehicle.params))
+    assert "file not found" in result.notes[0].lower()
+    version_at = session.machine.who.known_at
+    assert version_at <= times_of(session, ParamRequestList)[0] < version_at + 0.01
+
+
 def test_what_the_list_has_brought_whole_is_not_waited_for_as_a_file() -> None:
     vehicle = ardupilot()
     uplink = Uplink(vehicle)

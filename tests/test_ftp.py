@@ -13,9 +13,9 @@ from hypothesis import strategies as st
 from paramclient.errors import FileErrorCode, FileTransferError, LinkError, NoReply, UsageError
 from paramclient.protocol import pack, wire
 from paramclient.protocol.ftp import DirectoryEntry, FileRead, FileTransfers
-from paramclient.protocol.ftp.jobs import BUSY_PATIENCE, MOST_FAILURES, QUIET_TIME
+from paramclient.protocol.ftp.jobs import BUSY_PATIENCE, MOST_FAILURES, MOST_OPENINGS, QUIET_TIME
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
-from paramclient.protocol.ftp.reading import MOST_OPENINGS, MOST_RESTARTS, SMALLEST_WINDOW
+from paramclient.protocol.ftp.reading import MOST_RESTARTS, SMALLEST_WINDOW
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.pack import PackedParam
 from paramclient.protocol.timing import FEWEST_TRIES, MOST_TRIES, RoundTrip
@@ -36,11 +36,14 @@ Result = TypeVar("Result")
 class Desk:
     """The transfers of component 1/1, with everything they send, and a server that a test plays."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, keeps_session: bool = True) -> None:
         self.now = 5.0
+        self.keeps_session = keeps_session
         self.round_trip = RoundTrip()
         self.sent: list[Packet] = []
-        self.transfers = FileTransfers((1, 1), OWN, self.round_trip, self._send)
+        self.transfers = FileTransfers(
+            (1, 1), OWN, self.round_trip, self._send, keeps_session=lambda: self.keeps_session
+        )
 
     def _send(self, message: Message) -> None:
         assert isinstance(message, FileTransfer)
@@ -162,6 +165,15 @@ class TestReading:
         desk.closed()
         assert read.done
         assert read.result == b"a" * 239 + b"b" * 61
+
+    def test_only_a_server_that_keeps_to_our_number_is_asked_for_a_burst_with_it(self) -> None:
+        for keeps_session, requests in (
+            (True, [Opcode.OPEN_FILE_RO] * 2 + [Opcode.BURST_READ_FILE]),
+            (False, [Opcode.OPEN_FILE_RO]),
+        ):
+            desk = Desk(keeps_session=keeps_session)
+            desk.transfers.read("/A.TXT", desk.now)
+            assert [packet.opcode for packet in desk.take()] == requests
 
     def test_an_estimate_of_the_size_is_no_end(self) -> None:
         for size in (0, 10, 100_000):
@@ -972,9 +984,62 @@ class TestHaste:
         desk = self.known_link()
         desk.transfers.read("a", desk.now)
         first, _, _ = desk.take()
+        desk.answer(first, (50_000).to_bytes(4, "little"))
+        desk.pass_time(0.25)
+        read = desk.next(Opcode.READ_FILE)
+        assert (read.session, read.offset) == (first.session, 0)
+        desk.answer(read, b"x" * 239)
+        desk.pass_time(0.04)
+        burst = desk.first(Opcode.BURST_READ_FILE)
+        assert (burst.session, burst.offset) == (first.session, 239)
+
+    def test_a_burst_is_repeated_after_half_a_second_of_silence(self) -> None:
+        desk = self.known_link()
+        desk.transfers.read("a", desk.now)
+        first, _, _ = desk.take()
         desk.answer(first, bytes(4))
+        opened_at = desk.now
         desk.pass_time(0.3)
+        desk.answer(first, bytes(4))  # to the copy of the open
+        desk.pass_time(0.49)
+        reads = desk.take()
+        assert {packet.opcode for packet in reads} == {Opcode.READ_FILE}
+        assert {packet.offset for packet in reads} == {0}
+        assert len(reads) <= 4, "ArduPilot has room for 5 requests"
+        desk.pass_time(0.02)
+        assert desk.now < opened_at + 0.82
         assert desk.first(Opcode.BURST_READ_FILE).session == first.session
+
+    def test_an_open_that_is_answered_late_does_not_repeat_the_burst_beside_it(self) -> None:
+        """On a slow link it waits behind what was sent before it, and its burst is only late as well."""
+        desk = self.known_link()
+        read = desk.transfers.read("a", desk.now)
+        first, _, burst = desk.take()
+        desk.pass_time(0.25)
+        assert {packet.sequence for packet in desk.take()} == {first.sequence}
+        desk.answer(first, (300).to_bytes(4, "little"))
+        desk.pass_time(0.1)
+        assert desk.take() == []
+        desk.answer(burst, b"x" * 239)
+        desk.answer(burst, b"y" * 61, offset=239, nth=2)
+        desk.answer(burst, code=FileErrorCode.EOF, offset=300, nth=3)
+        assert read.received == 300
+        desk.closed(first.session)
+        assert read.result == b"x" * 239 + b"y" * 61
+
+    def test_a_burst_that_was_lost_with_its_open_is_looked_for(self) -> None:
+        desk = self.known_link()
+        desk.transfers.read("a", desk.now)
+        desk.take()
+        desk.pass_time(0.25)
+        again, *_ = desk.take()
+        desk.answer(again, (50_000).to_bytes(4, "little"))
+        desk.pass_time(0.3)
+        read, *_ = desk.take()
+        assert (read.opcode, read.offset) == (Opcode.READ_FILE, 0)
+        desk.answer(read, b"x" * 239)
+        desk.pass_time(0.04)
+        assert desk.first(Opcode.BURST_READ_FILE).offset == 239
 
     def test_on_a_bad_link_requests_go_out_twice(self) -> None:
         desk = self.known_link()
@@ -1164,7 +1229,13 @@ class Ground:
         self.requests = 0
         self._outbox: list[Message] = []
         self._framer = wire.Framer(wire.UNDERSTOOD, stream=False)
-        self.transfers = FileTransfers((1, 1), OWN, self.round_trip, self._outbox.append)
+        self.transfers = FileTransfers(
+            (1, 1),
+            OWN,
+            self.round_trip,
+            self._outbox.append,
+            keeps_session=lambda: isinstance(vehicle, ArduPilotVehicle),
+        )
         self.air.tick(self.now)
 
     def exchange(self) -> None:
@@ -1499,6 +1570,22 @@ class TestSpeed:
         beats = 2 * (ground.now - start + 1)  # HEARTBEAT and SYSTEM_TIME
         banner = 3
         assert ground.air.downlink.sent - sent <= 64 + 1 + banner + beats + 5
+
+    @pytest.mark.parametrize("round_trip", [0.015, 0.025, 0.05, 0.1])
+    @pytest.mark.parametrize("delay", [0.0, 0.02])
+    def test_a_serial_port_carries_the_file_once_however_short_the_round_trip(
+        self, round_trip: float, delay: float
+    ) -> None:
+        """Short messages have a short round trip at 57600 baud, and a block comes behind the banner."""
+        ground = Ground(ardupilot(ftp_rate=5760.0), round_trip=round_trip, delay=delay, rate=5760)
+        ground.run(0.5)
+        start, sent = ground.now, ground.air.downlink.sent
+        ground.read(PARAMS + "?withdefaults=1")
+        assert ground.now - start <= 3.3
+        ground.settle()
+        beats = 2 * (ground.now - start + 1)  # HEARTBEAT and SYSTEM_TIME
+        banner = 3
+        assert ground.air.downlink.sent - sent <= 64 + 1 + banner + beats + 8
 
     def test_a_slow_link_does_not_get_it_twice(self) -> None:
         vehicle = ardupilot(ftp_rate=400.0)

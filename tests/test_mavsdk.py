@@ -20,6 +20,7 @@ from typing import Any
 import anyio
 import pytest
 from mavsdk import ComponentType, Configuration, ConnectionResult, Mavsdk, log_subscribe, log_unsubscribe
+from mavsdk.plugins.ftp_server import FtpServer
 from mavsdk.plugins.param_server import ParamServer
 
 from paramclient import (
@@ -258,3 +259,40 @@ async def test_its_table_is_kept_for_the_next_session(tmp_path: Path) -> None:
             assert len(component.params) == known
             assert (await component.fetch_all()).source == "stream", "it has no hash to confirm it with"
     assert bits(component.params) == BITS
+
+
+class LossyLink(RawLink):
+    """One that loses messages, by a seed."""
+
+    def __init__(self, vehicle: Vehicle, loss: float, seed: int) -> None:
+        super().__init__(vehicle)
+        self._loss = loss
+        self._random = random.Random(seed)
+
+    async def send(self, data: bytes, peer: Peer | None) -> None:
+        if self._random.random() >= self._loss:
+            await super().send(data, peer)
+
+    def _take(self, data: bytes) -> None:
+        if self._random.random() >= self._loss:
+            super()._take(data)
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("loss", [0.0, 0.05])
+async def test_its_files_are_read_to_the_last_byte(loss: float, tmp_path: Path) -> None:
+    """Its server refuses what lies beyond the end of a file."""
+    sizes = [0, 1, 238, 239, 240, 3 * 239, 5000, 80_000]
+    contents = {f"{size}.bin": random.Random(size).randbytes(size) for size in sizes}
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+    with a_vehicle() as vehicle:
+        FtpServer(vehicle.mavsdk.server_component()).set_root_dir(str(tmp_path))
+        async with ParamClient(LossyLink(vehicle, loss, seed=1), cache=False) as client:
+            with anyio.fail_after(PATIENCE):
+                files = client.ftp(await client.component())
+                assert {entry.name: entry.size for entry in await files.list("/")} == {
+                    name: len(content) for name, content in contents.items()
+                }
+                for name, content in contents.items():
+                    assert await files.read(f"/{name}") == content, name

@@ -290,16 +290,32 @@ def test_no_file_is_said_and_remembered() -> None:
     server = Server(vehicle)
     session = Simulation(server)
     result = session.fetch()
-    assert (result.source, server.opened) == ("stream", [FULL_PATH, PARAMETER_FILE])
+    assert (result.source, server.opened) == ("stream", [FULL_PATH])
     assert "file not found" in result.notes[0].lower()
     assert is_whole(result, vehicle)
     assert remembered(session) is False
     again = session.fetch()
-    assert (again.notes, len(server.opened)) == ((), 2)
+    assert (again.notes, len(server.opened)) == ((), 1)
+
+
+def older_ardupilot() -> ArduPilotVehicle:
+    """One of 4.2, which serves the file without the defaults."""
+    vehicle = ArduPilotVehicle(live_period=0)
+    vehicle._version = replace(vehicle._version, flight_sw_version=0x040200FF)
+    return vehicle
+
+
+def test_an_older_server_without_the_file_is_asked_without_the_query_too() -> None:
+    vehicle = older_ardupilot()
+    assert vehicle._ftp is not None
+    vehicle._ftp.params = lambda: None
+    server = Server(vehicle)
+    result = Simulation(server).fetch()
+    assert (result.source, server.opened) == ("stream", [FULL_PATH, PARAMETER_FILE])
 
 
 def test_an_older_server_that_knows_no_query_is_asked_without() -> None:
-    server = Server(vehicle := ArduPilotVehicle(live_period=0))
+    server = Server(vehicle := older_ardupilot())
     assert vehicle._ftp is not None
     serve = vehicle._ftp._open_file
 
@@ -606,13 +622,13 @@ def test_a_file_that_takes_long_is_not_read_unasked() -> None:
     session = upkept(server)
     assert session.fetch().elapsed > 1.5
     opened = len(server.opened)
-    session.run(100.0)
+    session.run(65.0)  # a twentieth of the time, so 69 s
     assert len(server.opened) == opened
     assert lists(session) == 0
 
 
 def test_values_that_move_by_themselves_and_say_so_are_no_news_of_the_watch() -> None:
-    server = Server(vehicle := ArduPilotVehicle(live_period=7.0))
+    server = Server(vehicle := ArduPilotVehicle(live_period=8.0))
     session = upkept(server)
     session.fetch()
     session.events.clear()

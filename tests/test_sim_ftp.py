@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import pytest
 
 from paramclient.errors import FileErrorCode, UsageError
 from paramclient.protocol import pack, wire
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
 from paramclient.protocol.pack import PackedParam
-from paramclient.sim import ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
 from paramclient.values import ParamType, crc32_px4
 
 PARAMS = b"@PARAM/param.pck"
@@ -395,6 +397,30 @@ class TestPace:
         heard = pilot.listen(9.5 * frame / 1920)
         assert len(heard) == 10
         assert len(heard + pilot.listen(frame / 1920)) == 11
+
+    def test_on_a_serial_port_the_first_block_comes_behind_the_banner(self) -> None:
+        """On a real one at 57600 baud 0.095 to 0.105 s after open and burst were asked for."""
+        air = Air.symmetric([ArduPilotVehicle(ftp_rate=5760.0)], rate=5760.0)
+        framer = wire.Framer(stream=False)
+        air.tick(0.0)
+        opening = Packet(100, 3, Opcode.OPEN_FILE_RO, PARAMS + b"?withdefaults=1")
+        for request in (opening, opening, Packet(200, 3, Opcode.BURST_READ_FILE, size=MOST_DATA)):
+            air.receive(file_request(request), 0.5)
+        blocks: list[float] = []
+        now = 0.5
+        while len(blocks) < 4:
+            due = air.next_deadline()
+            assert due is not None
+            now = max(now, due)
+            air.tick(now)
+            for data in air.data_to_send():
+                message = wire.decode(framer.receive(data)[0])
+                if isinstance(message, wire.FileTransfer):
+                    answer = Packet.unpack(message.payload)
+                    blocks += [now] * (answer.requested == Opcode.BURST_READ_FILE)
+        assert 0.095 <= blocks[0] - 0.5 <= 0.125
+        gaps = [later - earlier for earlier, later in pairwise(blocks)]
+        assert gaps == pytest.approx([(MOST_DATA + 27) / 5760] * 3, abs=0.01)
 
     def test_px4_ends_a_burst_early_and_says_so(self) -> None:
         pilot = Pilot(PX4Vehicle())

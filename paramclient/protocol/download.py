@@ -9,7 +9,7 @@ from typing import Final
 from paramclient.errors import NoReply
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.reads import Read, Reads
-from paramclient.protocol.stream import REORDER_DEPTH, SHORTEST_QUIET, ListStream
+from paramclient.protocol.stream import LONGEST_JUMP, REORDER_DEPTH, SHORTEST_QUIET, ListStream
 from paramclient.protocol.table import Table
 from paramclient.protocol.timing import LONGEST_SILENCE, RoundTrip
 from paramclient.protocol.turns import Seen, Turns
@@ -55,6 +55,9 @@ RELIST_GAIN: Final = 1.2
 LONGEST_LEAD: Final = 0.2
 """Seconds before the end of ArduPilot's list from which reads are sent at the earliest: the list pauses only
 0.2 s after the first read (measured)."""
+LEAD_MARGIN: Final = 0.02
+"""Seconds by which a request for another pass is to arrive behind the expected end of this one: one that
+arrives before it cuts it off."""
 MOST_LOSS: Final = 0.9
 """The share of lost exchanges with which is reckoned at most."""
 ASSUMED_LIST: Final = 5.0
@@ -64,6 +67,9 @@ DEAD: Final = 1e-3
 BURST_GAIN: Final = 3.0
 """How many times faster than such a stream the link is taken to be: within a burst of PX4 it is a lot more,
 but a program that was busy sees bursts on any link."""
+PACED_GAIN: Final = 1.3
+"""The same for ArduPilot, whose list takes 30 % of what its port carries (measured): single reads may then be
+as many as its list has values."""
 
 
 class Download(Operation[None]):
@@ -84,6 +90,13 @@ class Download(Operation[None]):
 
     With what is there already only the rest is asked for. Should that turn out to be of another count, or to
     have other names, it counts as nothing.
+
+    Args:
+        target, round_trip, send, reads, turns, now: as their names say.
+        listed: whether the list was requested already.
+        count, present: what is there already, by index, of so many parameters.
+        beside_file: whether a file has been requested that may still bring everything. Then no pass is
+            requested before the one before it has ended.
 
     Attributes:
         count: parameters that the vehicle said it has; None before the first value.
@@ -109,6 +122,7 @@ class Download(Operation[None]):
         listed: bool = False,
         count: int | None = None,
         present: Mapping[int, str] | None = None,
+        beside_file: bool = False,
     ) -> None:
         super().__init__(now)
         self._target = target
@@ -124,6 +138,7 @@ class Download(Operation[None]):
         self._lost: set[int] = set()
         self.lists = 0
         self.gives_way = False
+        self._is_beside_file = beside_file
         self.held_up = 0.0
         self.held_since: float | None = None
         self._passes = 1
@@ -142,6 +157,7 @@ class Download(Operation[None]):
         self._list_patience = math.inf  # how long another pass may let its first value be waited for
         self._is_answered = False  # the first answer to it tells the round trip
         self._list_wait = 0.0
+        self._ahead_at: float | None = None  # when the next pass was requested, before the end of this one
         self._list_asked = 0  # times since the turn began
         self._is_heeded = False  # its head has come since
         self._has_looked = False  # at what it has passed over, as its end is near
@@ -237,6 +253,10 @@ class Download(Operation[None]):
         if self.done:
             return
         self._is_heard = True
+        if self._ahead_at is not None and index <= LONGEST_JUMP < stream.front:
+            self._stream_ends()  # the pass that was requested before its end has begun
+            self._ahead_at = now
+            self._ask_for_another_pass(now)
         if self.count is None:
             self._note_answer(now)
             self.count = count
@@ -285,7 +305,7 @@ class Download(Operation[None]):
 
     def go_on(self, now: float) -> None:
         """What is missing does not come otherwise."""
-        self.gives_way = False
+        self.gives_way = self._is_beside_file = False
         self.tick(now)
 
     def tick(self, now: float) -> None:
@@ -335,7 +355,8 @@ class Download(Operation[None]):
         stream = self._stream
         if self._is_streaming and not stream.is_awaited and self.count is not None:
             self._learn_pace()
-            self._reads.list_until = self._quiet_at + (self.count - stream.front) * stream.gap
+            left = self.count - stream.front + (0 if self._ahead_at is None else self.count)
+            self._reads.list_until = self._quiet_at + left * stream.gap
         self._stream_ends()
         self._forget_reads()
 
@@ -383,7 +404,6 @@ class Download(Operation[None]):
         self._turns.ask(self, now)
 
     def _ask_for_list(self, now: float) -> None:
-        self.lists += 1
         self._list_at = now
         self._is_heeded = self._has_looked = False
         self._list_asked += 1
@@ -394,6 +414,14 @@ class Download(Operation[None]):
         self._list_wait = max(min(self._list_wait * growth, LONGEST_LIST_WAIT), timeout)
         self._stream.is_awaited = True
         self._reads.is_idle = False
+        ahead_at, self._ahead_at = self._ahead_at, None
+        if ahead_at is not None and now < ahead_at + timeout:
+            self._list_at = ahead_at
+        else:
+            self._request_list()
+
+    def _request_list(self) -> None:
+        self.lists += 1
         copies = self._round_trip.copies(LIST_RISK, MOST_LISTS_AT_ONCE)
         if self._passes == 1 and not self._reads.pace.is_batched:
             copies = 1
@@ -438,7 +466,8 @@ class Download(Operation[None]):
             came, passed, _, is_bursty = stream.seen()
             loss = 1 - came / passed if passed else 0.0
             self._round_trip.list_loss = 1.0 - (1.0 - loss) ** 2
-            self._reads.pace.stream_seen(stream.gap, loss, BURST_GAIN if is_bursty else 1.0)
+            gain = PACED_GAIN if self._reads.pace.is_batched else 1.0
+            self._reads.pace.stream_seen(stream.gap, loss, BURST_GAIN if is_bursty else gain)
 
     def _stream_ends(self, *, is_cut: bool = False) -> None:
         self._learn_pace()
@@ -455,6 +484,7 @@ class Download(Operation[None]):
         if self._is_streaming:
             self._learn_pace()
         self._forget_reads()
+        self._ahead_at = None
         self._moves += 1
         self.count = count
         self.names.clear()
@@ -483,7 +513,9 @@ class Download(Operation[None]):
                 del self._stream.holes[index]
                 if index not in self._asked and index not in self.given_up:
                     self._ask(index, now)
-        elif self._another_pass_is_faster(count - len(self.names) - len(self.given_up)):
+        elif self._ahead_at is not None or self._another_pass_is_faster(
+            count - len(self.names) - len(self.given_up)
+        ):
             self._lost.update(self.missing)
             self._ask_for_another_pass(now)
         else:
@@ -491,27 +523,35 @@ class Download(Operation[None]):
 
     @property
     def _ending_at(self) -> float:
-        """When a read that is sent reaches the vehicle at the end of its list; infinity where unknown.
+        """When something that is sent reaches the vehicle at the end of its list; infinity where unknown.
 
         ArduPilot's list comes evenly. Reads beside it take more from it than they bring.
         """
-        stream, trip = self._stream, self._round_trip.smoothed
-        if not (self._is_streaming and self._reads.pace.is_batched) or stream.is_awaited or trip is None:
+        stream, trip = self._stream, self._round_trip.shortest
+        if not (self._is_streaming and self._reads.pace.is_batched) or stream.is_awaited or trip == math.inf:
             return math.inf
         last = (self.count or 0) - 1
         if stream.front < last // 2:
             return math.inf  # its pace is not known well enough
-        return stream.ends_at(last) - min(trip, LONGEST_LEAD)
+        return stream.ends_at(last) - min(trip, LONGEST_LEAD) + LEAD_MARGIN
 
     def _read_at_the_end(self, now: float) -> None:
-        """Ask for what the list has passed over, so that the requests arrive when it is over."""
-        if now < self._ending_at:
+        """Ask for what the list has passed over, so that the requests arrive when it is over.
+
+        Where another pass brings that sooner, it is requested.
+        """
+        if self._ahead_at is not None or now < self._ending_at:
             return
         self._learn_pace()
         front = self._stream.front - REORDER_DEPTH
-        passed_over = sum(index not in self.names for index in range(front))
-        if self._asked or not self._another_pass_is_faster(passed_over):
+        missing = [index for index in range(self.count or 0) if index not in self.names]
+        passed_over = sum(index < front for index in missing)
+        to_be_lost = round(self._stream_loss * (len(missing) - passed_over))
+        if self._asked or not self._another_pass_is_faster(passed_over + to_be_lost):
             self._ask_in_order(front, now)
+        elif not self._is_beside_file:
+            self._ahead_at = now
+            self._request_list()
 
     def _ask_in_order(self, stop: int, now: float) -> None:
         """Ask for what is missing below an index, and was not asked for."""
@@ -528,6 +568,8 @@ class Download(Operation[None]):
             return False
         trip = self._round_trip.smoothed or self._round_trip.timeout
         by_pass = self.count * self._stream.gap + trip + self._time_to_read(missing * self._stream_loss)
+        if self._reads.pace.is_batched:
+            by_pass += len(self._asked) / self._reads.pace.prospect  # its list waits until they are served
         return self._time_to_read(missing) > RELIST_GAIN * by_pass
 
     @property

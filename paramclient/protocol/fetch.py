@@ -198,6 +198,8 @@ class Fetch(Operation[FetchResult]):
 
     def look(self, now: float) -> None:
         """See how the file stands: it may be known by now that there is none, or that the list is quicker."""
+        if self.file is not None:
+            self.file.look(now)
         file = self.file
         if file is None or file.done:
             return
@@ -444,7 +446,13 @@ class Fetch(Operation[FetchResult]):
             # once, and before the file: so the answer is of the time before it
             means.send(ParamRequestRead(*self._target, HASH_CHECK, -1))
         file = self.file = PackFetch(
-            means.files, means.turns, means.table, means.changed, now, yields=self.check is not None
+            means.files,
+            means.turns,
+            means.table,
+            means.changed,
+            now,
+            adds_defaults=means.adds_defaults,
+            yields=self.check is not None,
         )
         file.on_done.append(partial(self._file_ended, file))
 
@@ -519,6 +527,7 @@ class Fetch(Operation[FetchResult]):
             listed=self._listed,
             count=count,
             present=present,
+            beside_file=self.file is not None,
         )
         if download.done:
             self._download_ended(download)

@@ -34,6 +34,9 @@ __all__ = ["Identification", "judge_encoding"]
 
 PX4_WITH_FILE: Final = 0x01120000
 """flight_sw_version of the first PX4 that serves the packed parameter file: 1.18."""
+ARDUPILOT_WITH_DEFAULTS: Final = 0x04040000
+"""flight_sw_version of the first ArduPilot of which every build adds the defaults to that file: 4.4. They
+came during the development of 4.3."""
 TRIES: Final = 4
 """AUTOPILOT_VERSION is asked for so often where nothing is known of the link, or where it was refused; many
 components (cameras, radios) never give one."""
@@ -136,6 +139,12 @@ class Identification:
             return True
         has_none = self.autopilot == MAV_AUTOPILOT_PX4 and self.identity.firmware < PX4_WITH_FILE
         return bool((self.capabilities or 0) & CAPABILITY_FTP) and not has_none
+
+    @property
+    def adds_defaults(self) -> bool:
+        """Whether it is known to serve that file with the defaults, if it serves it."""
+        is_ardupilot = self.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
+        return is_ardupilot and self.identity.firmware >= ARDUPILOT_WITH_DEFAULTS
 
     @property
     def firmware(self) -> tuple[int, str] | None:

@@ -55,6 +55,11 @@ class NameSearch(Operation[None]):
         """Names of which nothing is known."""
         return frozenset(self.passes)
 
+    def leave_out(self, names: Iterable[str]) -> None:
+        """Search no longer for these names. What was requested may still be answered."""
+        for name in names:
+            self.passes.pop(name, None)
+
 
 class NameSearches:
     """Every search of one component, one after the other.
@@ -212,7 +217,7 @@ class NameSearches:
         """The control of this window is answered: what is silent is lost, or does not exist."""
         risk = RISK if self._round_trip.seen_loss else CLEAN_RISK
         enough = max(PASSES_MIN, math.ceil(math.log(risk) / math.log(self._round_trip.feared_loss)))
-        for name in sorted(self._window):
+        for name in sorted(search.passes.keys() & self._window):
             search.passes[name] += 1
             if search.passes[name] < enough:
                 self._silent.append(name)

@@ -44,6 +44,8 @@ class PackFetch(Operation[None]):
         table: where the parameters go.
         changed: is told of the changes.
         now: the time.
+        adds_defaults: whether the component is known to serve the file with the defaults, if it serves it.
+            Else it is asked for without them where there is none with them.
         yields: whether to give up at once when another station has a file open.
 
     Attributes:
@@ -62,9 +64,11 @@ class PackFetch(Operation[None]):
         changed: Callable[[list[Change]], None],
         now: float,
         *,
+        adds_defaults: Callable[[], bool],
         yields: bool = False,
     ) -> None:
         super().__init__(now)
+        self._adds_defaults = adds_defaults
         self._yields = yields
         self._files = files
         self._turns = turns
@@ -74,6 +78,7 @@ class PackFetch(Operation[None]):
         self._heard_count: int | None = None
         self._attempts = 0
         self._query = WITH_DEFAULTS
+        self._not_found: FileTransferError | None = None  # with the defaults
         self._job: FileRead | None = None
         self._silent_at = math.inf
         self._doubts = table.doubts
@@ -164,6 +169,14 @@ class PackFetch(Operation[None]):
         if message.param_count <= MOST_PARAMETERS:
             self._heard_count = message.param_count
 
+    def look(self, now: float) -> None:
+        """See whether the component has said meanwhile that it has no file without the defaults either."""
+        error, job = self._not_found, self._job
+        if error is not None and job is not None and not self.is_served and self._adds_defaults():
+            self._job = None
+            self._files.release(job, now, is_served=False)
+            self._fails(error, now)
+
     def cancel(self, now: float, *, is_served: bool = True) -> None:
         """Nobody wants it any more; the file is closed on board, where the component serves files."""
         job, self._job = self._job, None
@@ -189,18 +202,17 @@ class PackFetch(Operation[None]):
         now = job.ended_at
         if job.result is None:
             may_be_the_query = isinstance(job.error, FileTransferError) and job.error.is_not_found
-            if may_be_the_query and self._query:
+            if may_be_the_query and self._query and not self._adds_defaults():
+                assert isinstance(job.error, FileTransferError)
+                self._not_found = job.error
                 self._query = ""
                 self._attempts -= 1
                 self._read(now)
             else:
                 assert job.error is not None
-                self.is_useless = may_be_the_query or _is_unknown(job.error)
-                self.is_in_use = isinstance(job.error, FileTransferError) and job.error.code in BUSY
                 is_there = self._doubts == self._table.doubts
                 self.is_unheard = is_there and isinstance(job.error, NoReply) and not job.received
-                self._turns.give_back(self)
-                self.fail(job.error, now)
+                self._fails(job.error, now)
             return
         total = total_of(job.result)
         if self._doubts != self._table.doubts:
@@ -221,6 +233,13 @@ class PackFetch(Operation[None]):
         self._turns.give_back(self)
         self._fill(pack)
         self.finish(None, now)
+
+    def _fails(self, error: Exception, now: float) -> None:
+        if isinstance(error, FileTransferError):
+            self.is_useless = error.is_not_found or error.code == FileErrorCode.UNKNOWN_COMMAND
+            self.is_in_use = error.code in BUSY
+        self._turns.give_back(self)
+        self.fail(error, now)
 
     def _is_none(self, error: PackError, now: float, *, is_useless: bool = False) -> None:
         """What came is not the vehicle's table: read it again, or give up."""
@@ -243,8 +262,3 @@ class PackFetch(Operation[None]):
         table.displaced.clear()
         table.count = self._count = pack.total
         self._changed(changes)
-
-
-def _is_unknown(error: Exception) -> bool:
-    """Whether it says that the component does not know what was asked for."""
-    return isinstance(error, FileTransferError) and error.code == FileErrorCode.UNKNOWN_COMMAND

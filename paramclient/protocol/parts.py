@@ -32,7 +32,7 @@ from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.trace import Trace, silent
 from paramclient.protocol.turns import Turns
 from paramclient.protocol.value_check import ValueChecks
-from paramclient.protocol.wire import MAV_AUTOPILOT_PX4, Message
+from paramclient.protocol.wire import MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4, Message
 from paramclient.protocol.writes import Writes
 from paramclient.values import Encoding
 
@@ -86,7 +86,13 @@ class Parts(ABC):
             trace=trace,
         )
         self.presence = Presence()
-        self.files = FileTransfers(target, own, self.round_trip, send)
+        self.files = FileTransfers(
+            target,
+            own,
+            self.round_trip,
+            send,
+            keeps_session=lambda: self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA,
+        )
         check_pace = CheckPace(upkeep.interval, is_chosen=upkeep.without_hash)
         self.sync = Sync(
             self.reads,
@@ -135,6 +141,7 @@ class Parts(ABC):
                 self.turns,
                 self.files,
                 expects_hash=lambda: self.sync.expects_hash,
+                adds_defaults=lambda: self.who.adds_defaults,
                 changed=self._moved,
                 doubt=self._doubt_identity,
                 following=self.following,

@@ -50,6 +50,7 @@ class Means:
         target: system and component.
         round_trip, send, reads, table, turns, files: as their names say.
         expects_hash: whether it has a hash, as far as is known.
+        adds_defaults: whether it is known to serve the parameter file with the defaults, if it serves it.
         changed: is told of changes that no PARAM_VALUE brought.
         doubt: is told that a table has turned out not to be what it was.
         following: the list that another station may be having sent.
@@ -64,6 +65,7 @@ class Means:
     turns: Turns
     files: FileTransfers
     expects_hash: Callable[[], bool]
+    adds_defaults: Callable[[], bool]
     changed: Callable[[list[Change]], None]
     doubt: Callable[[float], None]
     following: Following

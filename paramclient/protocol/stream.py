@@ -7,7 +7,7 @@ from typing import Final
 
 from paramclient.protocol.turns import Seen
 
-__all__ = ["ENOUGH_ADVANCES", "REORDER_DEPTH", "ListStream"]
+__all__ = ["ENOUGH_ADVANCES", "LONGEST_JUMP", "REORDER_DEPTH", "SHORTEST_QUIET", "ListStream"]
 
 REORDER_DEPTH: Final = 3
 """Later values that must have come before a missing one counts as lost, as in TCP's fast retransmit."""

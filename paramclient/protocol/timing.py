@@ -54,6 +54,7 @@ class RoundTrip:
 
     Attributes:
         smoothed: the smoothed round trip in seconds, or None before the first sample.
+        shortest: the shortest sample in seconds; infinity before the first one.
         variation: how much it varies, in seconds.
         list_loss: the share of exchanges that would be lost, by what a list has lost; 0 before one came.
         heard_at: when anything at all came from the component last; its receiver keeps that up to date.
@@ -71,6 +72,7 @@ class RoundTrip:
         "_was_answered",
         "heard_at",
         "list_loss",
+        "shortest",
         "smoothed",
         "variation",
     )
@@ -79,6 +81,7 @@ class RoundTrip:
         self.heard_at = math.inf
         self.list_loss = 0.0
         self.smoothed: float | None = None
+        self.shortest = math.inf
         self.variation = 0.0
         self._backoff = 1.0
         self._samples = 0
@@ -212,6 +215,7 @@ class RoundTrip:
         else:
             self.variation += (abs(self.smoothed - sample) - self.variation) / 4
             self.smoothed += (sample - self.smoothed) / 8
+        self.shortest = min(self.shortest, sample)
         self._backoff = 1.0
         self._silences = 0
         self._samples += 1

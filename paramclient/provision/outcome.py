@@ -110,7 +110,8 @@ class ApplyResult:
         rows: by name, one for each wanted parameter, in the order in which they are written.
         plan: what was planned first.
         before: the state that was stored before anything was sent.
-        extra: names that the vehicle has and that are not wanted; they were left alone.
+        extra: names that the vehicle had when its whole table was read last, and that are not wanted; they
+            were left alone.
         reboots: how often the vehicle was started again.
         reboot_required: names that were written and count only from the next start of the vehicle on.
         error: what ended it before its time, or None. What is in the rows holds all the same.

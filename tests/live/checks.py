@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import os
 import statistics
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterator, Mapping
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from functools import partial
 from typing import Final
 
@@ -27,6 +28,7 @@ from paramclient.events import Events
 from paramclient.logs import import_log
 from paramclient.metadata import ParamInfo
 from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.protocol.ftp.packets import MOST_DATA
 from paramclient.protocol.restart import SAVING_TIME
 from paramclient.protocol.small_change import CHANGE_MIN
 from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, message_name
@@ -44,6 +46,8 @@ MANY_UNKNOWN: Final = 15
 """Names that no vehicle has, in a set-up."""
 RESTORED: Final = 5
 """Parameters that are changed before an earlier state is brought back."""
+APPLIED: Final = 20
+"""Parameters that are set by a set-up over a radio."""
 READS: Final = 10
 """Single reads of which the median counts."""
 FRACTION: Final = 0.1
@@ -51,6 +55,8 @@ FRACTION: Final = 0.1
 SEEN_TIMEOUT: Final = 3.0
 """Seconds in which another session has to learn of a change."""
 PARAMETER_FILE: Final = "@PARAM/param.pck"
+HEARTBEATS: Final = 15
+"""Datagrams beside the blocks of a file that comes once: banner, heartbeats, and answers to requests."""
 RADIO_RATE: Final = 5760.0
 """Bytes per second at 57600 baud."""
 SLOWEST_FETCH: Final = 240.0
@@ -241,6 +247,20 @@ def lossy_checks() -> Iterator[Check]:
         )
     radio = Conditions(rate=RADIO_RATE, drops_telemetry=True)
     yield Check("fetch, 57600 baud", partial(fetch_under, conditions=radio), "every value right")
+    yield Check(
+        "read the parameter file, 57600 baud",
+        partial(read_file_once, conditions=radio),
+        "it comes once, also where the round trip is known to be short",
+        {"ardupilot": 3.7},
+    )
+    yield Check(
+        f"apply {APPLIED} values, 57600 baud",
+        partial(apply_under, conditions=radio),
+        "each set and proven",
+        {"ardupilot": 6.5},
+        kinds=("ardupilot",),
+        writes=True,
+    )
     worst = Conditions(loss=0.20, round_trip=0.1, seed=2)
     yield Check(
         "10 sets, 20% loss, 100 ms",
@@ -432,10 +452,16 @@ async def set_one(session: Session, *, number: ParamType) -> Measured:
     return Measured(f"{name} {param.value!r} to {value} in {seconds * 1000:.0f} ms")
 
 
-async def set_rounded(session: Session) -> Measured:
+def harmless_float(session: Session) -> str:
+    """Return a float that may be changed; skips the check where there is none."""
     name = session.choice.by_type.get(ParamType.REAL32)
     if name is None:
         raise Skip("no harmless parameter of type REAL32")
+    return name
+
+
+async def set_rounded(session: Session) -> Measured:
+    name = harmless_float(session)
     async with session.client() as vehicle:
         param = await vehicle.get(name)
         assert isinstance(param.value, float)
@@ -549,9 +575,7 @@ async def show_group(session: Session) -> Measured:
 
 
 async def set_small(session: Session) -> Measured:
-    name = session.choice.by_type.get(ParamType.REAL32)
-    if name is None:
-        raise Skip("no harmless float")
+    name = harmless_float(session)
     async with session.client() as vehicle:
         param = await vehicle.get(name)
         wanted = from_bits(param.bits + 1, ParamType.REAL32)
@@ -615,6 +639,22 @@ async def apply_hidden(session: Session) -> Measured:
     raise Skip("no switch of a group with a float is off")
 
 
+async def apply_under(session: Session, *, conditions: Conditions) -> Measured:
+    names = session.choice.many[:APPLIED]
+    if len(names) < APPLIED:
+        raise Skip("too few harmless parameters")
+    async with session.under(conditions), session.client() as vehicle:
+        before = session.journal.before
+        session.journal.note({name: before[name] for name in names})
+        await check_disarmed(vehicle)
+        wanted = {name: WrittenParam(name, another_value(before[name])) for name in names}
+        done = await apply(vehicle, ParamSet(wanted), timeout=SLOWEST_FETCH)
+        await put_back(session, vehicle)
+    if not done.complete or done.counts[ApplyStatus.SET] != APPLIED:
+        raise CheckFailed(f"{done}: {'; '.join(map(str, done.news[:5]))}")
+    return Measured(f"{APPLIED} set in {done.elapsed:.2f} s", done.elapsed)
+
+
 async def restore_before(session: Session) -> Measured:
     names = session.choice.many[:RESTORED]
     if not names:
@@ -675,6 +715,27 @@ async def read_file(session: Session) -> Measured:
     if max(seconds) > 2 * min(seconds) + 0.2:
         raise CheckFailed(f"{told} s: it does not take the same time again")
     return Measured(f"{max(sizes)} bytes in {told} s")
+
+
+async def read_file_once(session: Session, *, conditions: Conditions) -> Measured:
+    async with session.under(conditions), session.client() as vehicle:
+        await vehicle.get(0)
+        try:
+            for _ in range(READS):  # short messages, answered at once
+                with suppress(FileTransferError):
+                    await Ftp(vehicle).list("/no-such-directory")
+            before = session.relay.counts().down
+            began = time.monotonic()
+            size = len(await Ftp(vehicle).read(PARAMETER_FILE))
+        except (FileTransferError, NoReply) as error:
+            raise Skip(f"the vehicle serves no parameter file: {error}") from error
+        seconds = time.monotonic() - began
+        datagrams = session.relay.counts().down - before
+    blocks = math.ceil(size / MOST_DATA)
+    told = f"{size} bytes in {seconds:.2f} s, {datagrams} datagrams for {blocks} blocks"
+    if datagrams > 1.5 * blocks + HEARTBEATS:
+        raise CheckFailed(told)
+    return Measured(told, seconds)
 
 
 async def read_missing(session: Session) -> Measured:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from paramclient.protocol.ftp.jobs import BUSY
 from paramclient.protocol.ftp.observed import ObservedRead, ObservedReads
 from paramclient.protocol.ftp.reading import LARGEST_FILE, FileRead
 from paramclient.protocol.ftp.transfers import (
-    BUSY,
     DirectoryEntry,
     FileChecksum,
     FileList,

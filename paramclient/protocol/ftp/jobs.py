@@ -13,7 +13,7 @@ from paramclient.protocol.operation import Operation
 from paramclient.protocol.timing import LONGEST_SILENCE, RoundTrip
 from paramclient.protocol.wire import FileTransfer, Message
 
-__all__ = ["BUSY", "Job", "Line", "path_bytes"]
+__all__ = ["BUSY", "SESSION_LOST", "Job", "Line", "path_bytes"]
 
 Result = TypeVar("Result")
 
@@ -45,6 +45,10 @@ MOST_DOUBLINGS: Final = 4
 the wait doubles after that."""
 BUSY = frozenset((FileErrorCode.INVALID_SESSION, FileErrorCode.NO_SESSIONS_AVAILABLE))
 """What servers say of an open while another station has a file open, or has left one open."""
+SESSION_LOST = frozenset((FileErrorCode.INVALID_SESSION, FileErrorCode.FILE_NOT_FOUND))
+"""What servers say to a request in a session that is not open."""
+MOST_OPENINGS: Final = 3
+"""How often a file is opened when its session is lost on board."""
 
 
 def path_bytes(path: str) -> bytes:
@@ -68,11 +72,19 @@ class Line:
         target: system and component.
         round_trip: the component's; requests feed it, and it says when to repeat them.
         heard_at: when the server sent us anything last.
+        keeps_session: whether the server is known to give a session the number that its open asked for.
     """
 
     def __init__(
-        self, target: tuple[int, int], round_trip: RoundTrip, send: Callable[[Message], None], now: float
+        self,
+        target: tuple[int, int],
+        round_trip: RoundTrip,
+        send: Callable[[Message], None],
+        now: float,
+        *,
+        keeps_session: Callable[[], bool],
     ) -> None:
+        self.keeps_session = keeps_session
         self.target = target
         self.round_trip = round_trip
         self.heard_at = -math.inf
@@ -140,6 +152,7 @@ class Job(Operation[Result]):
         self._attempts = 0
         self._sent_at = math.inf
         self._failures = 0
+        self._openings = 1
         self._busy_since = math.inf
         self._open_at = math.inf  # when the file is opened again, as the server's session is in use
 
@@ -328,11 +341,8 @@ class Job(Operation[Result]):
                 self._failures += 1
                 self._line.close_session(number)
                 self.begin(now)
-            elif self._waits_for_others(code, now):
-                pass
             else:
-                self.asked_session = None
-                self._refused(packet, "does not open", now)
+                self._wait_or_refuse(packet, "does not open", now)
 
         is_first = self.asked_at == math.inf
         self.asked_at = now
@@ -340,12 +350,22 @@ class Job(Operation[Result]):
         self.asked_session = number
         self._ask(opcode, opened, now, data=self._path_data, session=number, copies=copies)
 
-    def _waits_for_others(self, code: int, now: float) -> bool:
-        """Begin again later where the server's session is in use; gives whether that is so."""
-        if code not in BUSY or self.yields or now - min(self._busy_since, now) >= BUSY_PATIENCE:
-            return False
+    def _wait_or_refuse(self, packet: Packet, what: str, now: float) -> None:
+        """Begin again later where the server's session is in use; else end with the error of a NAK."""
         self._busy_since = min(self._busy_since, now)
-        self._open_at = now + QUIET_TIME
+        is_in_use = self._code(packet) in BUSY and now - self._busy_since < BUSY_PATIENCE
+        if is_in_use and not self.yields:
+            self._open_at = now + QUIET_TIME
+        else:
+            self.asked_session = None
+            self._refused(packet, what, now)
+
+    def _may_reopen(self, packet: Packet) -> bool:
+        """Drop a session that the server has given up; gives whether its file may be opened again."""
+        self._openings += 1
+        if self._code(packet) not in SESSION_LOST or self._openings > MOST_OPENINGS:
+            return False
+        self.session = None
         return True
 
     @property

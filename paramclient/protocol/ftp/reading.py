@@ -10,9 +10,9 @@ from paramclient.errors import FileErrorCode, FileTransferError, UsageError
 from paramclient.protocol.ftp.blocks import Blocks
 from paramclient.protocol.ftp.jobs import Job, Line
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
-from paramclient.protocol.timing import MOST_TRIES
+from paramclient.protocol.timing import LONGEST_SILENCE, MOST_TRIES
 
-__all__ = ["LARGEST_FILE", "MOST_OPENINGS", "SESSION_LOST", "FileRead"]
+__all__ = ["LARGEST_FILE", "FileRead"]
 
 LARGEST_FILE: Final = 64 * 1024 * 1024
 """Bytes that a file may have unless it is said otherwise: more than any log of a flight, less than memory."""
@@ -25,9 +25,12 @@ BURSTS_KEPT: Final = 4
 FIRST_BLOCK: Final = 0.7
 FIRST_BLOCK_TRIPS: Final = 2.5
 """Seconds, and round trips, by which the first block of a burst may come later than a short answer: on 1,200
-bytes a second it takes 0.22 s alone, and 0.67 s where the vehicle keeps to a third of that. Asking too early
-lets the vehicle send everything twice. The messages that measured the round trip are almost half as long, so
-a short one tells that the link is not slow."""
+bytes a second it takes 0.22 s alone, and 0.67 s where the vehicle keeps to a third of that. After that a read
+is sent behind the burst: its answer, and no block before it, tells that the burst was lost."""
+BURST_SILENCE: Final = 0.5
+"""Seconds without a message of the server after which a burst of which nothing came is asked for again. At
+57600 baud its first block comes 0.1 s after the request, behind the banner (measured), and later behind
+telemetry. ArduPilot ends no burst for another one: repeated while it comes, the whole file is sent twice."""
 SLOWEST_GAP: Final = 2.0
 """Seconds to wait for the second block of a burst, when nothing is known of its pace."""
 QUIET_BLOCKS: Final = 6
@@ -64,12 +67,8 @@ BURST_DELAY: Final = 0.03
 it: PX4 answers reads at once, and begins a burst up to 20 ms later (measured)."""
 LATE_KEPT: Final = 256
 """Reads that count as lost and whose answers are taken all the same, should they still come."""
-MOST_OPENINGS: Final = 3
 MOST_RESTARTS: Final = 2
-"""How often a file is opened when its session is lost on board, and how often it is opened anew when nobody
-can tell whether it is open."""
-SESSION_LOST = frozenset((FileErrorCode.INVALID_SESSION, FileErrorCode.FILE_NOT_FOUND))
-"""What servers say to a read in a session that is not open."""
+"""How often a file is opened anew when nobody can tell whether it is open."""
 SMALLEST_SHARE: Final = 4
 SPARE_PIECES: Final = 1_000
 """A file may come in so many times as many pieces as its largest size has blocks, and some more: each piece
@@ -100,7 +99,6 @@ class FileRead(Job[bytes]):
         self.size: int | None = None
         self._read_size = read_size
         self._limit = limit
-        self._openings = 1
         self._restarts = 0
         self._has_bursts = True
         self._start_anew()
@@ -116,6 +114,7 @@ class FileRead(Job[bytes]):
         self._blocks = Blocks()
         self._bursts: list[int] = []
         self._burst_runs = False
+        self._read_behind_at = -math.inf  # when a read of where the burst begins was sent behind it last
         self._burst_attempts = 0
         self._burst_session = 0
         self._has_early_burst = False
@@ -145,7 +144,9 @@ class FileRead(Job[bytes]):
         self._start_anew()
         round_trip = self._line.round_trip
         # where the round trip is not measured, what waits for an answer may wait for several timeouts
-        if round_trip.smoothed is None or round_trip.seen_loss < COPY_RISK:
+        is_worth_it = round_trip.smoothed is None or round_trip.seen_loss < COPY_RISK
+        # MAVSDK's server closes the file when a request with another number comes (measured)
+        if is_worth_it and self._line.keeps_session():
             self._begin_early(now)
         else:
             self._open_file(Opcode.OPEN_FILE_RO, self._opened, now)
@@ -239,9 +240,8 @@ class FileRead(Job[bytes]):
         if len(packet.data) >= 4:
             self.size = int.from_bytes(packet.data[:4], "little")
         self._opened_at = now
-        self._has_early_burst = (
-            self._burst_runs and packet.session == self._burst_session and self._attempts == 1
-        )
+        # also where the open was repeated: on a slow link its answer may only be late
+        self._has_early_burst = self._burst_runs and packet.session == self._burst_session
         if not self._has_early_burst:
             self._burst_attempts = 0
             self._burst(now)
@@ -256,6 +256,7 @@ class FileRead(Job[bytes]):
         sequence = self._line.next_sequence(answers=BURST_ANSWERS)
         self._bursts = [*self._bursts[1 - BURSTS_KEPT :], sequence]
         self._burst_runs = True
+        self._read_behind_at = -math.inf
         self._has_early_burst = False
         self._may_burst = False
         self._burst_attempts += 1
@@ -274,9 +275,8 @@ class FileRead(Job[bytes]):
             )
         )
         if self.session is not None:
-            # the first answer to this, and no block before it, tells that the burst was not heard
             for _ in range(min(self._most_copies, 2)):
-                self._read(self._blocks.reached, now)
+                self._read_behind(now)
 
     def _is_of_a_burst(self, packet: Packet) -> bool:
         return any(0 < (packet.sequence - first) & 0xFFFF <= BURST_ANSWERS for first in self._bursts)
@@ -339,25 +339,53 @@ class FileRead(Job[bytes]):
 
     def _quiet_at(self) -> float:
         if self._block_at == math.inf:
-            round_trip = self._line.round_trip
-            longer = min(FIRST_BLOCK, FIRST_BLOCK_TRIPS * (round_trip.smoothed or FIRST_BLOCK))
-            if self._has_early_burst:
-                return self._opened_at + longer
-            backoff = 2.0 ** min(max(self._burst_attempts - 2, 0), MOST_DOUBLINGS)
-            begins_by = self._burst_sent_at + (round_trip.timeout + longer) * backoff
-            return min(begins_by, self._overtaken_at + BURST_DELAY)
+            return min(self._next_read_behind_at, self._repeats_at, self._overtaken_at + BURST_DELAY)
         if self._gap == UNKNOWN_GAP:
             return self._block_at + SLOWEST_GAP
         return self._block_at + max(QUIET_BLOCKS * self._gap, SHORTEST_QUIET)
 
+    @property
+    def _begins_by(self) -> float:
+        """When the first block of the burst is late."""
+        round_trip = self._line.round_trip
+        longer = min(FIRST_BLOCK, FIRST_BLOCK_TRIPS * (round_trip.smoothed or FIRST_BLOCK))
+        if self._has_early_burst:
+            return self._opened_at + longer
+        backoff = 2.0 ** min(max(self._burst_attempts - 2, 0), MOST_DOUBLINGS)
+        return self._burst_sent_at + (round_trip.timeout + longer) * backoff
+
+    @property
+    def _repeats_at(self) -> float:
+        """When a burst of which nothing has come is asked for again."""
+        heard_at = min(self._line.heard_at, self._burst_sent_at + LONGEST_SILENCE)
+        return max(self._begins_by, max(self._burst_sent_at, heard_at) + BURST_SILENCE)
+
+    @property
+    def _next_read_behind_at(self) -> float:
+        """When a read is sent behind a burst of which nothing has come; infinity where enough were sent."""
+        if len(self._flights) >= HELD:
+            return math.inf
+        if self._read_behind_at == -math.inf:
+            return self._begins_by
+        return self._read_behind_at + self._line.round_trip.prompt_timeout
+
     def _burst_is_silent(self, now: float) -> None:
-        was_heard = self._block_at < math.inf or self._overtaken_at < math.inf
-        if was_heard:
-            self._may_burst = self._may_burst or self._block_at == math.inf
+        if self._block_at < math.inf:
             self._stop_burst(now)
-        else:
+        elif self._overtaken_at < math.inf:
+            self._line.round_trip.timed_out(self._burst_attempts)
+            self._may_burst = True
+            self._stop_burst(now)
+        elif now >= self._repeats_at:
             self._line.round_trip.timed_out(self._burst_attempts)
             self._burst(now)
+        else:
+            self._read_behind(now)
+
+    def _read_behind(self, now: float) -> None:
+        """Send a read behind the burst: its answer, and no block before it, tells that the burst was lost."""
+        self._read_behind_at = now
+        self._read(self._blocks.reached, now)
 
     # Single reads
 
@@ -371,7 +399,7 @@ class FileRead(Job[bytes]):
         if packet.opcode == Opcode.ACK and packet.data:
             is_ahead = flight.offset >= self._blocks.reached
             self._keep(packet, flight.offset, now)
-            if is_ahead and self._burst_runs:
+            if is_ahead and self._burst_runs and flight.sent_at >= self._burst_sent_at:
                 self._overtaken_at = min(self._overtaken_at, now)
             self._may_burst = self._may_burst or (is_ahead and not self._burst_runs)
         elif packet.opcode == Opcode.ACK or self._code(packet) == FileErrorCode.EOF:
@@ -511,13 +539,11 @@ class FileRead(Job[bytes]):
 
     def _does_not_read(self, packet: Packet, now: float) -> None:
         """The server refuses; where the session is lost, as when another station resets all, begin anew."""
-        self._openings += 1
-        if self._code(packet) not in SESSION_LOST or self._openings > MOST_OPENINGS:
+        if self._may_reopen(packet):
+            self._start_anew()
+            self._open_file(Opcode.OPEN_FILE_RO, self._opened, now)
+        else:
             self._refused(packet, "does not read", now)
-            return
-        self.session = None
-        self._start_anew()
-        self._open_file(Opcode.OPEN_FILE_RO, self._opened, now)
 
     def _ends_at(self, offset: int) -> None:
         self._blocks.ends_at(min(offset, self._limit))

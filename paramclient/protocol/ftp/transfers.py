@@ -12,13 +12,13 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeVar
 
 from paramclient.errors import FileErrorCode, NoReply, UsageError
-from paramclient.protocol.ftp.jobs import BUSY, Job, Line
+from paramclient.protocol.ftp.jobs import Job, Line
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
-from paramclient.protocol.ftp.reading import LARGEST_FILE, MOST_OPENINGS, SESSION_LOST, FileRead
+from paramclient.protocol.ftp.reading import LARGEST_FILE, FileRead
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.wire import FileTransfer, Message
 
-__all__ = ["BUSY", "DirectoryEntry", "FileChecksum", "FileList", "FileRead", "FileTransfers", "FileWrite"]
+__all__ = ["DirectoryEntry", "FileChecksum", "FileList", "FileRead", "FileTransfers", "FileWrite"]
 
 AnyJob = TypeVar("AnyJob", bound=Job[Any])
 
@@ -54,7 +54,6 @@ class FileWrite(Job[None]):
         self.written = 0
         self._data = data
         self._write_size = write_size
-        self._openings = 1
 
     def begin(self, now: float) -> None:
         self.written = 0
@@ -79,12 +78,10 @@ class FileWrite(Job[None]):
 
     def _refused_or_lost(self, packet: Packet, what: str, now: float) -> None:
         """The server refuses; where it has given up the session, as after a long silence, begin anew."""
-        self._openings += 1
-        if self._code(packet) not in SESSION_LOST or self._openings > MOST_OPENINGS:
-            self._refused(packet, what, now)
-        else:
-            self.session = None
+        if self._may_reopen(packet):
             self.begin(now)
+        else:
+            self._refused(packet, what, now)
 
     def _taken(self, packet: Packet, now: float) -> None:
         was_closed_before = self._code(packet) == FileErrorCode.INVALID_SESSION and self._attempts > 1
@@ -109,8 +106,7 @@ class FileList(Job[tuple[DirectoryEntry, ...]]):
     def _answered(self, packet: Packet, now: float) -> None:
         is_end = packet.opcode == Opcode.NAK and self._code(packet) == FileErrorCode.EOF
         if packet.opcode == Opcode.NAK and not is_end:
-            if not self._waits_for_others(self._code(packet), now):
-                self._refused(packet, "does not list", now)
+            self._wait_or_refuse(packet, "does not list", now)
             return
         items = [] if is_end else [item for item in packet.data.split(b"\0") if item]
         for item in items:
@@ -138,8 +134,7 @@ class FileChecksum(Job[int]):
 
     def _answered(self, packet: Packet, now: float) -> None:
         if packet.opcode == Opcode.NAK:
-            if not self._waits_for_others(self._code(packet), now):
-                self._refused(packet, "gives no checksum of", now)
+            self._wait_or_refuse(packet, "gives no checksum of", now)
         else:
             self.finish(int.from_bytes(packet.data[:4], "little"), now)
 
@@ -156,6 +151,8 @@ class FileTransfers:
         own: ours; what the server sends to others is passed over.
         round_trip: the component's.
         send: takes what is to be sent.
+        keeps_session: whether the server is known to give a session the number that its open asked for, as
+            ArduPilot does.
 
     Attributes:
         on_closed: called once, in order, with the time, when the session of a job that has ended is closed.
@@ -168,7 +165,10 @@ class FileTransfers:
         own: tuple[int, int],
         round_trip: RoundTrip,
         send: Callable[[Message], None],
+        *,
+        keeps_session: Callable[[], bool],
     ) -> None:
+        self._keeps_session = keeps_session
         self._target = target
         self._own = own
         self._round_trip = round_trip
@@ -310,7 +310,9 @@ class FileTransfers:
 
     def _line_at(self, now: float) -> Line:
         if self._line is None:
-            self._line = Line(self._target, self._round_trip, self._send, now)
+            self._line = Line(
+                self._target, self._round_trip, self._send, now, keeps_session=self._keeps_session
+            )
         return self._line
 
     def _begin(self, job: AnyJob, now: float) -> AnyJob:
