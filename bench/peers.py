@@ -56,6 +56,8 @@ from tests.live.relay import Conditions, Relay
 REPEAT = 3
 LIMIT = 120.0
 """Seconds that one download may take."""
+SET_BY_STATIONS = re.compile(r"SR\d_\w+")
+"""Parameters in which ArduPilot keeps the streams that a station requests, as MAVProxy does at its start."""
 START_PATIENCE = 30.0
 """Further seconds for a client to start and to hear the vehicle."""
 ROUND_TRIP = 0.1
@@ -163,7 +165,7 @@ class LiveCase(Case):
 
     def is_settled(self, name: str) -> bool:
         """See `Case.is_settled`."""
-        return not self._field.journal.moves_by_itself(name)
+        return not (self._field.journal.moves_by_itself(name) or SET_BY_STATIONS.fullmatch(name))
 
     @contextmanager
     def flying(self, seed: int) -> Iterator[tuple[int, Any]]:
