@@ -337,7 +337,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def on_disk(path: Path) -> Mapping[str, Param]:
-    """What another process has written by now; its table in memory may be ahead, on a busy machine by much."""
+    """What another process has written. Its table in memory may be ahead, by much on a busy machine."""
     with ParamCache(path) as cache:
         return cache.component().params
 
