@@ -317,7 +317,8 @@ async def test_two_downloads_are_enough_for_any_file(ftp: bool) -> None:
     vehicle = ArduPilotVehicle(table=SETTINGS | OTHERS | switch, groups=groups, ftp=ftp)
     tap = Tap(vehicle)
     hidden = {"EK2_ENABLE": 1, "EK2_ALT_M_NSE": 1.5, "EK2_GPS_TYPE": 2, "GRIP_ENABLE": 0, "GRIP_REGRAB": 2.0}
-    unknown = {f"NO_SUCH_{number}": 1 for number in range(15)}
+    of_a_hidden_group = {f"GRIP_NONE{number}": 1 for number in range(15)}
+    unknown = {f"NO_SUCH_{number}": 1 for number in range(60)} | of_a_hidden_group
     async with a_client(tap) as client:
         component = await client.component()
         await anyio.sleep(10.0)  # what it measures at its start has been read
@@ -337,6 +338,9 @@ async def test_two_downloads_are_enough_for_any_file(ftp: bool) -> None:
         assert {row.name for row in result.rows.values() if row.category == MISSING} == unknown.keys()
         assert downloads(tap) == 2
         assert anyio.current_time() - began < plain + 0.5
+        requested = {message.param_id for message in tap.messages(wire.ParamRequestRead)}
+        assert of_a_hidden_group.keys() <= requested
+        assert requested.isdisjoint(unknown.keys() - of_a_hidden_group), "no hidden group can have them"
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final, Self
@@ -18,7 +18,7 @@ from paramclient.protocol.result import FetchResult
 from paramclient.protocol.wire import HASH_CHECK
 from paramclient.provision.cautions import cautions_for
 from paramclient.provision.planning import ParamInfo, Plan, check_component, plan
-from paramclient.values import Param, Trust, check_name
+from paramclient.values import Param, ParamType, Trust, check_name
 
 __all__ = [
     "LOOKING_PACE",
@@ -109,6 +109,9 @@ async def look(
     shown, silent = search.result()
     listed = {name: param for name, param in component.params.items() if param.index is not None}
     table = {name: param for name, param in listed.items() if param.trust is not Trust.CACHED}
+    is_whole = fetched.complete and len(table) == len(listed)
+    if is_whole and component.autopilot == "ardupilot":
+        silent |= _in_no_hidden_group(table, wanted).difference(component.params)
     missing = frozenset(fetched.missing)
     given_up = {name for name, param in table.items() if param.index in missing}
     unsure = given_up | heard.intersection(table, _not_covered(component, fetched))
@@ -127,7 +130,7 @@ async def look(
             at=time.time(),
             source=f"vehicle {component.system}/{component.component}",
         ),
-        fetched.complete and len(table) == len(listed),
+        is_whole,
         fetched.hash,
         (absent | unknown).difference(table),
         0.0 if fetched.source == "cache" else fetched.elapsed,
@@ -371,6 +374,26 @@ def _probably_hidden(component: Component, wanted: ParamSet) -> frozenset[str]:
     names = [name for name in wanted if name.startswith(groups) and name not in switches]
     unheard = frozenset(name for name in names if name not in component.params)
     return unheard if len(unheard) <= MOST_BESIDE else frozenset()
+
+
+def _in_no_hidden_group(table: Mapping[str, Param], wanted: ParamSet) -> frozenset[str]:
+    """Wanted names that an ArduPilot cannot have: neither its list nor a group that it hides has them.
+
+    The list leaves out what follows the switch of a group, an INT8 that is listed, while that is 0; the
+    names of the group begin alike (`AP_Param::next_group`). All else that can be read by name is in it.
+
+    Args:
+        table: the whole list.
+        wanted: what to look for.
+    """
+    switches = [name for name, param in table.items() if param.type is ParamType.INT8 and param.value == 0]
+    hidden = {start for name in switches for start in _starts(name)}
+    return frozenset(name for name in wanted if name not in table and hidden.isdisjoint(_starts(name)))
+
+
+def _starts(name: str) -> Iterator[str]:
+    """Return what a name may have in common with those of its group: all up to each underscore."""
+    return (name[: at + 1] for at, letter in enumerate(name) if letter == "_")
 
 
 def _is_name(name: str) -> bool:
