@@ -530,17 +530,18 @@ def test_a_database_that_stands_still_is_given_up(
     fragile: tuple[Server, ParamCache, ParamCache], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its connections stay, and nothing is answered: as on a machine that swaps, or whose disk hangs."""
-    monkeypatch.setattr("paramclient.cache.postgres.ANSWER_TIMEOUT", 0.3)
-    monkeypatch.setattr("paramclient.cache.postgres.CONNECT_TIMEOUT", 1)
     running, a, b = fragile
     a.save(whole_table(3))
     b.save(a_value(5))
     until(lambda: is_copied(a))
     running.stand_still()
     try:
-        a.save(a_value(6))
-        assert a.away is not None
-        assert told(a) == [(5, 1, 5), (6, 5, 6)]
+        with monkeypatch.context() as impatient:
+            impatient.setattr("paramclient.cache.postgres.ANSWER_TIMEOUT", 0.3)
+            impatient.setattr("paramclient.cache.postgres.CONNECT_TIMEOUT", 1)
+            a.save(a_value(6))
+            assert a.away is not None
+            assert told(a) == [(5, 1, 5), (6, 5, 6)]
     finally:
         running.go_on()
     until(lambda: a.away is None)
