@@ -6,9 +6,9 @@ from typing import Final
 
 from paramclient.errors import UsageError
 from paramclient.protocol.wire import MOST_PARAMETERS
-from paramclient.values import check_name
+from paramclient.values import check_name, is_portable_name
 
-__all__ = ["SETTLE_MAX", "check_accepted", "check_asked", "check_settle"]
+__all__ = ["SETTLE_MAX", "check_accepted", "check_asked", "check_asked_name", "check_settle"]
 
 SETTLE_MAX: Final = 60.0
 """Seconds for which a written value can be watched, at the most: a write to the same name waits meanwhile."""
@@ -21,9 +21,23 @@ def check_asked(name: str | int) -> None:
         UsageError: it cannot.
     """
     if isinstance(name, str):
-        check_name(name)
+        check_asked_name(name)
     elif not isinstance(name, int) or not 0 <= name < MOST_PARAMETERS:
         raise UsageError(f"parameter index {name}: indices are 0 to {MOST_PARAMETERS - 1}")
+
+
+def check_asked_name(name: str) -> str:
+    """Give a name back under which a vehicle can have a parameter.
+
+    Raises:
+        UsageError: it is no param_id, or one that no parameter file can hold: of a vehicle it is not taken.
+    """
+    if not is_portable_name(check_name(name)):
+        raise UsageError(
+            f"parameter name {name!r}: no parameter file can hold it, so a vehicle's is not taken; a name has"
+            " a letter, no space and none of # , ; = ; it begins with neither @ nor / and does not end with :"
+        )
+    return name
 
 
 def check_accepted(accept: str, sample: int) -> None:

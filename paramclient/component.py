@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, SupportsFloat, SupportsIndex, TypeVar
 
 import anyio
 
-from paramclient.asked import check_accepted, check_asked, check_settle
+from paramclient.asked import check_accepted, check_asked, check_asked_name, check_settle
 from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.events import Changes
 from paramclient.identity import Identity, autopilot_name
@@ -36,7 +36,7 @@ from paramclient.protocol.wire import (
 )
 from paramclient.protocol.writes import SetResult
 from paramclient.signing import timestamp_now
-from paramclient.values import Encoding, Param, check_name, check_value, decode, known_type
+from paramclient.values import Encoding, Param, check_value, decode, known_type
 
 if TYPE_CHECKING:
     from paramclient.client import ParamClient
@@ -229,7 +229,7 @@ class Component:
             NoReply: it did not answer. Whether it has taken the value is not known, as after cancellation.
             LinkError: the link failed, or the client was closed.
         """
-        if check_name(name) == HASH_CHECK:
+        if check_asked_name(name) == HASH_CHECK:
             raise UsageError(f"{HASH_CHECK} is no parameter: it can be read, and not written")
         machine = self._machine
         self._client._check_open()

@@ -19,6 +19,8 @@ class ClientStats:
         frames_received, frames_sent: whole ones.
         skipped: bytes that came and belong to no whole frame of a known id.
         damaged: what looked like a frame of a known id and had a wrong checksum.
+        unusable_names: messages that were left out as no parameter file can hold the name in them, and values
+            of packed files likewise.
         lost: frames that were lost on the way, by the gaps in their sequence numbers; None where the client
             was made without `traffic=True`.
         repeated: frames that came twice; None as before.
@@ -37,6 +39,7 @@ class ClientStats:
     frames_sent: int
     skipped: int
     damaged: int
+    unusable_names: int
     lost: int | None
     repeated: int | None
     reads: int
@@ -58,6 +61,7 @@ class ClientStats:
             frames_sent=station.frames_sent,
             skipped=skipped,
             damaged=damaged,
+            unusable_names=sum(machine.table.left_out for machine in machines),
             lost=None if station.traffic is None else station.traffic.lost,
             repeated=None if station.traffic is None else station.traffic.repeated,
             reads=sum(machine.reads.asked for machine in machines),

@@ -27,6 +27,7 @@ __all__ = [
     "cached_set",
     "differing",
     "incomplete",
+    "left_out_note",
     "set_of",
     "taken",
     "whole_set",
@@ -142,13 +143,16 @@ def set_of(table: CachedComponent) -> ParamSet:
     )
 
 
-def cached_set(cache: ParamCache, key: str, component: int) -> ParamSet:
+def cached_set(
+    cache: ParamCache, key: str, component: int, *, note: Callable[[str], None] | None = None
+) -> ParamSet:
     """All that the cache has of a component.
 
     Args:
         cache: the cache.
         key: `Identity.key` of the vehicle.
         component: component id.
+        note: is told of names that are left out, in a sentence.
 
     Raises:
         CacheError: it has no such table, or not all of it.
@@ -160,7 +164,20 @@ def cached_set(cache: ParamCache, key: str, component: int) -> ParamSet:
         who = f"{table.system}/{component} ({key})"
         of = "" if table.count is None else f" of {table.count}"
         raise CacheError(f"the cache has {table.size}{of} parameters of {who}, not all; fetch them first")
+    if table.left_out and note is not None:
+        note(left_out_note(table))
     return set_of(table)
+
+
+def left_out_note(table: CachedComponent) -> str:
+    """Return what says that names of a cached table are left out."""
+    shown = ", ".join(map(repr, table.left_out[:MOST_NAMED]))
+    more = len(table.left_out) - MOST_NAMED
+    rest = f" and {more} more" if more > 0 else ""
+    return (
+        f"{table.system}/{table.component} ({table.key}): left out, as no parameter file can hold the name: "
+        f"{shown}{rest}; the next full fetch takes it out of the cache"
+    )
 
 
 def before_last_apply(cache: ParamCache, key: str, component: int) -> ParamSet:

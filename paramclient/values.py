@@ -9,12 +9,14 @@ back on the way to an integer: a byte-wise integer whose bytes form a signalling
 from __future__ import annotations
 
 import math
+import re
 import struct
 import zlib
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum, StrEnum
-from typing import SupportsFloat, SupportsIndex, TypeAlias
+from functools import lru_cache
+from typing import Final, SupportsFloat, SupportsIndex, TypeAlias
 
 from paramclient.errors import UsageError
 
@@ -34,6 +36,7 @@ __all__ = [
     "format_value",
     "from_bits",
     "hash_chunk",
+    "is_portable_name",
     "known_type",
     "px4_hash",
     "same_bits",
@@ -47,6 +50,9 @@ Value: TypeAlias = int | float | bytes
 
 NAME_LENGTH = 16
 """Bytes in param_id; shorter names end with a NUL, names of 16 have none."""
+NAMES_REMEMBERED: Final = 4096
+"""Names of which it is remembered whether files can hold them: those of a few autopilots."""
+_portable: Final = re.compile(r"(?=[^A-Za-z]*[A-Za-z])(?![@/])(?:(?![#,;=])[!-~]){1,16}(?<!:)").fullmatch
 
 
 class ParamType(IntEnum):
@@ -212,6 +218,17 @@ def check_name(name: str) -> str:
     if len(name) > NAME_LENGTH:
         raise UsageError(f"parameter name {name!r} has {len(name)} bytes; a param_id holds {NAME_LENGTH}")
     return name
+
+
+@lru_cache(maxsize=NAMES_REMEMBERED)
+def is_portable_name(name: str) -> bool:
+    """Return whether every form of parameter file can hold a name.
+
+    It has 1 to 16 printable ASCII characters without space, `#`, `,`, `;` and `=`, one of them a letter; the
+    first is neither `@` nor `/`, and the last is not `:`. Names of PX4 and ArduPilot have capitals, digits
+    and `_`.
+    """
+    return _portable(name) is not None
 
 
 def check_value(value: SupportsIndex | SupportsFloat | bytes) -> Value:

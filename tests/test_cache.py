@@ -100,7 +100,7 @@ def test_every_type_keeps_its_bits_to_the_last_one(path: Path) -> None:
     params = [stored(f"P{number}", bits, kind) for number, (kind, bits) in enumerate(EDGES)]
     params.append(stored("RAW_64", 0xFFFFFFFF, ParamType.INT64, is_raw=True))
     params.append(stored("RAW_8", 0x7FC00000, ParamType.UINT8, is_raw=True))
-    params.append(stored("\xe9\xff ^1\x07 SIXTEEN", 1))
+    params.append(stored("~^1!\"$%'()*+-.Az", 1))
     with ParamCache(path) as cache:
         cache.save(update(*params))
         table = cache.load(PX4.key, 1)

@@ -40,7 +40,6 @@ from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.table import Room, Table
 from paramclient.protocol.timing import INITIAL_TIMEOUT
 from paramclient.protocol.wire import (
-    MAV_AUTOPILOT_ARDUPILOTMEGA,
     MOST_PARAMETERS,
     NO_INDEX,
     AutopilotVersion,
@@ -115,20 +114,6 @@ def test_a_cached_count_above_what_can_be_asked_for_is_none() -> None:
     )
     assert (session.machine.table.count, session.machine.table.complete) == (None, False)
     assert session.machine.table.params["A"].index is None
-
-
-@pytest.mark.parametrize("letter", ["\xb5", "\xdf", "\xff"])
-def test_a_name_whose_capitals_no_message_can_hold_is_left_as_it_is(letter: str) -> None:
-    """ArduPilot's names are taken in capitals; the capital of µ is Greek, that of ß two letters."""
-    session = Simulation()
-    beat(session, autopilot=MAV_AUTOPILOT_ARDUPILOTMEGA)
-    name = f"rc{letter}{'x' * 13}"
-    for value in (1.0, 2.0, 3.0):  # what flips is asked for by its name
-        say(session, param_value(name, value))
-        session.run(0.1)
-    session.run(3)
-    assert [*session.machine.table.params] == [f"RC{letter}{'X' * 13}"]
-    assert f"RC{letter}{'X' * 13}" in [request.param_id for request in session.sent_of(ParamRequestRead)]
 
 
 # More than there can be

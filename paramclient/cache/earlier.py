@@ -26,7 +26,7 @@ from paramclient.cache.session import Session
 from paramclient.errors import CacheError
 from paramclient.identity import Identity
 from paramclient.paramset import ParamSet, WrittenParam
-from paramclient.values import Value, known_type
+from paramclient.values import Value, is_portable_name, known_type
 
 __all__ = [
     "CLOCK_SLACK",
@@ -106,7 +106,7 @@ def snapshot(session: Session, owner: int, number: int) -> Snapshot:
     return Snapshot(
         **{field.name: getattr(summary, field.name) for field in fields(summary)},
         params=ParamSet(
-            params,
+            {name: each for name, each in params.items() if is_portable_name(name)},
             summary.component,
             identity.system,
             identity,
@@ -158,7 +158,7 @@ def state_at(
     state = {name: first.get(name, row.value) for name, row in rows.items()} | first
     params = {}
     for name, value in state.items():
-        if value is not None:
+        if value is not None and is_portable_name(name):
             params[name] = WrittenParam.of(read_param(name, *value))
     then = replace(identity, firmware=0, git_hash="", capabilities=0)
     return ParamSet(params, number, identity.system, then, when, f"history of {identity.key}")

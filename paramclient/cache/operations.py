@@ -16,6 +16,7 @@ from paramclient.cache.settle import settle
 from paramclient.errors import CacheError
 from paramclient.identity import Identity
 from paramclient.paramset import ParamSet
+from paramclient.values import is_portable_name
 
 __all__ = ["Merge", "Operation", "Remove", "Save", "SetDown"]
 
@@ -172,5 +173,7 @@ class Remove(Operation[int]):
 def _kept(session: Session, owner: int) -> ParamSet:
     rows = session.table(owner)
     return ParamSet.of(
-        read_param(name, *row.value, row.param_index, row.default_bits) for name, row in rows.items()
+        read_param(name, *row.value, row.param_index, row.default_bits)
+        for name, row in rows.items()
+        if is_portable_name(name)
     )

@@ -263,11 +263,14 @@ class CachedComponent(CachedSummary):
         params: by name, ordered by index, then name; those without an index last. Trust is CACHED.
         volatile: the names that the vehicle leaves out of its hash, as far as known.
         heard_at: by name, when the vehicle last gave the value.
+        left_out: names that an earlier version has kept and no parameter file can hold: they are not in
+            `params`, and go with the next whole table.
     """
 
     params: ParamMap = field(hash=False)
     volatile: frozenset[str]
     heard_at: Mapping[str, float] = field(hash=False)
+    left_out: tuple[str, ...]
     _history: Callable[[str | None, int | None], list[HistoryEntry]] = field(compare=False)
 
     def history(self, name: str | None = None, limit: int | None = None) -> list[HistoryEntry]:

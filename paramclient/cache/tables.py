@@ -27,6 +27,7 @@ from paramclient.cache.rows import Row, time_cell
 from paramclient.cache.session import Line, Session
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
+from paramclient.values import is_portable_name
 
 __all__ = [
     "HISTORY_LINES",
@@ -78,9 +79,14 @@ def component(
     """One table with its parameters, or None."""
     for owner, summary in session.summaries(key, number):
         params, volatile, heard_at = session.params(owner)
+        left_out = tuple(name for name in params.held if not is_portable_name(name))
+        for name in left_out:
+            del params.held[name]
+            params.defaults.pop(name, None)
         return CachedComponent(
             **{field.name: getattr(summary, field.name) for field in fields(summary)},
             params=ParamMap(params),
+            left_out=left_out,
             volatile=volatile,
             heard_at=MappingProxyType(heard_at),
             _history=history,

@@ -37,7 +37,7 @@ from paramclient.errors import CacheError, UsageError
 from paramclient.identity import autopilot_name
 from paramclient.metadata import Metadata
 from paramclient.notation import hash_text, time_or_none, time_text
-from paramclient.taken import NO_DEFAULTS
+from paramclient.taken import NO_DEFAULTS, left_out_note
 from paramclient.values import Param, check_name, format_value, type_name
 
 if TYPE_CHECKING:
@@ -200,7 +200,11 @@ def _open(options: CacheOptions) -> ParamCache:
 
 def _load(cache: ParamCache, summaries: Sequence[CachedSummary]) -> list[CachedComponent]:
     loaded = (cache.load(each.key, each.component) for each in summaries)
-    return [table for table in loaded if table is not None]  # another process may have removed one
+    tables = [table for table in loaded if table is not None]  # another process may have removed one
+    for table in tables:
+        if table.left_out:
+            report(left_out_note(table))
+    return tables
 
 
 def _has_defaults(table: CachedComponent) -> bool:

@@ -215,7 +215,7 @@ def _from_cache(vehicle: str, options: LinkOptions) -> ParamSet:
         if options.component is None and len(tables) > 1 and table.component != AUTOPILOT:
             known = ", ".join(f"{each.system}/{each.component}" for each in tables)
             raise UsageError(f"no autopilot is among {known}; choose with --component")
-        return cached_set(cache, table.key, table.component)
+        return cached_set(cache, table.key, table.component, note=report)
 
 
 async def _from_link(url: str, options: LinkOptions, *, is_alone: bool, only: bool) -> ParamSet:

@@ -81,6 +81,13 @@ def _about_link(link: LinkReport) -> Iterator[Finding]:
             "two programs that read one serial port.",
             "Compare the baud rate with the vehicle's, and close other programs that use the port.",
         )
+    if link.unusable_names:
+        yield Finding(
+            Severity.PROBLEM,
+            f"{_count(link.unusable_names, 'message')} had a parameter name that no parameter file can hold: "
+            "damage on a link without checksums, faulty firmware, or forged messages. They were left out.",
+            "Compare the parameters that are missing with the firmware's own list, and sign the link.",
+        )
     if link.repeated:
         yield Finding(
             Severity.NOTE,

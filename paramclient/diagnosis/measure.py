@@ -339,6 +339,7 @@ class _Diagnosis:
             lost=0 if mine is None else max(mine.lost, 0),
             repeated=0 if mine is None else mine.repeated,
             damaged=report.damaged,
+            unusable_names=component._machine.table.left_out,
             unknown=report.unknown,
             other_bytes=report.other_bytes,
             bytes_received=report.bytes_received,

@@ -46,6 +46,8 @@ class LinkReport:
         lost: how many frames that are.
         repeated: frames that arrived more than once.
         damaged: frames with a wrong checksum.
+        unusable_names: messages of the vehicle that were left out, as no parameter file can hold the name in
+            them.
         unknown: frames with an id that the dialect does not have.
         other_bytes: bytes received that belong to no frame.
         bytes_received, bytes_sent: totals.
@@ -64,6 +66,7 @@ class LinkReport:
     lost: int
     repeated: int
     damaged: int
+    unusable_names: int
     unknown: int
     other_bytes: int
     bytes_received: int

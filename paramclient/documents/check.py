@@ -85,6 +85,7 @@ class CheckedLinkDoc(Document):
     lost: int
     repeated: int
     damaged: int
+    unusable_names: int
     unknown: int
     other_bytes: int
     bytes_received: int
@@ -99,8 +100,8 @@ class CheckedLinkDoc(Document):
     def of(cls, link: LinkReport) -> CheckedLinkDoc:
         """All of it."""
         plain = (
-            *("name", "unanswered", "lost", "repeated", "damaged", "unknown", "other_bytes"),
-            *("bytes_received", "bytes_sent", "mavlink", "signed", "radio_free"),
+            *("name", "unanswered", "lost", "repeated", "damaged", "unusable_names"),
+            *("unknown", "other_bytes", "bytes_received", "bytes_sent", "mavlink", "signed", "radio_free"),
         )
         trips = link.round_trips
         return cls(

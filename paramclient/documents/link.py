@@ -24,6 +24,7 @@ class StatsDoc(Document):
     frames_sent: int
     skipped: int
     damaged: int
+    unusable_names: int
     lost: int | None
     repeated: int | None
     reads: int

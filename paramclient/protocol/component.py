@@ -39,7 +39,7 @@ from paramclient.protocol.wire import (
     SystemTime,
 )
 from paramclient.protocol.writes import Write
-from paramclient.values import Param, ParamType, Trust, Value, as_sent, encode
+from paramclient.values import Param, ParamType, Trust, Value, as_sent, encode, is_portable_name
 
 __all__ = ["ComponentMachine"]
 
@@ -136,7 +136,9 @@ class ComponentMachine(Parts):
                 self.fetches.updated(now)
         elif isinstance(message, ParamError):
             addressee = (message.target_system, message.target_component)
-            if addressee in (self._own, (0, 0)) and not self.writes.refused(message, now):
+            if message.param_index < 0 and not is_portable_name(message.param_id):
+                self.table.leave_out(message.param_id)
+            elif addressee in (self._own, (0, 0)) and not self.writes.refused(message, now):
                 self.reads.refused(message, now)
                 self.name_searches.refused(message, now)
         elif isinstance(message, CommandAck):
@@ -176,7 +178,9 @@ class ComponentMachine(Parts):
         who = self.who
         who.heard(now)
         name, _, number, count, index = message
-        if not name:
+        if not is_portable_name(name):
+            if name:
+                self.table.leave_out(name)
             return
         if name == HASH_CHECK:
             announced = self.sync.hash_heard(message, now)
@@ -276,6 +280,9 @@ class ComponentMachine(Parts):
 
     def foreign_set(self, name: str, raw: bytes, station: str, now: float) -> None:
         """Another station was heard setting a parameter of this component to these four bytes."""
+        if not is_portable_name(name):
+            self.table.leave_out(name)
+            return
         self._authors.foreign_set(self.spelling(name), station, now, raw)
 
     def foreign_file_request(self, message: FileTransfer, station: tuple[int, int], now: float) -> None:

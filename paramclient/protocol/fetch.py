@@ -14,6 +14,7 @@ from paramclient.protocol.list_pace import ListPace
 from paramclient.protocol.notes import (
     FILE_IN_USE,
     FROM_MEMORY,
+    LEFT_OUT,
     NO_FILE,
     NOT_ASKED,
     NOT_CONFIRMED,
@@ -143,6 +144,7 @@ class Fetch(Operation[FetchResult]):
         self.file: PackFetch | None = None
         self.file_failed: bool | None = None
         self._notes: tuple[str, ...] = ()
+        self._left_out_before = table.left_out
         if policy is Policy.CACHE_ONLY or refresh or listed:
             self._begin_download(now)
         elif sampled is not None and table.complete and table.count and not self._expects_hash():
@@ -546,6 +548,11 @@ class Fetch(Operation[FetchResult]):
         if file.error is None:
             self._drop_download()
             self.file_failed = False
+            if file.left_out:
+                self._table.unconfirm()
+                self._table.complete = False
+                self.finish(self._result("ftp", file.count or 0, file.left_out, None, now, ()), now)
+                return
             self._table.complete = True
             is_proven = self._proof.is_given(file.count or 0)
             if not is_proven and self._expects_hash() and not self._is_hash_unknown:
@@ -697,6 +704,10 @@ class Fetch(Operation[FetchResult]):
     ) -> FetchResult:
         received = count - len(missing)
         download = self.download
+        left_out = self._table.left_out - self._left_out_before
+        if left_out:
+            more = f", and {left_out - 1} more times" if left_out > 1 else ""
+            notes += (LEFT_OUT.format(self._table.left_out_name, more),)
         return FetchResult(
             *self._target,
             self._table.params.copy(),

@@ -5,6 +5,7 @@ from __future__ import annotations
 __all__ = [
     "FILE_IN_USE",
     "FROM_MEMORY",
+    "LEFT_OUT",
     "MOVED",
     "NOT_ASKED",
     "NOT_CONFIRMED",
@@ -22,6 +23,7 @@ UNPROVEN = (
     "Which parameters this firmware leaves out of its hash could not be proven, "
     "so after a start from the cache every value is read afresh."
 )
+LEFT_OUT = "Left out, as no parameter file can hold the name: what came under {!r}{}."
 MOVED = "The table moved during the download, so no hash stands for it; the next session downloads it again."
 UNBRACKETED = (
     "No hash was heard before the download, and what this firmware leaves out of it could not be proven, "

@@ -13,6 +13,7 @@ from paramclient.protocol.proof import Proof
 from paramclient.protocol.result import Announcement, FetchResult, Means, Policy, Progress
 from paramclient.protocol.sync import Sync
 from paramclient.protocol.wire import MOST_PARAMETERS, ParamValue
+from paramclient.values import is_portable_name
 
 __all__ = ["OVERHEARING_PATIENCE", "Overheard", "Overhearing"]
 
@@ -125,8 +126,9 @@ class Overheard:
             if table.count is not None:
                 self._sync.count_moved(now)
             table.move(total)
-        names = {index: entry.name for index, entry in came.entries()}
-        is_all = len(names) == total
+        entries = {index: entry.name for index, entry in came.entries()}
+        is_all = len(entries) == total
+        names = {index: name for index, name in entries.items() if is_portable_name(name)}
         if (
             is_all
             or total != self.count

@@ -17,6 +17,7 @@ from paramclient.protocol.result import Progress
 from paramclient.protocol.table import Table
 from paramclient.protocol.turns import Seen, Turns
 from paramclient.protocol.wire import MOST_PARAMETERS, ParamValue
+from paramclient.values import is_portable_name
 
 __all__ = ["PARAMETER_FILE", "PackFetch"]
 
@@ -53,6 +54,7 @@ class PackFetch(Operation[None]):
         is_in_use: whether it ended as another station has a file open.
         is_useless: whether the component does not have the file, or one that cannot be read: with this
             firmware that will not change.
+        left_out: the indices of entries whose names no parameter file can hold: they did not come.
         is_unheard: whether it ended as nothing at all came of it, though the component was there.
     """
 
@@ -87,6 +89,7 @@ class PackFetch(Operation[None]):
         self.is_useless = False
         self.is_in_use = False
         self.is_unheard = False
+        self.left_out: tuple[int, ...] = ()
         self._count: int | None = None
         self._waits_since: float | None = now
         turns.ask(self, now)
@@ -254,6 +257,9 @@ class PackFetch(Operation[None]):
         table = self._table
         changes = table.take_pack(pack, self._asked_at, self._heard)
         present = {entry.name for entry in pack.entries}
+        self.left_out = tuple(
+            index for index, entry in enumerate(pack.entries) if not is_portable_name(entry.name)
+        )
         changes += table.remove(
             lambda param: (
                 param.name not in present and (param.index is not None or param.name in table.displaced)

@@ -39,6 +39,7 @@ from paramclient.values import (
     as_sent,
     bits_of_wire,
     from_bits,
+    is_portable_name,
     known_type,
 )
 
@@ -119,6 +120,8 @@ class Table:
         dirty: names whose value, type or index changed since `take_dirty` was called last.
         gone: the moments at which removed names were found missing, since `take_gone` was called last.
         slept: seconds of sleep of this computer by which moments were moved back, see `age`.
+        left_out: how often something was said under a name that no parameter file can hold, see `leave_out`.
+        left_out_name: the last such name, or an empty text.
         overwritten: values that the cache has not been told of and that are no longer current: those that
             our writes have set or replaced, and the first observation of a changed value that came again.
     """
@@ -142,6 +145,8 @@ class Table:
         self.passed_over: dict[str, frozenset[int]] = {}
         self.dirty: dict[str, str] = {}
         self.overwritten: list[Observation] = []
+        self.left_out = 0
+        self.left_out_name = ""
         self._hash: int | None = None
         self._hash_is_stale = False
         self._encoding = encoding
@@ -173,6 +178,11 @@ class Table:
         self._hash_is_stale = False
         self.volatile = volatile
         self.volatile_known = proven
+
+    def leave_out(self, name: str) -> None:
+        """Count what was said under a name that no parameter file can hold: it is not taken."""
+        self.left_out += 1
+        self.left_out_name = name
 
     def unconfirm(self) -> None:
         """No hash is known to belong to this table any more."""
@@ -341,6 +351,8 @@ class Table:
     def take_pack(self, pack: Pack, moment: float, newer: Collection[str], *, start: int = 0) -> list[Change]:
         """Take the entries of a packed parameter file; give the changes that they brought.
 
+        Entries whose names no other form of file can hold are left out.
+
         Args:
             pack: the file, or a part of it.
             moment: when it was asked for.
@@ -349,6 +361,9 @@ class Table:
         """
         changes = []
         for index, (name, number, bits, default) in enumerate(pack.entries, start=start):
+            if not is_portable_name(name):
+                self.leave_out(name)
+                continue
             if default is None and pack.with_defaults:
                 default = bits  # the vehicle gives those that differ
             change = self.take(name, number, bits, index, default, moment, is_older=name in newer)
@@ -389,6 +404,9 @@ class Table:
     ) -> list[Change]:
         """Put in what the cache knows, as *cached*; what was heard on this link stays.
 
+        A table whose list has a name that no parameter file can hold was kept by an earlier version: that
+        name is left out, and the table is downloaded anew.
+
         Args:
             params: the cached table.
             count: the param_count with it; with another one than was heard, nothing below counts.
@@ -398,6 +416,8 @@ class Table:
             moments: as in `fill`.
         """
         known = kept(params)
+        if any(is_listed(held) and not is_portable_name(name) for name, held in known.held.items()):
+            complete = placed = False
         changes = self.fill(known, are_placed=placed and self.count in (None, count), moments=moments)
         if self.count not in (None, count):
             return changes
@@ -440,7 +460,7 @@ class Table:
             if old is not None:
                 if parts_of(old)[1] == parts_of(cached)[1] and name not in self._filed:
                     changes += self._complement(name, old, cached, default)
-            elif self._room.has_some(len(self._held)):
+            elif is_portable_name(name) and self._room.has_some(len(self._held)):
                 self._room.taken += 1
                 new = trusted(cached, CACHED)
                 if not are_placed and is_listed(new):

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn, SupportsFloat, SupportsI
 
 import anyio
 
-from paramclient.asked import check_accepted, check_asked, check_settle
+from paramclient.asked import check_accepted, check_asked, check_asked_name, check_settle
 from paramclient.component import Component
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.events import Changes, Event, Found, Heard, Lost
@@ -38,7 +38,7 @@ from paramclient.remote.reading import (
     value_as_sent,
 )
 from paramclient.remote.requests import Answer
-from paramclient.values import Encoding, Param, check_name, check_value
+from paramclient.values import Encoding, Param, check_value
 
 if TYPE_CHECKING:
     from paramclient.remote.client import RemoteClient
@@ -195,7 +195,7 @@ class RemoteComponent(Component):
         write is not sent again: LinkError then says that it is not known whether it was done.
         """
         requested = check_value(value)
-        body: dict[str, Any] = {"values": {check_name(name): value_as_sent(requested)}}
+        body: dict[str, Any] = {"values": {check_asked_name(name): value_as_sent(requested)}}
         if check_settle(settle):
             body["settle_s"] = settle
         if force:

@@ -160,7 +160,7 @@ def stats_of(documents: list[Document]) -> ClientStats:
     counted = [each.name for each in fields(ClientStats) if each.name != "round_trips"]
     sums: dict[str, Any] = {}
     for name in counted:
-        told = [each[name] for each in documents if each[name] is not None]
+        told = [each[name] for each in documents if each.get(name) is not None]  # an older one counts less
         sums[name] = sum(told) if told or name not in ("lost", "repeated") else None
     trips = {
         (int(system), int(component)): float(seconds)

@@ -21,6 +21,7 @@ _COUNTERS: Final = {
     "frames_sent": "Frames that were sent.",
     "skipped": "Bytes that belong to no frame.",
     "damaged": "Frames with a wrong checksum.",
+    "unusable_names": "Messages left out, as no parameter file can hold the name in them.",
     "lost": "Frames that were lost on the way.",
     "repeated": "Frames that came twice.",
     "reads": "Parameters that were asked for one by one.",
