@@ -10,6 +10,7 @@ import logging
 import re
 import socket
 import ssl
+import time
 from collections import deque
 from collections.abc import AsyncIterator
 from dataclasses import dataclass
@@ -22,7 +23,7 @@ import anyio.abc
 import pytest
 
 from paramclient.errors import UsageError
-from paramclient.service import AccessSettings, Hub, Listening, Settings, Tokens, connections, serve
+from paramclient.service import AccessSettings, Hub, Listening, Settings, Tokens, connections, places, serve
 from paramclient.service.tokens import GUESSES
 from paramclient.sim import GenericVehicle
 from tests.shell import until
@@ -218,6 +219,14 @@ async def test_guessing_is_slow_and_leaves_no_trace_of_tokens(caplog: pytest.Log
         await service.send(head + body)
     assert "guess-" not in caplog.text
     assert ANNA not in caplog.text
+
+
+def over_tls() -> Listening:
+    return Listening(port=0, tls_cert=DATA / "tls_station.pem", tls_key=DATA / "tls_station.key")
+
+
+def trusting() -> ssl.SSLContext:
+    return ssl.create_default_context(cafile=str(DATA / "tls_station.pem"))
 
 
 # Those who come by way of a browser
@@ -441,7 +450,7 @@ async def test_a_body_that_does_not_come_is_not_waited_for_at_the_end(
 
 
 async def test_connections_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "MOST_CONNECTIONS", 3)
+    monkeypatch.setattr(places, "MOST_CONNECTIONS", 3)
     async with served() as service, contextlib.AsyncExitStack() as stack:
         held = [await stack.enter_async_context(service.connection()) for _ in range(3)]
         for reader, writer in held:
@@ -454,8 +463,8 @@ async def test_connections_are_counted(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 async def test_of_one_address_beyond_this_machine_there_are_fewer(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "MOST_FROM_ONE", 2)
-    monkeypatch.setattr(connections, "_is_here", lambda _: False)
+    monkeypatch.setattr(places, "MOST_FROM_ONE", 2)
+    monkeypatch.setattr(places, "is_loopback", lambda _: False)
     async with served() as service, contextlib.AsyncExitStack() as stack:
         for _ in range(2):
             reader, writer = await stack.enter_async_context(service.connection())
@@ -531,6 +540,36 @@ async def test_a_listener_who_never_reads_is_left(monkeypatch: pytest.MonkeyPatc
             await until(lambda: service.hub.feed.listeners == 0)
 
 
+@pytest.mark.parametrize("is_secure", [False, True])
+async def test_whoever_reads_nothing_does_not_hold_up_the_end(
+    is_secure: bool, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Streams of events, WebSockets and downloads, each with more on its way than the systems hold."""
+    listening = over_tls() if is_secure else None
+    streams = [("/api/v1/events", ()), ("/api/v1/ws", UPGRADE), ("/openapi.json", ())]
+    async with contextlib.AsyncExitStack() as stack:
+        async with served(listening=listening) as service:
+            service.hub.feed._events = deque(maxlen=64)
+            held = []
+            for path, more in streams:
+                narrow = stack.enter_context(a_narrow_socket(service.port))
+                secure = trusting() if is_secure else None
+                name = "127.0.0.1" if is_secure else None
+                reader, writer = await asyncio.open_connection(
+                    sock=narrow, limit=1, ssl=secure, server_hostname=name
+                )
+                stack.callback(writer.transport.abort)
+                held.append((reader, writer))
+                writer.write(service.head("GET", path, *more) * (100 if path == "/openapi.json" else 1))
+                await reader.read(1)
+            await until(lambda: service.hub.feed.listeners == 2)
+            await overwhelm(service)
+            assert service.hub.feed.listeners == 2
+            ending = time.monotonic()
+        assert time.monotonic() - ending < 3.0
+    assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
+
+
 # Those who speak through a vehicle
 
 
@@ -579,15 +618,13 @@ async def test_a_name_that_tries_to_be_html_is_a_text_everywhere() -> None:
 
 
 async def test_over_tls_nothing_is_told_in_clear() -> None:
-    listening = Listening(port=0, tls_cert=DATA / "tls_station.pem", tls_key=DATA / "tls_station.key")
-    trusting = ssl.create_default_context(cafile=str(DATA / "tls_station.pem"))
-    async with served(tokens=TOKENS, listening=listening) as service:
+    async with served(tokens=TOKENS, listening=over_tls()) as service:
         body = json.dumps({"token": ANNA}).encode()
         head = service.head(
             *("POST", "/api/v1/session", "Connection: close", "Content-Type: application/json"),
             *(f"Content-Length: {len(body)}", f"Origin: https://127.0.0.1:{service.port}"),
         )
-        async with service.connection(ssl=trusting) as (reader, writer):
+        async with service.connection(ssl=trusting()) as (reader, writer):
             writer.write(head + body)
             answer = Answer.of(await taken(reader))
         assert answer.status == 200

@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import json
-from ipaddress import ip_address
 from typing import Any, Final
 
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+from paramclient.service.places import Place, Stage
+
 __all__ = ["Connection"]
 
-MOST_CONNECTIONS: Final = 512
-"""Connections at once: some hundred listeners, and half of the 1,024 files that a process may open."""
-MOST_FROM_ONE: Final = 128
-"""Of them from one address; those of this machine count for themselves, as behind a proxy all are of it."""
 HEAD_PATIENCE: Final = 10.0
 """Seconds for the head of a request to come, once the connection is there or its first byte has come."""
 STALL_PATIENCE: Final = 60.0
@@ -23,19 +20,26 @@ has missed."""
 
 
 class Connection(H11Protocol):
-    """One connection, until it becomes a WebSocket, which has time limits of its own."""
+    """One connection, until it becomes a WebSocket, which has time limits of its own.
+
+    Args:
+        place: the one that it has.
+        options: as uvicorn's protocol takes them.
+    """
 
     # the timers are asyncio's, which only uvicorn needs to know here
     _head: Any = None
     _stall: Any = None
     _unsent = 0
 
+    def __init__(self, place: Place, **options: Any) -> None:
+        super().__init__(**options)
+        self._place = place
+
     def connection_made(self, transport: Any) -> None:
         super().connection_made(transport)
-        if len(self.connections) > MOST_CONNECTIONS or self._has_too_many():
-            transport.abort()
-        else:
-            self._await_head()
+        self._place.leave = transport.abort
+        self._await_head()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._stop()
@@ -46,6 +50,7 @@ class Connection(H11Protocol):
         if self._is_over():
             return
         if self.transport.get_protocol() is not self:  # it is a WebSocket now
+            self._place.stage = Stage.ASKING
             self._stop()
         elif self.conn.their_state is not h11.IDLE:
             self._head_has_come()
@@ -64,6 +69,8 @@ class Connection(H11Protocol):
 
     def on_response_complete(self) -> None:
         super().on_response_complete()
+        if self.cycle.response_complete:
+            self._place.stage = Stage.IDLE
         self._watch()
 
     def pause_writing(self) -> None:
@@ -91,16 +98,12 @@ class Connection(H11Protocol):
             self.transport.write(self.conn.send(event) or b"")
         self.transport.close()
 
-    def _has_too_many(self) -> bool:
-        if self.client is None or _is_here(self.client[0]):
-            return False
-        hosts = [client[0] for each in self.connections if (client := getattr(each, "client", None))]
-        return hosts.count(self.client[0]) > MOST_FROM_ONE
-
     def _await_head(self) -> None:
         self._head = self.loop.call_later(HEAD_PATIENCE, self.transport.abort)
 
     def _head_has_come(self) -> None:
+        if self.cycle is not None and not self.cycle.response_complete:
+            self._place.stage = Stage.ASKING
         if self._head is not None:
             self._head.cancel()
             self._head = None
@@ -131,10 +134,3 @@ class Connection(H11Protocol):
         if self._stall is not None:
             self._stall.cancel()
             self._stall = None
-
-
-def _is_here(address: str) -> bool:
-    try:
-        return ip_address(address.partition("%")[0]).is_loopback
-    except ValueError:
-        return False

@@ -11,19 +11,27 @@ from typing import Final
 
 import anyio
 import uvicorn
+from starlette.types import ASGIApp, Receive, Scope, Send
 
 from paramclient.errors import LinkError, UsageError
 from paramclient.service.app import Settings, create_app
 from paramclient.service.connections import Connection
+from paramclient.service.gate import Gate
 from paramclient.service.hub import Hub
+from paramclient.service.log_limit import LogLimit
+from paramclient.service.places import Place, Places
 from paramclient.service.tls import tls_of
 
 __all__ = ["Listening", "serve"]
 
 BACKLOG: Final = 256
-"""Connections that may wait to be taken: all listeners that come back at once after a restart."""
-ENDING_TIME: Final = 5.0
-"""Seconds for answers that are under way when the service ends."""
+"""Connections that may wait to be accepted: all listeners that come back at once after a restart."""
+ENDING_TIME: Final = 1.5
+"""Seconds for answers that are under way when the service ends; then their connections are cut off."""
+CUT_OFF_TIME: Final = 0.5
+"""Seconds for requests to notice that their connection was cut off; then they are cancelled."""
+ENDING_INTERVAL: Final = 0.02
+"""Seconds between two looks whether all has ended."""
 KEEP_ALIVE: Final = 30.0
 """Seconds for which a connection without a request is kept."""
 LARGEST_FRAME: Final = 4_096
@@ -66,19 +74,61 @@ class Listening:
 
 
 class _Server(uvicorn.Server):
-    """Tells when it listens, and leaves signals to whoever has started it."""
+    """Accepts by a gate, tells when it is ready, and leaves signals to whoever has started it."""
 
     def __init__(self, config: uvicorn.Config) -> None:
         super().__init__(config)
-        self.listens = anyio.Event()
+        self.is_ready = anyio.Event()
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        await super().startup(sockets)
-        self.listens.set()
+        await self.lifespan.startup()
+        self.started = True
+        self.is_ready.set()
+
+    def protocol(self, place: Place) -> Connection:
+        """The protocol of a new connection."""
+        return Connection(
+            place, config=self.config, server_state=self.server_state, app_state=self.lifespan.state
+        )
+
+    async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
+        """Let answers come to their end for a while; then cut off whoever does not take them."""
+        state = self.server_state
+        for connection in list(state.connections):
+            connection.shutdown()
+        with anyio.move_on_after(ENDING_TIME):
+            while state.connections or state.tasks:  # noqa: ASYNC110 - these sets tell nobody
+                await anyio.sleep(ENDING_INTERVAL)
+        self.cut_off()
+        with anyio.move_on_after(CUT_OFF_TIME):
+            while state.tasks:  # noqa: ASYNC110
+                await anyio.sleep(ENDING_INTERVAL)
+        for task in state.tasks:
+            task.cancel()
+
+    def cut_off(self) -> None:
+        """End all connections at once."""
+        for connection in list(self.server_state.connections):
+            connection.transport.abort()
 
     @contextlib.contextmanager
     def capture_signals(self) -> Generator[None, None, None]:
         yield
+
+
+class _Ending:
+    """An application whose requests may be cancelled when the service ends, and nothing is wrong then."""
+
+    def __init__(self, app: ASGIApp, stop: anyio.Event) -> None:
+        self._app = app
+        self._stop = stop
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await self._app(scope, receive, send)
+        except anyio.get_cancelled_exc_class():
+            if not self._stop.is_set():
+                raise
 
 
 async def serve(
@@ -109,28 +159,34 @@ async def serve(
     settings = Settings() if settings is None else settings
     settings = replace(settings, access=replace(settings.access, listen=listening.host))
     stop = anyio.Event() if stop is None else stop
+    app = _Ending(create_app(hub, settings), stop)
+    config = _config(app, listening)
     opened = _open(listening)
+    server = _Server(config)
     try:
-        server = _Server(_config(hub, settings, listening))
         port: int = opened.getsockname()[1]
         url = Listening(listening.host, port, listening.tls_cert, listening.tls_key).url
         async with anyio.create_task_group() as tasks, hub:
-            tasks.start_soon(server.serve, [opened])
-            await server.listens.wait()
+            tasks.start_soon(server.serve)
+            await server.is_ready.wait()
+            gate = Gate(opened, Places(), server.protocol, tls=config.ssl, limit=LogLimit())
+            tasks.start_soon(gate.run)
             if listens is not None:
                 listens(url)
             try:
                 await stop.wait()
             finally:
+                gate.close()
                 server.should_exit = True
     finally:
         opened.close()
+        server.cut_off()
 
 
-def _config(hub: Hub, settings: Settings, listening: Listening) -> uvicorn.Config:
+def _config(app: ASGIApp, listening: Listening) -> uvicorn.Config:
     tls = tls_of(listening.tls_cert, listening.tls_key)
     return uvicorn.Config(
-        create_app(hub, settings),
+        app,
         lifespan="off",
         http=Connection,
         ws="websockets-sansio",
@@ -140,9 +196,7 @@ def _config(hub: Hub, settings: Settings, listening: Listening) -> uvicorn.Confi
         access_log=False,
         server_header=False,
         proxy_headers=False,
-        backlog=BACKLOG,
         timeout_keep_alive=int(KEEP_ALIVE),
-        timeout_graceful_shutdown=int(ENDING_TIME),
         ssl_certfile=None if tls is None else tls.cert,
         ssl_keyfile=None if tls is None else tls.key,
     )
