@@ -16,7 +16,7 @@ import anyio
 import pytest
 
 from paramclient.errors import UsageError
-from paramclient.service import access
+from paramclient.service import held_bodies
 from paramclient.service.access import AccessMiddleware, AccessSettings, may_write
 from paramclient.service.request import SESSION_PATH
 from paramclient.service.tokens import (
@@ -34,7 +34,7 @@ from paramclient.service.tokens import (
     token_line,
     tokens_from,
 )
-from tests.shell import swiftly
+from tests.shell import swiftly, until
 
 ANNA = "anna-may-write-0123456789"
 BEN = "ben-may-read-0123456789ab"
@@ -352,7 +352,8 @@ def test_hosts_are_named_one_by_one(host: str) -> None:
 async def test_without_tokens_whoever_is_on_this_machine_may_write() -> None:
     door = Door()
     assert (await door.request("POST", WRITE, body=b"{}")).status == 200
-    assert door.state == {"asker": "local", "name": "local", "role": "write", "read_only": False}
+    local = {"asker": "local", "name": "local", "role": "write", "read_only": False}
+    assert door.state == {**local, "quota": "the address 10.0.0.2"}
     assert may_write(Asked(door.seen[-1][0]))
     await door.request(raw=[(b"x-asker", b"calibrate.py")])
     assert door.state["asker"] == "local (calibrate.py)"
@@ -396,6 +397,7 @@ async def test_a_token_says_who_asks_and_goes_no_further() -> None:
         "name": "anna",
         "role": "write",
         "read_only": False,
+        "quota": "the token anna",
     }
     assert (await door.request(token=BEN, client=("::ffff:10.0.0.9", 1))).status == 200
     assert (door.state["asker"], door.state["role"]) == ("ben@10.0.0.9", "read")
@@ -899,7 +901,7 @@ async def test_a_body_that_takes_for_ever_is_not_waited_for() -> None:
 
 @swiftly
 async def test_bodies_are_not_many_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(access, "MAX_BODIES", 250)
+    monkeypatch.setattr(held_bodies, "MAX_BODIES", 250)
     door = Door(SMALL)
     statuses: list[int] = []
 
@@ -911,6 +913,119 @@ async def test_bodies_are_not_many_at_once(monkeypatch: pytest.MonkeyPatch) -> N
             tasks.start_soon(ask)
     assert sorted(statuses) == [200, 200, 503, 503, 503]
     assert (await door.request("POST", WRITE, body=b"x" * 90)).status == 200, "and then there is room again"
+
+
+@dataclass
+class Pending(Door):
+    """An application that has read its body, and answers when it is told to."""
+
+    go_on: anyio.Event = field(default_factory=anyio.Event)
+
+    async def app(self, scope: Any, receive: Any, send: Any) -> None:
+        if scope["path"] == WRITE:
+            await self.go_on.wait()
+        await super().app(scope, receive, send)
+
+
+@swiftly
+async def test_bodies_count_until_their_requests_are_answered(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(held_bodies, "MAX_BODIES", 250)
+    door = Pending(SMALL)
+    statuses: list[int] = []
+
+    async def ask() -> None:
+        statuses.append((await door.request("POST", WRITE, body=b"x" * 90)).status)
+
+    async with anyio.create_task_group() as tasks:
+        for _ in range(3):
+            tasks.start_soon(ask)
+        await until(lambda: statuses)
+        assert statuses == [503], "two are read, and wait for their answer"
+        door.go_on.set()
+    assert sorted(statuses) == [200, 200, 503]
+    assert (await door.request("POST", WRITE, body=b"x" * 90)).status == 200, "and then there is room again"
+
+
+@swiftly
+async def test_one_holder_takes_no_room_from_others() -> None:
+    """Sixty bodies of a megabyte, none of them whole: as many are read as fit into the quota of one."""
+    door = Door(GUARDED)
+    megabyte = b" " * (1 << 20)
+    answers: list[Answer] = []
+
+    async def ask() -> None:
+        body = [megabyte, *[b" "] * 50]
+        answers.append(await door.request("POST", WRITE, body=body, pause=1.0, token=ANNA))
+
+    async with anyio.create_task_group() as tasks:
+        for _ in range(60):
+            tasks.start_soon(ask)
+        await until(lambda: len(answers) == 45)
+        assert {answer.problem for answer in answers} == {"too-many"}
+        assert {answer.status for answer in answers} == {429}
+        assert str(held_bodies.MAX_BODIES_OF_ONE).encode() in answers[0].body
+        assert answers[0].headers["retry-after"] == "1"
+        others = await door.request("POST", "/api/v1/components/1/1/diff", body=megabyte, token=BEN)
+        assert others.status == 200
+        assert (await door.request("POST", WRITE, body=megabyte, token=ANNA)).problem == "too-many"
+    assert [answer.status for answer in answers].count(200) == 15
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "statuses"),
+    [
+        ("10.0.0.2", "10.0.0.2", [200, 429]),
+        ("10.0.0.2", "10.0.0.3", [200, 200]),
+        ("2001:db8::1", "2001:db8::2:1", [200, 429]),
+        ("2001:db8::1", "2001:db8:0:1::1", [200, 200]),
+    ],
+)
+@swiftly
+async def test_without_tokens_the_address_is_the_holder(
+    first: str, second: str, statuses: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(held_bodies, "MAX_BODIES_OF_ONE", 150)
+    door = Pending(SMALL)
+    given: list[int] = []
+
+    async def ask(address: str) -> None:
+        answer = await door.request("POST", WRITE, body=b"x" * 90, client=(address, 50_000))
+        given.append(answer.status)
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(ask, first)
+        tasks.start_soon(ask, second)
+        await anyio.sleep(1)
+        door.go_on.set()
+    assert sorted(given) == statuses
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "most"),
+    [
+        ("POST", "/api/v1/find", 65_536),
+        ("POST", f"{READ}/1/1/fetch", 65_536),
+        ("POST", f"{READ}/1/1/restore", 65_536),
+        ("PUT", f"{READ}/1/1/params/A", 65_536),
+        ("POST", f"{READ}/1/1/metadata", 65_536),
+        ("POST", f"{READ}/1/1/diff", 3 << 20),
+        ("POST", f"{READ}/1/1/plan", 3 << 20),
+        ("POST", f"{READ}/1/1/verify", 3 << 20),
+        ("POST", f"{READ}/1/1/apply", 3 << 20),
+        ("PATCH", f"{READ}/1/1/params", 3 << 20),
+        ("POST", "/api/v1/fleet/diff", 3 << 20),
+        ("POST", "/api/v1/files", 2 << 20),
+        ("PUT", f"{READ}/1/1/metadata", 8 << 20),
+    ],
+)
+@swiftly
+async def test_only_values_and_files_may_be_long(method: str, path: str, most: int) -> None:
+    door = Door()
+    long = await door.request(method, path, raw=[(b"content-length", b"%d" % (most + 1)), _JSON])
+    assert (long.status, long.problem, long.asked) == (413, "too-large", [])
+    assert str(most).encode() in long.body
+    assert not door.seen
+    assert (await door.request(method, path, body=b"x" * most)).status == 200
 
 
 @pytest.mark.parametrize("method", ["GET", "HEAD", "DELETE", "OPTIONS"])

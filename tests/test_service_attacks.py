@@ -404,7 +404,7 @@ async def test_a_deep_body_is_a_problem_and_no_more() -> None:
         body = b"[" * 200_000
         head = service.head(
             "POST",
-            "/api/v1/find",
+            f"{C}/diff",
             "Connection: close",
             "Content-Type: application/json",
             f"Content-Length: {len(body)}",

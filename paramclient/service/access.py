@@ -20,7 +20,16 @@ import anyio
 
 from paramclient.errors import UsageError
 from paramclient.protocol.authors import LONGEST_ASKER
-from paramclient.service.request import ASK, HOST, SESSION_PATH, Denied, Request, Scope
+from paramclient.service.held_bodies import HeldBodies, HeldBody
+from paramclient.service.request import (
+    ASK,
+    HOST,
+    LARGEST_DESCRIPTION,
+    SESSION_PATH,
+    Denied,
+    Request,
+    Scope,
+)
 from paramclient.service.tokens import SESSION_AGE, Guesses, Holder, Sessions, Tokens
 
 __all__ = ["AccessMiddleware", "AccessSettings", "may_write"]
@@ -32,10 +41,6 @@ Receive: TypeAlias = Callable[[], Awaitable[Message]]
 Send: TypeAlias = Callable[[Message], Awaitable[None]]
 App: TypeAlias = Callable[[Scope, Receive, Send], Awaitable[None]]
 
-MAX_BODY: Final = 8 * 1024 * 1024
-"""Bytes of one body: parameter files have a hundredth of it."""
-MAX_BODIES: Final = 8 * MAX_BODY
-"""Bytes of all bodies that are being read at once."""
 LONGEST_SESSION: Final = 1_024
 """Bytes of the body that begins a session: all that those without a token may send."""
 BODY_PATIENCE: Final = 60.0
@@ -65,7 +70,7 @@ class AccessSettings:
         hosts: names by which the service may be called, beside this machine's loopback names, and addresses.
         origins: pages elsewhere that may use it from a browser, such as `https://station.example`.
         read_only: nobody may change anything.
-        max_body: bytes of one body.
+        max_body: bytes of one body, where `Request.longest_body` allows as many.
 
     Raises:
         UsageError: it would be open to others without a token, or something in it cannot be.
@@ -76,7 +81,7 @@ class AccessSettings:
     hosts: Collection[str] = ()
     origins: Collection[str] = ()
     read_only: bool = False
-    max_body: int = MAX_BODY
+    max_body: int = LARGEST_DESCRIPTION
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hosts", frozenset(map(_host_name, self.hosts)))
@@ -106,7 +111,7 @@ class AccessMiddleware:
         self._settings = settings
         self._sessions = Sessions(clock)
         self._guesses = Guesses(clock)
-        self._in_bodies = 0
+        self._bodies = HeldBodies()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
@@ -137,12 +142,14 @@ class AccessMiddleware:
         state["name"] = None if holder is None else holder.name
         state["role"] = None if holder is None else holder.role
         state["read_only"] = self._settings.read_only
-        if request.has_body:
-            request.check_content()
-            body = await self._body(request, receive, self._settings.max_body)
-            receive = _after(body, receive)
+        state["quota"] = _quota(request, holder if self._settings.tokens is not None else None)
         scope = {**request.scope, "headers": [each for each in request.headers if each[0] not in _SECRET]}
-        await self._app(scope, receive, answer.send)
+        with self._bodies.hold(state["quota"]) as held:
+            if request.has_body:
+                request.check_content()
+                most = min(request.longest_body, self._settings.max_body)
+                receive = _after(await self._body(request, receive, most, held), receive)
+            await self._app(scope, receive, answer.send)
 
     # Where it comes from
 
@@ -237,7 +244,8 @@ class AccessMiddleware:
                 self._sessions.end(request.cookie)
             await answer.respond(204, b"", [(b"set-cookie", _set_cookie(request, "", 0))])
             return
-        token = _token_in(await self._body(request, receive, LONGEST_SESSION))
+        with self._bodies.hold(_quota(request, None)) as held:
+            token = _token_in(await self._body(request, receive, LONGEST_SESSION, held))
         headers = []
         if self._settings.tokens is not None:
             holder = self._holder_of(token, request.address, self._settings.tokens)
@@ -249,13 +257,13 @@ class AccessMiddleware:
 
     # What it brings
 
-    async def _body(self, request: Request, receive: Receive, most: int) -> bytes:
+    async def _body(self, request: Request, receive: Receive, most: int, held: HeldBody) -> bytes:
         """All of it, before anything is done with it.
 
         Raises:
             Denied: it is too long, takes too long, or there are too many at once.
         """
-        too_large = Denied(413, "too-large", f"A body has at most {most} bytes.")
+        too_large = Denied(413, "too-large", f"A body of this request has at most {most} bytes.")
         if request.length is not None and request.length > most:
             raise too_large
         body = bytearray()
@@ -268,21 +276,12 @@ class AccessMiddleware:
                         raise Denied(400, "bad-request", "The body ends before its end.")
                     piece = message.get("body", b"")
                     body += piece
-                    self._in_bodies += len(piece)
+                    held.add(len(piece))
                     if len(body) > most:
                         raise too_large
-                    if self._in_bodies > MAX_BODIES:
-                        raise Denied(
-                            503,
-                            "busy",
-                            "Too much is being sent to this service at once.",
-                            [(b"retry-after", b"1")],
-                        )
                     is_whole = not message.get("more_body", False)
         except TimeoutError:
             raise Denied(408, "too-slow", f"The body has not come within {BODY_PATIENCE:.0f} s.") from None
-        finally:
-            self._in_bodies -= len(body)
         return bytes(body)
 
 
@@ -372,6 +371,11 @@ def _asker(request: Request, holder: Holder | None) -> str:
     if not 1 <= len(client) <= LONGEST_CLIENT or not (client.isascii() and client.isprintable()):
         raise Denied(400, "bad-request", f"X-Asker has 1 to {LONGEST_CLIENT} printable ASCII characters.")
     return f"{who} ({client})"[:LONGEST_ASKER]
+
+
+def _quota(request: Request, holder: Holder | None) -> str:
+    """Who has a share of what is there for all: the holder of a token, or without tokens the address."""
+    return f"the address {request.network}" if holder is None else f"the token {holder.name}"
 
 
 def _after(body: bytes, receive: Receive) -> Receive:

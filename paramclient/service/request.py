@@ -5,11 +5,20 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, MutableMapping
 from dataclasses import dataclass, field
-from ipaddress import IPv6Address, ip_address
+from ipaddress import IPv6Address, IPv6Network, ip_address
 from typing import Any, Final, TypeAlias
 from urllib.parse import unquote
 
-__all__ = ["ASK", "HOST", "SESSION_PATH", "Denied", "Request", "Scope"]
+__all__ = [
+    "ASK",
+    "HOST",
+    "LARGEST_DESCRIPTION",
+    "LARGEST_UPLOAD",
+    "SESSION_PATH",
+    "Denied",
+    "Request",
+    "Scope",
+]
 
 Scope: TypeAlias = MutableMapping[str, Any]
 
@@ -18,6 +27,15 @@ LONGEST_HEADERS: Final = 16 * 1024
 """How many headers a request has, and how long they are together. Browsers send about 15 with 1 kB."""
 LONGEST_TARGET: Final = 8 * 1024
 """Bytes of path and query."""
+LONGEST_BODY: Final = 64 * 1024
+"""Bytes of a body that has neither values nor a file in it."""
+LONGEST_VALUES: Final = 3 * 1024 * 1024
+"""Bytes of a body with values, or with files in JSON: the largest file in base64, and what stands beside."""
+LARGEST_UPLOAD: Final = 2 * 1024 * 1024
+"""Bytes of a parameter file that somebody sends: ten thousand parameters in the longest of the forms. To read
+more takes more than a few seconds, in which everybody else has half of the processor."""
+LARGEST_DESCRIPTION: Final = 8 * 1024 * 1024
+"""Bytes of a file that describes parameters: ArduPilot's for one vehicle has half of that."""
 
 SESSION_PATH: Final = "/api/v1/session"
 READ_BY_POST: Final = frozenset(
@@ -32,6 +50,16 @@ ONCE: Final = (
     *(b"sec-fetch-site", b"sec-fetch-mode", b"sec-fetch-dest", b"x-asker"),
 )
 """Headers that decide something: of two, what is behind here might take the other one."""
+LONG_BODIES: Final = {
+    ("POST", "apply"): LONGEST_VALUES,
+    ("POST", "diff"): LONGEST_VALUES,
+    ("POST", "plan"): LONGEST_VALUES,
+    ("POST", "verify"): LONGEST_VALUES,
+    ("PATCH", "params"): LONGEST_VALUES,
+    ("POST", "files"): LARGEST_UPLOAD,
+    ("PUT", "metadata"): LARGEST_DESCRIPTION,
+}
+"""Bytes of the bodies with values and files, by method and the last part of the path."""
 ASK: Final = [(b"www-authenticate", b'Bearer realm="paramclient"')]
 """What goes with 401."""
 
@@ -114,6 +142,11 @@ class Request:
     @property
     def has_body(self) -> bool:
         return bool(self.length) or self.header(b"transfer-encoding") is not None
+
+    @property
+    def longest_body(self) -> int:
+        """Bytes that its body may have."""
+        return LONG_BODIES.get((self.method, self.path.rpartition("/")[2]), LONGEST_BODY)
 
     def check_content(self) -> None:
         """See that it may have a body, of a kind that no page elsewhere can send without asking first."""
@@ -220,6 +253,17 @@ class Request:
             return "here"
         mapped = parsed.ipv4_mapped if isinstance(parsed, IPv6Address) else None
         return str(mapped or parsed)
+
+    @property
+    def network(self) -> str:
+        """The address, or the network of an IPv6 one: a machine has 2⁶⁴ of these."""
+        try:
+            parsed = ip_address(self.address)
+        except ValueError:
+            return self.address
+        if isinstance(parsed, IPv6Address) and not parsed.is_loopback:
+            return str(IPv6Network((parsed, 64), strict=False))
+        return self.address
 
 
 def _length(header: tuple[bytes, bytes]) -> int:

@@ -18,6 +18,7 @@ from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.provision.looking import identified
 from paramclient.service.asking import ValueGiven, value_of
 from paramclient.service.problems import ServiceError
+from paramclient.service.request import LARGEST_UPLOAD
 from paramclient.taken import before_last_apply, cached_set, whole_set
 from paramclient.values import Trust, check_name
 
@@ -52,9 +53,6 @@ MOST_VALUES: Final = 65_535
 """Values of one request: as many as an index can count."""
 LONGEST_NAME: Final = 255
 """Characters of a file's name."""
-LARGEST_UPLOAD: Final = 2 * 1024 * 1024
-"""Bytes of a parameter file that somebody sends: ten thousand parameters in the longest of the forms. To read
-more takes more than a few seconds, in which everybody else has half of the processor."""
 LATEST: Final = 253_402_300_799.0
 """The last second of the year 9999: what stands beyond cannot be written as a date."""
 

@@ -13,6 +13,7 @@ from paramclient.metadata import Metadata, metadata_of, read_content
 from paramclient.service.asking import Seconds, Target, TheHub, answered, may_write
 from paramclient.service.following import Followed
 from paramclient.service.problems import ServiceError
+from paramclient.service.request import LARGEST_DESCRIPTION
 from paramclient.service.routes.files import RAW_BODY, body_of
 from paramclient.service.wanted import LONGEST_NAME
 
@@ -22,8 +23,6 @@ router = APIRouter(prefix="/api/v1/components/{system}/{component}", tags=["desc
 
 MOST_PATTERNS: Final = 64
 """Patterns of one request."""
-LARGEST_DESCRIPTION: Final = 8 * 1024 * 1024
-"""Bytes of a file that describes parameters: ArduPilot's for one vehicle has half of that."""
 
 
 class Asked(Body):
