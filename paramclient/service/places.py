@@ -9,6 +9,9 @@ from typing import Final
 
 from paramclient.service.addresses import is_loopback, network_of
 
+if sys.platform != "win32":
+    import resource
+
 __all__ = ["Place", "Places", "Stage", "most_connections"]
 
 MOST_CONNECTIONS: Final = 512
@@ -146,12 +149,19 @@ class Places:
 def most_connections() -> int:
     """How many connections there may be: half of the files that this process may open, and no more than
     `MOST_CONNECTIONS`."""
-    if sys.platform == "win32":
-        return MOST_CONNECTIONS
-    import resource  # there is none on Windows
+    return MOST_CONNECTIONS if (files := _most_files()) is None else min(MOST_CONNECTIONS, files // 2)
 
-    limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    return MOST_CONNECTIONS if limit == resource.RLIM_INFINITY else min(MOST_CONNECTIONS, limit // 2)
+
+if sys.platform == "win32":
+
+    def _most_files() -> int | None:
+        return None
+
+else:
+
+    def _most_files() -> int | None:
+        limit, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        return None if limit == resource.RLIM_INFINITY else limit
 
 
 def _nothing() -> None:
