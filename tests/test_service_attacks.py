@@ -32,7 +32,7 @@ ANNA = "anna-may-write-0123456789"
 BEN = "ben-may-read-0123456789ab"
 TOKENS = Tokens.of_text(f"anna write {ANNA}\nben read {BEN}")
 DATA = Path(__file__).parent / "data"
-EVIL = "<img src=x onerr"
+EVIL = "<img/src/onerr>"
 """As much of a program as fits into the name of a parameter."""
 C = "/api/v1/components/1/1"
 KERNEL = 16_000_000
@@ -610,7 +610,7 @@ async def test_a_name_that_tries_to_be_html_is_a_text_everywhere() -> None:
                 f"Content-Length: {len(body)}",
             )
             assert Answer.of(await service.send(sent + body)).status == 200
-            event = await reader.readuntil(b'"name":"<img src=x onerr"')
+            event = await reader.readuntil(b'"name":"<img/src/onerr>"')
             assert b'"change"' in event
 
 
