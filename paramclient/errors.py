@@ -23,6 +23,7 @@ The tree says who is to blame::
     │   └── ClientClosed              the client was closed while a call waited, or is not open
     ├── PackError                     a packed parameter file that is none
     └── CacheError                    the cache on disk
+        └── NotInCache                it can be read, and does not have what was asked for
 
 Each carries what is known as attributes, so that a program need not read its text.
 """
@@ -46,6 +47,7 @@ __all__ = [
     "LinkError",
     "MetadataError",
     "NoReply",
+    "NotInCache",
     "PackError",
     "ParamClientError",
     "ParamErrorCode",
@@ -417,3 +419,7 @@ class PackError(ParamClientError):
 
 class CacheError(ParamClientError):
     """The cache on disk could not do what was asked of it."""
+
+
+class NotInCache(CacheError):
+    """The cache can be read, and does not have the table, the snapshot or the state that was asked for."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from itertools import islice
 from typing import TYPE_CHECKING, Final
 
-from paramclient.errors import CacheError, NoReply, UnknownVehicle, UsageError, VehicleError
+from paramclient.errors import NoReply, NotInCache, UnknownVehicle, UsageError, VehicleError
 from paramclient.paramset import ParamSet
 from paramclient.provision.applying import BEFORE_APPLY
 from paramclient.values import Param, Trust
@@ -159,11 +159,11 @@ def cached_set(
     """
     table = cache.load(key, component)
     if table is None:
-        raise CacheError(f"the cache has no table of component {component} of {key}")
+        raise NotInCache(f"the cache has no table of component {component} of {key}")
     if not table.complete:
         who = f"{table.system}/{component} ({key})"
         of = "" if table.count is None else f" of {table.count}"
-        raise CacheError(f"the cache has {table.size}{of} parameters of {who}, not all; fetch them first")
+        raise NotInCache(f"the cache has {table.size}{of} parameters of {who}, not all; fetch them first")
     if table.left_out and note is not None:
         note(left_out_note(table))
     return set_of(table)
@@ -191,7 +191,7 @@ def before_last_apply(cache: ParamCache, key: str, component: int) -> ParamSet:
     except UnknownVehicle:
         kept = []
     if not kept:
-        raise CacheError(f"the cache knows of no apply to {key}; name the moment whose state is to come back")
+        raise NotInCache(f"the cache knows of no apply to {key}; name the moment whose state is to come back")
     return cache.state_at(key, component, kept[-1].id)
 
 

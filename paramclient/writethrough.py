@@ -100,7 +100,9 @@ class WriteThrough:
         self._owned = owned
         self._worker = Worker("paramclient cache")
         self._kept: dict[ComponentMachine, _Kept] = {}
-        self._has_failed = False
+        self._flushing = anyio.Lock()
+        self._failure: CacheError | UsageError | None = None  # None once it could be written again
+        self._failures = 0
         self._tables: dict[tuple[int, int], bool] = {}
         self._something_to_write = anyio.Event()
         self._bringing: set[ComponentMachine] = set()
@@ -123,12 +125,14 @@ class WriteThrough:
             self._end_news = await self._run(partial(self._cache.subscribe, told)) or _nothing
 
     async def close(self) -> None:
-        """Write what is left, and end the thread."""
+        """Write what is left, or warn of what is lost, and end the thread."""
         self._end_news()
+        is_written = False
         try:
-            await self.flush()
-            await self.flush()  # all of it, where the file had gone
+            is_written = await self.flush() and await self.flush()  # all of it, where the file had gone
         finally:
+            if not is_written:
+                self._tell_of_loss()
             cache = self._cache if self._owned else None
             await self._worker.close(_nothing if cache is None else cache.close)
 
@@ -239,6 +243,22 @@ class WriteThrough:
         Args:
             is_last: whether what a fetch under way has brought must not be left for later.
         """
+        async with self._flushing:
+            return await self._flush(is_last=is_last)
+
+    async def write_all(self) -> None:
+        """Write all that has been heard, so that the cache can be asked about it.
+
+        Raises:
+            CacheError: the cache could not take it. It is kept, and written when that is possible.
+        """
+        failures = self._failures
+        async with self._flushing:
+            if failures == self._failures and await self._flush(is_last=True):
+                return
+        raise CacheError(f"what was heard last could not be written: {self._failure}") from self._failure
+
+    async def _flush(self, *, is_last: bool) -> bool:
         portion: list[_News] = []
         size = 0
         times = self._present_times()
@@ -279,8 +299,12 @@ class WriteThrough:
             for new in news:
                 if not is_written and self._kept.get(new.kept.machine) is new.kept:
                     new.take_back()
+            for kept in self._kept.values() if self._failure is not None else ():
+                kept.machine.table.keeps_all = True
         if is_written:
-            self._has_failed = False
+            self._failure = None
+            for kept in self._kept.values():
+                kept.machine.table.keeps_all = False
             logger.debug("written: %s values", sum(len(new.update.params) for new in news))
             self._begin_anew(cache.replacements)
         return is_written
@@ -456,10 +480,28 @@ class WriteThrough:
         try:
             return await self._worker.run(work)
         except (CacheError, UsageError) as error:  # a UsageError comes of a clock that is far off
-            if not self._has_failed:
+            if self._failure is None:
                 logger.warning("going on without the cache: %s", error)
-            self._has_failed = True
+            self._failure = error
+            self._failures += 1
             return None
+
+    def _tell_of_loss(self) -> None:
+        """Warn of what can no longer be written."""
+        for machine, kept in self._kept.items():
+            values, earlier = len(machine.table.dirty), len(machine.table.overwritten)
+            if values or earlier:
+                logger.warning(
+                    "%d/%d (%s): not written to the cache, and lost: %d %s and %d earlier %s, as %s",
+                    machine.system,
+                    machine.component,
+                    kept.identity.key,
+                    values,
+                    "value" if values == 1 else "values",
+                    earlier,
+                    "value" if earlier == 1 else "values",
+                    self._failure,
+                )
 
 
 @dataclass(slots=True)

@@ -394,8 +394,8 @@ def test_restore_takes_a_moment_or_a_snapshot(
     ("when", "text"),
     [
         ([], "the cache knows of no apply to uid:"),
-        (["2h ago"], "no earlier state of uid:"),
-        (["4"], "no earlier state of uid:"),
+        (["2h ago"], "is not known: its table was never complete; there is no snapshot"),
+        (["4"], "there is no snapshot 4 of uid:"),
     ],
 )
 def test_restore_needs_something_to_go_back_to(

@@ -23,7 +23,7 @@ from typing import Any, Final
 from paramclient.cache.records import Snapshot
 from paramclient.cache.rows import Damaged, Row, identity_cells, read_identity, read_param, time_cell
 from paramclient.cache.session import Session
-from paramclient.errors import CacheError
+from paramclient.errors import NotInCache
 from paramclient.identity import Identity
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.values import Value, is_portable_name, known_type
@@ -93,14 +93,14 @@ def snapshot(session: Session, owner: int, number: int) -> Snapshot:
     """
     found = session.snapshot(owner, number)
     if found is None:
-        raise CacheError(_no_such(session, owner, number))
+        raise NotInCache(_no_such(session, owner, number))
     summary, row, blob, expected = found
     try:
         if not isinstance(blob, bytes) or _checksum(row, blob) != expected:
             raise ValueError("it is not what was written")
         identity, params = _unpacked(blob)
     except (ArithmeticError, LookupError, TypeError, ValueError, Damaged, struct.error, zlib.error) as error:
-        raise CacheError(
+        raise NotInCache(
             f"snapshot {number} of {summary.key}, component {summary.component}, is damaged: {error}"
         ) from error
     return Snapshot(
@@ -146,11 +146,11 @@ def state_at(
             if since is None
             else f"at {_text(when)} is not known: what is kept of its history begins at {_text(since)}"
         )
-        raise CacheError(f"the state of {who} {reach}{_older(session, owner, when)}")
+        raise NotInCache(f"the state of {who} {reach}{_older(session, owner, when)}")
     twice = session.setback_over(owner, when)
     if twice is not None:
         back, until = twice
-        raise CacheError(
+        raise NotInCache(
             f"the state of {who} at {_text(when)} cannot be told: the clock of this computer was set back"
             f" from {_text(until)} to {_text(back)}{_older(session, owner, when)}"
         )

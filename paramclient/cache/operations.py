@@ -13,7 +13,7 @@ from paramclient.cache.records import Snapshot, TableUpdate
 from paramclient.cache.rows import read_param
 from paramclient.cache.session import Session
 from paramclient.cache.settle import settle
-from paramclient.errors import CacheError
+from paramclient.errors import NotInCache
 from paramclient.identity import Identity
 from paramclient.paramset import ParamSet
 from paramclient.values import is_portable_name
@@ -104,7 +104,7 @@ class SetDown(Operation[Snapshot]):
         owner = session.owner_of(key, self.component)
         if owner is None:
             if isinstance(self.vehicle, str):
-                raise CacheError(f"the table of {key}, component {self.component}, has just been removed")
+                raise NotInCache(f"the table of {key}, component {self.component}, has just been removed")
             autopilot = self.vehicle.autopilot if self.component == 1 else 0
             new = TableUpdate(
                 identity=self.vehicle, component=self.component, autopilot=autopilot, at=self.at
@@ -131,7 +131,7 @@ class SetDown(Operation[Snapshot]):
         owner = session.owner_of(key, self.component)
         number = None if owner is None else session.snapshot_at(owner, earlier.kept_time(self.at))
         if owner is None or number is None:
-            raise CacheError(f"the table of {key}, component {self.component}, has just been removed")
+            raise NotInCache(f"the table of {key}, component {self.component}, has just been removed")
         return earlier.snapshot(session, owner, number)
 
     def resolved(self, session: Session) -> SetDown:
@@ -141,7 +141,7 @@ class SetDown(Operation[Snapshot]):
         [(key, _)] = self.tables
         found = session.summaries(key, self.component)
         if not found:
-            raise CacheError(f"the table of {key}, component {self.component}, has just been removed")
+            raise NotInCache(f"the table of {key}, component {self.component}, has just been removed")
         [(owner, kept)] = found
         return replace(self, params=_kept(session, owner), hash=kept.hash, complete=kept.complete)
 

@@ -29,7 +29,7 @@ from paramclient.cache.records import (
 from paramclient.cache.session import Session
 from paramclient.cache.sqlite import SqliteStore
 from paramclient.cache.transfer import CopyResult, copy_store
-from paramclient.errors import CacheError
+from paramclient.errors import CacheError, NotInCache
 from paramclient.identity import Identity
 from paramclient.paramset import ParamSet
 
@@ -369,11 +369,11 @@ class ParamCache:
             plain: dict[str, None] = dict.fromkeys(each for like in chosen.values() for each in like)
             found = fleet.fleet_diff(session, number, plain if written is None else written)
             if not found.vehicles:
-                raise CacheError(f"the cache {self.place} holds no table of component {number}")
+                raise NotInCache(f"the cache {self.place} holds no table of component {number}")
             held = {each.name for each in found.names if each.values}
             for name, like in chosen.items():
                 if held.isdisjoint(like):
-                    raise CacheError(f"no vehicle in the cache {self.place} has a parameter {name}")
+                    raise NotInCache(f"no vehicle in the cache {self.place} has a parameter {name}")
             return found
 
         return self._store.read(work)

@@ -33,7 +33,7 @@ from paramclient.cli.output import (
 )
 from paramclient.cli.sources import is_file, open_file, tables_in
 from paramclient.cli.written import show_file
-from paramclient.errors import CacheError, UsageError
+from paramclient.errors import NotInCache, UsageError
 from paramclient.identity import autopilot_name
 from paramclient.metadata import Metadata
 from paramclient.notation import hash_text, time_or_none, time_text
@@ -83,7 +83,7 @@ def show(
         tables = [] if is_list else _load(cache, summaries)
     views = [_View.of(table, wanted, described, cache, changed=changed) for table in tables]
     if unknown := [name for name in wanted if not any(name in table.params for table in tables)]:
-        raise CacheError(f"not among the cached parameters: {', '.join(unknown)}")
+        raise NotInCache(f"not among the cached parameters: {', '.join(unknown)}")
     if options.json:
         from paramclient.documents.cached import CachedTablesDoc  # only here: loads pydantic
 
@@ -161,7 +161,7 @@ def cache_copy(source: str, target: str, /, *, json: bool = False) -> ExitCode:
         json: Print JSON, for programs.
     """
     if not is_address(source) and not Path(source).is_file():
-        raise CacheError(f"there is no cache {source}")
+        raise NotInCache(f"there is no cache {source}")
 
     def told(key: str, number: int, count: int) -> None:
         if sys.stderr.isatty():

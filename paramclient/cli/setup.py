@@ -48,7 +48,7 @@ from paramclient.cli.targets import (
 from paramclient.cli.when import parse_when
 from paramclient.cli.written import described
 from paramclient.component import Component
-from paramclient.errors import CacheError, NoReply, ParamClientError, UnknownVehicle, UsageError
+from paramclient.errors import NoReply, NotInCache, ParamClientError, UnknownVehicle, UsageError
 from paramclient.metadata import Metadata
 from paramclient.paramset import ParamSet
 from paramclient.protocol.result import Progress
@@ -286,6 +286,7 @@ async def _state(found: Targets, vehicle: Component, when: str | None, options: 
     if cache is None:
         raise UsageError("earlier states are in the cache, and --no-cache excludes that; or name a file")
     await identified(vehicle)
+    await found.client._writer.write_all()
     key, component = vehicle.identity.key, vehicle.component
     return await anyio.to_thread.run_sync(lambda: _kept(cache, key, component, moment))
 
@@ -297,7 +298,7 @@ def _kept(cache: ParamCache, key: str, component: int, moment: float | None) -> 
         return cache.state_at(key, component, moment)
     except UnknownVehicle:  # the user named no vehicle of the cache: this one was heard on the link
         what = f"the cache {cache.place} has no earlier state of {key}, component {component}"
-        raise CacheError(what) from None
+        raise NotInCache(what) from None
 
 
 async def _described(

@@ -122,6 +122,8 @@ class Table:
         slept: seconds of sleep of this computer by which moments were moved back, see `age`.
         left_out: how often something was said under a name that no parameter file can hold, see `leave_out`.
         left_out_name: the last such name, or an empty text.
+        keeps_all: whether `overwritten` has every value that was replaced before the cache was told of it, as
+            while the cache cannot be written; else only those of our writes.
         overwritten: values that the cache has not been told of and that are no longer current: those that
             our writes have set or replaced, and the first observation of a changed value that came again.
     """
@@ -145,6 +147,7 @@ class Table:
         self.passed_over: dict[str, frozenset[int]] = {}
         self.dirty: dict[str, str] = {}
         self.overwritten: list[Observation] = []
+        self.keeps_all = False
         self.left_out = 0
         self.left_out_name = ""
         self._hash: int | None = None
@@ -698,7 +701,7 @@ class Table:
         """Note that a value has changed, at the moment that the table has of it by now.
 
         The cache is told of each value that our writes have set, however short it stood, and of what they
-        replaced.
+        replaced; with `keeps_all`, of each value.
 
         Args:
             name, by: the parameter and the author of the change.
@@ -707,7 +710,7 @@ class Table:
         """
         before = self.dirty.get(name)
         if old is not None:
-            if before is not None and (is_ours(before) or is_ours(by)):
+            if before is not None and (self.keeps_all or is_ours(before) or is_ours(by)):
                 since, author = self._changed.get(name, (seen_at, before))
                 param = param_of(name, old, default)
                 if since < seen_at:

@@ -496,7 +496,7 @@ class Run:
             await client._writer.aside(lambda: write_file(path, seen.table))
         cache = client.cache
         if cache is not None and self.plan.steps:
-            await client._writer.flush()  # so that history knows what is changed from
+            await client._writer.write_all()  # so that history knows what is changed from
             await client._writer.aside(
                 lambda: cache.store_snapshot(
                     component.identity,

@@ -14,6 +14,7 @@ from paramclient.errors import (
     InvalidParameters,
     LinkError,
     NoReply,
+    NotInCache,
     ParamClientError,
     Refused,
     TypeMismatch,
@@ -121,4 +122,5 @@ _MAKERS: Final[dict[str, Callable[[str, Problem], ParamClientError]]] = {
     "AnotherVehicle": _another,
     "NoReply": _no_reply,
     "CacheError": lambda detail, problem: CacheError(detail),
+    "NotInCache": lambda detail, problem: NotInCache(detail),
 }

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeVar
 from pydantic import BeforeValidator, Field, model_validator
 
 from paramclient.documents.base import Body
-from paramclient.errors import CacheError, UnknownVehicle, UsageError
+from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.files import FileForm, ParamFile, loads
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.provision.looking import identified
@@ -209,10 +209,13 @@ async def key_of(hub: Hub, target: Followed) -> str:
 
 
 async def written(hub: Hub) -> None:
-    """Have everything on the disk that was heard so far."""
+    """Have everything on the disk that was heard so far.
+
+    Raises:
+        CacheError: it cannot be written, so that no answer from the cache would be the whole one.
+    """
     for _, client in hub.clients():
-        await client._writer.flush()
-        await client._writer.aside(_nothing)  # what was being written already, is then
+        await client._writer.write_all()
 
 
 async def past(hub: Hub, key: str, component: int, when: float | int | None) -> ParamSet:
@@ -260,10 +263,15 @@ def the_cache(hub: Hub) -> ParamCache:
 
 
 async def known_to(hub: Hub, look: Callable[[], Result]) -> Result:
-    """What the cache knows. That it does not is no failure of the disk: that was read just now."""
+    """What the cache knows.
+
+    Raises:
+        ServiceError: it can be read, and does not know it.
+        CacheError: it cannot be read.
+    """
     try:
         return await hub.aside(look)
-    except (CacheError, UnknownVehicle) as error:  # the latter where another program has just removed it
+    except (NotInCache, UnknownVehicle) as error:  # the latter where another program has just removed it
         raise ServiceError(404, "unknown-state", str(error), error=type(error).__name__) from error
 
 
@@ -320,7 +328,3 @@ def _choose(file: ParamFile, target: Followed, component: int | None) -> ParamSe
 
 async def _value(target: Followed, name: str, given: ValueGiven) -> WrittenParam:
     return WrittenParam(check_name(name), await value_of(target, name, given))
-
-
-def _nothing() -> None:
-    return
