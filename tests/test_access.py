@@ -20,6 +20,7 @@ from paramclient.service import held_bodies
 from paramclient.service.access import AccessMiddleware, AccessSettings, may_write
 from paramclient.service.request import SESSION_PATH
 from paramclient.service.tokens import (
+    GUESS_DELAY,
     GUESSES,
     GUESSES_AGE,
     MOST_GUESSERS,
@@ -560,29 +561,112 @@ def test_sessions_are_few() -> None:
 
 
 @swiftly
-async def test_whoever_guesses_has_to_wait(caplog: pytest.LogCaptureFixture) -> None:
+async def test_guesses_are_answered_late_and_a_right_token_is_not_refused(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
     door = Door(GUARDED)
+    asked = anyio.current_time()
     with caplog.at_level(logging.DEBUG):
         for number in range(GUESSES):
             assert (await door.request(token=f"wrong-{number}")).status == 401
-        waits = await door.request(token=ANNA)
-    assert (waits.status, waits.problem) == (429, "too-many-guesses")
-    assert waits.headers["retry-after"] == str(int(GUESSES_AGE))
+        assert round(anyio.current_time() - asked, 3) == 0
+        for number in range(3):
+            late = await door.request(token=f"wrong-too-{number}")
+            assert (late.status, late.problem) == (429, "too-many-guesses")
+            assert late.headers["retry-after"] == str(int(GUESSES_AGE))
+            assert round(anyio.current_time() - asked, 3) == (number + 1) * GUESS_DELAY
     assert [record.getMessage() for record in caplog.records] == ["many wrong tokens have come from 10.0.0.2"]
+    asked = anyio.current_time()
+    assert (await door.request(token=ANNA)).status == 200, "others may be behind the same proxy"
     body = json.dumps({"token": ANNA}).encode()
-    assert (await door.request("POST", SESSION_PATH, body=body)).status == 429
-    assert (await door.request(token=ANNA, client=("10.0.0.3", 1))).status == 200, "others do not"
+    assert (await door.request("POST", SESSION_PATH, body=body)).status == 200
+    assert round(anyio.current_time() - asked, 3) == 2 * GUESS_DELAY, (
+        "else a right one is told from a wrong one at once"
+    )
+    asked = anyio.current_time()
+    assert (await door.request(token=ANNA, client=("10.0.0.3", 1))).status == 200
     assert (await door.request(path="/")).status == 200
     door.now = GUESSES_AGE
     assert (await door.request(token=ANNA)).status == 200
+    assert round(anyio.current_time() - asked, 3) == 0, "nobody else waits, and nobody a minute later"
+
+
+PROXY = AccessSettings(listen="0.0.0.0", tokens=TOKENS, proxies=["10.0.0.2", "192.0.2.0/24", "2001:db8::/32"])
+
+
+@pytest.mark.parametrize(
+    ("raw", "client"),
+    [
+        ([], "10.0.0.2"),
+        ([("x-forwarded-for", "198.51.100.7")], "198.51.100.7"),
+        ([("x-forwarded-for", "1.2.3.4, 198.51.100.7")], "198.51.100.7"),
+        ([("x-forwarded-for", "1.2.3.4"), ("x-forwarded-for", "198.51.100.7, 192.0.2.9")], "198.51.100.7"),
+        ([("x-forwarded-for", "198.51.100.7:50123")], "198.51.100.7"),
+        ([("x-forwarded-for", "[2001:db9::7]:50123, 2001:db8::1")], "2001:db9::7"),
+        ([("x-forwarded-for", "::ffff:198.51.100.7")], "198.51.100.7"),
+        ([("x-forwarded-for", "192.0.2.1, 192.0.2.2")], "192.0.2.1"),
+        ([("x-forwarded-for", "198.51.100.7, unknown, 192.0.2.2")], "192.0.2.2"),
+        ([("x-forwarded-for", "")], "10.0.0.2"),
+        ([("forwarded", "for=1.2.3.4, for=198.51.100.7;proto=https")], "198.51.100.7"),
+        ([("forwarded", 'proto=https; FOR="[2001:db9::7]:4711"')], "2001:db9::7"),
+        ([("forwarded", 'for="1.2.3.4, for=198.51.100.7')], "198.51.100.7"),
+        ([("forwarded", "for=_hidden")], "10.0.0.2"),
+        ([("forwarded", "for=198.51.100.7"), ("x-forwarded-for", "198.51.100.7")], "198.51.100.7"),
+    ],
+)
+@swiftly
+async def test_a_proxy_that_is_trusted_says_who_asks(raw: list[tuple[str, str]], client: str) -> None:
+    door = Door(PROXY)
+    headers = [(name.encode(), value.encode()) for name, value in raw]
+    assert (await door.request(token=ANNA, raw=headers)).status == 200
+    assert door.state["asker"] == f"anna@{client}"
 
 
 @swiftly
-async def test_a_program_with_an_old_token_shuts_nobody_out() -> None:
+async def test_what_others_say_of_themselves_counts_for_nothing() -> None:
+    told = [(b"x-forwarded-for", b"198.51.100.7"), (b"forwarded", b"for=198.51.100.8")]
+    door = Door(PROXY)
+    assert (await door.request(token=ANNA, raw=told, client=("10.0.0.3", 1))).status == 200
+    assert door.state["asker"] == "anna@10.0.0.3"
+    assert (await door.request(token=ANNA, raw=told)).problem == "bad-request", (
+        "one of the two is not the proxy's"
+    )
     door = Door(GUARDED)
+    assert (await door.request(token=ANNA, raw=told)).status == 200
+    assert door.state["asker"] == "anna@10.0.0.2"
+
+
+@swiftly
+async def test_guesses_slow_down_one_client_of_a_proxy_that_is_trusted() -> None:
+    door = Door(PROXY)
+    for number in range(2 * GUESSES):
+        await door.request(token=f"wrong-{number}", raw=[(b"x-forwarded-for", b"198.51.100.7")])
+    asked = anyio.current_time()
+    assert (await door.request(token=ANNA, raw=[(b"x-forwarded-for", b"198.51.100.8")])).status == 200
+    assert round(anyio.current_time() - asked, 3) == 0
+    assert (await door.request(token=ANNA, raw=[(b"x-forwarded-for", b"198.51.100.7")])).status == 200
+    assert round(anyio.current_time() - asked, 3) == GUESS_DELAY
+
+
+@pytest.mark.parametrize("proxy", ["proxy.example", "10.0.0.1/8", "10.0.0.0/33", ""])
+def test_proxies_are_addresses_and_networks(proxy: str) -> None:
+    with pytest.raises(UsageError, match="is no address and no network such as"):
+        AccessSettings(tokens=TOKENS, proxies=[proxy])
+
+
+def test_behind_a_proxy_it_does_not_start_without_a_token() -> None:
+    with pytest.raises(UsageError, match=r"behind a proxy .* needs a token"):
+        AccessSettings(proxies=["127.0.0.1"])
+
+
+@swiftly
+async def test_a_program_with_an_old_token_slows_nobody_down() -> None:
+    door = Door(GUARDED)
+    asked = anyio.current_time()
     for _ in range(10 * GUESSES):
         assert (await door.request(token="an-old-token-of-somebody")).status == 401
     assert (await door.request(token=ANNA)).status == 200
+    assert round(anyio.current_time() - asked, 3) == 0
 
 
 def test_those_who_guess_are_remembered_in_bounds() -> None:
@@ -728,6 +812,26 @@ async def test_a_page_that_is_named_may_use_it_from_elsewhere() -> None:
     assert other.headers["vary"] == "Origin"
     assert "access-control-allow-origin" not in other.headers
     assert (await door.request(raw=[(b"origin", b"https://other.example")])).problem == "foreign-origin"
+
+
+@swiftly
+async def test_without_tokens_a_page_that_is_named_may_read_only() -> None:
+    """It is in the browser of somebody on this computer, who may do everything."""
+    door = Door(AccessSettings(origins=["https://station.example"]))
+    foreign = [(b"origin", b"https://station.example"), (b"sec-fetch-site", b"cross-site"), *BROWSER_READS]
+    assert (await door.request(raw=foreign)).status == 200
+    assert door.state["role"] == "read"
+    assert not may_write(Asked(door.seen[-1][0]))
+    seen = len(door.seen)
+    for method in ("POST", "PUT", "PATCH", "DELETE"):
+        body = None if method == "DELETE" else b"{}"
+        refused = await door.request(method, WRITE, body=body, raw=foreign)
+        assert (refused.status, refused.problem) == (403, "forbidden")
+        assert b"Without tokens" in refused.body
+        assert refused.headers["access-control-allow-origin"] == "https://station.example", "it may read why"
+    assert len(door.seen) == seen
+    own = [(b"origin", b"http://127.0.0.1:8765")]
+    assert (await door.request("POST", WRITE, body=b"{}", raw=own)).status == 200
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,17 @@ import anyio.abc
 import pytest
 
 from paramclient.errors import UsageError
-from paramclient.service import AccessSettings, Hub, Listening, Settings, Tokens, connections, places, serve
+from paramclient.service import (
+    AccessSettings,
+    Hub,
+    Listening,
+    Settings,
+    Tokens,
+    access,
+    connections,
+    places,
+    serve,
+)
 from paramclient.service.tokens import GUESSES
 from paramclient.sim import GenericVehicle
 from tests.shell import until
@@ -201,7 +211,10 @@ async def test_beyond_this_machine_nothing_is_served_without_a_token() -> None:
         await serve(hub, listening=Listening("0.0.0.0", 0))
 
 
-async def test_guessing_is_slow_and_leaves_no_trace_of_tokens(caplog: pytest.LogCaptureFixture) -> None:
+async def test_guessing_is_slow_and_leaves_no_trace_of_tokens(
+    caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(access, "GUESS_DELAY", 0.05)
     caplog.set_level(logging.DEBUG)
     async with served(tokens=TOKENS) as service:
         statuses = [

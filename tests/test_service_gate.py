@@ -154,12 +154,12 @@ def test_of_each_kind_there_is_one_line_in_a_minute(
         limit.flush()
     assert caplog.messages == [
         *("refused 0", "failed 0"),
-        *("refused 0 (and 600 more such lines in 60 s)", "failed 0 (and 600 more such lines in 60 s)"),
+        *("refused 0 (and 599 more such lines in 60 s)", "failed 0 (and 599 more such lines in 60 s)"),
     ]
     caplog.clear()
     clock.now += MINUTE
     limit.flush()
-    assert caplog.messages[0] == "refused 0 (and 399 more such lines in 60 s)"
+    assert caplog.messages[0] == "refused 0 (and 400 more such lines in 100 s)"
     clock.now += MINUTE
     limit.flush()
     limit.tell(LOG, "full", "refused again")

@@ -39,6 +39,7 @@ async def serve(
     read_only: bool = False,
     host: tuple[str, ...] = (),
     allow_origin: tuple[str, ...] = (),
+    trusted_proxy: tuple[str, ...] = (),
     system_id: Id = None,
     component_id: Id = None,
     tls_cert: Path | None = None,
@@ -65,7 +66,9 @@ async def serve(
         host: A name by which browsers and programs call this service, such as companion.local; may be given
             several times.
         allow_origin: A page elsewhere that may use it from a browser, such as https://station.example; may be
-            given several times.
+            given several times. Without tokens it may read only.
+        trusted_proxy: The address of a reverse proxy, or its network such as 10.0.0.0/8, whose header
+            X-Forwarded-For or Forwarded says who asks; may be given several times.
         system_id: Our own system id on the links, 255 without it.
         component_id: Our own component id, 190 without it.
         tls_cert: A certificate in PEM, to be served over TLS.
@@ -97,6 +100,7 @@ async def serve(
         tokens=service.tokens_from(token_file),
         hosts=host,
         origins=allow_origin,
+        proxies=trusted_proxy,
         read_only=read_only,
     )
     settings = service.Settings(access=access)

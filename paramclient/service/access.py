@@ -20,7 +20,9 @@ import anyio
 
 from paramclient.errors import UsageError
 from paramclient.protocol.authors import LONGEST_ASKER
+from paramclient.service.addresses import is_in, network
 from paramclient.service.held_bodies import HeldBodies, HeldBody
+from paramclient.service.log_limit import LogLimit
 from paramclient.service.request import (
     ASK,
     HOST,
@@ -30,7 +32,7 @@ from paramclient.service.request import (
     Request,
     Scope,
 )
-from paramclient.service.tokens import SESSION_AGE, Guesses, Holder, Sessions, Tokens
+from paramclient.service.tokens import GUESS_DELAY, SESSION_AGE, Guesses, Holder, Sessions, Tokens
 
 __all__ = ["AccessMiddleware", "AccessSettings", "may_write"]
 
@@ -68,7 +70,10 @@ class AccessSettings:
         listen: the address or name that is listened at.
         tokens: who has one; None only where nobody but this machine can connect.
         hosts: names by which the service may be called, beside this machine's loopback names, and addresses.
-        origins: pages elsewhere that may use it from a browser, such as `https://station.example`.
+        origins: pages elsewhere that may use it from a browser, such as `https://station.example`; without
+            tokens they may read only.
+        proxies: addresses and networks of proxies, whose X-Forwarded-For or Forwarded says who asks. Tokens
+            are needed then: everyone who can reach the proxy comes from its address.
         read_only: nobody may change anything.
         max_body: bytes of one body, where `Request.longest_body` allows as many.
 
@@ -80,12 +85,19 @@ class AccessSettings:
     tokens: Tokens | None = None
     hosts: Collection[str] = ()
     origins: Collection[str] = ()
+    proxies: Collection[str] = ()
     read_only: bool = False
     max_body: int = LARGEST_DESCRIPTION
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "hosts", frozenset(map(_host_name, self.hosts)))
         object.__setattr__(self, "origins", frozenset(map(_origin, self.origins)))
+        object.__setattr__(self, "proxies", frozenset(str(network(each)) for each in self.proxies))
+        if self.tokens is None and self.proxies:
+            raise UsageError(
+                "behind a proxy the service would let everyone who reaches that change parameters: it needs "
+                "a token. Make one with `paramclient token NAME --file FILE` and start with --token-file FILE"
+            )
         beyond = [name for name in (self.listen, *sorted(self.hosts)) if not _is_loopback(name)]
         if self.tokens is None and beyond:
             raise UsageError(
@@ -93,6 +105,10 @@ class AccessSettings:
                 "token. Make one with `paramclient token NAME --file FILE` and start with --token-file FILE, "
                 "or listen at 127.0.0.1 alone"
             )
+
+    def is_proxy(self, address: str) -> bool:
+        """Whether an address is that of a proxy that is trusted."""
+        return is_in(address, map(network, self.proxies))
 
 
 class AccessMiddleware:
@@ -111,13 +127,15 @@ class AccessMiddleware:
         self._settings = settings
         self._sessions = Sessions(clock)
         self._guesses = Guesses(clock)
+        self._proxies = tuple(map(network, settings.proxies))
+        self._limit = LogLimit(clock)
         self._bodies = HeldBodies()
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] not in ("http", "websocket"):
             await self._app(scope, receive, send)
             return
-        request = Request(scope)
+        request = Request(scope, self._proxies)
         answer = _Answer(request, send, varies=bool(self._settings.origins))
         try:
             await self._let_in(request, receive, answer)
@@ -126,13 +144,14 @@ class AccessMiddleware:
 
     async def _let_in(self, request: Request, receive: Receive, answer: _Answer) -> None:
         request.check_shape()
+        request.take_forwarded()
         self._check_host(request)
         self._check_origin(request)
         answer.origin = request.origin if request.origin in self._settings.origins else None
         if request.is_preflight:
             await answer.preflight()
             return
-        holder = self._holder(request)
+        holder = await self._holder(request)
         if request.path == SESSION_PATH and request.method in ("POST", "DELETE"):
             await self._session(request, receive, answer, holder)
             return
@@ -195,41 +214,55 @@ class AccessMiddleware:
 
     # Who it is
 
-    def _holder(self, request: Request) -> Holder | None:
+    async def _holder(self, request: Request) -> Holder | None:
         """Whose token or session came with it; None for nobody's, where that is enough."""
         tokens = self._settings.tokens
         if tokens is None:
-            return _LOCAL
+            is_foreign = request.origin is not None and request.origin != request.own_origin
+            return _FOREIGN if is_foreign else _LOCAL
         token = request.token
         if token is not None:
-            return self._holder_of(token, request.address, tokens)
+            return await self._holder_of(token, request.address, tokens)
         cookie = request.cookie
         holder = None if cookie is None else self._sessions.holder(cookie)
         if holder is None and not request.is_public:
             raise Denied(401, "unauthenticated", "This service is open to those who have a token.", ASK)
         return holder
 
-    def _holder_of(self, token: bytes, address: str, tokens: Tokens) -> Holder:
-        wait = math.ceil(self._guesses.wait(address))
-        if wait > 0:
+    async def _holder_of(self, token: bytes, address: str, tokens: Tokens) -> Holder:
+        """Whose token this is; late where many wrong ones have come from the same address.
+
+        A right one is late too, else a guess that is not answered at once would be known to be wrong. It is
+        never refused: the address may be that of a proxy with others behind it.
+        """
+        if is_late := self._guesses.wait(address) > 0:
+            await anyio.sleep(GUESS_DELAY)
+        holder = tokens.holder(token)
+        if holder is not None:
+            return holder
+        if self._guesses.add(address, token):
+            self._limit.tell(logger, "guesses", f"many wrong tokens have come from {address}")
+        if is_late:
+            wait = max(1, math.ceil(self._guesses.wait(address)))
             raise Denied(
                 429,
                 "too-many-guesses",
-                f"Too many wrong tokens have come from this address; it may try again in {wait} s.",
+                f"Too many wrong tokens have come from this address; for {wait} s all of its tokens wait.",
                 [(b"retry-after", str(wait).encode())],
             )
-        holder = tokens.holder(token)
-        if holder is None:
-            if self._guesses.add(address, token):
-                logger.warning("many wrong tokens have come from %s", address)
-            raise Denied(401, "unauthenticated", "The service does not know this token.", ASK)
-        return holder
+        raise Denied(401, "unauthenticated", "The service does not know this token.", ASK)
 
     def _check_role(self, request: Request, holder: Holder | None) -> None:
         if not request.changes:
             return
         if self._settings.read_only:
             raise Denied(403, "read-only", "This service was started with --read-only; nothing is changed.")
+        if holder is _FOREIGN:
+            raise Denied(
+                403,
+                "forbidden",
+                "Without tokens a page from elsewhere may read only; start the service with --token-file.",
+            )
         if holder is None or holder.role != "write":
             raise Denied(403, "forbidden", "This token allows to read only.")
 
@@ -248,7 +281,7 @@ class AccessMiddleware:
             token = _token_in(await self._body(request, receive, LONGEST_SESSION, held))
         headers = []
         if self._settings.tokens is not None:
-            holder = self._holder_of(token, request.address, self._settings.tokens)
+            holder = await self._holder_of(token, request.address, self._settings.tokens)
             value = _set_cookie(request, self._sessions.begin(holder), int(SESSION_AGE))
             headers.append((b"set-cookie", value))
         assert holder is not None
@@ -438,6 +471,8 @@ def _is_loopback(listen: str) -> bool:
 
 _LOOPBACK_NAMES: Final = frozenset({"localhost"})
 _LOCAL: Final = Holder("local", "write")
+_FOREIGN: Final = Holder("local", "read")
+"""A page from elsewhere, where there are no tokens: it is in a browser of somebody on this computer."""
 _SECRET: Final = frozenset({b"authorization", b"cookie"})
 _MISSHAPEN: Final = (400, 414, 431)
 _JSON: Final = (b"content-type", b"application/json")

@@ -57,18 +57,8 @@ class LogLimit:
 
     def flush(self, *, ends: bool = False) -> None:
         """Tell of each kind whose minute is over how many lines were left out; at the end, of all kinds."""
-        now = self._clock()
-        for kind, told in list(self._kinds.items()):
-            if now - told.at < MINUTE and not ends:
-                continue
-            if not told.more or ends:
-                del self._kinds[kind]
-            if told.more:
-                seconds, more = min(now - told.at, MINUTE), told.more
-                told.at, told.more = now, 0
-                told.logger.log(
-                    told.level, "%s (and %d more such lines in %.0f s)", told.text, more, seconds, extra=_OURS
-                )
+        for kind in list(self._kinds):
+            self._flush(kind, ends=ends)
 
     @contextmanager
     def of_libraries(self) -> Iterator[None]:
@@ -92,12 +82,25 @@ class LogLimit:
 
     def _is_due(self, logger: logging.Logger, kind: str, text: str, level: int) -> bool:
         kind = kind if kind in self._kinds or len(self._kinds) < MOST_KINDS else ""
+        self._flush(kind)
         told = self._kinds.get(kind)
         if told is not None:
             told.more += 1
             return False
         self._kinds[kind] = _Kind(logger, level, text, self._clock())
         return True
+
+    def _flush(self, kind: str, *, ends: bool = False) -> None:
+        told, now = self._kinds.get(kind), self._clock()
+        if told is None or (now - told.at < MINUTE and not ends):
+            return
+        if told.more:
+            said = f"{told.text} (and {told.more} more such lines in {now - told.at:.0f} s)"
+            told.logger.log(told.level, "%s", said, extra=_OURS)
+        if told.more and not ends:
+            told.at, told.more = now, 0
+        else:
+            del self._kinds[kind]
 
 
 _OURS: Final = {"is_summary": True}

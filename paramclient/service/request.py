@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, MutableMapping
+from collections.abc import Iterable, MutableMapping, Sequence
 from dataclasses import dataclass, field
-from ipaddress import IPv6Address, IPv6Network, ip_address
 from typing import Any, Final, TypeAlias
 from urllib.parse import unquote
+
+from paramclient.service.addresses import Network, first_beyond, forwarded_for, is_in, network_of, parsed
 
 __all__ = [
     "ASK",
@@ -79,17 +80,26 @@ class Denied(Exception):
 
 @dataclass(slots=True)
 class Request:
-    """What is looked at of a request, read in one way only."""
+    """What is looked at of a request, read in one way only.
+
+    Attributes:
+        scope: that of ASGI.
+        proxies: those whose word is taken for whom they forward.
+        address: where it comes from; "here" where there is no address.
+    """
 
     scope: Scope
+    proxies: Sequence[Network] = ()
     headers: list[tuple[bytes, bytes]] = field(init=False)
     method: str = field(init=False)
     path: str = field(init=False)
+    address: str = field(init=False)
 
     def __post_init__(self) -> None:
         self.headers = [(bytes(name).lower(), bytes(value)) for name, value in self.scope["headers"]]
         self.method = self.scope.get("method", "GET")
         self.path = self.scope["path"]
+        self.address = self._peer
 
     def header(self, name: bytes) -> bytes | None:
         """The value of a header that comes once at most.
@@ -240,30 +250,33 @@ class Request:
                 return value
         return None
 
-    @property
-    def address(self) -> str:
-        """Where it comes from."""
-        client = self.scope.get("client")
-        if not client:
-            return "here"
-        text = str(client[0]).partition("%")[0]
-        try:
-            parsed = ip_address(text)
-        except ValueError:
-            return "here"
-        mapped = parsed.ipv4_mapped if isinstance(parsed, IPv6Address) else None
-        return str(mapped or parsed)
+    def take_forwarded(self) -> None:
+        """Where a trusted proxy has sent it, take the address from what that says.
+
+        Raises:
+            Denied: X-Forwarded-For and Forwarded name different clients; one of them is not the proxy's.
+        """
+        if not is_in(self._peer, self.proxies):
+            return
+        clients = {
+            first_beyond(self.proxies, self._peer, forwarded_for(values))
+            for name in (b"x-forwarded-for", b"forwarded")
+            if (values := [value.decode("latin-1") for key, value in self.headers if key == name])
+        }
+        if len(clients) > 1:
+            raise Denied(400, "bad-request", "X-Forwarded-For and Forwarded name different clients.")
+        self.address = next(iter(clients), self._peer)
 
     @property
     def network(self) -> str:
         """The address, or the network of an IPv6 one: a machine has 2⁶⁴ of these."""
-        try:
-            parsed = ip_address(self.address)
-        except ValueError:
-            return self.address
-        if isinstance(parsed, IPv6Address) and not parsed.is_loopback:
-            return str(IPv6Network((parsed, 64), strict=False))
-        return self.address
+        return network_of(self.address)
+
+    @property
+    def _peer(self) -> str:
+        client = self.scope.get("client")
+        address = parsed(str(client[0])) if client else None
+        return "here" if address is None else str(address)
 
 
 def _length(header: tuple[bytes, bytes]) -> int:

@@ -169,7 +169,8 @@ async def serve(
         async with anyio.create_task_group() as tasks, hub:
             tasks.start_soon(server.serve)
             await server.is_ready.wait()
-            gate = Gate(opened, Places(), server.protocol, tls=config.ssl, limit=LogLimit())
+            places = Places(is_proxy=settings.access.is_proxy)
+            gate = Gate(opened, places, server.protocol, tls=config.ssl, limit=LogLimit())
             tasks.start_soon(gate.run)
             if listens is not None:
                 listens(url)

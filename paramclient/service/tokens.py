@@ -10,11 +10,11 @@ import secrets
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
-from ipaddress import IPv6Address, ip_address
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
 from paramclient.errors import UsageError
+from paramclient.service.addresses import network_of
 from paramclient.signing import read_private
 
 __all__ = [
@@ -52,8 +52,11 @@ MOST_SESSIONS: Final = 16
 """Sessions of one holder: a laptop, a phone, and what was not ended. The oldest goes first."""
 
 GUESSES: Final = 10
-"""Different wrong tokens from one address before it has to wait. The same one again is no guess: a program
-that was not told of a change must not shut out the others on its machine."""
+"""Different wrong tokens from one address before its tokens are looked at late. The same one again is no
+guess: a program that was not told of a change must not slow down the others on its machine."""
+GUESS_DELAY: Final = 1.0
+"""Seconds until a token from such an address is looked at, right or wrong: with its 128 connections an
+address gets as many answers a second."""
 GUESSES_AGE: Final = 60.0
 """Seconds after which a wrong token is forgotten."""
 MOST_GUESSERS: Final = 1_024
@@ -254,16 +257,16 @@ class Guesses:
         self._wrong: OrderedDict[str, dict[bytes, float]] = OrderedDict()
 
     def wait(self, address: str) -> float:
-        """Seconds until this address may show a token again; 0 where it may now."""
-        wrong = self._wrong.get(_network(address))
+        """Seconds for which tokens from this address are still looked at late; 0 where they are not."""
+        wrong = self._wrong.get(network_of(address))
         if wrong is None or len(wrong) < GUESSES:
             return 0.0
         return max(0.0, next(iter(wrong.values())) + GUESSES_AGE - self._clock())
 
     def add(self, address: str, token: bytes) -> bool:
-        """A wrong one has come; true when it was the last before the address has to wait."""
+        """A wrong one has come; true when it was the last before tokens are looked at late."""
         now = self._clock()
-        network = _network(address)
+        network = network_of(address)
         wrong = {key: at for key, at in self._wrong.pop(network, {}).items() if now - at < GUESSES_AGE}
         key = hmac.digest(self._key, token, "sha256")[:8]
         is_new = key not in wrong
@@ -307,17 +310,6 @@ def _of_line(words: list[str]) -> tuple[Holder, bytes]:
 
 def _digest(token: bytes) -> bytes:
     return hashlib.sha256(token).digest()
-
-
-def _network(address: str) -> str:
-    """Whom an address stands for: of IPv6, one machine has 2⁶⁴."""
-    try:
-        parsed = ip_address(address)
-    except ValueError:
-        return address
-    if isinstance(parsed, IPv6Address) and not parsed.is_loopback:
-        return parsed.packed[:8].hex()
-    return address
 
 
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,31}")
