@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Final
 
 from paramclient.errors import UsageError
+from paramclient.ownership import GROUP_READS, OF_OTHERS, has_trusted_owner, mode_of
 from paramclient.protocol.wire import SigningKey, SigningPolicy, SigningReport, timestamp_of
 
 __all__ = ["Signing", "key_from_environment", "read_key", "read_private", "refused_in_words", "timestamp_now"]
@@ -19,11 +20,6 @@ FILE_VARIABLE: Final = "PARAMCLIENT_SIGNING_KEY_FILE"
 PASSPHRASE_VARIABLE: Final = "PARAMCLIENT_SIGNING_PASSPHRASE"
 LONGEST_FILE: Final = 1_000
 """Bytes of a key file that are looked at: a key, in text or not, with some blank lines."""
-OF_OTHERS: Final = 0o077
-"""The bits of a file's mode that let others than its owner get at it."""
-READ_BY_GROUP: Final = 0o040
-"""What a credential of systemd has besides, since version 254: it stands for an entry of the access list that
-lets the user of the unit read it, and for no group (systemd's issue 29435)."""
 CREDENTIALS_VARIABLE: Final = "CREDENTIALS_DIRECTORY"
 """The folder of the credentials of a unit, which nobody else can enter (systemd.exec, "Credentials")."""
 
@@ -84,16 +80,26 @@ def read_private(path: str | os.PathLike[str], what: str, most: int) -> bytes:
         most: bytes that are read.
 
     Raises:
-        UsageError: it cannot be read, or is open to others than its owner (where there are such modes).
+        UsageError: it cannot be read, belongs to another user than that of this process or root, or is open
+            to others than its owner (where there are such modes). Also root does not take another user's: who
+            owns a file can change it.
     """
     try:
         with Path(path).open("rb") as file:
-            mode = os.fstat(file.fileno()).st_mode & 0o777
+            status = os.fstat(file.fileno())
             data = file.read(most)
     except OSError as error:
         raise UsageError(f"{os.fspath(path)}: the {what} cannot be read: {error.strerror}") from error
-    of_others = OF_OTHERS & ~READ_BY_GROUP if _is_credential(path) else OF_OTHERS
-    if os.name == "posix" and mode & of_others:
+    if not has_trusted_owner(status):
+        raise UsageError(
+            f"{os.fspath(path)}: this {what} belongs to another user (id {status.st_uid}), who can change it;"
+            " `chown` it to the user of this program"
+        )
+    mode = mode_of(status)
+    # a credential of systemd has it since version 254 in the place of an entry of the access list, which lets
+    # the user of the unit read it, and for no group (systemd's issue 29435)
+    of_others = OF_OTHERS & ~GROUP_READS if _is_credential(path) else OF_OTHERS
+    if mode & of_others:
         raise UsageError(
             f"{os.fspath(path)}: others than its owner can get at this {what} (mode {mode:o}); "
             "`chmod 600` ends that, and what others may have read is better replaced"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ctypes
 import os
+import random
 import resource
 import subprocess
 import sys
@@ -14,6 +15,7 @@ from typing import Any
 
 import paramclient
 from paramclient.cache import BY_VEHICLE, ParamCache, StoredParam, TableState, TableUpdate
+from paramclient.cache.database import APPLICATION_ID
 from paramclient.identity import Identity
 from paramclient.values import Param, ParamType, from_bits
 
@@ -79,6 +81,14 @@ def values(cache: ParamCache, identity: Identity = PX4, component: int = 1) -> d
     """The values of one table; none where there is no table."""
     found = cache.load(identity.key, component)
     return {} if found is None else {name: param.value for name, param in found.params.items()}
+
+
+def rubbish(size: int, seed: int = 1) -> bytes:
+    """What begins as one of our files does, and is none any more."""
+    content = bytearray(random.Random(seed).randbytes(size))
+    content[:16] = b"SQLite format 3\0"
+    content[68:72] = APPLICATION_ID.to_bytes(4, "big")
+    return bytes(content)
 
 
 def set_aside(path: Path) -> list[Path]:

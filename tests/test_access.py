@@ -15,6 +15,7 @@ from urllib.parse import quote
 import anyio
 import pytest
 
+from paramclient import signing
 from paramclient.errors import UsageError
 from paramclient.service import held_bodies
 from paramclient.service.access import AccessMiddleware, AccessSettings, may_write
@@ -277,6 +278,25 @@ def test_a_file_of_tokens_is_its_owners_alone(tmp_path: Path) -> None:
         UsageError, match=r"others than its owner can get at this file of tokens \(mode 640\)"
     ):
         Tokens.read(path)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="there are no such owners")
+def test_a_file_of_tokens_is_of_this_user_or_root_and_no_link_to_write_through(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "tokens"
+    add_token(path, "anna", "write")
+    link = tmp_path / "link"
+    link.symlink_to(path)
+    assert len(Tokens.read(link)) == 1
+    with pytest.raises(UsageError, match="link: it is a link; name the file itself"):
+        add_token(link, "bob", "read")
+    assert len(Tokens.read(path)) == 1
+    monkeypatch.setattr(signing, "has_trusted_owner", lambda status: False)
+    with pytest.raises(UsageError, match="this file of tokens belongs to another user"):
+        Tokens.read(path)
+    with pytest.raises(UsageError, match="this file of tokens belongs to another user"):
+        add_token(path, "bob", "read")
 
 
 @pytest.mark.skipif(os.name != "posix", reason="there are no such modes")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import gc
 import logging
@@ -13,7 +14,7 @@ import signal
 import sqlite3
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from functools import cache as cached
@@ -39,6 +40,7 @@ from tests.caches import (
     PX4,
     full_disk,
     read_only,
+    rubbish,
     set_aside,
     start,
     stored,
@@ -57,6 +59,14 @@ COMPANIONS = ("-wal", "-shm")
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     return tmp_path / "parameters.sqlite3"
+
+
+@pytest.fixture(autouse=True)
+def _private() -> Iterator[None]:
+    """Files that the tests write are like those of the cache, their owner's alone."""
+    before = os.umask(0o077)
+    yield
+    os.umask(before)
 
 
 def connect(path: Path) -> closing[sqlite3.Connection]:
@@ -231,9 +241,7 @@ print("done", *cache.notes)
 """
 
 
-@pytest.mark.parametrize(
-    "begin", [None, b"", b"rubbish" * 2000], ids=["no file", "empty file", "damaged file"]
-)
+@pytest.mark.parametrize("begin", [None, b"", rubbish(14_000)], ids=["no file", "empty file", "damaged file"])
 def test_several_programs_write_at_once(path: Path, begin: bytes | None) -> None:
     """They also race for making the file, and for setting a damaged one aside, which happens once."""
     if begin is not None:
@@ -442,17 +450,11 @@ def sound_with(at: int, byte: int) -> Callable[[Path], None]:
 @pytest.mark.parametrize(
     ("make", "why"),
     [
-        (lambda path: path.write_bytes(b"A"), "not a database"),
-        (lambda path: path.write_bytes(random.Random(1).randbytes(3 * PAGE)), "not a database"),
-        (lambda path: path.write_text("[settings]\n" * 1000), "not a database"),
-        (lambda path: path.write_bytes(bytes(2 * PAGE)), "not a database"),
-        (lambda path: path.write_bytes(sound_file()[:50]), "malformed|not a database"),
+        (lambda path: path.write_bytes(rubbish(3 * PAGE)), "not a database"),
         (lambda path: path.write_bytes(sound_file()[:200]), "malformed|not a database"),
         (sound_with(47, 255), "unsupported file format"),
         (sound_with(sound_file().index(b"first_seen"), 0xCF), "UTF-8 column 'sql'"),
         (sound_with(sound_file().index(b"history_of"), 0xE8), "codec can't decode byte 0xe8"),
-        (sound_but("PRAGMA application_id = 0"), "application id is 0x0"),
-        (sound_but("PRAGMA application_id = 1196444487"), "application id is 0x47504b47"),
         (lambda path: other_program(path, APPLICATION_ID), "tables are not those of version 0"),
         (lambda path: other_program(path, APPLICATION_ID, 1), "tables are not those of version 1"),
         (sound_but("PRAGMA user_version = -1"), "tables are not those of version -1"),
@@ -521,6 +523,108 @@ def test_another_programs_database_is_left_where_it_is(
     assert set_aside(path) == []
 
 
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda path: path.write_bytes(b"A"),
+        lambda path: path.write_bytes(random.Random(1).randbytes(3 * PAGE)),
+        lambda path: path.write_text("[settings]\n" * 1000),
+        lambda path: path.write_bytes(bytes(2 * PAGE)),
+        lambda path: path.write_bytes(sound_file()[:50]),
+        sound_with(0, 0),
+        sound_with(71, 0),
+        sound_but("PRAGMA application_id = 1196444487"),
+        sound_but("PRAGMA application_id = 0; PRAGMA user_version = 99"),
+        sound_but("PRAGMA application_id = 0; DROP TABLE history"),
+    ],
+)  # fmt: skip
+def test_what_is_no_cache_is_an_error_and_left_as_it_is(
+    path: Path, caplog: pytest.LogCaptureFixture, make: Callable[[Path], None]
+) -> None:
+    make(path)
+    path.chmod(0o664)
+    content = path.read_bytes()
+    with ParamCache(path) as cache:
+        for use in (cache.vehicles, lambda: cache.save(whole_table(2))):
+            with pytest.raises(CacheError, match="was left as it is; name another file"):
+                use()
+        assert cache.notes == ()
+    assert (os.listdir(path.parent), path.read_bytes()) == ([path.name], content)  # noqa: PTH208
+    assert path.stat().st_mode & 0o777 == 0o664
+    assert not caplog.records
+
+
+def test_a_log_that_is_none_of_sqlite_is_left_as_it_is(path: Path) -> None:
+    notes = path.with_name(f"{path.name}-wal")
+    notes.write_text("my notes")
+    with ParamCache(path) as cache, pytest.raises(CacheError, match="is no cache of paramclient"):
+        cache.save(whole_table(2))
+    assert notes.read_text() == "my notes"
+
+
+def test_a_file_of_ours_without_an_application_id_gets_one(path: Path) -> None:
+    sound_but("PRAGMA application_id = 0")(path)
+    with ParamCache(path) as cache:
+        assert [values(cache, *table) for table in SOUND_TABLES] == list(SOUND_TABLES.values())
+        works(cache)
+        assert cache.notes == ()
+    with connect(path) as connection:
+        assert connection.execute("PRAGMA application_id").fetchall() == [(APPLICATION_ID,)]
+
+
+@pytest.mark.parametrize("mode", [0o666, 0o640, 0o604, 0o620])
+def test_a_file_that_others_can_get_at_is_made_its_owners_alone(
+    path: Path, mode: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    path.write_bytes(sound_file())
+    path.chmod(mode)
+    with ParamCache(path) as cache:
+        assert len(cache.vehicles()) == 2
+        assert path.stat().st_mode & 0o777 == 0o600
+        works(cache)
+    [told] = caplog.messages
+    assert told.startswith(f"others than its owner could get at the cache {path} (mode {mode:o})")
+    assert told.endswith("it is mode 600 now")
+
+
+@pytest.mark.parametrize(("mode", "is_refused"), [(0o666, True), (0o620, True), (0o644, False)])
+def test_a_file_that_others_can_write_and_that_cannot_be_mended_is_refused(
+    path: Path, mode: int, is_refused: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path.write_bytes(sound_file())
+    path.chmod(mode)
+
+    def refuse(path: Path) -> int:
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(database, "make_private", refuse)
+    with ParamCache(path) as cache:
+        if is_refused:
+            with pytest.raises(CacheError, match=rf"others can write to the cache .* \(mode {mode:o}\)"):
+                cache.vehicles()
+        else:
+            assert len(cache.vehicles()) == 2
+
+
+def test_a_link_to_a_file_of_another_user_is_not_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = tmp_path / "target"
+    target.write_bytes(sound_file())
+    link = tmp_path / "link"
+    link.symlink_to(target)
+    with ParamCache(link) as cache:
+        assert len(cache.vehicles()) == 2
+    monkeypatch.setattr(os, "geteuid", lambda: 12345)
+    for place in (target, tmp_path / "not there"):
+        link.unlink()
+        link.symlink_to(place)
+        with ParamCache(link) as cache, pytest.raises(CacheError, match="leads to a file of another user"):
+            cache.save(whole_table(2))
+    with ParamCache(target) as cache:
+        assert len(cache.vehicles()) == 2
+
+
 def test_a_newer_file_is_set_aside_for_the_program_that_wrote_it(path: Path) -> None:
     sound_but("PRAGMA user_version = 99; CREATE TABLE more (a)")(path)
     content = path.read_bytes()
@@ -536,12 +640,12 @@ def test_files_set_aside_in_one_second_get_numbers(path: Path, monkeypatch: pyte
     monkeypatch.setattr(time, "gmtime", lambda: time.struct_time((2026, 11, 20, 10, 0, 0, 4, 324, 0)))
     with ParamCache(path) as cache:
         for number in range(3):
-            path.write_bytes(bytes([number]) * 100)
+            path.write_bytes(rubbish(100, number))
             assert cache.vehicles() == []
     assert [each.name for each in set_aside(path)] == [
         f"{path.name}.damaged-20261120T100000Z-{number}" for number in (1, 2, 3)
     ]
-    assert [each.read_bytes()[0] for each in set_aside(path)] == [0, 1, 2]
+    assert [each.read_bytes() for each in set_aside(path)] == [rubbish(100, number) for number in range(3)]
 
 
 def test_an_older_file_is_brought_up_to_date(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -593,7 +697,7 @@ def test_a_file_from_before_there_were_snapshots_has_a_past_from_its_last_write_
 
 @pytest.mark.parametrize("version", [2, 3])
 def test_a_file_from_before_tables_were_packed_keeps_every_cell(path: Path, version: int) -> None:
-    odd = stored("\xdf\0", 4)
+    odd = stored("~ODD", 4)
     cells = [
         stored("PLAIN", 1, index=0),
         stored("LAST", (1 << 64) - 1, ParamType.INT64, at=NOW - 0.1, volatile=True),
@@ -608,14 +712,14 @@ def test_a_file_from_before_tables_were_packed_keeps_every_cell(path: Path, vers
         before = [cache.load(PX4.key, component) for component in (1, 154)]
         summaries = cache.components()
     assert before[0] is not None
-    assert list(before[0].params) == ["PLAIN", "A", "NAN", "RAW", "LAST", "\xdf\0"]
+    assert list(before[0].params) == ["PLAIN", "A", "NAN", "RAW", "LAST", "~ODD"]
     make_older(path, version)
     with ParamCache(path) as cache:
         after = [cache.load(PX4.key, component) for component in (1, 154)]
         assert after == before
         assert after[0] is not None
         assert list(after[0].params) == list(before[0].params)
-        assert after[0].params["\xdf\0"].default == -5
+        assert after[0].params["~ODD"].default == -5
         assert cache.components() == summaries
         cache.save(update(stored("PLAIN", 2)))
         assert [entry.old.value for entry in cache.history(PX4.key)] == [1]
@@ -681,13 +785,18 @@ PLACES = st.one_of(
 @given(flips=st.lists(st.tuples(PLACES, st.integers(1, 255)), min_size=1, max_size=30))
 @settings(max_examples=100, deadline=None)
 def test_flipped_bits_never_stop_the_cache_nor_cost_the_file(flips: list[tuple[int, int]]) -> None:
-    """What is read is what was written, or the file is set aside as it is."""
+    """What is read is what was written, or the file is set aside, or one that is no cache any more left."""
     content = bytearray(sound_file())
     for at, bits in flips:
         content[at] ^= bits
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cache"
         path.write_bytes(content)
+        if content[:16] != sound_file()[:16] or content[68:72] != sound_file()[68:72]:
+            with ParamCache(path) as cache, pytest.raises(CacheError, match="was left as it is"):
+                cache.save(whole_table(2))
+            assert path.read_bytes() == content
+            return
         with ParamCache(path) as cache:
             found = [values(cache, *table) for table in SOUND_TABLES]
             if cache.notes:  # nothing was written so far but, perhaps, the header's mark for WAL
@@ -982,7 +1091,7 @@ def test_a_read_only_folder_without_a_cache_holds_nothing(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize(
     "make",
-    [lambda path: path.write_bytes(b"rubbish"), sound_but("UPDATE vehicle SET board = 'much'")],
+    [lambda path: path.write_bytes(rubbish(100)), sound_but("UPDATE vehicle SET board = 'much'")],
     ids=["rubbish", "a cell"],
 )
 def test_damage_where_nothing_can_be_renamed_is_an_error(
@@ -1039,7 +1148,7 @@ def test_no_descriptor_is_left_open(path: Path, monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(database, "BUSY_TIMEOUT", 0.0)
     before = descriptors()
     for _ in range(3):
-        path.write_bytes(b"rubbish")
+        path.write_bytes(rubbish(100))
         with ParamCache(path) as cache:
             works(cache)
             with connect(path) as other:

@@ -37,7 +37,7 @@ from paramclient.paramset import ParamSet
 from paramclient.protocol import wire
 from paramclient.provision import apply
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
-from tests.caches import full_disk, read_only, set_aside, start
+from tests.caches import full_disk, read_only, rubbish, set_aside, start
 from tests.shell import (
     VALUES,
     Radio,
@@ -796,7 +796,7 @@ async def test_a_cache_that_somebody_closed(path: Path, caplog: pytest.LogCaptur
 async def test_a_damaged_file_is_set_aside(path: Path, caplog: pytest.LogCaptureFixture) -> None:
     vehicle = small_px4()
     await session(vehicle, path)
-    path.write_bytes(b"this is no database" * 1000)  # noqa: ASYNC240 - a small file
+    path.write_bytes(rubbish(20_000))  # noqa: ASYNC240 - a small file
     assert (await session(vehicle, path)).source == "stream"
     assert [record.name for record in caplog.records] == ["paramclient.cache"]
     assert len(set_aside(path)) == 1

@@ -37,7 +37,8 @@ MAY_IMPORT = {
     "sim": {"errors", "values", "protocol.wire", "protocol.ftp.packets", "protocol.pack", "sim"},
     "clocks": set[str](),
     "links": {"errors", "values", "clocks", "sim", "links"},
-    "cache": {"errors", "values", "identity", "params", "paramset", "cache"},
+    "ownership": set[str](),
+    "cache": {"errors", "values", "identity", "params", "paramset", "ownership", "cache"},
     "provision.cautions": {"errors"},
     "provision.nearest": set[str](),
     "provision.planning": {

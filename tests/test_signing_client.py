@@ -102,6 +102,18 @@ def test_a_key_that_others_can_get_at_is_refused(tmp_path: Path, mode: int) -> N
         read_key(path)
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+def test_a_key_of_another_user_is_refused_also_for_root(tmp_path: Path) -> None:
+    path = a_file(tmp_path / "key", SECRET)
+    os.chown(path, 12345, 0)
+    (tmp_path / "link").symlink_to(path)
+    for named in (path, tmp_path / "link"):
+        with pytest.raises(UsageError, match=r"this signing key belongs to another user \(id 12345\)"):
+            read_key(named)
+    os.chown(path, 0, 0)
+    assert read_key(tmp_path / "link") == KEY
+
+
 @pytest.mark.parametrize(
     "data", [b"", b"hunter2-hunter2", SECRET[:31], SECRET + b"\n", b"\xff" * 44, bytes(32), b"ab" * 600]
 )

@@ -15,7 +15,7 @@ import pytest
 
 from paramclient import ParamCache, ParamClient, Trust, UnknownVehicle, writethrough
 from paramclient.cache import TableUpdate
-from tests.caches import PX4, full_disk, set_aside, stored, update
+from tests.caches import PX4, full_disk, rubbish, set_aside, stored, update
 from tests.shell import Tap, bits, small_px4, swift_loop, swiftly
 from tests.test_design import MODULES
 
@@ -134,7 +134,7 @@ def move(path: Path) -> None:
 
 def damage(path: Path) -> None:
     """Another program finds it damaged, and sets it aside."""
-    path.write_bytes(b"no database at all" * 5000)
+    path.write_bytes(rubbish(90_000))
     with ParamCache(path) as other:
         other.components()
 

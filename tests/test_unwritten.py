@@ -234,3 +234,16 @@ async def test_a_service_that_is_ended_says_on_stderr_what_is_lost(path: Path) -
         r"warning: 1/1 \(uid:\w+/1\): not written to the cache, and lost: \d+ values? and", err
     ), err
     assert "Traceback" not in err
+
+
+@pytest.mark.parametrize("words", [("show",), ("history", "1"), ("cache", "remove", "1")], ids=" ".join)
+def test_the_command_leaves_a_file_that_is_no_cache_as_it_is(
+    words: tuple[str, ...], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    notes = tmp_path / "notes.txt"
+    notes.write_text("things to do\n" * 100)
+    ended = in_process(capsys, "--cache", str(notes))(*words)
+    assert (ended.code, ended.out) == (5, "")
+    assert "notes.txt is no cache of paramclient (file is not a database), and was left as it is" in ended.err
+    assert notes.read_text() == "things to do\n" * 100
+    assert [*tmp_path.iterdir()] == [notes]

@@ -4,15 +4,17 @@ SQLite in WAL mode with synchronous=NORMAL. What was committed survives the deat
 a power cut may take the last transactions, never the file.
 
 The structure of the file is checked when it is opened; each table has a checksum of its own, checked when it
-is read. Under an open connection, another process may find the file damaged and rename it, or somebody may
-delete it: every operation looks whether its file still stands under the path. SQLite does so too before it
-would touch the `-wal` of the file that came in its place. Opening, creating, upgrading and renaming happen
-under a lock on the folder (`flock`), so that two processes never do it at once. The file itself is opened by
-SQLite alone: to close another descriptor of it would drop SQLite's locks.
+is read. Only a file that is empty, or a database with our application id, is ever changed or renamed;
+anything else under the path is an error. Under an open connection, another process may find the file damaged
+and rename it, or somebody may delete it: every operation looks whether its file still stands under the path.
+SQLite does so too before it would touch the `-wal` of the file that came in its place. Opening, creating,
+upgrading and renaming happen under a lock on the folder (`flock`), so that two processes never do it at once.
+The file itself is opened by SQLite alone: to close another descriptor of it would drop SQLite's locks.
 """
 
 from __future__ import annotations
 
+import errno
 import logging
 import os
 import sqlite3
@@ -32,11 +34,18 @@ from paramclient.cache.lock import BUSY_TIMEOUT, locked
 from paramclient.cache.rows import Damaged
 from paramclient.cache.schema import MIGRATIONS, Step
 from paramclient.errors import CacheError
+from paramclient.ownership import OF_OTHERS, OTHERS_WRITE, make_private, mode_of
 
 __all__ = ["APPLICATION_ID", "Database"]
 
 APPLICATION_ID: Final = 0x5041524D
 """Stands in the file's header and says whose database it is: `PARM`."""
+
+_MAGIC: Final = b"SQLite format 3\0"
+_ID_AT: Final = slice(68, 72)
+"""How a database of SQLite begins, and where its application id stands (SQLite, "Database File Format")."""
+_LOG_MAGICS: Final = (b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
+"""How a write-ahead log of SQLite begins."""
 
 _TRIES: Final = 3
 """Rounds of one operation: the file may be renamed under it by another process, and be damaged, once each."""
@@ -80,10 +89,13 @@ class Database:
     """One SQLite file, opened at the first operation. Safe to use from several threads.
 
     A file that is damaged, or newer than this version, is renamed to say why and when (with its `-wal` and
-    `-shm`), a warning is logged and remembered, and a fresh one takes its place. Nothing is ever deleted.
+    `-shm`), a warning is logged and remembered, and a fresh one takes its place. Nothing is ever deleted. A
+    file that others can get at is made its owner's alone, with a warning.
 
     Args:
         path: the file, absolute, with links followed.
+        link: the link by which the file was named, or None: then it has to belong to the user of this
+            process.
 
     Attributes:
         path: the same.
@@ -91,8 +103,9 @@ class Database:
         replacements: how often a fresh file was made, or another one than before was found in its place.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, link: Path | None = None) -> None:
         self.path = path
+        self._link = link
         self.notes: list[str] = []
         self.replacements = 0
         self._lock = threading.Lock()
@@ -102,6 +115,7 @@ class Database:
         self._file: tuple[int, int] | None = None
         self._for_once = False
         self._without_locks = False
+        self._is_ours = False  # what is open has our application id
 
     def read(self, work: Work[T]) -> T:
         """Do work that only reads, in one transaction.
@@ -150,6 +164,7 @@ class Database:
                     self.replacements += 1
                     self._drop()
                 except Damaged as damage:
+                    self._check_ours(damage)
                     self._set_aside(damage)
                 except OSError as error:
                     self._drop()
@@ -184,6 +199,7 @@ class Database:
                 return self._connection
             self.replacements += 1
             self._drop()
+        self._check_link()
         if writing:
             self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         with locked(self.path.parent):
@@ -218,15 +234,17 @@ class Database:
         version = self._inspect(connection)
         if not (version or writing):
             raise _Empty
+        self._make_private()
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
         connection.execute("PRAGMA foreign_keys = ON")
-        if version < len(MIGRATIONS):
+        if version < len(MIGRATIONS) or not self._is_ours:
             connection.execute("BEGIN IMMEDIATE")
             connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
             _migrate(connection, MIGRATIONS[version:])
             connection.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
             connection.execute("COMMIT")
+            self._is_ours = True
         return connection
 
     def _open_without_locks(self) -> sqlite3.Connection:
@@ -263,12 +281,14 @@ class Database:
         return connection
 
     def _inspect(self, connection: sqlite3.Connection) -> int:
-        """The schema version of the file, 0 for one that is still empty; `Damaged` where it is not ours.
+        """The schema version of the file, 0 for one that is still empty; `Damaged` where it is that.
 
-        The integrity check takes a few milliseconds for each megabyte. Without it a flipped bit can make
-        SQLite miss a row that is there, and nothing would tell.
+        A file without an application id counts as ours by its tables. The integrity check takes a few
+        milliseconds for each megabyte. Without it a flipped bit can make SQLite miss a row that is there, and
+        nothing would tell.
         """
         [(application,)] = connection.execute("PRAGMA application_id")
+        self._is_ours = application == APPLICATION_ID
         [(version,)] = connection.execute("PRAGMA user_version")
         try:
             tables = _schema_of(connection)
@@ -278,13 +298,15 @@ class Database:
             raise Damaged(str(error)) from error  # the statement cannot be wrong: the header is
         if not (application or version or tables):
             return 0
-        if application != APPLICATION_ID:
-            if tables and not _schema_after(MIGRATIONS) & tables:
-                raise CacheError(f"{self.path} is another program's database; name another file")
-            raise Damaged(f"its application id is {application:#x}")
+        looks_like_ours = 1 <= version <= len(MIGRATIONS) and _schema_after(MIGRATIONS[:version]) <= tables
+        if not (self._is_ours or (application == 0 and looks_like_ours)):
+            raise CacheError(
+                f"{self.path} is another program's database (its application id is {application:#x}), and was"
+                " left as it is; name another file"
+            )
         if version > len(MIGRATIONS):
             raise _Newer(f"its schema has version {version}, this program knows {len(MIGRATIONS)}")
-        if version < 1 or not _schema_after(MIGRATIONS[:version]) <= tables:
+        if not looks_like_ours:
             raise Damaged(f"its tables are not those of version {version}")
         [(verdict,)] = connection.execute("PRAGMA integrity_check(1)")
         if verdict != "ok":
@@ -299,6 +321,70 @@ class Database:
         if code == sqlite3.SQLITE_READONLY and self._may_write():
             return Damaged("its header forbids writing")
         return CacheError(f"the cache {self.path} cannot be used: {error}")
+
+    def _check_ours(self, damage: Damaged) -> None:
+        """See that what is damaged is a cache, by its first bytes where SQLite cannot read it.
+
+        Nobody in this process uses a file that SQLite cannot read, so to close it costs nobody's locks.
+
+        Raises:
+            CacheError: it is something else, which is left as it is.
+        """
+        if self._is_ours or self._which() != self._file:
+            return
+        size = _size(self.path)
+        try:
+            with (self.path if size else self._companion("-wal")).open("rb") as file:
+                begins = file.read(_ID_AT.stop)
+        except OSError:
+            begins = b""
+        is_file = begins.startswith(_MAGIC) and begins[_ID_AT] == APPLICATION_ID.to_bytes(4, "big")
+        if is_file if size else begins.startswith(_LOG_MAGICS):
+            return
+        self._drop()
+        text = " ".join(str(damage).split())
+        raise CacheError(
+            f"{self.path} is no cache of paramclient ({text:.200}), and was left as it is; name another file"
+        )
+
+    def _check_link(self) -> None:
+        """See that a link leads to a file of this user, or is this user's own where there is no file yet.
+
+        Raises:
+            CacheError: it is another user's.
+        """
+        if self._link is None or os.name != "posix":
+            return
+        status = _status(self.path) or self._link.lstat()
+        if status.st_uid != os.geteuid():
+            raise CacheError(
+                f"{self._link} leads to a file of another user, {self.path}, and is not followed"
+            )
+
+    def _make_private(self) -> None:
+        """Make the file its owner's alone, with a warning.
+
+        Raises:
+            CacheError: others can write to it, and that cannot be ended.
+        """
+        for file in filter(Path.exists, map(self._companion, ("", "-wal", "-shm"))):
+            try:
+                mode = make_private(file)
+            except FileNotFoundError:
+                continue  # another process has closed the database just now
+            except OSError as error:
+                mode = mode_of(file.stat())
+                if mode & OTHERS_WRITE and error.errno != errno.EROFS:
+                    raise CacheError(
+                        f"others can write to the cache {file} (mode {mode:o}), and that cannot be ended: "
+                        f"{error.strerror}"
+                    ) from error
+                continue
+            if mode & OF_OTHERS and file == self.path:
+                _log.warning(
+                    "others than its owner could get at the cache %s (mode %o); it is mode %o now",
+                    *(file, mode, mode & ~OF_OTHERS),
+                )
 
     def _set_aside(self, damage: Damaged) -> None:
         what = f"the cache {self.path} is {damage.kind} ({' '.join(str(damage).split()):.200})"
@@ -347,7 +433,7 @@ class Database:
         self._close_connection()
         self._connection = None
         self._close_connection = _nothing
-        self._for_once = self._without_locks = False
+        self._for_once = self._without_locks = self._is_ours = False
 
 
 def _nothing() -> None:

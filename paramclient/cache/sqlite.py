@@ -32,16 +32,17 @@ class SqliteStore:
 
     Args:
         path: the file, absolute, with links followed.
+        link: the link by which it was named, or None.
 
     Attributes:
         path: the same.
         place: the same, for people.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, *, link: Path | None = None) -> None:
         self.path = path
         self.place = str(path)
-        self._database = Database(path)
+        self._database = Database(path, link=link)
 
     @property
     def notes(self) -> tuple[str, ...]:

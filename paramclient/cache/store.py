@@ -82,8 +82,9 @@ class ParamCache:
             self.path = Path(default_path().with_name(address.name) if local is None else local).resolve()
             self._store = SharedStore(address, self.path)
         else:
-            self.path = Path(default_path() if path is None else path).resolve()
-            self._store = SqliteStore(self.path)
+            named = Path(default_path() if path is None else path)
+            self.path = named.resolve()
+            self._store = SqliteStore(self.path, link=named if named.is_symlink() else None)
 
     def __enter__(self) -> ParamCache:
         return self

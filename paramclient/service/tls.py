@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Final, NoReturn
 
 from paramclient.errors import UsageError
+from paramclient.ownership import OTHERS_WRITE, has_trusted_owner, mode_of
 
 __all__ = ["Tls", "tls_of"]
 
@@ -65,8 +66,14 @@ def tls_of(cert: str | os.PathLike[str] | None, key: str | os.PathLike[str] | No
 def _check_pem(path: Path, what: str, mark: bytes) -> None:
     try:
         with path.open("rb") as file:
+            status = os.fstat(file.fileno())
             data = file.read(LONGEST_FILE)
     except OSError as error:
         raise UsageError(f"{path}: the {what} cannot be read: {error.strerror}") from error
+    if not has_trusted_owner(status) or mode_of(status) & OTHERS_WRITE:
+        raise UsageError(
+            f"{path}: others than the user of this program can change this {what} (owner {status.st_uid},"
+            f" mode {mode_of(status):o})"
+        )
     if mark not in data:
         raise UsageError(f"{path}: there is no {what} in PEM in this file")

@@ -43,6 +43,7 @@ LONGEST_TOKEN: Final = 256
 MOST_TOKENS: Final = 256
 """Each is compared for each request."""
 LONGEST_FILE: Final = 100_000
+_NO_LINK: Final = getattr(os, "O_NOFOLLOW", 0)  # Windows has no such flag
 DIGEST: Final = "sha256:"
 """How a line begins its third word that has not the token but its digest."""
 
@@ -190,12 +191,15 @@ def add_token(path: str | os.PathLike[str], name: str, role: Role) -> str:
     """Make a token, and add its line to a file, which is made for its owner alone if it is not there.
 
     Raises:
-        UsageError: the file cannot be written, is open to others, holds something else, or has the name.
+        UsageError: the file cannot be written, is a link, belongs to another user, is open to others, holds
+            something else, or has the name.
     """
     token = new_token()
     line = token_line(name, role, token)
     try:
-        os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o600))
+        if Path(path).is_symlink():
+            raise UsageError(f"{os.fspath(path)}: it is a link; name the file itself")
+        os.close(os.open(path, os.O_RDWR | os.O_CREAT | os.O_APPEND | _NO_LINK, 0o600))
         before = read_private(path, "file of tokens", LONGEST_FILE + 1).decode("utf-8", "replace")
         gap = "" if before.endswith("\n") or not before else "\n"
         try:
