@@ -32,6 +32,7 @@ from paramclient.cache.records import (
     TableUpdate,
     by_station,
 )
+from paramclient.cache.setups import CutOff, RunningSetup, SetupNotes
 from paramclient.cache.store import ParamCache, default_path
 from paramclient.cache.tables import HISTORY_LINES
 from paramclient.cache.transfer import CopyResult
@@ -45,6 +46,7 @@ __all__ = [
     "CachedSummary",
     "CachedVehicle",
     "CopyResult",
+    "CutOff",
     "FleetDiff",
     "FleetValue",
     "FleetVehicle",
@@ -54,7 +56,9 @@ __all__ = [
     "Holder",
     "NameSpread",
     "ParamCache",
+    "RunningSetup",
     "SNAPSHOTS",
+    "SetupNotes",
     "Snapshot",
     "SnapshotSummary",
     "StoredParam",

@@ -18,7 +18,7 @@ if sys.platform == "win32":
 else:
     import fcntl
 
-__all__ = ["BUSY_TIMEOUT", "locked"]
+__all__ = ["BUSY_TIMEOUT", "locked", "try_to_lock"]
 
 BUSY_TIMEOUT: Final = 5.0
 """Seconds to wait for another process. Its transactions take milliseconds; who holds the file for longer is
@@ -40,13 +40,21 @@ def locked(folder: Path) -> Iterator[None]:
     descriptor = _open(folder)
     try:
         deadline = time.monotonic() + BUSY_TIMEOUT
-        while not _try_to_lock(descriptor):
+        while not try_to_lock(descriptor):
             if time.monotonic() > deadline:
                 raise CacheError(f"another process holds the folder {folder}")
             time.sleep(_LOCK_POLL)
         yield
     finally:
         os.close(descriptor)  # and the lock goes with it
+
+
+def try_to_lock(descriptor: int) -> bool:
+    """Lock a file that stands at its beginning, until its descriptor is closed or this process ends.
+
+    False where another descriptor holds it.
+    """
+    return _try_to_lock(descriptor)
 
 
 if sys.platform == "win32":

@@ -9,7 +9,7 @@ from typing import Annotated, Final
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
-from paramclient.cache import HistoryEntry, ParamCache, SnapshotSummary
+from paramclient.cache import CutOff, HistoryEntry, ParamCache, SetupNotes, SnapshotSummary
 from paramclient.cli.options import CacheOptions, Id
 from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import print_document, print_table
@@ -37,7 +37,8 @@ def history(
 ) -> ExitCode:
     """Print how the values of a vehicle have changed: when, from, to, and by whom. The newest comes last.
 
-    With --snapshots, print what was set down of its tables instead, each with its number.
+    A set-up that was cut off, as the service ended while it ran, has a line of its own. With --snapshots,
+    print what was set down of its tables instead, each with its number.
 
     Args:
         vehicle: Its system id, its hardware id in full, uid: and at least 6 digits of it, or its key.
@@ -58,17 +59,30 @@ def history(
             kept = [each for each in cache.snapshots(key, component) if begin is None or each.at >= begin]
             _print_snapshots(kept[-limit:] if limit else kept, options)
         else:
-            _print_entries(cache.history(key, component, name, limit, begin), options)
+            entries = cache.history(key, component, name, limit, begin)
+            oldest = entries[0].at if limit and len(entries) == limit else begin
+            notes = SetupNotes.beside(cache.path).cut_off() if name is None else []
+            cut_off = [
+                note
+                for note in notes
+                if note.key == key
+                and component in (None, note.component)
+                and (oldest is None or note.at >= oldest)
+            ]
+            _print_entries(entries, cut_off, options)
     return ExitCode.DONE
 
 
-def _print_entries(entries: Sequence[HistoryEntry], options: CacheOptions) -> None:
+def _print_entries(entries: Sequence[HistoryEntry], cut_off: Sequence[CutOff], options: CacheOptions) -> None:
     if options.json:
         from paramclient.documents.past import HistoryDoc  # only here: loads pydantic
 
-        print_document(HistoryDoc.of(entries))
-    else:
-        print_table(["time", "component", "name", "old", "new", "by"], map(_entry_cells, entries))
+        print_document(HistoryDoc.of(entries, cut_off=cut_off))
+        return
+    rows = [(entry.at, _entry_cells(entry)) for entry in entries]
+    rows += [(note.at, _cut_off_cells(note)) for note in cut_off]
+    rows.sort(key=lambda row: row[0])
+    print_table(["time", "component", "name", "old", "new", "by"], (cells for _, cells in rows))
 
 
 def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> None:
@@ -87,6 +101,11 @@ def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> 
 def _entry_cells(entry: HistoryEntry) -> tuple[object, ...]:
     new = None if entry.new is None else _value(entry.new)
     return time_text(entry.at), entry.component, entry.name, _value(entry.old), new, entry.by
+
+
+def _cut_off_cells(note: CutOff) -> tuple[object, ...]:
+    far = f"{note.done} of {note.total} values" if note.total else "nothing written"
+    return time_text(note.at), note.component, f"({note.kind} cut off)", None, far, note.asked_by
 
 
 def _reason(each: SnapshotSummary) -> str:

@@ -12,10 +12,18 @@ from paramclient.notation import bits_text, hash_text, time_text, value_json
 from paramclient.values import type_name
 
 if TYPE_CHECKING:
-    from paramclient.cache import HistoryEntry, SnapshotSummary
+    from paramclient.cache import CutOff, HistoryEntry, SnapshotSummary
     from paramclient.paramset import ParamSet
 
-__all__ = ["ExactDoc", "HistoryDoc", "HistoryEntryDoc", "SnapshotDoc", "SnapshotsDoc", "WholeSnapshotDoc"]
+__all__ = [
+    "CutOffDoc",
+    "ExactDoc",
+    "HistoryDoc",
+    "HistoryEntryDoc",
+    "SnapshotDoc",
+    "SnapshotsDoc",
+    "WholeSnapshotDoc",
+]
 
 
 class ExactDoc(Document):
@@ -60,18 +68,59 @@ class HistoryEntryDoc(Document):
         )
 
 
+class CutOffDoc(Document):
+    """A set-up that was cut off, as the service ended while it ran; see `CutOff`.
+
+    `at` (unix seconds) is when it was last known to run.
+    """
+
+    time: str
+    component: int
+    kind: str
+    by: str
+    done: int
+    total: int
+    at: float
+
+    @classmethod
+    def of(cls, note: CutOff) -> CutOffDoc:
+        """All of it that is of the past of a vehicle."""
+        return cls(
+            time=time_text(note.at),
+            component=note.component,
+            kind=note.kind,
+            by=note.asked_by,
+            done=note.done,
+            total=note.total,
+            at=round(note.at, 3),
+        )
+
+
 class HistoryDoc(Document):
-    """Changes of values, the newest last. `before` is what to ask with for those that came before them."""
+    """Changes of values, the newest last. `before` is what to ask with for those that came before them.
+
+    `cut_off` has the set-ups of this time that were cut off, where there are any.
+    """
 
     history: list[HistoryEntryDoc]
     before: Maybe[float] = None
+    cut_off: Maybe[list[CutOffDoc]] = None
 
     @classmethod
     def of(
-        cls, entries: Iterable[HistoryEntry], *, exact: bool = False, before: float | None = None
+        cls,
+        entries: Iterable[HistoryEntry],
+        *,
+        exact: bool = False,
+        before: float | None = None,
+        cut_off: Iterable[CutOff] = (),
     ) -> HistoryDoc:
         """Lines of history."""
-        return cls(history=[HistoryEntryDoc.of(entry, exact=exact) for entry in entries], before=before)
+        return cls(
+            history=[HistoryEntryDoc.of(entry, exact=exact) for entry in entries],
+            before=before,
+            cut_off=[CutOffDoc.of(note) for note in cut_off] or None,
+        )
 
 
 class SnapshotDoc(Document):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import math
 import os
 import time
@@ -15,13 +16,16 @@ import anyio
 import anyio.abc
 import anyio.lowlevel
 
+from paramclient.cache import SetupNotes
 from paramclient.client import ParamClient
 from paramclient.component import address_in_words
 from paramclient.documents.call import FetchResultDoc
 from paramclient.documents.component import ProgressDoc
+from paramclient.documents.job import far_text
 from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.links import Link, create_link
 from paramclient.metadata.store import MetadataStore
+from paramclient.notation import time_text
 from paramclient.protocol.vehicle_choice import LOOK_TIME, VehicleChoice
 from paramclient.service.feed import Feed
 from paramclient.service.following import Followed
@@ -32,7 +36,7 @@ from paramclient.worker import Worker
 from paramclient.writethrough import chosen_cache
 
 if TYPE_CHECKING:
-    from paramclient.cache import ParamCache
+    from paramclient.cache import CutOff, ParamCache, RunningSetup
     from paramclient.sim import Endpoint
 
 __all__ = ["Hub"]
@@ -44,6 +48,8 @@ MOST_READINGS: Final = 8
 """Files that are read, or wait for it: each may have megabytes, and take seconds."""
 
 Result = TypeVar("Result")
+
+logger = logging.getLogger(__name__)
 
 
 class Hub:
@@ -89,6 +95,7 @@ class Hub:
         self._reader = Worker("paramclient files")
         self._readings = 0
         self._closing = anyio.Event()
+        self._setups = None if self.cache is None else SetupNotes.beside(self.cache.path)
         self._tasks: anyio.abc.TaskGroup | None = None
         self._line_tasks: anyio.abc.TaskGroup | None = None
         for link in links:
@@ -107,10 +114,16 @@ class Hub:
         """Seconds since it was made."""
         return time.monotonic() - self._began
 
+    @property
+    def is_closing(self) -> bool:
+        """Whether the service is ending."""
+        return self._closing.is_set()
+
     async def __aenter__(self) -> Hub:
         tasks = self._tasks = anyio.create_task_group()
         await tasks.__aenter__()
         self.jobs.open(tasks)
+        await self._recall_setups()
         tasks.start_soon(self.feed.run_gathering, name="paramclient feed")
         lines = self._line_tasks = anyio.create_task_group()
         await lines.__aenter__()
@@ -146,6 +159,28 @@ class Hub:
         """
         self._check_open()
         return await self._worker.run(work)
+
+    async def note_setup(self, job: Job) -> RunningSetup | None:
+        """Note on the disk that a set-up begins, before it does anything; None without a cache.
+
+        Raises:
+            CacheError: it cannot be noted.
+        """
+        notes = self._setups
+        if notes is None:
+            return None
+        (system, component), key = job.followed.address, job.followed.key
+        begin = partial(notes.begin, system=system, component=component, asked_by=job.asked_by, key=key)
+        return await self.aside(lambda: begin(job.id, job.kind, link=job.followed.line.name))
+
+    async def end_note(self, note: RunningSetup, *, is_cut_off: bool) -> None:
+        """A set-up has ended, or is cut off as the service ends. This is done to its end in any case."""
+        with anyio.CancelScope(shield=True):
+            await self._worker.run(note.cut_off if is_cut_off else note.end)
+
+    async def cut_off(self) -> list[CutOff]:
+        """The set-ups that were cut off, as the disk knows them."""
+        return [] if self._setups is None else await self.aside(self._setups.cut_off)
 
     async def read_aside(self, work: Callable[[], Result]) -> Result:
         """Read what somebody has sent, in a thread of its own: that may take seconds, and others look into
@@ -324,6 +359,20 @@ class Hub:
         if self._fetches and is_due and not client.listens_only:
             with suppress(ServiceError):  # as many are under way as may be
                 self.begin_fetch(followed, OURSELVES)
+
+    async def _recall_setups(self) -> None:
+        """See which set-ups the last run of the service has not brought to their end, and tell of them."""
+        notes = self._setups
+        if notes is None:
+            return
+        self.jobs.cut_off = await self._worker.run(lambda: notes.cut_off(tells=True))
+        for each in self.jobs.cut_off:
+            if not each.is_told:
+                logger.warning(
+                    "%s of %d/%d on %s, which %s had asked for at %s, was cut off %s, as the service ended",
+                    *("a restore" if each.kind == "restore" else "an apply", each.system, each.component),
+                    *(each.link, each.asked_by, time_text(each.began), far_text(each)),
+                )
 
     async def _recall(self, followed: Followed) -> None:
         """What the disk knows: how old cached values are, and how the firmware describes its parameters."""

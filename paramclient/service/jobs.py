@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import secrets
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
 from typing import TYPE_CHECKING, Final, Literal
 
 import anyio
@@ -17,6 +17,7 @@ from paramclient.errors import ParamClientError
 from paramclient.service.problems import ServiceError, problem_of
 
 if TYPE_CHECKING:
+    from paramclient.cache import CutOff
     from paramclient.service.feed import Feed
     from paramclient.service.following import Followed
 
@@ -106,9 +107,13 @@ class Jobs:
 
     Args:
         feed: where beginnings and ends are told.
+
+    Attributes:
+        cut_off: set-ups that an earlier run of the service has not brought to their end.
     """
 
     def __init__(self, feed: Feed) -> None:
+        self.cut_off: Sequence[CutOff] = ()
         self._feed = feed
         self._jobs: dict[str, Job] = {}
         self._tasks: anyio.abc.TaskGroup | None = None
@@ -121,6 +126,22 @@ class Jobs:
     def all(self) -> list[Job]:
         """All of them, the oldest first."""
         return list(self._jobs.values())
+
+    @property
+    def documents(self) -> list[JobDoc]:
+        """How all of them stand, the oldest first."""
+        return [*map(JobDoc.of_cut_off, self.cut_off), *(job.document() for job in self._jobs.values())]
+
+    def document(self, name: str) -> JobDoc:
+        """How the one of this name stands.
+
+        Raises:
+            ServiceError: there is none.
+        """
+        for note in self.cut_off:
+            if note.id == name:
+                return JobDoc.of_cut_off(note)
+        return self.find(name).document()
 
     def begin(self, kind: Kind, followed: Followed, work: Work, asked_by: str) -> Job:
         """Begin one.

@@ -79,13 +79,13 @@ async def fetch_everybody(
 @router.get("/jobs")
 async def jobs(hub: TheHub) -> JobsDoc:
     """What is under way, and what was lately."""
-    return JobsDoc(jobs=[job.document() for job in hub.jobs.all])
+    return JobsDoc(jobs=hub.jobs.documents)
 
 
 @router.get("/jobs/{job}")
 async def one_job(hub: TheHub, job: str) -> JobDoc:
     """One of them."""
-    return hub.jobs.find(job).document()
+    return hub.jobs.document(job)
 
 
 @router.delete("/jobs/{job}", status_code=204)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import Field, model_validator
 
-from paramclient.cache import HISTORY_LINES, HistoryEntry
+from paramclient.cache import HISTORY_LINES, CutOff, HistoryEntry
 from paramclient.documents.base import Body
 from paramclient.documents.cached import CachedTableDoc, VehicleDoc, VehiclesDoc
 from paramclient.documents.fleet import FleetDiffDoc
@@ -264,13 +265,29 @@ async def _page(
     if before is not None:
         lines = [line for line in lines if line.at < before]
     page = lines[-limit:]
+    told = [] if name is not None else await _cut_off(hub, key, component, since, before)
     if len(page) == len(lines):
-        return HistoryDoc.of(page, exact=True)
+        return HistoryDoc.of(page, exact=True, cut_off=told)
     if before is None and lines[0].at == page[0].at:  # there may be more of them
         lines = await hub.aside(lambda: cache.history(key, component, name, HISTORY_LINES, since))
     oldest = page[0].at
     page = [*_same_moment(lines[: len(lines) - len(page)], oldest), *page]
-    return HistoryDoc.of(page, exact=True, before=oldest if len(page) < len(lines) else None)
+    if len(page) == len(lines):
+        return HistoryDoc.of(page, exact=True, cut_off=told)
+    told = [note for note in told if note.at >= oldest]
+    return HistoryDoc.of(page, exact=True, before=oldest, cut_off=told)
+
+
+async def _cut_off(
+    hub: Hub, key: str, component: int, since: float | None, before: float | None
+) -> list[CutOff]:
+    """The set-ups of a component that were cut off in a time."""
+    begin, end = -math.inf if since is None else since, math.inf if before is None else before
+    return [
+        note
+        for note in await hub.cut_off()
+        if (note.key, note.component) == (key, component) and begin <= note.at < end
+    ]
 
 
 def _same_moment(lines: Sequence[HistoryEntry], at: float) -> Sequence[HistoryEntry]:

@@ -293,16 +293,24 @@ def _begin(
             if progress.row is not None:
                 rows[progress.row.name] = progress.row.so_far
             job.progress = ApplyProgressDoc.of(progress)
+            if note is not None and not hub.is_closing:  # what then fails was not written
+                note.note(done=progress.done, total=progress.total, key=target.key)
             now = anyio.current_time()
             if progress.phase != told or now >= told_at + PROGRESS_INTERVAL:
                 told_at, told = now, progress.phase
                 hub.jobs.tell(job)
 
+        note = await hub.note_setup(job)
+        is_whole = False
         try:
             result = await work(tell)
+            is_whole = result.error is None
         except anyio.get_cancelled_exc_class():
             job.result = InterruptedDoc.of(rows.values(), system=system, component=component)
             raise
+        finally:
+            if note is not None:
+                await hub.end_note(note, is_cut_off=hub.is_closing and not is_whole)
         return ApplyResultDoc.of(result, system=system, component=component, full=full)
 
     return hub.jobs.begin(kind, target, run, asker)
