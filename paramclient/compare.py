@@ -6,13 +6,13 @@ Nothing here knows of a vehicle, a file or the time: whatever can be had as a `P
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
-from fnmatch import fnmatchcase
 
 from paramclient.errors import UsageError
 from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.patterns import NameChoice
 from paramclient.values import ParamType, Value, bits_of, from_bits, same_bits
 
 __all__ = ["Comparison", "Difference", "Moved", "Standing", "compare", "defaults_of", "same_value"]
@@ -198,11 +198,11 @@ def defaults_of(*sets: ParamSet) -> ParamSet:
     return ParamSet(kept, source="the firmware's defaults")
 
 
-def _chosen(known: Iterable[str], patterns: Iterable[str]) -> set[str]:
-    fitting = {pattern: {name for name in known if fnmatchcase(name, pattern)} for pattern in patterns}
-    if useless := [pattern for pattern, found in fitting.items() if not found]:
-        raise UsageError(f"no parameter of either side is called {' or '.join(useless)}")
-    return set().union(*fitting.values())
+def _chosen(known: Collection[str], patterns: Iterable[str]) -> set[str]:
+    chosen, useless = NameChoice(patterns).choose(known)
+    if useless:
+        raise UsageError(f"no parameter of either side is called {useless}")
+    return chosen
 
 
 def _hold(name: str, left: ParamSet, right: ParamSet, base: ParamSet | None) -> Difference:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from fnmatch import fnmatchcase
 
 from paramclient.errors import UsageError
 from paramclient.identity import Identity
+from paramclient.patterns import NameChoice
 from paramclient.values import Param, ParamType, Value, bits_of, format_value, same_bits
 
 __all__ = ["ParamSet", "WrittenParam"]
@@ -114,11 +114,10 @@ class ParamSet(Mapping[str, WrittenParam]):
         Raises:
             UsageError: one fits no name. Whoever misspells one must not hear that all is well.
         """
-        fitting = {pattern: {name for name in self if fnmatchcase(name, pattern)} for pattern in patterns}
-        if useless := [pattern for pattern, found in fitting.items() if not found]:
+        chosen, useless = NameChoice(patterns).choose(self.keys())
+        if useless:
             of = f" of {self.source}" if self.source else ""
-            raise UsageError(f"no parameter{of} is called {' or '.join(useless)}")
-        chosen = set().union(*fitting.values())
+            raise UsageError(f"no parameter{of} is called {useless}")
         return replace(self, params={name: param for name, param in self.items() if name in chosen})
 
     def __getitem__(self, name: str) -> WrittenParam:

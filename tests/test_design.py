@@ -20,12 +20,13 @@ PACKAGE = ROOT / "paramclient"
 MAY_IMPORT = {
     "errors": set[str](),
     "version": set[str](),
+    "patterns": set[str](),
     "values": {"errors"},
     "params": {"errors", "values"},
     "identity": {"errors", "values"},
-    "paramset": {"errors", "values", "identity"},
+    "paramset": {"errors", "values", "identity", "patterns"},
     "metadata.info": {"errors", "values"},
-    "compare": {"errors", "values", "paramset"},
+    "compare": {"errors", "values", "paramset", "patterns"},
     "notation": {"errors", "values", "paramset"},
     "protocol.wire": {"errors", "values", "protocol.wire"},
     "protocol.ftp.packets": {"errors", "values"},
@@ -39,7 +40,7 @@ MAY_IMPORT = {
     "links": {"errors", "values", "clocks", "sim", "links"},
     "ownership": set[str](),
     "cache": {"errors", "values", "identity", "params", "paramset", "ownership", "cache"},
-    "provision.cautions": {"errors"},
+    "provision.cautions": {"errors", "patterns"},
     "provision.nearest": set[str](),
     "provision.planning": {
         *("errors", "values", "identity", "params", "paramset"),
@@ -51,7 +52,7 @@ MAY_IMPORT = {
 here belongs to the shell: it may know all of these and the rest of the shell, and none of these knows it."""
 
 PURE = (
-    *("errors", "values", "params", "paramset", "compare", "identity", "protocol", "sim"),
+    *("errors", "values", "params", "paramset", "patterns", "compare", "identity", "protocol", "sim"),
     *("provision.planning", "provision.nearest"),
 )
 """Rooms without input and output: time comes in as an argument, bytes as bytes."""

@@ -23,7 +23,7 @@ from paramclient.links import SimLink
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.protocol import wire
 from paramclient.service import AccessSettings, Hub, Settings, Tokens, create_app
-from paramclient.service.hub import MOST_READINGS
+from paramclient.service.quota import LONG_REQUESTS_OF_ONE
 from paramclient.service.routes.files import attachment
 from paramclient.service.wanted import LARGEST_UPLOAD
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
@@ -518,7 +518,7 @@ async def test_a_file_is_read_and_its_faults_are_told_by_line() -> None:
         assert (await upload(b"A,1\n" * (LARGEST_UPLOAD // 4 + 1), 413))[
             "type"
         ] == "urn:paramclient:too-large"
-        large = {"file": {"name": "a.param", "text": "A,1\n" * (LARGEST_UPLOAD // 4 + 1)}}
+        large = {"file": {"name": "a.parm", "text": "A 1\n" * (LARGEST_UPLOAD // 4 + 1)}}
         assert (await service.post(f"{HERE}/plan", {"wanted": large}, 413))["most"] == LARGEST_UPLOAD
         several = dumps(
             [
@@ -541,9 +541,9 @@ async def test_files_are_read_one_after_the_other_and_not_without_end() -> None:
             answers.append(answer.status_code)
 
         async with anyio.create_task_group() as tasks:
-            for _ in range(MOST_READINGS + 3):
+            for _ in range(LONG_REQUESTS_OF_ONE + 3):
                 tasks.start_soon(upload)
-        assert sorted(answers) == [200] * MOST_READINGS + [429] * 3
+        assert sorted(answers) == [200] * LONG_REQUESTS_OF_ONE + [429] * 3
 
 
 @swiftly

@@ -79,7 +79,6 @@ async def serve(
         raise UsageError(f"serving needs {' and '.join(missing)}: pip install 'paramclient[service]'")
     from paramclient import service  # only here: needs the extra
 
-    gc.freeze()  # as when the command begins: this stays loaded too
     if no_cache and cache is not None:
         raise UsageError("--cache and --no-cache exclude each other")
     if not links:
@@ -104,10 +103,13 @@ async def serve(
         read_only=read_only,
     )
     settings = service.Settings(access=access)
+
+    def listens(url: str) -> None:
+        gc.freeze()  # as when the command begins: a collection of all this takes as long as ten requests
+        print_line(f"serving on {url}")
+
     with _stopping() as stop:
-        await service.serve(
-            hub, settings, listening=listening, stop=stop, listens=lambda url: print_line(f"serving on {url}")
-        )
+        await service.serve(hub, settings, listening=listening, stop=stop, listens=listens)
     return ExitCode.DONE
 
 

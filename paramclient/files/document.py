@@ -21,7 +21,7 @@ from typing import Any, Final, NoReturn
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.model import FileForm, ParamFile
-from paramclient.files.text import MOST_PROBLEMS, is_plain, shown, time_of
+from paramclient.files.text import is_plain, shown, time_of
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.values import ParamType, Value, format_value, shortest_float, type_name
 
@@ -149,10 +149,10 @@ def _file(content: object, form: FileForm, source: str, text: str) -> ParamFile:
     try:
         sets, header = parse(content, source)
     except Wrong as error:
-        problems = [_problem(place, what, text) for place, what in error.problems[:MOST_PROBLEMS]]
+        problems = [_problem(place, what, text) for place, what in error.problems]
         more = [": ".join(filter(None, (_at(source, line), what))) for line, what in problems[1:]]
-        if len(error.problems) > MOST_PROBLEMS:
-            more.append(f"and {len(error.problems) - MOST_PROBLEMS} more")
+        if error.count > len(problems):
+            more.append(f"and {error.count - len(problems)} more")
         line, what = problems[0]
         raise FileError(what, source=source, line=line, more=tuple(more)) from None
     if not any(sets):

@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import datetime
-from typing import Annotated, Any, Literal
+from functools import partial
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from paramclient.errors import UsageError
-from paramclient.files.text import as_type
+from paramclient.files.text import MOST_PROBLEMS, as_type
 from paramclient.identity import Identity
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.values import ParamType, Value, check_name, from_bits, known_type
 
-__all__ = ["Place", "parse"]
+__all__ = ["Place", "Wrong", "parse"]
 
 Place = tuple[str | int, ...]
 """Where in a document something stands: keys and positions from the top."""
@@ -30,43 +33,116 @@ _bits = re.compile(r"[0-9a-fA-F]{8}(?:[0-9a-fA-F]{8})?").fullmatch
 def parse(content: object, source: str) -> tuple[tuple[ParamSet, ...], tuple[str, ...]]:
     """The sets and the header of a document that was read as JSON or YAML.
 
+    Sets and parameters are validated one by one: pydantic would keep an error for each bad one, which is many
+    times as large as what it is about, and would let no other thread run meanwhile.
+
     Raises:
         Wrong: it is not one.
     """
-    try:
-        document = _Document.model_validate(content)
-    except ValidationError as error:
-        raise Wrong([(each["loc"], _told(each)) for each in error.errors(include_url=False)]) from None
-    problems: list[tuple[Place, str]] = []
-    sets = []
-    for place, each in enumerate(document.sets):
-        params = {}
-        for name, written in each.params.items():
-            where: Place = ("sets", place, "params", name)
-            try:
-                params[check_name(name)] = written.param(name)
-            except UsageError as error:
-                problems.append((where, str(error)))
-        identity = None if each.identity is None else Identity(**each.identity.model_dump())
-        at = None if each.at is None else each.at.timestamp()
-        sets.append(ParamSet(params, each.component, each.system, identity, at, source))
-    if problems:
-        raise Wrong(problems)
+    faults = _Faults()
+    document = faults.checked(_Document, content, ())
+    raw_sets = content.get("sets") if isinstance(content, dict) else None
+    found = [
+        _Written.of(each, ("sets", number), faults)
+        for number, each in enumerate(raw_sets if isinstance(raw_sets, list) else ())
+    ]
+    faults.raise_if_any()
+    assert document is not None, "else there is a fault"
+    sets = [each.params(source, faults) for each in found]
+    faults.raise_if_any()
     return tuple(sets), tuple(document.header)
 
 
 class Wrong(Exception):
-    """A document is not as it should be: places in it, and what is wrong there."""
+    """A document is not as it should be.
 
-    def __init__(self, problems: list[tuple[Place, str]]) -> None:
+    Attributes:
+        problems: the first places in it, and what is wrong there.
+        count: how many there are.
+    """
+
+    def __init__(self, problems: list[tuple[Place, str]], count: int) -> None:
         super().__init__(problems)
         self.problems = problems
+        self.count = count
+
+
+class _Faults:
+    """What is wrong with a document: the first few in words, the others by their number."""
+
+    def __init__(self) -> None:
+        self._problems: list[tuple[Place, str]] = []
+        self._count = 0
+
+    def add(self, place: Place, told: Callable[[], str]) -> None:
+        """One more."""
+        self._count += 1
+        if self._count <= MOST_PROBLEMS:
+            self._problems.append((place, told()))
+
+    def checked(self, model: type[_Known], content: object, place: Place) -> _Known | None:
+        """The content as this model has it; None where it is wrong."""
+        found = None
+        try:
+            found = model.model_validate(content)
+        except ValidationError as error:
+            for each in error.errors(include_url=False):
+                self.add((*place, *each["loc"]), partial(_told, each))
+        if isinstance(content, dict):
+            for name in content:
+                if name not in model.model_fields:
+                    self.add((*place, name), lambda: "no such field is known")
+        return found
+
+    def raise_if_any(self) -> None:
+        """Raise Wrong for all of it, if there is anything."""
+        if self._count:
+            raise Wrong(self._problems, self._count)
+
+
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """A set as it is written."""
+
+    place: Place
+    set: _Set | None
+    identity: _Identity | None
+    written: dict[str, _Param]
+
+    @classmethod
+    def of(cls, content: object, place: Place, faults: _Faults) -> _Written:
+        """The set that stands at a place."""
+        found = faults.checked(_Set, content, place)
+        fields = content if isinstance(content, dict) else {}
+        identity = fields.get("identity")
+        named = fields.get("params")
+        written = {}
+        for name, each in (named if isinstance(named, dict) else {}).items():
+            param = faults.checked(_Param, each, (*place, "params", name))
+            if param is not None:
+                written[name] = param
+        who = None if identity is None else faults.checked(_Identity, identity, (*place, "identity"))
+        return cls(place, found, who, written)
+
+    def params(self, source: str, faults: _Faults) -> ParamSet:
+        """Its parameters, where the fields of each agree."""
+        assert self.set is not None, "else there was a fault"
+        params = {}
+        for name, written in self.written.items():
+            try:
+                params[check_name(name)] = written.param(name)
+            except UsageError as error:
+                faults.add((*self.place, "params", name), partial(str, error))
+        identity = None if self.identity is None else Identity(**self.identity.model_dump())
+        at = None if self.set.at is None else self.set.at.timestamp()
+        return ParamSet(params, self.set.component, self.set.system, identity, at, source)
 
 
 class _Model(BaseModel):
-    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    model_config = ConfigDict(strict=True, allow_inf_nan=False)
 
 
+_Known = TypeVar("_Known", bound=_Model)
 _Id = Annotated[int, Field(ge=1, le=255)]
 _Count = Annotated[int, Field(ge=0)]
 
@@ -117,10 +193,10 @@ class _Param(_Model):
 class _Set(_Model):
     system: _Id | None = None
     component: _Id | None = None
-    identity: _Identity | None = None
+    identity: Any = None
     at: Annotated[datetime | None, Field(strict=False)] = None
     source: str = ""
-    params: dict[str, _Param]
+    params: dict[str, Any]
 
     @model_validator(mode="before")
     @classmethod
@@ -140,8 +216,8 @@ class _Set(_Model):
 
 class _Document(_Model):
     paramclient: Literal[1]
-    header: list[str] = []
-    sets: list[_Set]
+    header: Annotated[list[str], Field(fail_fast=True)] = []
+    sets: list[Any]
 
 
 def _kind(text: str) -> ParamType | int:
@@ -183,8 +259,6 @@ def _with_bits(value: Value, kind: ParamType | int | None, text: str) -> Value:
 
 def _told(error: Any) -> str:
     """What pydantic found, in a sentence."""
-    if error["type"] == "extra_forbidden":
-        return "no such field is known"
     if error["type"] == "missing":
         return "the field is missing"
     found = error["input"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable
+from collections.abc import Iterator
 from typing import Any, Final
 
 import yaml
@@ -14,14 +14,6 @@ __all__ = ["NotYaml", "load"]
 
 DEEPEST: Final = 20
 """Levels of nesting; our document has six, and the parser calls itself for each."""
-
-_STANDARD = "tag:yaml.org,2002:"
-_PLAIN_WORDS: Final = (
-    ("null", re.compile(r"(?:~|null|)$"), ["~", "n", ""]),
-    ("bool", re.compile(r"(?:true|false)$"), list("tf")),
-    ("int", re.compile(r"-?(?:0|[1-9][0-9]*)$"), list("-0123456789")),
-    ("float", re.compile(r"-?(?:0|[1-9][0-9]*)(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?$"), list("-0123456789")),
-)
 
 
 class NotYaml(Exception):
@@ -39,12 +31,14 @@ class NotYaml(Exception):
 def load(text: str) -> Any:
     """The content of one YAML document: dicts, lists, strings, numbers, booleans and None.
 
+    It is built from the parser's events, without the nodes that PyYAML makes of them: those take a kilobyte
+    for each value.
+
     Raises:
         NotYaml: see there.
     """
     try:
-        _check_events(text)
-        return yaml.load(text, _Loader)
+        return _content(yaml.parse(text, _Parser))
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
         raise NotYaml(error.problem or str(error), None if mark is None else mark.line + 1) from None
@@ -52,48 +46,81 @@ def load(text: str) -> Any:
         raise NotYaml(str(error).splitlines()[0], None) from None
 
 
-def _check_events(text: str) -> None:
-    """Follow no references, trust no tags, and nest no deeper than any document of ours."""
-    depth = 0
-    for event in yaml.parse(text, _Loader):
-        depth += isinstance(event, yaml.CollectionStartEvent)
-        depth -= isinstance(event, yaml.CollectionEndEvent)
-        if isinstance(event, yaml.AliasEvent):
-            raise _refused(event, "found an alias (*), which is not followed")
-        if getattr(event, "anchor", None) is not None or getattr(event, "tag", None) is not None:
-            raise _refused(event, "found an anchor or a tag (&, !), which are not read")
-        if depth > DEEPEST:
-            raise _refused(event, f"found more than {DEEPEST} levels")
+def _content(events: Iterator[Any]) -> Any:
+    """What stands in the one document that there is.
+
+    It follows no references, trusts no tags, and nests no deeper than any document of ours.
+    """
+    whole: list[Any] = []
+    above: list[_Collection] = [_Collection(whole)]
+    documents = 0
+    for event in events:
+        match event:
+            case yaml.DocumentStartEvent():
+                documents += 1
+                if documents > 1:
+                    raise _refused(event, "expected a single document in the stream, found another document")
+            case yaml.AliasEvent():
+                raise _refused(event, "found an alias (*), which is not followed")
+            case yaml.CollectionEndEvent():
+                above.pop()
+            case yaml.ScalarEvent() | yaml.CollectionStartEvent():
+                if event.anchor is not None or event.tag is not None:
+                    raise _refused(event, "found an anchor or a tag (&, !), which are not read")
+                if isinstance(event, yaml.ScalarEvent):
+                    above[-1].add(event, _scalar(event))
+                    continue
+                if len(above) > DEEPEST:
+                    raise _refused(event, f"found more than {DEEPEST} levels")
+                inner = _Collection({} if isinstance(event, yaml.MappingStartEvent) else [])
+                above[-1].add(event, inner.content)
+                above.append(inner)
+    return whole[0] if whole else None
+
+
+class _Collection:
+    """A list or a mapping that is being read."""
+
+    def __init__(self, content: list[Any] | dict[str, Any]) -> None:
+        self.content = content
+        self._key: str | None = None
+
+    def add(self, event: Any, value: Any) -> None:
+        """Take a value in, or the key of the next one."""
+        if isinstance(self.content, list):
+            self.content.append(value)
+        elif self._key is not None:
+            self.content[self._key] = value
+            self._key = None
+        elif not isinstance(value, str):
+            raise _refused(event, "found a key that is no text")
+        elif value in self.content:
+            raise _refused(event, f"{shown(value)} stands twice")
+        else:
+            self._key = value
+
+
+def _scalar(event: Any) -> str | int | float | bool | None:
+    """What a scalar means; without quotes and marks it may be more than text."""
+    text: str = event.value
+    if not event.implicit[0]:
+        return text
+    if text in _WORDS:
+        return _WORDS[text]
+    if _whole(text):
+        try:
+            return int(text)
+        except ValueError:  # Python converts no more than some thousand digits
+            raise _refused(event, f"{shown(text)} is beyond the range of every type") from None
+    return float(text) if _fraction(text) else text
 
 
 def _refused(at: Any, problem: str) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(problem=problem, problem_mark=at.start_mark)
 
 
-class _Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]  # the one in C is not everywhere
-    """A safe loader that takes fewer words for something else than text."""
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Hashable, Any]:
-        seen = set()
-        for key, _ in node.value:
-            name = self.construct_object(key, deep=True)
-            if not isinstance(name, str):
-                raise _refused(key, "found a key that is no text")
-            if name in seen:
-                raise _refused(key, f"{shown(name)} stands twice")
-            seen.add(name)
-        mapping: dict[Hashable, Any] = super().construct_mapping(node, deep)
-        return mapping
-
-
-def _whole(_: _Loader, node: Any) -> int:
-    try:
-        return int(node.value)
-    except ValueError:  # Python converts no more than some thousand digits
-        raise _refused(node, f"{shown(node.value)} is beyond the range of every type") from None
-
-
-_Loader.add_constructor(f"{_STANDARD}int", _whole)
-_Loader.yaml_implicit_resolvers = {}  # none of those of YAML 1.1
-for _tag, _pattern, _first in _PLAIN_WORDS:
-    _Loader.add_implicit_resolver(_STANDARD + _tag, _pattern, _first)
+_Parser: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+"""The parser in C is not everywhere."""
+_WORDS: Final = {"~": None, "null": None, "": None, "true": True, "false": False}
+_whole: Final = re.compile(r"-?(?:0|[1-9][0-9]*)").fullmatch
+_fraction: Final = re.compile(r"-?(?:0|[1-9][0-9]*)(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?").fullmatch

@@ -12,6 +12,7 @@ from importlib import resources
 from typing import Any, Final
 
 from paramclient.errors import UsageError
+from paramclient.patterns import NameChoice
 
 __all__ = ["CATEGORIES", "OUT_OF_RANGE", "READ_ONLY", "Caution", "Cautions", "Choice", "cautions_for"]
 
@@ -132,11 +133,11 @@ class Choice:
                     f"{each!r} cannot be included: it is neither a glob of parameter names, such as "
                     f"COMPASS_OFS*, nor one of {', '.join(CATEGORIES)}"
                 )
-        self._pattern = _pattern(globs) if globs else None
+        self._names = NameChoice(globs)
 
     def has(self, name: str, category: str) -> bool:
         """Whether a parameter of this category is included."""
-        return category in self._categories or (self._pattern is not None and bool(self._pattern.match(name)))
+        return category in self._categories or self._names.has(name)
 
 
 @cache

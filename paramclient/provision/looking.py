@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final, Self
@@ -29,6 +29,7 @@ __all__ = [
     "look_for",
     "plan_for",
     "prepare",
+    "prepare_aside",
     "verify",
 ]
 
@@ -205,13 +206,35 @@ async def prepare(
         NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
+    return await prepare_aside(component, wanted, _here, include=include, info=info, force=force)
+
+
+async def prepare_aside(
+    component: Component,
+    wanted: ParamSet,
+    aside: Callable[[Callable[[], Plan]], Awaitable[Plan]],
+    *,
+    include: str | Iterable[str] = (),
+    info: Mapping[str, ParamInfo] | None = None,
+    force: bool = False,
+) -> Plan:
+    """The same for event loops that serve others: a plan of thousands of parameters takes a second.
+
+    Args:
+        component, wanted, include, info, force: as in `prepare`.
+        aside: works plans out, such as in a thread.
+
+    Raises:
+        UsageError, NoReply, LinkError: as `prepare`.
+    """
     check_component(wanted, component.component)
     given = (include,) if isinstance(include, str) else tuple(include)
+    autopilot = component.autopilot
     # what cannot be right is told before the vehicle is asked
-    plan({}, wanted, include=given, autopilot=component.autopilot)
+    await aside(lambda: plan({}, wanted, include=given, autopilot=autopilot))
     await identified(component)
     seen = await look(component, wanted)
-    return plan_for(component, seen.table, wanted, given, info, force=force)
+    return await aside(lambda: plan_for(component, seen.table, wanted, given, info, force=force))
 
 
 async def verify(
@@ -251,6 +274,11 @@ def plan_for(
         encoding=component.encoding,
         force=force,
     )
+
+
+async def _here(work: Callable[[], Plan]) -> Plan:
+    """Work a plan out at once."""
+    return work()
 
 
 def _heard(component: Component, seen: Seen, found: Mapping[str, Param]) -> dict[str, WrittenParam]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import binascii
 from collections.abc import Awaitable, Callable
-from typing import Annotated, TypeVar
+from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import anyio
 from fastapi import Depends, Path, Query, Request
@@ -19,6 +19,9 @@ from paramclient.service.hub import Hub
 from paramclient.service.problems import ServiceError
 from paramclient.values import Param, ParamType, Value, from_bits, type_name
 
+if TYPE_CHECKING:
+    from paramclient.metadata import Metadata
+
 __all__ = [
     "Bits",
     "LinkName",
@@ -29,7 +32,9 @@ __all__ = [
     "ValueGiven",
     "answered",
     "asker_of",
+    "holder_of",
     "may_write",
+    "value_meant",
     "value_of",
 ]
 
@@ -70,6 +75,12 @@ def asker_of(request: Request) -> str:
     """Who asks, as the history names them."""
     asker: str = request.scope["state"]["asker"]
     return asker
+
+
+def holder_of(request: Request) -> str:
+    """Of whose quota a request is: of the token's that came with it, else of the address's."""
+    holder: str = request.scope["state"]["quota"]
+    return holder
 
 
 async def may_write(request: Request) -> None:
@@ -135,25 +146,31 @@ async def value_of(followed: Followed, name: str, given: int | float | str | Bit
         UsageError: there is none of this name, or the bits are of another type.
         ParamClientError: the type had to be asked for, and did not come.
     """
-    match given:
-        case Raw():
-            return binascii.unhexlify(given.raw)
-        case Bits():
-            known = followed.component.params.get(name)
-            if known is None:
-                known = await followed.component.get(name)
-            return _of_bits(int(given.bits, 16), known)
-        case str():
-            number = number_of(given)
-            if number is not None:
-                return number
-            metadata = followed.metadata
-            info = None if metadata is None else metadata.get(name)
-            if info is None:
-                raise UsageError(f"{name}: {given!r} is no number, and there is no description with names")
-            return info.parse(given)
-        case _:
-            return given
+    if not isinstance(given, Bits):
+        return value_meant(followed.metadata, name, given)
+    known = followed.component.params.get(name)
+    if known is None:
+        known = await followed.component.get(name)
+    return _of_bits(int(given.bits, 16), known)
+
+
+def value_meant(metadata: Metadata | None, name: str, given: int | float | str | Raw) -> Value:
+    """The same without bits, which mean nothing without the vehicle's type.
+
+    Raises:
+        UsageError: there is no value of this name.
+    """
+    if isinstance(given, Raw):
+        return binascii.unhexlify(given.raw)
+    if not isinstance(given, str):
+        return given
+    number = number_of(given)
+    if number is not None:
+        return number
+    info = None if metadata is None else metadata.get(name)
+    if info is None:
+        raise UsageError(f"{name}: {given!r} is no number, and there is no description with names")
+    return info.parse(given)
 
 
 def _of_bits(bits: int, known: Param) -> Value:

@@ -32,6 +32,7 @@ from paramclient.service.following import Followed
 from paramclient.service.jobs import Job, Jobs
 from paramclient.service.line import Line
 from paramclient.service.problems import ServiceError
+from paramclient.service.quota import LONG_REQUESTS_MAX, LONG_REQUESTS_OF_ONE, Quota
 from paramclient.worker import Worker
 from paramclient.writethrough import chosen_cache
 
@@ -43,9 +44,6 @@ __all__ = ["Hub"]
 
 OURSELVES: Final = "service"
 """Who has asked for what the service does by itself."""
-
-MOST_READINGS: Final = 8
-"""Files that are read, or wait for it: each may have megabytes, and take seconds."""
 
 Result = TypeVar("Result")
 
@@ -70,6 +68,7 @@ class Hub:
         feed: what happens.
         jobs: what is under way.
         lines: the links, by name.
+        long_requests: how many requests that take long are not answered yet.
 
     Raises:
         UsageError: no such link, two of one name, or options that cannot be.
@@ -93,7 +92,9 @@ class Hub:
         self._options = options
         self._worker = Worker("paramclient service")
         self._reader = Worker("paramclient files")
-        self._readings = 0
+        self.long_requests = Quota(
+            "requests that take long", most=LONG_REQUESTS_MAX, most_of_one=LONG_REQUESTS_OF_ONE
+        )
         self._closing = anyio.Event()
         self._setups = None if self.cache is None else SetupNotes.beside(self.cache.path)
         self._tasks: anyio.abc.TaskGroup | None = None
@@ -183,20 +184,14 @@ class Hub:
         return [] if self._setups is None else await self.aside(self._setups.cut_off)
 
     async def read_aside(self, work: Callable[[], Result]) -> Result:
-        """Read what somebody has sent, in a thread of its own: that may take seconds, and others look into
-        the cache.
+        """Parse or compare what somebody has sent, in a thread of its own: that may take seconds, and others
+        look into the cache. `long_requests` bounds how many wait for it.
 
         Raises:
-            ServiceError: too many wait for that, or the service is ending.
+            ServiceError: the service is ending.
         """
         self._check_open()
-        if self._readings >= MOST_READINGS:
-            raise ServiceError(429, "too-many", f"{MOST_READINGS} files are being read already.")
-        self._readings += 1
-        try:
-            return await self._reader.run(work)
-        finally:
-            self._readings -= 1
+        return await self._reader.run(work)
 
     def find(self, system: int, component: int, link: str | None = None) -> Followed:
         """The component of this address.
@@ -228,12 +223,15 @@ class Hub:
         chosen = [line for line in self.lines.values() if link in (None, line.name)]
         return [(line, line.client) for line in chosen if line.client is not None]
 
-    def begin_fetch(self, followed: Followed, asked_by: str, **options: Any) -> Job:
+    def begin_fetch(self, followed: Followed, asked_by: str, holder: str = "", **options: Any) -> Job:
         """Begin to bring a component's table up to date; the options are those of `Component.fetch_all`.
 
         Several at the same time share one download. To cancel the job gives up its own interest.
+
+        Raises:
+            ServiceError: too many jobs are under way, of this holder or of all.
         """
-        return self.jobs.begin("fetch", followed, partial(_fetch, options), asked_by)
+        return self.jobs.begin("fetch", followed, partial(_fetch, options), asked_by, holder)
 
     async def wait_for(
         self, system: int | None, component: int | None, link: str | None, timeout: float | None

@@ -6,6 +6,7 @@ import logging
 import secrets
 import time
 from collections.abc import Awaitable, Callable, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Final, Literal
 
 import anyio
@@ -28,6 +29,8 @@ State = Literal["running", "done", "failed", "cancelled"]
 
 MOST_RUNNING: Final = 256
 """Jobs that are under way at once: one for each component that a link can carry. Each is a task."""
+MOST_OF_ONE: Final = 64
+"""Those of one holder of a token or, without tokens, of one address; the service's own are not counted."""
 MOST_ENDED: Final = 64
 """Jobs that are kept when they have ended, for those who ask late."""
 
@@ -42,17 +45,19 @@ class Job:
         kind: what it is.
         followed: whom it is about.
         asked_by: who wanted it.
+        holder: of whose quota it is; "" for that of the service.
         state: running, done, failed or cancelled.
         progress: how far it is, as a document; whoever does the work sets it.
         result: what it ended with, as a document.
         error: what it failed with.
     """
 
-    def __init__(self, kind: Kind, followed: Followed, asked_by: str) -> None:
+    def __init__(self, kind: Kind, followed: Followed, asked_by: str, holder: str) -> None:
         self.id = secrets.token_hex(8)
         self.kind = kind
         self.followed = followed
         self.asked_by = asked_by
+        self.holder = holder
         self.state: State = "running"
         self.progress: Document | None = None
         self.result: Document | None = None
@@ -80,6 +85,13 @@ class Job:
             result=self.result.as_json() if with_result and self.result is not None else None,
             problem=None if self.error is None else problem_of(self.error),
         )
+
+    def later_document(self) -> Callable[[], JobDoc]:
+        """What makes the same document, as it stands now, in any thread: a result may have many rows."""
+        document, result = self.document(with_result=False), self.result
+        if result is None:
+            return lambda: document
+        return lambda: document.model_copy(update={"result": result.as_json()})
 
     def cancel(self) -> None:
         """End it; what it shares with others goes on for them."""
@@ -128,34 +140,49 @@ class Jobs:
         return list(self._jobs.values())
 
     @property
-    def documents(self) -> list[JobDoc]:
-        """How all of them stand, the oldest first."""
-        return [*map(JobDoc.of_cut_off, self.cut_off), *(job.document() for job in self._jobs.values())]
+    def later_documents(self) -> list[Callable[[], JobDoc]]:
+        """What makes the documents of all of them, the oldest first; see `Job.later_document`."""
+        cut_off = [partial(JobDoc.of_cut_off, note) for note in self.cut_off]
+        return [*cut_off, *(job.later_document() for job in self._jobs.values())]
 
-    def document(self, name: str) -> JobDoc:
-        """How the one of this name stands.
+    def later_document(self, name: str) -> Callable[[], JobDoc]:
+        """What makes the document of the one of this name.
 
         Raises:
             ServiceError: there is none.
         """
         for note in self.cut_off:
             if note.id == name:
-                return JobDoc.of_cut_off(note)
-        return self.find(name).document()
+                return partial(JobDoc.of_cut_off, note)
+        return self.find(name).later_document()
 
-    def begin(self, kind: Kind, followed: Followed, work: Work, asked_by: str) -> Job:
+    def begin(self, kind: Kind, followed: Followed, work: Work, asked_by: str, holder: str = "") -> Job:
         """Begin one.
 
+        Args:
+            kind: what it is.
+            followed: whom it is about.
+            work: does it.
+            asked_by: who wanted it.
+            holder: of whose quota it is; "" for that of the service.
+
         Raises:
-            ServiceError: too many are under way.
+            ServiceError: too many are under way, of this holder or of all.
         """
         assert self._tasks is not None, "the hub is open"
         ended = [job.id for job in self._jobs.values() if job.state != "running"]
         if len(self._jobs) - len(ended) >= MOST_RUNNING:
-            raise ServiceError(429, "too-many", f"{MOST_RUNNING} jobs are under way already.")
+            raise ServiceError(
+                429, "too-many", f"{MOST_RUNNING} jobs are under way already.", most=MOST_RUNNING
+            )
+        own = sum(job.holder == holder for job in self._jobs.values() if job.state == "running")
+        if holder and own >= MOST_OF_ONE:
+            raise ServiceError(
+                429, "too-many", f"{MOST_OF_ONE} jobs of yours are under way already.", most=MOST_OF_ONE
+            )
         for name in ended[: max(0, len(ended) - MOST_ENDED + 1)]:
             del self._jobs[name]
-        job = Job(kind, followed, asked_by)
+        job = Job(kind, followed, asked_by, holder)
         self._jobs[job.id] = job
         self.tell(job)
         self._tasks.start_soon(self._run, job, work, name=f"paramclient job {job.id}")

@@ -9,15 +9,17 @@ from collections.abc import Callable
 from datetime import datetime
 from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeVar
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from paramclient.documents.base import Body
+from paramclient.documents.base import Body, InParts
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.files import FileForm, ParamFile, loads
 from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.patterns import is_pattern
 from paramclient.provision.looking import identified
-from paramclient.service.asking import ValueGiven, value_of
+from paramclient.service.asking import Bits, ValueGiven, value_meant, value_of
 from paramclient.service.problems import ServiceError
+from paramclient.service.reading import check_pieces
 from paramclient.service.request import LARGEST_UPLOAD
 from paramclient.taken import before_last_apply, cached_set, whole_set
 from paramclient.values import Trust, check_name
@@ -29,12 +31,16 @@ if TYPE_CHECKING:
 
 __all__ = [
     "Elsewhere",
+    "FewPatterns",
     "GivenFile",
     "Moment",
     "Number",
+    "Patterns",
     "Source",
     "LARGEST_UPLOAD",
     "LONGEST_NAME",
+    "MOST_PATTERNS",
+    "MOST_VALUES",
     "cached",
     "check_size",
     "key_of",
@@ -42,6 +48,7 @@ __all__ = [
     "known_set",
     "parsed",
     "past",
+    "read_upload",
     "resolved",
     "state",
     "the_cache",
@@ -49,8 +56,12 @@ __all__ = [
     "when_of",
 ]
 
-MOST_VALUES: Final = 65_535
-"""Values of one request: as many as an index can count."""
+MOST_VALUES: Final = 10_000
+"""Values of one request, and parameters of one file: more than a vehicle has."""
+MOST_PATTERNS: Final = 64
+"""Patterns of one request: each is compared with every name."""
+MOST_NAMES: Final = 10_000
+"""Names of one request, with its patterns: the page sends the names that were chosen, one by one."""
 LONGEST_NAME: Final = 255
 """Characters of a file's name."""
 LATEST: Final = 253_402_300_799.0
@@ -80,6 +91,26 @@ Moment = Annotated[float, BeforeValidator(when_of), Field(ge=0, le=LATEST, allow
 """A time, in unix seconds when it is read."""
 Id = Annotated[int, Field(ge=1, le=255)]
 Number = Annotated[int, Field(ge=1, lt=1 << 62)]
+
+
+def _few_patterns(given: tuple[str, ...]) -> tuple[str, ...]:
+    if sum(map(is_pattern, given)) > MOST_PATTERNS:
+        raise ValueError(
+            f"at most {MOST_PATTERNS} of them may be patterns, with *, ? or [; the others are names"
+        )
+    return given
+
+
+FewPatterns: Final = AfterValidator(_few_patterns)
+"""Stands with names and patterns of which few may be patterns."""
+Patterns = Annotated[
+    tuple[Annotated[str, Field(min_length=1, max_length=64)], ...],
+    Field(max_length=MOST_NAMES, fail_fast=True),
+    FewPatterns,
+]
+"""Names, and patterns of the shell."""
+Values = Annotated[dict[str, ValueGiven], InParts, Field(min_length=1, max_length=MOST_VALUES)]
+"""Values by name."""
 
 
 class GivenFile(Body):
@@ -112,8 +143,7 @@ class GivenFile(Body):
                 data = base64.b64decode(self.base64 or "", validate=True)
             except (binascii.Error, ValueError) as error:
                 raise UsageError(f"{self.name or 'the file'} is no base64: {error}") from None
-        check_size(len(data), LARGEST_UPLOAD)
-        return loads(data, source=self.name, form=self.form)
+        return read_upload(data, self.name, self.form)
 
 
 class Elsewhere(Body):
@@ -146,7 +176,7 @@ class Source(Body):
     at: Moment | None = None
     component: Elsewhere | None = None
     vehicle: Cached | None = None
-    values: Annotated[dict[str, ValueGiven], Field(min_length=1, max_length=MOST_VALUES)] | None = None
+    values: Values | None = None
     defaults: Literal[True] | None = None
 
     @model_validator(mode="after")
@@ -154,6 +184,22 @@ class Source(Body):
         if len(self.model_fields_set) != 1 or None in (getattr(self, name) for name in self.model_fields_set):
             raise ValueError(f"a source has one of these members: {', '.join(type(self).model_fields)}")
         return self
+
+
+def read_upload(data: bytes, name: str, form: FileForm | None) -> ParamFile:
+    """A parameter file that somebody has sent. It takes its time.
+
+    Raises:
+        FileError: it cannot be read.
+        ServiceError: it is too large, or holds too many parameters.
+    """
+    check_size(len(data), LARGEST_UPLOAD)
+    check_pieces(data)
+    file = loads(data, source=name, form=form)
+    if sum(map(len, file.sets)) > MOST_VALUES:
+        what = f"A file may hold {MOST_VALUES:,} parameters here, not more."
+        raise ServiceError(413, "too-large", what, most=MOST_VALUES)
+    return file
 
 
 async def resolved(hub: Hub, target: Followed, source: Source) -> ParamSet:
@@ -179,7 +225,7 @@ async def resolved(hub: Hub, target: Followed, source: Source) -> ParamSet:
         when = kept.at if kept.snapshot is None else kept.snapshot
         return await past(hub, kept.key, kept.component, when)
     if source.values is not None:
-        return ParamSet({name: await _value(target, name, given) for name, given in source.values.items()})
+        return await _valued(hub, target, source.values)
     if source.defaults:
         raise UsageError("the firmware's defaults are a base to compare with, and nothing besides")
     return await state(hub, target, source.at if source.snapshot is None else source.snapshot)
@@ -326,5 +372,22 @@ def _choose(file: ParamFile, target: Followed, component: int | None) -> ParamSe
     return file.choose(wanted, system=target.component.system if is_of_several else None)
 
 
-async def _value(target: Followed, name: str, given: ValueGiven) -> WrittenParam:
-    return WrittenParam(check_name(name), await value_of(target, name, given))
+async def _valued(hub: Hub, target: Followed, values: dict[str, ValueGiven]) -> ParamSet:
+    """Values as a set. What bits mean tells the vehicle, one by one; the others are read in a thread."""
+    of_bits = {
+        name: await value_of(target, name, given) for name, given in values.items() if isinstance(given, Bits)
+    }
+    metadata = target.metadata
+
+    def work() -> ParamSet:
+        return ParamSet(
+            {
+                name: WrittenParam(
+                    check_name(name),
+                    value_meant(metadata, name, given) if not isinstance(given, Bits) else of_bits[name],
+                )
+                for name, given in values.items()
+            }
+        )
+
+    return await hub.read_aside(work)

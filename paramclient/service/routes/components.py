@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
+import anyio.lowlevel
 from fastapi import APIRouter, Depends, Request, Response
 from pydantic import Field
 
@@ -11,12 +12,14 @@ from paramclient.client import HEARING_PATIENCE
 from paramclient.component import Component
 from paramclient.documents.base import Body
 from paramclient.documents.component import ComponentDoc, ComponentsDoc
+from paramclient.service.answering import document_answer
 from paramclient.service.asking import LinkName, Seconds, Target, TheHub, answered, may_write
 from paramclient.service.following import Followed
+from paramclient.service.reading import BodyRoute
 
 __all__ = ["router"]
 
-router = APIRouter(prefix="/api/v1", tags=["components"])
+router = APIRouter(prefix="/api/v1", tags=["components"], route_class=BodyRoute)
 
 Id = Annotated[int | None, Field(ge=1, le=255)]
 
@@ -53,13 +56,19 @@ class Restarted(Body):
     timeout_s: Seconds = None
 
 
-@router.get("/components")
-async def all_components(hub: TheHub) -> ComponentsDoc:
+@router.get("/components", response_model=ComponentsDoc)
+async def all_components(hub: TheHub) -> Response:
     """Everyone who is heard, and the number of the event up to which that holds."""
     for followed in hub.followed:
         followed.look()
+        await anyio.lowlevel.checkpoint()
     place = hub.feed.place
-    return ComponentsDoc(run=place.run, seq=place.seq, components=[each.document for each in hub.followed])
+    documents = []
+    for followed in hub.followed:
+        documents.append(followed.document)
+        await anyio.lowlevel.checkpoint()
+    found = ComponentsDoc(run=place.run, seq=place.seq, components=documents)
+    return await document_answer(hub.aside, lambda: found)
 
 
 @router.get("/components/{system}/{component}")

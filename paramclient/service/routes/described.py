@@ -2,27 +2,28 @@
 
 from __future__ import annotations
 
-from fnmatch import fnmatchcase
-from typing import Annotated, Final
+from typing import Annotated
 
-from fastapi import APIRouter, Depends, Query, Request
+from fastapi import APIRouter, Depends, Query, Request, Response
 
 from paramclient.documents.base import Body
 from paramclient.documents.param import DescribedDoc, InfosDoc
 from paramclient.metadata import Metadata, metadata_of, read_content
+from paramclient.patterns import NameChoice
+from paramclient.service.answering import document_answer
 from paramclient.service.asking import Seconds, Target, TheHub, answered, may_write
 from paramclient.service.following import Followed
 from paramclient.service.problems import ServiceError
+from paramclient.service.reading import BodyRoute, long_request
 from paramclient.service.request import LARGEST_DESCRIPTION
 from paramclient.service.routes.files import RAW_BODY, body_of
-from paramclient.service.wanted import LONGEST_NAME
+from paramclient.service.wanted import LONGEST_NAME, MOST_PATTERNS
 
 __all__ = ["router"]
 
-router = APIRouter(prefix="/api/v1/components/{system}/{component}", tags=["descriptions"])
-
-MOST_PATTERNS: Final = 64
-"""Patterns of one request."""
+router = APIRouter(
+    prefix="/api/v1/components/{system}/{component}", tags=["descriptions"], route_class=BodyRoute
+)
 
 
 class Asked(Body):
@@ -31,23 +32,25 @@ class Asked(Body):
     timeout_s: Seconds = None
 
 
-@router.get("/metadata")
+@router.get("/metadata", response_model=InfosDoc)
 async def known_infos(
+    hub: TheHub,
     target: Target,
     names: Annotated[
         list[str], Query(max_length=MOST_PATTERNS, description="Such as MC_*; any of them.")
     ] = [],  # noqa: B006 - FastAPI copies it
-) -> InfosDoc:
+) -> Response:
     """What is known here of the parameters that the component has."""
     metadata = target.metadata
     if metadata is None:
         raise ServiceError(404, "not-described", "Nothing is known here of what its parameters mean.")
-    chosen = [
-        name
-        for name in target.component.params
-        if not names or any(fnmatchcase(name, pattern) for pattern in names)
-    ]
-    return InfosDoc.of(metadata, chosen)
+    known = list(target.component.params)
+
+    def document() -> InfosDoc:
+        chosen = NameChoice(names)
+        return InfosDoc.of(metadata, [name for name in known if not names or chosen.has(name)])
+
+    return await document_answer(hub.aside, document)
 
 
 @router.post("/metadata")
@@ -68,7 +71,8 @@ async def described_by_file(
 ) -> DescribedDoc:
     """Take the descriptions of a file, for as long as the service runs."""
     content = await body_of(request, LARGEST_DESCRIPTION)
-    return _take(target, await hub.read_aside(lambda: read_content(content, source=name)))
+    with long_request(request):
+        return _take(target, await hub.read_aside(lambda: read_content(content, source=name)))
 
 
 def _take(target: Followed, metadata: Metadata) -> DescribedDoc:

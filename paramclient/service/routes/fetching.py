@@ -14,14 +14,25 @@ from paramclient.documents.call import FetchedAllDoc, FetchResultDoc, SilentDoc
 from paramclient.documents.job import JobDoc, JobsDoc
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.protocol.sampling import SAMPLE_SIZE
-from paramclient.service.asking import LinkName, Seconds, Target, TheHub, answered, asker_of, may_write
+from paramclient.service.answering import JSON, document_answer, written_out
+from paramclient.service.asking import (
+    LinkName,
+    Seconds,
+    Target,
+    TheHub,
+    answered,
+    asker_of,
+    holder_of,
+    may_write,
+)
 from paramclient.service.hub import Hub
 from paramclient.service.jobs import Job
 from paramclient.service.problems import problem_of
+from paramclient.service.reading import BodyRoute
 
 __all__ = ["accepted", "awaited", "router"]
 
-router = APIRouter(prefix="/api/v1", tags=["fetches"])
+router = APIRouter(prefix="/api/v1", tags=["fetches"], route_class=BodyRoute)
 
 
 class Fetched(Body):
@@ -55,6 +66,7 @@ async def fetch(
     job = hub.begin_fetch(
         target,
         asker_of(request),
+        holder_of(request),
         refresh=body.refresh,
         accept=body.accept,
         sample=body.sample,
@@ -76,16 +88,21 @@ async def fetch_everybody(
     return await answered(request, lambda: _fetch_everybody(hub, body, link), *hub.followed)
 
 
-@router.get("/jobs")
-async def jobs(hub: TheHub) -> JobsDoc:
+@router.get("/jobs", response_model=JobsDoc)
+async def jobs(hub: TheHub) -> Response:
     """What is under way, and what was lately."""
-    return JobsDoc(jobs=hub.jobs.documents)
+    documents = hub.jobs.later_documents
+
+    def write() -> bytes:
+        return written_out(JobsDoc(jobs=[]), jobs=(document() for document in documents))
+
+    return Response(await hub.aside(write), media_type=JSON)
 
 
-@router.get("/jobs/{job}")
-async def one_job(hub: TheHub, job: str) -> JobDoc:
+@router.get("/jobs/{job}", response_model=JobDoc)
+async def one_job(hub: TheHub, job: str) -> Response:
     """One of them."""
-    return hub.jobs.document(job)
+    return await document_answer(hub.aside, hub.jobs.later_document(job))
 
 
 @router.delete("/jobs/{job}", status_code=204)

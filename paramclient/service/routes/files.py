@@ -4,26 +4,26 @@ from __future__ import annotations
 
 import re
 import time
-from collections.abc import Callable
-from functools import partial
 from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request, Response
 
 from paramclient.documents.written import FormDoc, FormsDoc, UploadedDoc
 from paramclient.errors import UsageError
-from paramclient.files import FileForm, ParamFile, dumps, loads
+from paramclient.files import FileForm, dumps
 from paramclient.files.model import ENDINGS
 from paramclient.identity import autopilot_name
 from paramclient.paramset import ParamSet
+from paramclient.service.answering import document_answer
 from paramclient.service.asking import Target, TheHub, answered
 from paramclient.service.hub import Hub
+from paramclient.service.reading import long_request
 from paramclient.service.wanted import (
     LARGEST_UPLOAD,
     LONGEST_NAME,
     check_size,
     known_set,
-    parsed,
+    read_upload,
     state,
     when_of,
 )
@@ -85,7 +85,7 @@ async def file(
     return await answered(request, work, target)
 
 
-@router.post("/files", openapi_extra=RAW_BODY)
+@router.post("/files", response_model=UploadedDoc, openapi_extra=RAW_BODY)
 async def files(
     request: Request,
     hub: TheHub,
@@ -93,15 +93,19 @@ async def files(
     form: Annotated[FileForm | None, Query()] = None,
     component: Id = None,
     system: Id = None,
-) -> UploadedDoc:
+) -> Response:
     """Read a parameter file of any form; it is kept nowhere.
 
     Of a file with several components, `params` are those of the autopilot, or of the one that is named.
     """
     data = await body_of(request, LARGEST_UPLOAD)
-    read: Callable[[], ParamFile] = partial(loads, data, source=name, form=form)
-    found = await parsed(hub, read)
-    return UploadedDoc.of(found, found.choose(component, system=system))
+
+    def document() -> UploadedDoc:
+        found = read_upload(data, name, form)
+        return UploadedDoc.of(found, found.choose(component, system=system))
+
+    with long_request(request):
+        return await document_answer(hub.read_aside, document)
 
 
 def moment(text: str) -> float | int:

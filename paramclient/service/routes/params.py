@@ -7,18 +7,20 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from fnmatch import fnmatchcase
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import anyio
+import anyio.lowlevel
 from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import Field
 
 from paramclient.asked import SETTLE_MAX
-from paramclient.documents.base import Body, Document
+from paramclient.documents.base import Body, Document, InParts
 from paramclient.documents.call import NotSetDoc, SetManyDoc, SetResultDoc
 from paramclient.documents.param import ParamDoc
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
+from paramclient.patterns import NameChoice
+from paramclient.service.answering import JSON
 from paramclient.service.asking import (
     Seconds,
     Target,
@@ -29,26 +31,26 @@ from paramclient.service.asking import (
     may_write,
     value_of,
 )
-from paramclient.service.following import Followed
+from paramclient.service.following import Followed, param_text
 from paramclient.service.problems import problem_of
+from paramclient.service.reading import BodyRoute
+from paramclient.service.wanted import MOST_PATTERNS, MOST_VALUES
 from paramclient.values import Param
+
+if TYPE_CHECKING:
+    from paramclient.metadata import Metadata
 
 __all__ = ["router"]
 
-router = APIRouter(prefix="/api/v1/components/{system}/{component}", tags=["parameters"])
+router = APIRouter(
+    prefix="/api/v1/components/{system}/{component}", tags=["parameters"], route_class=BodyRoute
+)
 
-MOST_PATTERNS = 64
-"""Patterns of one request."""
-MOST_VALUES = 10_000
-"""Values of one request: more than a table has."""
-JSON = "application/json"
+
+AT_ONCE = 1_000
+"""Parameters that are written out before others are served: that takes 10 ms."""
 
 Name = Annotated[str, Field(min_length=1, max_length=16)]
-
-
-Patterns = Annotated[
-    list[str] | None, Query(max_length=MOST_PATTERNS, description="Such as MC_*; one of them must fit.")
-]
 
 
 class ParamsDoc(Document):
@@ -96,7 +98,7 @@ class Write(Body):
 class WriteMany(Body):
     """Several values, by name."""
 
-    values: Annotated[dict[Name, ValueGiven], Field(min_length=1, max_length=MOST_VALUES)]
+    values: Annotated[dict[Name, ValueGiven], InParts, Field(min_length=1, max_length=MOST_VALUES)]
     settle_s: Settle = 0.0
     force: Force = False
     timeout_s: Seconds = None
@@ -115,18 +117,20 @@ async def known_params(
     metadata: Annotated[bool, Query(description="With what is known beside the values.")] = False,
 ) -> Response:
     """All that is known of the parameters, with no traffic."""
-    params: Mapping[str, Param] = target.component.params
-    chosen = [
-        param
-        for name, param in params.items()
-        if (not names or any(fnmatchcase(name, pattern) for pattern in names))
-        and (not changed or param.is_changed)
-    ]
+    params = list(target.component.params.values())
+    if names:
+        params = await hub.aside(lambda: _named(params, names))
+    chosen = [param for param in params if not changed or param.is_changed]
     target.look()
-    text = ",".join(_texts_with_metadata(target, chosen)) if metadata else target.texts(chosen)[1:-1]
     place = hub.feed.place
     head = f'{{"run":"{place.run}","seq":{place.seq},"params":{{'
-    return Response(f"{head}{text}}}}}", media_type=JSON)
+    described = target.metadata if metadata else None
+    if described is None:
+        texts = await _texts(target, chosen)
+        return Response(f"{head}{texts}}}}}", media_type=JSON)
+    heard_at = {param.name: target.heard_at(param.name) for param in chosen}
+    texts = await hub.aside(lambda: _texts_with_metadata(chosen, described, heard_at))
+    return Response(f"{head}{texts}}}}}", media_type=JSON)
 
 
 @router.get("/params/{name:path}", responses={200: {"model": ParamDoc}}, response_class=Response)
@@ -208,8 +212,33 @@ def _text_with_metadata(target: Followed, param: Param) -> str:
     return document.model_dump_json()
 
 
-def _texts_with_metadata(target: Followed, params: list[Param]) -> list[str]:
-    return [f"{json.dumps(each.name)}:{_text_with_metadata(target, each)}" for each in params]
+def _named(params: list[Param], names: list[str]) -> list[Param]:
+    choice = NameChoice(names)
+    return [param for param in params if choice.has(param.name)]
+
+
+async def _texts(target: Followed, params: list[Param]) -> str:
+    """The members of a JSON object, a part at a time: others are served in between."""
+    parts = []
+    for start in range(0, len(params), AT_ONCE):
+        parts.append(target.texts(params[start : start + AT_ONCE])[1:-1])
+        await anyio.lowlevel.checkpoint()
+    return ",".join(parts)
+
+
+def _texts_with_metadata(
+    params: list[Param], metadata: Metadata, heard_at: Mapping[str, float | None]
+) -> str:
+    """The same with what is known of each; in any thread."""
+    return ",".join(
+        f"{json.dumps(each.name)}:"
+        + (
+            param_text(each, heard_at[each.name])
+            if (info := metadata.get(each.name)) is None
+            else ParamDoc.kept(each, info, heard_at=heard_at[each.name], whole=True).model_dump_json()
+        )
+        for each in params
+    )
 
 
 def _unknown(target: Followed, name: str) -> UnknownParameter:

@@ -4,26 +4,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import partial
 from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Depends, Path, Query, Request, Response
 from pydantic import Field, model_validator
 
 from paramclient.cache import HISTORY_LINES, CutOff, HistoryEntry
-from paramclient.documents.base import Body
+from paramclient.documents.base import Body, InParts
 from paramclient.documents.cached import CachedTableDoc, VehicleDoc, VehiclesDoc
-from paramclient.documents.fleet import FleetDiffDoc
+from paramclient.documents.fleet import FleetDiffDoc, NameSpreadDoc
 from paramclient.documents.past import HistoryDoc, SnapshotDoc, SnapshotsDoc, WholeSnapshotDoc
 from paramclient.documents.written import SetDoc
 from paramclient.errors import UsageError
 from paramclient.files import FileForm
 from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.service.answering import JSON, document_answer, written_out
 from paramclient.service.asking import Target, TheHub, answered, may_write
 from paramclient.service.following import Followed
 from paramclient.service.hub import Hub
 from paramclient.service.problems import ServiceError
+from paramclient.service.reading import BodyRoute, long_request
 from paramclient.service.routes.files import Form, From, attachment, moment
 from paramclient.service.wanted import (
+    FewPatterns,
     GivenFile,
     Moment,
     cached,
@@ -39,13 +43,15 @@ from paramclient.values import check_name
 
 __all__ = ["router"]
 
-router = APIRouter(prefix="/api/v1", tags=["history"])
+router = APIRouter(prefix="/api/v1", tags=["history"], route_class=BodyRoute)
 
 LONGEST_PAGE: Final = 1_000
 """Lines of history in one answer."""
 A_PAGE: Final = 100
 MOST_NAMES: Final = 1_000
 """Names and patterns that a fleet is compared in."""
+MOST_CELLS: Final = 250_000
+"""Names times vehicles of one comparison of a fleet: its answer has up to 30 MB."""
 
 Key = Annotated[str, Path(max_length=400, description="As /vehicles names it, percent-encoded.")]
 Id = Annotated[int, Path(ge=1, le=255)]
@@ -72,12 +78,16 @@ class FleetCompared(Body):
 
     names: (
         Annotated[
-            tuple[Annotated[str, Field(min_length=1, max_length=64)], ...], Field(max_length=MOST_NAMES)
+            tuple[Annotated[str, Field(min_length=1, max_length=64)], ...],
+            Field(max_length=MOST_NAMES, fail_fast=True),
+            FewPatterns,
         ]
         | None
     ) = None
     file: GivenFile | None = None
-    values: Annotated[dict[str, int | float], Field(min_length=1, max_length=MOST_NAMES)] | None = None
+    values: Annotated[dict[str, int | float], InParts, Field(min_length=1, max_length=MOST_NAMES)] | None = (
+        None
+    )
     component: Annotated[int, Field(ge=1, le=255)] | None = None
 
     @model_validator(mode="after")
@@ -90,7 +100,7 @@ class FleetCompared(Body):
 # of who is heard
 
 
-@router.get("/components/{system}/{component}/history")
+@router.get("/components/{system}/{component}/history", response_model=HistoryDoc)
 async def history(
     request: Request,
     hub: TheHub,
@@ -99,7 +109,7 @@ async def history(
     limit: Limit = A_PAGE,
     since: Since = None,
     before: Before = None,
-) -> HistoryDoc:
+) -> Response:
     """How the values of a component have changed, the newest last."""
     return await answered(request, lambda: _history(hub, target, name, limit, since, before))
 
@@ -127,22 +137,23 @@ async def set_down(request: Request, hub: TheHub, target: Target, body: SetDown)
     return await answered(request, work)
 
 
-@router.get("/components/{system}/{component}/snapshots/{snapshot}")
-async def one_snapshot(request: Request, hub: TheHub, target: Target, snapshot: Snapshot) -> WholeSnapshotDoc:
+@router.get("/components/{system}/{component}/snapshots/{snapshot}", response_model=WholeSnapshotDoc)
+async def one_snapshot(request: Request, hub: TheHub, target: Target, snapshot: Snapshot) -> Response:
     """A snapshot with its parameters."""
 
-    async def work() -> WholeSnapshotDoc:
+    async def work() -> Response:
         return await _snapshot(hub, await _key(hub, target), target.component.component, snapshot)
 
     return await answered(request, work)
 
 
-@router.get("/components/{system}/{component}/state")
-async def state_at(request: Request, hub: TheHub, target: Target, at: At) -> SetDoc:
+@router.get("/components/{system}/{component}/state", response_model=SetDoc)
+async def state_at(request: Request, hub: TheHub, target: Target, at: At) -> Response:
     """The table of a component as it was at a time."""
 
-    async def work() -> SetDoc:
-        return SetDoc.of(await state(hub, target, at))
+    async def work() -> Response:
+        found = await state(hub, target, at)
+        return await document_answer(hub.aside, lambda: SetDoc.of(found))
 
     return await answered(request, work)
 
@@ -150,22 +161,25 @@ async def state_at(request: Request, hub: TheHub, target: Target, at: At) -> Set
 # of everyone in the cache
 
 
-@router.get("/vehicles")
-async def vehicles(hub: TheHub) -> VehiclesDoc:
+@router.get("/vehicles", response_model=VehiclesDoc)
+async def vehicles(hub: TheHub) -> Response:
     """Every vehicle that was ever heard, the one heard last first, with what is kept of it."""
     cache = the_cache(hub)
     await written(hub)
     known, tables = await hub.aside(lambda: (cache.vehicles(), cache.components()))
-    return VehiclesDoc(vehicles=[VehicleDoc.of(each, tables) for each in known])
+    return await document_answer(
+        hub.aside, lambda: VehiclesDoc(vehicles=[VehicleDoc.of(each, tables) for each in known])
+    )
 
 
-@router.get("/vehicles/{key:path}/{component}/params")
-async def kept_params(hub: TheHub, key: Key, component: Id) -> CachedTableDoc:
+@router.get("/vehicles/{key:path}/{component}/params", response_model=CachedTableDoc)
+async def kept_params(hub: TheHub, key: Key, component: Id) -> Response:
     """The parameters of a vehicle as they were last known."""
-    return CachedTableDoc.of(await cached(hub, key, component), kept=True)
+    table = await cached(hub, key, component)
+    return await document_answer(hub.aside, lambda: CachedTableDoc.of(table, kept=True))
 
 
-@router.get("/vehicles/{key:path}/{component}/history")
+@router.get("/vehicles/{key:path}/{component}/history", response_model=HistoryDoc)
 async def kept_history(
     hub: TheHub,
     key: Key,
@@ -174,7 +188,7 @@ async def kept_history(
     limit: Limit = A_PAGE,
     since: Since = None,
     before: Before = None,
-) -> HistoryDoc:
+) -> Response:
     """How its values have changed, the newest last."""
     await cached(hub, key, component)
     return await _page(hub, key, component, name, limit, since, before)
@@ -187,17 +201,18 @@ async def kept_snapshots(hub: TheHub, key: Key, component: Id) -> SnapshotsDoc:
     return await _snapshots(hub, key, component)
 
 
-@router.get("/vehicles/{key:path}/{component}/snapshots/{snapshot}")
-async def kept_snapshot(hub: TheHub, key: Key, component: Id, snapshot: Snapshot) -> WholeSnapshotDoc:
+@router.get("/vehicles/{key:path}/{component}/snapshots/{snapshot}", response_model=WholeSnapshotDoc)
+async def kept_snapshot(hub: TheHub, key: Key, component: Id, snapshot: Snapshot) -> Response:
     """A snapshot with its parameters."""
     await cached(hub, key, component)
     return await _snapshot(hub, key, component, snapshot)
 
 
-@router.get("/vehicles/{key:path}/{component}/state")
-async def kept_state(hub: TheHub, key: Key, component: Id, at: At) -> SetDoc:
+@router.get("/vehicles/{key:path}/{component}/state", response_model=SetDoc)
+async def kept_state(hub: TheHub, key: Key, component: Id, at: At) -> Response:
     """Its table as it was at a time."""
-    return SetDoc.of(await past(hub, key, component, at))
+    found = await past(hub, key, component, at)
+    return await document_answer(hub.aside, lambda: SetDoc.of(found))
 
 
 @router.get("/vehicles/{key:path}/{component}/file", responses=_FILE, response_class=Response)
@@ -209,9 +224,14 @@ async def kept_file(
     return await attachment(hub, await past(hub, key, component, when), form)
 
 
-@router.post("/fleet/diff")
-async def fleet_diff(hub: TheHub, body: FleetCompared) -> FleetDiffDoc:
+@router.post("/fleet/diff", response_model=FleetDiffDoc)
+async def fleet_diff(request: Request, hub: TheHub, body: FleetCompared) -> Response:
     """Compare all vehicles in the cache: in some parameters with each other, or with what is wanted."""
+    with long_request(request):
+        return await _fleet_diff(hub, body)
+
+
+async def _fleet_diff(hub: Hub, body: FleetCompared) -> Response:
     cache = the_cache(hub)
     wanted: ParamSet | tuple[str, ...]
     if body.file is not None:
@@ -227,7 +247,16 @@ async def fleet_diff(hub: TheHub, body: FleetCompared) -> FleetDiffDoc:
     await written(hub)
     await hub.aside(cache.components)  # whether it can be read at all
     found = await known_to(hub, lambda: cache.fleet_diff(wanted, component=body.component))
-    return FleetDiffDoc.of(found)
+    cells = len(found.names) * len(found.vehicles)
+    if cells > MOST_CELLS:
+        few = MOST_CELLS // len(found.vehicles)
+        what = f"Of {len(found.vehicles)} vehicles, {few} names may be compared at once, not more."
+        raise ServiceError(413, "too-large", what, most=MOST_CELLS)
+    spreads = (NameSpreadDoc.of(each) for each in found.names)
+    head = FleetDiffDoc(
+        component=found.component, vehicles=len(found.vehicles), different=found.differs, names=[]
+    )
+    return Response(await hub.read_aside(lambda: written_out(head, names=spreads)), media_type=JSON)
 
 
 async def _key(hub: Hub, target: Followed) -> str:
@@ -244,7 +273,7 @@ async def _key(hub: Hub, target: Followed) -> str:
 
 async def _history(
     hub: Hub, target: Followed, name: str | None, limit: int, since: float | None, before: float | None
-) -> HistoryDoc:
+) -> Response:
     key = await _key(hub, target)
     return await _page(hub, key, target.component.component, name, limit, since, before)
 
@@ -257,7 +286,7 @@ async def _page(
     limit: int,
     since: float | None,
     before: float | None,
-) -> HistoryDoc:
+) -> Response:
     """The newest lines before a time; those of one moment stay together, as that tells the next page."""
     cache = the_cache(hub)
     most = limit + 1 if before is None else HISTORY_LINES
@@ -267,15 +296,17 @@ async def _page(
     page = lines[-limit:]
     told = [] if name is not None else await _cut_off(hub, key, component, since, before)
     if len(page) == len(lines):
-        return HistoryDoc.of(page, exact=True, cut_off=told)
+        return await document_answer(hub.aside, partial(HistoryDoc.of, page, exact=True, cut_off=told))
     if before is None and lines[0].at == page[0].at:  # there may be more of them
         lines = await hub.aside(lambda: cache.history(key, component, name, HISTORY_LINES, since))
     oldest = page[0].at
     page = [*_same_moment(lines[: len(lines) - len(page)], oldest), *page]
     if len(page) == len(lines):
-        return HistoryDoc.of(page, exact=True, cut_off=told)
+        return await document_answer(hub.aside, partial(HistoryDoc.of, page, exact=True, cut_off=told))
     told = [note for note in told if note.at >= oldest]
-    return HistoryDoc.of(page, exact=True, before=oldest, cut_off=told)
+    return await document_answer(
+        hub.aside, partial(HistoryDoc.of, page, exact=True, before=oldest, cut_off=told)
+    )
 
 
 async def _cut_off(
@@ -303,10 +334,11 @@ async def _snapshots(hub: Hub, key: str, component: int) -> SnapshotsDoc:
     return SnapshotsDoc.of(await hub.aside(lambda: cache.snapshots(key, component)), exact=True)
 
 
-async def _snapshot(hub: Hub, key: str, component: int, number: int) -> WholeSnapshotDoc:
+async def _snapshot(hub: Hub, key: str, component: int, number: int) -> Response:
     cache = the_cache(hub)
     kept = await hub.aside(lambda: cache.snapshots(key, component))
     for each in kept:
         if each.id == number:
-            return WholeSnapshotDoc.whole(each, await past(hub, key, component, number))
+            found = await past(hub, key, component, number)
+            return await document_answer(hub.aside, partial(WholeSnapshotDoc.whole, each, found))
     raise ServiceError(404, "unknown-snapshot", f"There is no snapshot {number} of it.")

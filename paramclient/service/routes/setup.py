@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
-from typing import Annotated, Final, TypeVar
+from typing import Final, TypeVar
 
 import anyio
 from fastapi import APIRouter, Depends, Request, Response
-from pydantic import Field, model_validator
+from pydantic import model_validator
 
 from paramclient.compare import compare, defaults_of
 from paramclient.documents.base import Body, Document
@@ -20,27 +20,26 @@ from paramclient.metadata import Metadata, MetadataStore
 from paramclient.paramset import ParamSet
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, apply, overlay, prepare, restore
 from paramclient.provision.applying import restored
-from paramclient.service.asking import Seconds, Target, TheHub, answered, asker_of, may_write
+from paramclient.provision.looking import prepare_aside
+from paramclient.service.answering import document_answer
+from paramclient.service.asking import Seconds, Target, TheHub, answered, asker_of, holder_of, may_write
 from paramclient.service.following import Followed
 from paramclient.service.hub import Hub
 from paramclient.service.jobs import Job, Kind
 from paramclient.service.problems import ServiceError
+from paramclient.service.reading import BodyRoute, long_request
 from paramclient.service.routes.fetching import accepted, awaited
-from paramclient.service.wanted import Moment, Number, Source, known_set, resolved, state
+from paramclient.service.wanted import Moment, Number, Patterns, Source, known_set, resolved, state
 from paramclient.taken import NO_DEFAULTS, whole_set
 
 __all__ = ["router"]
 
-router = APIRouter(prefix="/api/v1/components/{system}/{component}", tags=["set-ups"])
+router = APIRouter(prefix="/api/v1/components/{system}/{component}", tags=["set-ups"], route_class=BodyRoute)
 
-MOST_PATTERNS: Final = 10_000
-"""Names and patterns of one request: the page sends the names that were chosen, one by one."""
 PROGRESS_INTERVAL: Final = 0.25
 """Seconds between two events that tell how far a set-up is."""
 
 Result = TypeVar("Result")
-Pattern = Annotated[str, Field(min_length=1, max_length=64)]
-Patterns = Annotated[tuple[Pattern, ...], Field(max_length=MOST_PATTERNS)]
 
 
 class Compared(Body):
@@ -103,26 +102,41 @@ class Restored(Body):
         return self.at if self.snapshot is None else self.snapshot
 
 
-@router.post("/diff")
-async def diff(request: Request, hub: TheHub, target: Target, body: Compared) -> DiffDoc:
+@router.post("/diff", response_model=DiffDoc)
+async def diff(request: Request, hub: TheHub, target: Target, body: Compared) -> Response:
     """Compare parameters, as the left side, with those of a component, as the right one."""
-    return await answered(request, lambda: _diff(hub, target, body), target)
+    with long_request(request):
+        return await answered(request, lambda: _diff(hub, target, body), target)
 
 
-@router.post("/plan")
-async def plan(request: Request, hub: TheHub, target: Target, body: Wanted) -> PlanDoc:
+@router.post("/plan", response_model=PlanDoc)
+async def plan(request: Request, hub: TheHub, target: Target, body: Wanted) -> Response:
     """Work out what a set-up would send, in which order, and what not and why. Nothing is written."""
     system, component = target.address
-    found = await answered(request, lambda: _plan(hub, target, body), target)
-    return PlanDoc.of(found, system=system, component=component, full=body.full)
+
+    async def work() -> Response:
+        found = await _plan(hub, target, body)
+        return await document_answer(
+            hub.read_aside, lambda: PlanDoc.of(found, system=system, component=component, full=body.full)
+        )
+
+    with long_request(request):
+        return await answered(request, work, target)
 
 
-@router.post("/verify")
-async def verify(request: Request, hub: TheHub, target: Target, body: Wanted) -> VerifiedDoc:
+@router.post("/verify", response_model=VerifiedDoc)
+async def verify(request: Request, hub: TheHub, target: Target, body: Wanted) -> Response:
     """Compare a component with what it should have. Nothing is written."""
     system, component = target.address
-    found = await answered(request, lambda: _plan(hub, target, body), target)
-    return VerifiedDoc.of(found, system=system, component=component, full=body.full)
+
+    async def work() -> Response:
+        found = await _plan(hub, target, body)
+        return await document_answer(
+            hub.read_aside, lambda: VerifiedDoc.of(found, system=system, component=component, full=body.full)
+        )
+
+    with long_request(request):
+        return await answered(request, work, target)
 
 
 @router.post(
@@ -155,7 +169,7 @@ async def apply_(request: Request, hub: TheHub, target: Target, body: Applied) -
             progress=tell,
         )
 
-    job = _begin(hub, "apply", target, asker, work, full=body.full)
+    job = _begin(hub, "apply", target, request, work, full=body.full)
     return await _result(request, job, waits=body.wait)
 
 
@@ -169,7 +183,8 @@ async def restore_(request: Request, hub: TheHub, target: Target, body: Restored
     """Bring an earlier state of a component back, with its own identity and calibration."""
     asker = asker_of(request)
     if body.dry_run:
-        found = await answered(request, lambda: _plan_back(hub, target, body), target)
+        with long_request(request):
+            found = await answered(request, lambda: _plan_back(hub, target, body), target)
         system, component = target.address
         return PlanDoc.of(found, system=system, component=component, full=body.full)
 
@@ -187,26 +202,30 @@ async def restore_(request: Request, hub: TheHub, target: Target, body: Restored
             progress=tell,
         )
 
-    job = _begin(hub, "restore", target, asker, work, full=body.full)
+    job = _begin(hub, "restore", target, request, work, full=body.full)
     return await _result(request, job, waits=body.wait)
 
 
-async def _diff(hub: Hub, target: Followed, body: Compared) -> DiffDoc:
+async def _diff(hub: Hub, target: Followed, body: Compared) -> Response:
     left = await resolved(hub, target, body.wanted)
     base = None
     if body.base is not None and not body.base.defaults:
         base = await resolved(hub, target, body.base)
     right = await _present(target, body)
     if body.base is not None and body.base.defaults:
-        base = defaults_of(left, right)
+        base = await hub.read_aside(lambda: defaults_of(left, right))
         if not base:
             raise UsageError(NO_DEFAULTS)
     if body.partial:
         right = replace(right, params={name: param for name, param in right.items() if name in left})
-    outcome = compare(left, right, base=base, names=body.only or None)
     sets = [left, right] if base is None else [left, right, base]
     found = [*await _described(hub, target, sets), None][:3]
-    return DiffDoc.of(outcome, *found, everything=body.full)
+
+    def document() -> DiffDoc:
+        outcome = compare(left, right, base=base, names=body.only or None)
+        return DiffDoc.of(outcome, *found, everything=body.full)
+
+    return await document_answer(hub.read_aside, document)
 
 
 async def _present(target: Followed, body: Compared) -> ParamSet:
@@ -232,7 +251,8 @@ async def _wanted(hub: Hub, target: Followed, body: Wanted) -> ParamSet:
     found = await resolved(hub, target, body.wanted)
     if body.over is not None:
         found = overlay(found, await resolved(hub, target, body.over))
-    return found.only(body.only) if body.only else found
+    whole = found
+    return await hub.read_aside(lambda: whole.only(body.only)) if body.only else whole
 
 
 async def _plan(hub: Hub, target: Followed, body: Wanted) -> Plan:
@@ -240,7 +260,9 @@ async def _plan(hub: Hub, target: Followed, body: Wanted) -> Plan:
 
     async def work() -> Plan:
         include, info = body.include, target.metadata
-        return await prepare(target.component, wanted, include=include, info=info, force=body.force)
+        return await prepare_aside(
+            target.component, wanted, hub.read_aside, include=include, info=info, force=body.force
+        )
 
     return await _within(target, body.timeout_s, work)
 
@@ -268,7 +290,7 @@ def _begin(
     hub: Hub,
     kind: Kind,
     target: Followed,
-    asker: str,
+    request: Request,
     work: Callable[[Callable[[ApplyProgress], None]], Awaitable[ApplyResult]],
     *,
     full: bool,
@@ -276,7 +298,7 @@ def _begin(
     """Begin to set a component up, as a job; one at a time, as two would undo each other's work.
 
     Raises:
-        ServiceError: one is under way.
+        ServiceError: one is under way, or too many jobs are.
     """
     for other in hub.jobs.all:
         if other.state == "running" and other.kind != "fetch" and other.followed is target:
@@ -313,7 +335,7 @@ def _begin(
                 await hub.end_note(note, is_cut_off=hub.is_closing and not is_whole)
         return ApplyResultDoc.of(result, system=system, component=component, full=full)
 
-    return hub.jobs.begin(kind, target, run, asker)
+    return hub.jobs.begin(kind, target, run, asker_of(request), holder_of(request))
 
 
 async def _result(request: Request, job: Job, *, waits: bool) -> Document | Response:
