@@ -35,10 +35,10 @@ from paramclient import (
 from paramclient.documents.param import ParamDoc
 from paramclient.remote import RemoteClient, RemoteComponent
 from paramclient.remote.address import TOKEN_VARIABLE, ServiceAddress, chosen_token
+from paramclient.remote.bounded import MOST_EVENT, EventReader
 from paramclient.remote.mirror import MOST_WAITING, Mirror
 from paramclient.remote.problems import error_of
 from paramclient.remote.reading import number_of, param_of, value_as_sent
-from paramclient.remote.requests import MOST_EVENT, _EventReader
 from paramclient.values import Value, from_bits, type_name
 
 WHOM: dict[str, Any] = {"system": 1, "component": 1}
@@ -229,8 +229,10 @@ def test_a_problem_that_no_exception_stands_behind() -> None:
 
 
 def cut(text: bytes, size: int) -> list[str]:
-    reader = _EventReader()
-    return [each for at in range(0, len(text), size) for each in reader.receive(text[at : at + size])]
+    reader = EventReader()
+    return [
+        each.decode() for at in range(0, len(text), size) for each in reader.receive(text[at : at + size])
+    ]
 
 
 def test_events_are_read_however_they_are_cut() -> None:
@@ -241,7 +243,7 @@ def test_events_are_read_however_they_are_cut() -> None:
 
 
 def test_an_event_without_end() -> None:
-    reader = _EventReader()
+    reader = EventReader()
     for _ in range(MOST_EVENT >> 20):
         reader.receive(b"x" * (1 << 20))
     with pytest.raises(ValueError, match="without end"):

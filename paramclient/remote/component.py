@@ -6,6 +6,7 @@ import weakref
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
+from types import NoneType
 from typing import TYPE_CHECKING, Any, Final, NoReturn, SupportsFloat, SupportsIndex, TypeAlias
 
 import anyio
@@ -28,6 +29,7 @@ from paramclient.remote.mirror import Mirror
 from paramclient.remote.problems import NotHeard, error_of
 from paramclient.remote.reading import (
     Document,
+    check_kind,
     fetch_result_of,
     hash_of,
     identity_of,
@@ -401,9 +403,31 @@ class RemoteComponent(Component):
             changes.end(error)
 
     def _read(self, document: Document) -> None:
-        self._document = document
+        _check(document)
         self._identity = identity_of(document["identity"])
+        self._document = document
         self._told_at = anyio.current_time()
+
+
+def _check(document: Document) -> None:
+    """See that the members have their kinds that are read when somebody asks for them.
+
+    Raises:
+        KeyError, TypeError, ValueError: one has not.
+    """
+    for name in ("autopilot", "encoding_reason", "state"):
+        check_kind(document[name], str)
+    Encoding(document["encoding"])
+    SyncState(document["sync_state"])
+    hash_of(document["hash"])
+    check_kind(document["count"], int, NoneType)
+    check_kind(document["is_armed"], bool, NoneType)
+    check_kind(document["silence_s"], int, float)
+    check_kind(document["round_trip_s"], int, float, NoneType)
+    last = document["last_fetch"]
+    if last is not None:
+        check_kind(last["source"], str)
+        check_kind(last["elapsed_s"], int, float)
 
 
 NOTHING_YET: Final = Progress(0, None, 0.0, None)

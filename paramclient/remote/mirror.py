@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Final
 
 from paramclient.protocol.change import Change
 from paramclient.values import Param, Trust
 
 __all__ = ["MOST_WAITING", "Mirror"]
 
-MOST_WAITING = 20_000
+MOST_NAMES: Final = 65_535
+"""Names in a table, as in that of the service."""
+MOST_WAITING: Final = 20_000
 """Changes that are kept while a table is being loaded; with more it is loaded again instead."""
 
 
@@ -43,10 +46,15 @@ class Mirror:
 
         Returns:
             What is different from before, or None where it has to be loaded again.
+
+        Raises:
+            ValueError: it has more names than there can be.
         """
         waiting, self._waiting = self._waiting, None
         if waiting is None:
             return None
+        if len(params) > MOST_NAMES:
+            raise ValueError(f"a table of more than {MOST_NAMES} names")
         before, self._told = self._told, dict(params)
         self.is_loaded, self._seq = True, seq
         self.params.clear()
@@ -58,7 +66,11 @@ class Mirror:
         return changes
 
     def take(self, seq: int, change: Change) -> Change | None:
-        """Take one change; give it, if it is one of the value."""
+        """Take one change; give it, if it is one of the value.
+
+        Raises:
+            ValueError: the table would have more names than there can be.
+        """
         if not self.is_loaded:
             if self._waiting is not None:
                 self._waiting.append((seq, change))
@@ -67,9 +79,11 @@ class Mirror:
             return None
         if seq <= self._seq:
             return None
-        self._seq = seq
         name, new, by = change.name, change.new, change.by
         old = self._told.get(name)
+        if old is None and new is not None and len(self._told) >= MOST_NAMES:
+            raise ValueError(f"a table of more than {MOST_NAMES} names")
+        self._seq = seq
         if new is None:
             self._told.pop(name, None)
             self.params.pop(name, None)

@@ -30,6 +30,8 @@ __all__ = ["NotHeard", "error_of"]
 
 Problem = Mapping[str, Any]
 
+LONGEST_DETAIL: Final = 10_000
+"""Characters of an explanation: one that names each bad line of a file has some thousands."""
 _OF_USER: Final = (400, 401, 403, 413, 421, 422)
 """States of answers (RFC 9110) that say that the request itself cannot be right, whoever else is told so."""
 
@@ -50,6 +52,7 @@ def error_of(problem: Problem, *, status: int, link: str) -> ParamClientError:
         KeyError, TypeError, ValueError: it is not what it says that it is.
     """
     detail = str(problem.get("detail") or problem.get("title") or f"the service answers {status}")
+    detail = detail[:LONGEST_DETAIL]
     make = _MAKERS.get(str(problem.get("error")))
     if make is not None:
         return make(detail, problem)

@@ -18,6 +18,7 @@ from paramclient.values import Param, ParamType, Trust, Value, from_bits
 
 __all__ = [
     "Document",
+    "check_kind",
     "fetch_result_of",
     "hash_of",
     "identity_of",
@@ -35,6 +36,8 @@ __all__ = [
 Document = Mapping[str, Any]
 
 _WORDS: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
+_IDENTITY: Final = {"link": (str,), "git_hash": (str,), "uid": (str, type(None))}
+"""What those members of an identity are that are no numbers."""
 _FLOAT32: Final = struct.Struct("<f")
 
 
@@ -105,7 +108,20 @@ def hash_of(told: str | None) -> int | None:
 
 def identity_of(document: Document) -> Identity:
     """Who a vehicle is; what this version does not know is left out."""
-    return Identity(**{each.name: document[each.name] for each in fields(Identity)})
+    told = {each.name: document[each.name] for each in fields(Identity)}
+    for name, value in told.items():
+        check_kind(value, *_IDENTITY.get(name, (int,)))
+    return Identity(**told)
+
+
+def check_kind(value: object, *kinds: type) -> None:
+    """See that a value is of one of these kinds; a boolean is no number.
+
+    Raises:
+        TypeError: it is not.
+    """
+    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+        raise TypeError(f"{value!r:.40} is not what it should be")
 
 
 def progress_of(document: Document) -> Progress:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-import json
+import math
 import os
 import socket
 import ssl
@@ -17,7 +17,9 @@ import httpx
 
 from paramclient.errors import LinkError, ParamClientError, UsageError
 from paramclient.remote.address import TOKEN_VARIABLE, ServiceAddress
+from paramclient.remote.bounded import MOST_ANSWER, EventReader, Pace, checked_document, decoder_of
 from paramclient.remote.problems import error_of
+from paramclient.remote.reading import understood
 from paramclient.version import __version__
 
 __all__ = ["Answer", "Place", "Requests", "Unreached"]
@@ -28,10 +30,10 @@ OPEN_TIMEOUT: Final = 10.0
 SILENCE: Final = 6.0
 """Seconds without a word on the event stream after which the service counts as away: it says something every
 two. A vehicle counts as lost after five."""
-MOST_ANSWER: Final = 64 << 20
-"""Bytes that an answer may have: the largest table there can be takes some 15 million."""
-MOST_EVENT: Final = 16 << 20
-"""Bytes that one event may have: one that names every parameter of the largest table takes two million."""
+HELLO_PATIENCE: Final = 10.0
+"""Seconds for the first event of a stream, which the service sends at once."""
+LONGEST_PLACE: Final = 64
+"""Characters of a place: a run has 16 digits, a number 18 at most."""
 MOST_CONNECTIONS: Final = 200
 """Requests that are under way at once; further ones wait for their turn."""
 KEEPALIVE: Final = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3}
@@ -49,7 +51,8 @@ class Place(NamedTuple):
     def read(cls, text: str | None) -> Place | None:
         """What `RUN-SEQ` says; None for anything else."""
         run, dash, seq = (text or "").rpartition("-")
-        return cls(run, int(seq)) if dash and seq.isdecimal() else None
+        is_one = dash and seq.isdecimal() and len(run) + len(seq) < LONGEST_PLACE
+        return cls(run, int(seq)) if is_one else None
 
     def __str__(self) -> str:
         return f"{self.run}-{self.seq}"
@@ -124,20 +127,29 @@ class Requests:
             await self._http.aclose()
 
     async def ask(
-        self, method: str, path: str, body: Mapping[str, Any] | None = None, *, link: str | None = None
+        self,
+        method: str,
+        path: str,
+        body: Mapping[str, Any] | None = None,
+        *,
+        link: str | None = None,
+        patience: float | None = None,
     ) -> Answer:
-        """Send a request and wait for its answer, however long that takes. Cancelled, it is withdrawn.
+        """Send a request and wait for its answer. Cancelled, it is withdrawn.
 
         Args:
             method, path: behind the prefix.
             body: as JSON, or None for none.
             link: which link is meant, or None.
+            patience: seconds until the answer begins; None for however long that takes. An answer that has
+                begun has to go on, see `Pace`.
 
         Raises:
             Unreached: there was no answer.
             ParamClientError: that of a problem; LinkError for what is no answer of a service.
         """
-        async with self._sent(method, path, body, {} if link is None else {"link": link}) as response:
+        query = {} if link is None else {"link": link}
+        async with self._sent(method, path, body, query, None, patience) as response:
             content = await self._read(response)
             place = Place.read(response.headers.get("X-Seq"))
             if response.is_success and not content:
@@ -154,22 +166,35 @@ class Requests:
         Raises:
             Unreached, ParamClientError: as in `ask`; while listening, Unreached when it ends.
         """
-        headers = {"Accept": "text/event-stream"} | ({} if after is None else {"Last-Event-ID": str(after)})
+        headers = {"Accept": "text/event-stream", "Accept-Encoding": "identity"} | (
+            {} if after is None else {"Last-Event-ID": str(after)}
+        )
         async with self._sent("GET", "/events", None, {}, headers, OPEN_TIMEOUT) as response:
             kind = response.headers.get("Content-Type", "")
+            if response.headers.get("Content-Encoding", "identity") != "identity":
+                raise self._foreign()
             if not (response.is_success and kind.startswith("text/event-stream")):
                 raise self._error(response, self._document(response, await self._read(response)))
             async with aclosing(self._heard(response)) as heard:
                 yield heard
 
     async def _heard(self, response: httpx.Response) -> AsyncGenerator[list[Any], None]:
-        chunks = response.aiter_bytes().__aiter__()
-        reader = _EventReader()
+        chunks = response.aiter_raw().__aiter__()
+        reader = EventReader()
+        now = anyio.current_time()
+        pace, hello_ends = Pace(now), now + HELLO_PATIENCE
         while True:
             try:
-                with anyio.fail_after(SILENCE):
+                patience = min(SILENCE, pace.left(reader.size, now), hello_ends - now)
+                with anyio.fail_after(patience):
                     chunk = await anext(chunks)
-                yield [json.loads(text) for text in reader.receive(chunk)]
+                now = anyio.current_time()
+                events = [checked_document(data) for data in reader.receive(chunk)]
+                if events:
+                    hello_ends = math.inf
+                if reader.size <= len(chunk):  # the last event has begun in it
+                    pace = Pace(now)
+                yield events
             except TimeoutError:
                 raise self._unreached("says nothing any more", None) from None
             except StopAsyncIteration:
@@ -215,14 +240,25 @@ class Requests:
 
     async def _read(self, response: httpx.Response) -> bytes:
         content = bytearray()
+        pace, received = Pace(anyio.current_time()), 0
+        chunks = response.aiter_raw().__aiter__()
         try:
-            async for chunk in response.aiter_bytes():
-                content += chunk
-                if len(content) > MOST_ANSWER:
+            decode = decoder_of(response.headers.get("Content-Encoding", "").strip().lower())
+            while True:
+                with anyio.fail_after(pace.left(received, anyio.current_time())):
+                    chunk = await anext(chunks, None)
+                if chunk is None:
+                    return bytes(content)
+                received += len(chunk)
+                content += decode(chunk, MOST_ANSWER - len(content))
+                if max(len(content), received) > MOST_ANSWER:
                     raise LinkError(f"{self.name}: an answer without end", link=self.name)
-        except (httpx.TransportError, httpx.DecodingError) as error:
+        except TimeoutError:
+            raise self._unreached("answers too slowly", None) from None
+        except httpx.TransportError as error:
             raise self._unreached(_reason(error), error) from error
-        return bytes(content)
+        except ValueError as error:
+            raise self._foreign() from error
 
     def _document(self, response: httpx.Response, content: bytes) -> Any:
         kind = response.headers.get("Content-Type", "").partition(";")[0].strip()
@@ -231,7 +267,7 @@ class Requests:
         if kind not in ("application/json", "application/problem+json"):
             raise self._foreign()
         try:
-            return json.loads(content)
+            return checked_document(content)
         except ValueError as error:
             raise self._foreign() from error
 
@@ -246,8 +282,9 @@ class Requests:
         if problem.get("error") == "ClientClosed" or str(problem.get("type")).endswith(":closing"):
             raise self._unreached("is closing", None)
         try:
-            return error_of(problem, status=status, link=self.name)
-        except (KeyError, TypeError, ValueError):
+            with understood(self.name):
+                return error_of(problem, status=status, link=self.name)
+        except LinkError:
             return self._foreign()
 
     def _unreached(self, words: str, cause: Exception | None, *, may_be_done: bool = True) -> Unreached:
@@ -257,33 +294,6 @@ class Requests:
 
     def _foreign(self) -> LinkError:
         return LinkError(f"{self.name} answers, but not as a service of paramclient does", link=self.name)
-
-
-class _EventReader:
-    """Server-sent events (WHATWG HTML, "Server-sent events") to the data of each; their ids stand in it."""
-
-    def __init__(self) -> None:
-        self._rest = b""
-        self._data: list[bytes] = []
-
-    def receive(self, chunk: bytes) -> list[str]:
-        """The data of the events that end with this chunk.
-
-        Raises:
-            ValueError: one is too long.
-        """
-        *lines, self._rest = (self._rest + chunk).split(b"\n")
-        if len(self._rest) > MOST_EVENT:
-            raise ValueError("an event without end")
-        events = []
-        for line in lines:
-            field, _, value = line.rstrip(b"\r").partition(b":")
-            if field == b"data":
-                self._data.append(value.removeprefix(b" "))
-            elif not field and not value and self._data:
-                events.append(b"\n".join(self._data).decode())
-                self._data = []
-        return events
 
 
 def _socket_options() -> list[tuple[int, int, int]]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import anyio
 
-from paramclient.errors import LinkError, NoReply
+from paramclient.errors import LinkError, NoReply, ParamClientError
 from paramclient.events import Event, Events, Found, Lost, Rebooted, Resynced
 from paramclient.remote.component import Key, RemoteComponent
 from paramclient.remote.connection import Connection
@@ -27,6 +27,10 @@ UNSURE: Final = ("cached", "lost")
 MOST_GONE: Final = 1_000
 """Components that the service knows no more and that are the same when it hears them again; of older ones
 nobody is told any more."""
+ANSWER_PATIENCE: Final = 30.0
+"""Seconds until the service begins to give a list or a table, which it has at hand."""
+MOST_COMPONENTS: Final = 4_096
+"""Components that a service may have on all its links."""
 RETRY_PAUSE: Final = 1.0
 """Seconds until a table is asked for again that could not be loaded."""
 
@@ -138,6 +142,8 @@ class Roster:
         key = key_of(document)
         component = self.components.get(key)
         if component is None:
+            if len(self.components) >= MOST_COMPONENTS:
+                raise ValueError(f"more than {MOST_COMPONENTS} components")
             component = self._gone.pop(key, None) or RemoteComponent(self._client, document, seq)
             component._return(document, seq)
             self.components[key] = component
@@ -208,7 +214,7 @@ class Roster:
                     await self.load_list()
                 else:
                     await self._load(next(iter(self._stale.values())))
-            except (Unreached, LinkError) as error:
+            except (Unreached, ParamClientError) as error:
                 logger.info("%s: a table could not be loaded: %s", self._requests.name, error)
                 await anyio.sleep(RETRY_PAUSE)
 
@@ -255,9 +261,12 @@ class Roster:
 
     async def _snapshot(self, path: str, link: str | None) -> Document:
         """What is known on the service at one moment, of the run whose events are heard."""
-        answer: Document = (await self._requests.ask("GET", path, link=link)).document
+        asked = await self._requests.ask("GET", path, link=link, patience=ANSWER_PATIENCE)
+        answer: Document = asked.document
         place = self.connection.place
-        if place is None or answer.get("run") != place.run:
+        with understood(self._requests.name):
+            is_of_run = place is not None and answer["run"] == place.run
+        if not is_of_run:
             raise LinkError(f"{self._requests.name}: it has started again", link=self._requests.name)
         return answer
 
