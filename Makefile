@@ -6,7 +6,8 @@
 #   make bench      speed of parser and start      make dist       wheel and sdist, into dist
 #   make cost       CPU and memory                 make peers      downloads beside other programs
 #   make scale      250 systems on one link        make fuzz       each target of fuzz/ for a while
-#   make soak       10,000 sessions at random      make clean      remove all that was made
+#   make soak       10,000 sessions at random      make kills      1,000 programs killed as they write
+#   make clean      remove all that was made
 #   make screenshots  what the page looks like, into docs/images
 #   make live LINK=udpin:127.0.0.1:14550   checks on a real vehicle, which must be disarmed
 
@@ -19,6 +20,7 @@ BIN = $(VENV)/bin
 PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 TESTS ?=
 SESSIONS ?= 10000
+KILLS ?= 1000
 TARGETS ?= cache component files framer metadata pack signing tlog
 SECONDS ?= 1800
 LINK ?=
@@ -39,7 +41,7 @@ WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)
 # the tests start some hundred processes; without bytecode each would compile paramclient anew, and each worker the tests
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test coverage soak live fuzz lint docs screenshots bench cost scale peers dist clean
+.PHONY: demo test coverage soak kills live fuzz lint docs screenshots bench cost scale peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -57,6 +59,9 @@ coverage: $(VENV)/with-test
 
 soak: $(VENV)/with-test
 	$(BIN)/python -m tests.soak --sessions $(SESSIONS)
+
+kills: $(VENV)/with-test
+	$(BIN)/python bench/kills.py --kills $(KILLS)
 
 # without LINK it says how to call it; see docs/testing.md
 live: $(VENV)/with-test

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, SupportsFloat, SupportsIndex, TypeVar
 import anyio
 
 from paramclient.asked import check_accepted, check_asked, check_asked_name, check_settle
-from paramclient.errors import NoReply, ParamClientError, UsageError
+from paramclient.errors import CacheError, NoReply, NotDurable, ParamClientError, UsageError
 from paramclient.events import Changes
 from paramclient.identity import Identity, autopilot_name
 from paramclient.params import ParamMap
@@ -196,6 +196,7 @@ class Component:
         timeout: float | None = None,
         settle: float = 0.0,
         force: bool = False,
+        durable: bool = False,
         asker: str | None = None,
     ) -> SetResult:
         """Write one parameter and prove by its value that the vehicle has taken it.
@@ -213,6 +214,8 @@ class Component:
                 `changes`.
             force: send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot,
                 which ignores them.
+            durable: return only when the value and its line of history are on the disk, past a loss of power.
+                Without it they are written within 0.25 s, and a loss of power may cost them later too.
             asker: for whom it is done, in printable ASCII: the change, and its line of history, are then by
                 "us for ASKER".
 
@@ -227,12 +230,16 @@ class Component:
             TypeMismatch: it holds the parameter in another type.
             ValueNotApplied: it keeps the value it had and gives no reason.
             NoReply: it did not answer. Whether it has taken the value is not known, as after cancellation.
+            NotDurable: the vehicle has taken the value, and it could not be written to the disk.
+            CacheError: with `durable`, nothing can be written to the disk; nothing was sent.
             LinkError: the link failed, or the client was closed.
         """
         if check_asked_name(name) == HASH_CHECK:
             raise UsageError(f"{HASH_CHECK} is no parameter: it can be read, and not written")
         machine = self._machine
         self._client._check_open()
+        if durable:
+            await self._wait_until_kept()
         write = machine.write(
             name,
             check_value(value),
@@ -243,9 +250,16 @@ class Component:
         )
         try:
             what = f"PARAM_SET {name} to {self.system}/{self.component}"
-            return await self._wait(write, timeout, lambda: (what, write.attempts))
+            result = await self._wait(write, timeout, lambda: (what, write.attempts))
         finally:
             machine.writes.cancel(write, anyio.current_time())
+        if durable:
+            try:
+                await self._client._writer.write_durably(machine)
+            except CacheError as error:
+                what = f"{self.system}/{self.component} has taken {name}, but it is not on the disk: {error}"
+                raise NotDurable(what) from error
+        return result
 
     async def fetch_all(
         self,
@@ -431,6 +445,22 @@ class Component:
                 with anyio.move_on_after(self._heard_at + patience - now):
                     await self._cache_is_read.wait()
                 self._client._check_open()
+
+    async def _wait_until_kept(self) -> None:
+        """Wait until what is heard of it goes to the cache, as long as that may take.
+
+        Raises:
+            UsageError: the client keeps no cache.
+            CacheError: that is not so in time.
+        """
+        writer = self._client._writer
+        if self._client.cache is None:
+            raise UsageError("durable needs a cache, and the client keeps none")
+        with anyio.move_on_after(IDENTITY_PATIENCE + CACHE_PATIENCE):
+            await self._cache_is_read.wait()
+        self._client._check_open()
+        if (why := writer.obstacle(self._machine)) is not None:
+            raise CacheError(f"nothing was set: {why}, so it could not be written to the disk")
 
     def _listen(self, changes: Changes) -> None:
         """Tell of what changes from now on, for as long as this is held."""

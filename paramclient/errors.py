@@ -23,7 +23,8 @@ The tree says who is to blame::
     │   └── ClientClosed              the client was closed while a call waited, or is not open
     ├── PackError                     a packed parameter file that is none
     └── CacheError                    the cache on disk
-        └── NotInCache                it can be read, and does not have what was asked for
+        ├── NotInCache                it can be read, and does not have what was asked for
+        └── NotDurable                the vehicle has taken a value, and the disk has not
 
 Each carries what is known as attributes, so that a program need not read its text.
 """
@@ -47,6 +48,7 @@ __all__ = [
     "LinkError",
     "MetadataError",
     "NoReply",
+    "NotDurable",
     "NotInCache",
     "PackError",
     "ParamClientError",
@@ -423,3 +425,7 @@ class CacheError(ParamClientError):
 
 class NotInCache(CacheError):
     """The cache can be read, and does not have the table, the snapshot or the state that was asked for."""
+
+
+class NotDurable(CacheError):
+    """The vehicle has taken what was written with `durable`, and the disk has not: a crash may lose it."""

@@ -4,10 +4,19 @@ from __future__ import annotations
 
 import os
 import stat
+import sys
 from pathlib import Path
 from typing import Final
 
-__all__ = ["GROUP_READS", "OF_OTHERS", "OTHERS_WRITE", "has_trusted_owner", "make_private", "mode_of"]
+__all__ = [
+    "GROUP_READS",
+    "OF_OTHERS",
+    "OTHERS_WRITE",
+    "has_trusted_owner",
+    "is_own",
+    "make_private",
+    "mode_of",
+]
 
 OF_OTHERS: Final = 0o077
 """The bits of a file's mode that let others than its owner get at it."""
@@ -18,12 +27,17 @@ GROUP_READS: Final = 0o040
 
 def mode_of(status: os.stat_result) -> int:
     """Return what a file's mode allows to whom, without its kind; of Windows, which has no such modes, 0."""
-    return stat.S_IMODE(status.st_mode) if os.name == "posix" else 0
+    return 0 if sys.platform == "win32" else stat.S_IMODE(status.st_mode)
+
+
+def is_own(status: os.stat_result) -> bool:
+    """Return whether a file belongs to the user of this process; of Windows, which does not say, True."""
+    return sys.platform == "win32" or status.st_uid == os.geteuid()
 
 
 def has_trusted_owner(status: os.stat_result) -> bool:
     """Return whether a file belongs to the user of this process, or to root, who can change it anyway."""
-    return os.name != "posix" or status.st_uid in (0, os.geteuid())
+    return is_own(status) or status.st_uid == 0
 
 
 def make_private(path: Path) -> int:

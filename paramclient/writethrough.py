@@ -103,6 +103,7 @@ class WriteThrough:
         self._flushing = anyio.Lock()
         self._failure: CacheError | UsageError | None = None  # None once it could be written again
         self._failures = 0
+        self._syncs_begun = self._synced = 0  # the number of the last one that has succeeded
         self._tables: dict[tuple[int, int], bool] = {}
         self._something_to_write = anyio.Event()
         self._bringing: set[ComponentMachine] = set()
@@ -257,6 +258,34 @@ class WriteThrough:
             if failures == self._failures and await self._flush(is_last=True):
                 return
         raise CacheError(f"what was heard last could not be written: {self._failure}") from self._failure
+
+    def obstacle(self, machine: ComponentMachine) -> str | None:
+        """Why nothing of a component can be written at present, in words; None where it can."""
+        if self._cache is None:
+            return "the client keeps no cache"
+        if machine not in self._kept or self._is_doubted(machine):
+            return f"it is not known which vehicle {machine.system}/{machine.component} is"
+        return None
+
+    async def write_durably(self, machine: ComponentMachine) -> None:
+        """Have all that was heard of a component on the disk, past a loss of power.
+
+        Calls at the same time share the work.
+
+        Raises:
+            CacheError: it cannot be written. It is kept, and written when that is possible.
+        """
+        cache, begun = self._cache, self._syncs_begun
+        async with self._flushing:
+            if self._synced <= begun:  # else one that was begun after this call has succeeded
+                self._syncs_begun += 1
+                number = self._syncs_begun
+                is_done = cache is not None and await self._flush(is_last=True)
+                if cache is None or not (is_done and await self._run(partial(_sync, cache))):
+                    raise CacheError(f"it could not be written: {self._failure}") from self._failure
+                self._synced = number
+        if (why := self.obstacle(machine)) is not None:
+            raise CacheError(why)
 
     async def _flush(self, *, is_last: bool) -> bool:
         portion: list[_News] = []
@@ -569,6 +598,11 @@ def _firmware(identity: Identity) -> tuple[int, str]:
 
 def _save(cache: ParamCache, updates: list[TableUpdate], clock: Callable[[], float]) -> bool:
     cache.save(updates, clock=clock)
+    return True
+
+
+def _sync(cache: ParamCache) -> bool:
+    cache.sync()
     return True
 
 

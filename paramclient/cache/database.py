@@ -1,7 +1,9 @@
 """The file: opened when needed, shared with other processes, and set aside when it cannot be trusted.
 
 SQLite in WAL mode with synchronous=NORMAL. What was committed survives the death of a process at any moment;
-a power cut may take the last transactions, never the file.
+a power cut may take the last transactions, never the file. A durable transaction is committed with
+synchronous=FULL: the log is synchronised with the disk before the call returns, and with it all that was
+committed before (SQLite, "PRAGMA synchronous").
 
 The structure of the file is checked when it is opened; each table has a checksum of its own, checked when it
 is read. Only a file that is empty, or a database with our application id, is ever changed or renamed;
@@ -34,7 +36,7 @@ from paramclient.cache.lock import BUSY_TIMEOUT, locked
 from paramclient.cache.rows import Damaged
 from paramclient.cache.schema import MIGRATIONS, Step
 from paramclient.errors import CacheError
-from paramclient.ownership import OF_OTHERS, OTHERS_WRITE, make_private, mode_of
+from paramclient.ownership import OF_OTHERS, OTHERS_WRITE, is_own, make_private, mode_of
 
 __all__ = ["APPLICATION_ID", "Database"]
 
@@ -128,17 +130,21 @@ class Database:
         """
         return self._run(work, writing=False)
 
-    def write(self, work: Work[T]) -> T:
+    def write(self, work: Work[T], *, durable: bool = False) -> T:
         """Do work in one transaction that holds the file's only write lock; all of it happens, or nothing.
 
         Creates the file (mode 0600) and its folder (0700). The work is done again, from the start, where the
         file had to be set aside.
 
+        Args:
+            work: what is done.
+            durable: return when this, and all that was written before, is on the disk, past a loss of power.
+
         Raises:
             CacheError: the file cannot be written: read-only, disk full, held for too long by another
                 process.
         """
-        return self._run(work, writing=True)
+        return self._run(work, writing=True, durable=durable)
 
     def close(self) -> None:
         """Close the file; every later operation raises CacheError. Closing again does nothing."""
@@ -146,7 +152,7 @@ class Database:
             self._closed = True
             self._drop()
 
-    def _run(self, work: Work[T], *, writing: bool) -> T:
+    def _run(self, work: Work[T], *, writing: bool, durable: bool = False) -> T:
         with self._lock:
             if self._closed:
                 raise CacheError(f"the cache {self.path} is closed")
@@ -155,7 +161,7 @@ class Database:
                     if not writing and self._is_absent():
                         with _fresh(MIGRATIONS) as nothing:
                             return work(nothing)
-                    return self._transact(work, writing=writing)
+                    return self._transact(work, writing=writing, durable=durable)
                 except _Empty:
                     self._drop()
                     with _fresh(MIGRATIONS) as nothing:
@@ -174,13 +180,19 @@ class Database:
                     raise
             raise CacheError(f"the cache {self.path} is damaged or replaced again and again")
 
-    def _transact(self, work: Work[T], *, writing: bool) -> T:
+    def _transact(self, work: Work[T], *, writing: bool, durable: bool) -> T:
         """One try. Where it fails the connection is left as it is; to close it takes the transaction back."""
         try:
             connection = self._connected(writing=writing)
+            if durable:
+                connection.execute("PRAGMA synchronous = FULL")
             connection.execute("BEGIN IMMEDIATE" if writing else "BEGIN")
             result = work(connection)
+            if durable:  # the same version once more: what writes nothing synchronises nothing
+                connection.execute(f"PRAGMA user_version = {len(MIGRATIONS)}")
             connection.execute("COMMIT")
+            if durable:
+                connection.execute("PRAGMA synchronous = NORMAL")
         except (sqlite3.ProgrammingError, sqlite3.InterfaceError):
             raise  # the program's mistake, not the file's
         except sqlite3.Error as error:
@@ -237,6 +249,7 @@ class Database:
         self._make_private()
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
+        connection.execute("PRAGMA fullfsync = ON")  # of macOS, whose fsync leaves data in the drive's cache
         connection.execute("PRAGMA foreign_keys = ON")
         if version < len(MIGRATIONS) or not self._is_ours:
             connection.execute("BEGIN IMMEDIATE")
@@ -353,10 +366,10 @@ class Database:
         Raises:
             CacheError: it is another user's.
         """
-        if self._link is None or os.name != "posix":
+        if self._link is None:
             return
         status = _status(self.path) or self._link.lstat()
-        if status.st_uid != os.geteuid():
+        if not is_own(status):
             raise CacheError(
                 f"{self._link} leads to a file of another user, {self.path}, and is not followed"
             )

@@ -24,7 +24,13 @@ T_co = TypeVar("T_co", covariant=True)
 
 
 class Operation(ABC, Generic[T_co]):
-    """One change of a cache. It happens as a whole, or not at all."""
+    """One change of a cache. It happens as a whole, or not at all.
+
+    Attributes:
+        is_durable: whether it is done only when it is on the disk, past a loss of power.
+    """
+
+    is_durable: bool = False
 
     @property
     @abstractmethod
@@ -48,10 +54,12 @@ class Save(Operation[None]):
         updates: in the order given.
         clock: gives the present by the clock that their times were read from; None for `at` of each, which is
             what counts after a wait, too.
+        is_durable: as in `Operation`; without updates it is about all that was saved before.
     """
 
     updates: Sequence[TableUpdate]
     clock: Callable[[], float] | None = field(default=None, compare=False)
+    is_durable: bool = field(default=False, compare=False)
 
     @property
     def tables(self) -> Iterable[tuple[str, int | None]]:

@@ -96,7 +96,7 @@ class LocalCopy:
             )
             return result
 
-        return self._write(work)
+        return self._write(work, durable=operation.is_durable)
 
     def waiting(self, limit: int) -> list[Entry]:
         """What waits, the oldest first; without what the database has refused."""
@@ -173,13 +173,13 @@ class LocalCopy:
         """Close the file."""
         self.database.close()
 
-    def _write(self, work: Callable[[SqliteSession], T]) -> T:
+    def _write(self, work: Callable[[SqliteSession], T], *, durable: bool = False) -> T:
         def whole(connection: Any) -> T:
             for statement in _TABLES:
                 connection.execute(statement)
             return work(SqliteSession(connection, is_shared=True))
 
-        return self.database.write(whole)
+        return self.database.write(whole, durable=durable)
 
 
 def packed(operation: Operation[object]) -> bytes:

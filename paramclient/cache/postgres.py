@@ -178,6 +178,11 @@ class PostgresDatabase:
                 " (SELECT DISTINCT hashtext(key) AS half FROM unnest(%s::text[]) AS key ORDER BY half) AS a",
                 (_LOCKS, keys),
             )
+            if any(operation.is_durable for operation, _, _ in operations):
+                connection.execute(
+                    "SELECT set_config('synchronous_commit', 'on', true)"
+                    " WHERE current_setting('synchronous_commit') = 'off'"
+                )
             before = _revisions(connection, keys)
             session = PostgresSession(connection)
             results = [

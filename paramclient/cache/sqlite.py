@@ -72,7 +72,11 @@ class SqliteStore:
 
     def do(self, operation: Operation[T]) -> T:
         """Write, in one transaction."""
-        return self._database.write(lambda connection: operation.do(SqliteSession(connection)))
+
+        def work(connection: sqlite3.Connection) -> T:
+            return operation.do(SqliteSession(connection))
+
+        return self._database.write(work, durable=operation.is_durable)
 
     def close(self) -> None:
         """Close the file."""

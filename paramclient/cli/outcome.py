@@ -12,6 +12,7 @@ from paramclient.errors import (
     FileTransferError,
     LinkError,
     NoReply,
+    NotDurable,
     PackError,
     ParamClientError,
     Refused,
@@ -77,5 +78,7 @@ _STATUSES: Final = {
     VehicleArmed: "armed",
     NoReply: "no-reply",
     UsageError: "invalid",
+    NotDurable: "not-durable",
+    CacheError: "cache",
     LinkError: "link",
 }

@@ -86,6 +86,7 @@ async def apply(
     allow_armed: bool = False,
     skip_invalid: bool = False,
     force: bool = False,
+    durable: bool = False,
     backup: str | None = None,
     over: Annotated[str | None, Parameter(name="--overlay")] = None,
     everybody: Everybody = False,
@@ -112,6 +113,7 @@ async def apply(
         allow_armed: Go on although it is armed.
         skip_invalid: Set the others although some values cannot be right.
         force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
+        durable: End only when the values and their lines of history are on the disk, past a loss of power.
         backup: A new file for what the vehicle has before; its ending tells the form. {uid} and {system} in
             it stand for the vehicle's own.
         over: A file that lies over the other, with {uid} or {system} in its name for the vehicle's own.
@@ -156,6 +158,7 @@ async def apply(
                 allow_armed=allow_armed,
                 skip_invalid=skip_invalid,
                 force=force,
+                durable=durable,
                 backup=None if backup is None else lambda each: backups[each.system, each.component],
                 timeout=found.deadline.left(),
                 progress=tell,

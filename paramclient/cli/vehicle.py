@@ -162,6 +162,7 @@ async def set_(
     *pairs: Annotated[str, Parameter(name="NAME VALUE", allow_leading_hyphen=True)],
     settle: Annotated[float, Parameter(validator=Number(gte=0, lte=SETTLE_MAX))] = 0.0,
     force: bool = False,
+    durable: bool = False,
     metadata: MetadataChoice = None,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
@@ -178,6 +179,7 @@ async def set_(
         settle: Seconds after the last of them until all are read once more. 1.2 shows what PX4's modules
             clamp.
         force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
+        durable: Go on only when the value and its line of history are on the disk, past a loss of power.
         metadata: A file that describes parameters; or vehicle, to ask the vehicle for what it says of them.
     """
     wanted = parse_pairs(pairs)
@@ -193,7 +195,9 @@ async def set_(
             report(problem)
         await session.check_only()
         began = anyio.current_time()
-        outcomes = [await _write(session, name, value, force=force) for name, value in writes]
+        outcomes = [
+            await _write(session, name, value, force=force, durable=durable) for name, value in writes
+        ]
         if settle:
             await anyio.sleep(settle)
             outcomes = [await _read_again(session, outcome) for outcome in outcomes]
@@ -440,10 +444,10 @@ class _Written:
         return self.name, format_value(self.requested, ParamType.REAL64), actual, self.status
 
 
-async def _write(session: Session, name: str, value: int | float, *, force: bool) -> _Written:
+async def _write(session: Session, name: str, value: int | float, *, force: bool, durable: bool) -> _Written:
     left = session.deadline.left()
     try:
-        done = await session.component.set(name, value, timeout=left, force=force)
+        done = await session.component.set(name, value, timeout=left, force=force, durable=durable)
     except ParamClientError as error:
         known = session.component.params.get(name)
         return _Written(

@@ -37,6 +37,7 @@ async def apply(
     allow_armed: bool = False,
     skip_invalid: bool = False,
     force: bool = False,
+    durable: bool = False,
     backup: str | os.PathLike[str] | None = None,
     timeout: float | None = None,
     asker: str | None = None,
@@ -67,6 +68,8 @@ async def apply(
         allow_armed: go on although it is armed.
         skip_invalid: set the others although some values cannot be right.
         force: as in `plan`.
+        durable: return only when the values and their lines of history are on the disk, past a loss of power;
+            where that fails, `error` of the result is a CacheError.
         backup: a file for the state before; its form follows from its name, see `paramclient.files`.
         timeout: seconds, after which the result says how far it came.
         asker: for whom it is done, as in `Component.set`.
@@ -77,7 +80,8 @@ async def apply(
     Raises:
         InvalidParameters: values cannot be right, and `skip_invalid` is not given.
         UsageError: as from `plan`; the plan is one for another vehicle; or SYS_AUTOCONFIG is included, which
-            takes the others back at the next start, and `reboot` is not given.
+            takes the others back at the next start, and `reboot` is not given; or `durable`, and the client
+            keeps no cache.
         VehicleArmed: it is armed, and `allow_armed` is not given.
         FileError, CacheError: the state before could not be stored.
         NoReply: the vehicle did not answer before anything was sent.
@@ -92,6 +96,7 @@ async def apply(
         allow_armed=allow_armed,
         skip_invalid=skip_invalid,
         force=force,
+        durable=durable,
         backup=backup,
         asker=asker,
         progress=progress,

@@ -35,6 +35,7 @@ async def apply_all(
     allow_armed: bool = False,
     skip_invalid: bool = False,
     force: bool = False,
+    durable: bool = False,
     backup: Callable[[Component], str | os.PathLike[str]] | None = None,
     timeout: float | None = None,
     asker: str | None = None,
@@ -47,7 +48,7 @@ async def apply_all(
         components: the vehicles.
         wanted: what they shall have: all the same; or each its own, by (system, component) or by a call.
             `overlay` puts what is one vehicle's own over what all share.
-        include, reboot, allow_armed, skip_invalid, force, timeout, asker: as in `apply`.
+        include, reboot, allow_armed, skip_invalid, force, durable, timeout, asker: as in `apply`.
         info: gives the metadata for a vehicle.
         backup: gives the name of the file for the state before of a vehicle.
         progress, before_writing: as in `apply`, with the vehicle.
@@ -71,6 +72,7 @@ async def apply_all(
             allow_armed=allow_armed,
             skip_invalid=skip_invalid,
             force=force,
+            durable=durable,
             backup=None if backup is None else backup(component),
             timeout=timeout,
             asker=asker,

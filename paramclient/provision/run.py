@@ -95,6 +95,7 @@ class Run:
         allow_armed: bool,
         skip_invalid: bool,
         force: bool,
+        durable: bool = False,
         backup: str | os.PathLike[str] | None,
         asker: str | None,
         progress: Callable[[ApplyProgress], None] | None,
@@ -116,6 +117,7 @@ class Run:
         self._allow_armed = allow_armed
         self._skip_invalid = skip_invalid
         self._force = force
+        self._durable = durable
         self._backup = backup
         self._asker = check_asker(asker)
         self._progress = progress
@@ -142,6 +144,8 @@ class Run:
 
     async def prepare(self) -> None:
         """Look at the vehicle, plan, and store what it has. Nothing is written if that fails."""
+        if self._durable and self._component._client.cache is None:
+            raise UsageError("durable needs a cache, and the client keeps none")
         check_component(self._wanted, self._component.component)
         plan({}, self._wanted, include=self._include, autopilot=self._component.autopilot)
         await identified(self._component)
@@ -181,7 +185,9 @@ class Run:
                     await anyio.sleep_until(self._written_at + LASTING_TIME)
                     await self._prove()
                 else:
-                    return
+                    break
+            if self._durable and self.sent:
+                await self._component._client._writer.write_durably(self._component._machine)
         except ParamClientError as error:
             if not self.sent:
                 raise

@@ -189,6 +189,7 @@ class RemoteComponent(Component):
         timeout: float | None = None,
         settle: float = 0.0,
         force: bool = False,
+        durable: bool = False,
         asker: str | None = None,
     ) -> SetResult:
         """See `Component.set`.
@@ -202,6 +203,8 @@ class RemoteComponent(Component):
             body["settle_s"] = settle
         if force:
             body["force"] = True
+        if durable:
+            body["durable"] = True
         answer = await self._ask(
             "params",
             body,

@@ -14,6 +14,7 @@ from paramclient.errors import (
     InvalidParameters,
     LinkError,
     NoReply,
+    NotDurable,
     NotInCache,
     ParamClientError,
     Refused,
@@ -125,5 +126,6 @@ _MAKERS: Final[dict[str, Callable[[str, Problem], ParamClientError]]] = {
     "AnotherVehicle": _another,
     "NoReply": _no_reply,
     "CacheError": lambda detail, problem: CacheError(detail),
+    "NotDurable": lambda detail, problem: NotDurable(detail),
     "NotInCache": lambda detail, problem: NotInCache(detail),
 }

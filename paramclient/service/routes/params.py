@@ -85,6 +85,10 @@ Force = Annotated[
     bool, Field(description="Whether NaN and infinity are sent to autopilots that cannot store them.")
 ]
 
+Durable = Annotated[
+    bool, Field(description="Whether it is answered only when value and history are on the disk.")
+]
+
 
 class Write(Body):
     """One value."""
@@ -92,6 +96,7 @@ class Write(Body):
     value: ValueGiven
     settle_s: Settle = 0.0
     force: Force = False
+    durable: Durable = False
     timeout_s: Seconds = None
 
 
@@ -101,6 +106,7 @@ class WriteMany(Body):
     values: Annotated[dict[Name, ValueGiven], InParts, Field(min_length=1, max_length=MOST_VALUES)]
     settle_s: Settle = 0.0
     force: Force = False
+    durable: Durable = False
     timeout_s: Seconds = None
 
 
@@ -198,7 +204,13 @@ async def _write(
 ) -> SetResultDoc:
     value = await value_of(target, name, given)
     result = await target.component.set(
-        name, value, timeout=body.timeout_s, settle=body.settle_s, force=body.force, asker=asker
+        name,
+        value,
+        timeout=body.timeout_s,
+        settle=body.settle_s,
+        force=body.force,
+        durable=body.durable,
+        asker=asker,
     )
     target.was_heard(result.param.name)
     return SetResultDoc.of(result)

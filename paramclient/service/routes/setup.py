@@ -72,6 +72,7 @@ class Applied(Wanted):
     reboot: bool = False
     allow_armed: bool = False
     skip_invalid: bool = False
+    durable: bool = False
     dry_run: bool = False
     wait: bool = True
 
@@ -164,6 +165,7 @@ async def apply_(request: Request, hub: TheHub, target: Target, body: Applied) -
             allow_armed=body.allow_armed,
             skip_invalid=body.skip_invalid,
             force=body.force,
+            durable=body.durable,
             timeout=body.timeout_s,
             asker=asker,
             progress=tell,

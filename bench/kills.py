@@ -1,0 +1,334 @@
+"""Kill programs that write the cache at random moments, and look for what is lost.
+
+    python bench/kills.py [--kills 1000] [--seed 1] [--only station,service,database] [--slack 0.5]
+
+In each round a victim runs for up to a second and sets parameters of a simulated vehicle, in every second
+round some of them with `durable`, and gets SIGKILL at a random moment, also while it starts:
+
+station   a program with a ParamClient, and a SQLite file
+service   what `paramclient serve` does, with a SQLite file; the parameters are set over HTTP
+database  the PostgreSQL of a station, with all of its processes; the station goes on, and ends in good order
+
+Then the cache is opened. It must not be damaged, and table and history must have every set that was
+acknowledged as durable, and every other one that was acknowledged more than 0.25 s and the slack before the
+kill. 0.25 s is how long changes are gathered. The slack is for a batch under way at that time, for the
+commit, and for two waits for a core where other programs take them. The table has the age of the oldest set
+that was lost. Of a database, nothing that was acknowledged may be missing, as its station lives on.
+
+Exit code 1 says that something was lost.
+"""
+
+from __future__ import annotations
+
+import argparse
+import http.client
+import json
+import logging
+import os
+import random
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from urllib.parse import urlsplit
+
+sys.path.insert(0, str(Path(__file__).parent.parent))
+
+import anyio
+
+from paramclient import ParamCache, ParamClient, service
+from paramclient.sim import PX4Vehicle
+from paramclient.writethrough import FLUSH_INTERVAL
+from tests.postgres import PROGRAMS, Server, database_on, server
+
+LONGEST_LIFE = 1.0
+"""Seconds from the first set until the kill."""
+EARLY = 0.1
+"""The share of the rounds in which the victim is killed before it has set anything."""
+DURABLE = 0.3
+"""The share of the sets that are durable, in every second round."""
+NAMES = [f"PARAM_{number:02}" for number in range(30)]
+FRESH_EVERY = 25
+"""Rounds after which a fresh cache begins: histories are bounded."""
+PATIENCE = 60.0
+
+
+@dataclass(frozen=True)
+class Acknowledged:
+    """A set that the vehicle has acknowledged, by the clock of all processes."""
+
+    name: str
+    value: int
+    durable: bool
+    at: float
+
+
+@dataclass
+class Figures:
+    """What came of the rounds of one kind of victim."""
+
+    kills: int = 0
+    sets: int = 0
+    durable: int = 0
+    lost: list[str] = field(default_factory=list)
+    oldest: float = 0.0
+    """Seconds before the kill at which the oldest set was acknowledged that was lost and may be."""
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("--kills", type=int, default=1000)
+    parser.add_argument("--seed", type=int, default=time.time_ns())
+    parser.add_argument("--only", default="station,service,database")
+    parser.add_argument("--slack", type=float, default=0.5, help="seconds")
+    options = parser.parse_args()
+    kinds = [kind for kind in options.only.split(",") if kind != "database" or PROGRAMS is not None]
+    if len(kinds) < len(options.only.split(",")):
+        print("no PostgreSQL is here: no database is killed", file=sys.stderr)
+    print(f"{options.kills} kills, seed {options.seed}", flush=True)
+    logging.disable()  # that a database is gone is what is wanted
+    dice = random.Random(options.seed)
+    figures = {kind: Figures() for kind in kinds}
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        os.environ["XDG_CACHE_HOME"] = str(folder / "home")
+        rounds = Rounds(folder, dice, options.slack, figures)
+        if "database" in kinds:
+            rounds.server = stack.enter_context(server())
+            rounds.url = stack.enter_context(database_on(rounds.server.url))
+        for number in range(options.kills):
+            kind = kinds[number] if number < len(kinds) else dice.choice(kinds)
+            rounds.play(kind, number)
+            if not (number + 1) % 50:
+                print(f"{number + 1}: {sum(len(each.lost) for each in figures.values())} lost", flush=True)
+    print(f"{'victim':10}{'kills':>7}{'sets':>9}{'durable':>9}{'lost':>6}  oldest that may be lost")
+    for kind, found in figures.items():
+        counted = f"{kind:10}{found.kills:7}{found.sets:9,}{found.durable:9,}{len(found.lost):6}"
+        print(f"{counted}  {found.oldest:.3f} s")
+    for text in (text for found in figures.values() for text in found.lost):
+        print(text)
+    return int(any(found.lost for found in figures.values()))
+
+
+class Rounds:
+    """One kill after the other.
+
+    Attributes:
+        server, url: the PostgreSQL, and a database in it.
+    """
+
+    server: Server
+    url: str
+
+    def __init__(self, folder: Path, dice: random.Random, slack: float, figures: dict[str, Figures]) -> None:
+        self._folder = folder
+        self._dice = dice
+        self._slack = slack
+        self._figures = figures
+        self._durable = 0.0
+        self._values = iter(range(1, 1 << 24))  # what a float32 tells apart, too
+
+    def play(self, kind: str, number: int) -> None:
+        """Let a victim run, kill it, and look at what is kept."""
+        place = (
+            self.url if kind == "database" else str(self._folder / f"{kind}-{number // FRESH_EVERY}.sqlite3")
+        )
+        first = next(self._values)
+        for _ in range(2_000):  # those that the victim may use
+            last = next(self._values)
+        found = self._figures[kind]
+        found.kills += 1
+        is_early = self._dice.random() < EARLY
+        life = self._dice.uniform(0.0, LONGEST_LIFE)
+        self._durable = self._dice.choice((0.0, DURABLE))
+        play = (
+            self._play_service
+            if kind == "service"
+            else partial(self._play_station, is_database=kind == "database")
+        )
+        acknowledged, killed_at = play(place, first, last, is_early=is_early, life=life)
+        found.sets += len(acknowledged)
+        found.durable += sum(each.durable for each in acknowledged)
+        self._check(kind, number, place, acknowledged, killed_at)
+
+    def _play_station(
+        self, place: str, first: int, last: int, *, is_early: bool, life: float, is_database: bool
+    ) -> tuple[list[Acknowledged], float]:
+        reading, writing = os.pipe()
+        values = range(first, last)
+        child = forked(partial(station, place, writing, values, self._durable, self._dice.random()))
+        os.close(writing)
+        with os.fdopen(reading, "rb") as told:
+            if is_early and not is_database:
+                time.sleep(life / 2)
+                said = b""
+            else:
+                said = told.readline()  # it has set something
+                time.sleep(life)
+            killed_at = time.monotonic()
+            if is_database:
+                self.server.kill()
+                time.sleep(self._dice.uniform(0.0, 0.3))
+                self.server.start()
+                time.sleep(self._dice.uniform(0.0, 0.3))
+                os.kill(child, signal.SIGTERM)
+                killed_at = float("inf")
+            else:
+                os.kill(child, signal.SIGKILL)
+            said += told.read()
+        os.waitpid(child, 0)
+        lines = (line.split() for line in said.decode().splitlines(keepends=True) if line.endswith("\n"))
+        return [
+            Acknowledged(name, int(value), durable == "True", float(at)) for name, value, durable, at in lines
+        ], killed_at
+
+    def _play_service(
+        self, place: str, first: int, last: int, *, is_early: bool, life: float
+    ) -> tuple[list[Acknowledged], float]:
+        reading, writing = os.pipe()
+        child = forked(partial(serve, place, writing))
+        os.close(writing)
+        killed: list[float] = []
+
+        def kill(_: object = None, __: object = None) -> None:
+            killed.append(time.monotonic())
+            os.kill(child, signal.SIGKILL)
+
+        acknowledged: list[Acknowledged] = []
+        before = signal.signal(signal.SIGALRM, kill)
+        with os.fdopen(reading, "rb") as told:
+            if is_early:
+                signal.setitimer(signal.ITIMER_REAL, max(life, 0.01))
+            line = told.readline()
+            if line:
+                where = urlsplit(line.decode().strip())
+                connection = http.client.HTTPConnection(where.hostname or "", where.port, timeout=PATIENCE)
+                with suppress(OSError, http.client.HTTPException):
+                    ask(connection, "POST", "/api/v1/find", {})
+                    if not is_early:
+                        signal.setitimer(signal.ITIMER_REAL, max(life, 0.01))
+                    for value in range(first, last):
+                        if killed:
+                            break
+                        name, durable = self._dice.choice(NAMES), self._dice.random() < self._durable
+                        body = {"value": value, "durable": durable}
+                        ask(connection, "PUT", f"/api/v1/components/1/1/params/{name}", body)
+                        acknowledged.append(Acknowledged(name, value, durable, time.monotonic()))
+                connection.close()
+            told.read()
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        if not killed:
+            kill()
+        os.waitpid(child, 0)
+        signal.signal(signal.SIGALRM, before)
+        return acknowledged, killed[0]
+
+    def _check(
+        self, kind: str, number: int, place: str, acknowledged: list[Acknowledged], killed_at: float
+    ) -> None:
+        """Look for every set in table and history."""
+        found = self._figures[kind]
+        with ParamCache(place) as cache:
+            tables = cache.components()
+            values: dict[str, int] = {}
+            lines: set[tuple[str, int]] = set()
+            for table in tables:
+                loaded = cache.load(table.key, table.component)
+                assert loaded is not None
+                values |= {name: int(param.value) for name, param in loaded.params.items() if name in NAMES}
+                lines |= {
+                    (line.name, int(line.new.value)) for line in loaded.history() if line.new is not None
+                }
+            if cache.away is not None:
+                found.lost.append(f"{kind} {number}: {cache.away}")
+            found.lost += [f"{kind} {number}: {note}" for note in cache.notes]
+        last = {each.name: each.value for each in acknowledged}
+        for each in acknowledged:
+            is_there = (each.name, each.value) in lines and (
+                each.value < last[each.name] or values.get(each.name, 0) >= each.value
+            )
+            age = killed_at - each.at
+            if is_there:
+                continue
+            if each.durable or age > FLUSH_INTERVAL + self._slack:
+                found.lost.append(f"{kind} {number}: {each}, {age:.3f} s before the kill")
+            else:
+                found.oldest = max(found.oldest, age)
+
+
+def forked(work: Callable[[], object]) -> int:
+    """Do something in a process of its own; the process id."""
+    child = os.fork()
+    if child:
+        return child
+    code = 1
+    try:
+        os.setsid()
+        work()
+        code = 0
+    finally:
+        os._exit(code)
+
+
+def station(place: str, told: int, values: Iterable[int], share: float, seed: float) -> None:
+    """Set parameters, and tell of each that was acknowledged."""
+    anyio.run(_station, place, told, values, share, seed)
+
+
+async def _station(place: str, told: int, values: Iterable[int], share: float, seed: float) -> None:
+    dice = random.Random(seed)
+    with anyio.open_signal_receiver(signal.SIGTERM) as signals:
+        async with anyio.create_task_group() as tasks:
+
+            async def work() -> None:
+                vehicle = PX4Vehicle(table=dict.fromkeys(NAMES, 0))
+                async with ParamClient(vehicle, cache=place) as client:
+                    component = await client.only_component()
+                    await component.fetch_all()
+                    for value in values:
+                        name, durable = dice.choice(NAMES), dice.random() < share
+                        await component.set(name, value, durable=durable)
+                        tell(told, f"{name} {value} {durable} {time.monotonic()}\n")
+                        await anyio.sleep(dice.uniform(0.0, 0.01))
+                    await anyio.sleep_forever()
+
+            tasks.start_soon(work)
+            async for _ in signals:
+                tasks.cancel_scope.cancel()
+                break
+
+
+def serve(place: str, told: int) -> None:
+    """What `paramclient serve` does, with its address on the pipe."""
+
+    async def work() -> None:
+        hub = service.Hub([PX4Vehicle(table=dict.fromkeys(NAMES, 0))], cache=place)
+        listening = service.Listening(port=0)
+        await service.serve(hub, listening=listening, listens=lambda url: tell(told, f"{url}\n"))
+
+    anyio.run(work)
+
+
+def tell(told: int, text: str) -> None:
+    os.write(told, text.encode())
+
+
+def ask(connection: http.client.HTTPConnection, method: str, path: str, body: object) -> None:
+    """One request, which succeeds.
+
+    Raises:
+        OSError, HTTPException: the service is not there any more.
+    """
+    connection.request(method, path, json.dumps(body), {"content-type": "application/json"})
+    answer = connection.getresponse()
+    text = answer.read()
+    assert answer.status == 200, text
+
+
+if __name__ == "__main__":
+    sys.exit(main())
