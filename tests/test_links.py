@@ -577,6 +577,23 @@ async def test_udp_both_kinds_speak_to_each_other(host: str) -> None:
 
 
 @pytest.mark.asyncio
+@pytest.mark.parametrize("host", LOOPBACKS)
+async def test_one_address_is_spoken_to_from_one_port_in_each_session(host: str) -> None:
+    """PX4 answers only the address and port that it heard first."""
+    shown = f"[{host}]" if ":" in host else host
+    async with opened(f"udpin:{shown}:0") as near, opened(f"udpin:{shown}:0") as far:
+        name = f"udpout:{shown}:{near.address[1]}"
+        async with opened(name) as link:
+            usual = link.address[1]
+            async with opened(name) as beside, opened(f"udpout:{shown}:{far.address[1]}") as elsewhere:
+                assert len({usual, beside.address[1], elsewhere.address[1]}) == 3
+                await beside.send(HEARTBEAT, None)
+                assert len(await collect(near, 1)) == 1
+        async with opened(name) as link:
+            assert link.address[1] == usual
+
+
+@pytest.mark.asyncio
 async def test_a_host_name_is_looked_up() -> None:
     async with opened("udpin:localhost:0") as link, opened(f"udpout:localhost:{link.address[1]}") as far:
         assert link.address[0] == "127.0.0.1"

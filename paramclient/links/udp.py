@@ -32,6 +32,7 @@ import sys
 import time
 from contextlib import suppress
 from typing import Final
+from zlib import crc32
 
 import anyio
 import anyio.lowlevel
@@ -59,6 +60,10 @@ own address from when it was opened, and this computer may have got another one 
 
 LOOK_AGAIN: Final = 10.0
 """Seconds of silence after which it is looked whether a name has another address by now."""
+
+LOCAL_PORTS: Final = range(20480, 28672)
+"""Ports that `udpout` speaks from. Linux, macOS and Windows give out ports from 32768 on by themselves, so
+other programs rarely have one of these."""
 
 AT_ONCE: Final = 0.001
 """Seconds within which the first datagram of a read was read at once: the others came later than that one."""
@@ -244,8 +249,12 @@ class UdpIn(UdpLink):
 class UdpOut(UdpLink):
     """`udpout`: speaks to one address, from one local port for as long as it is open.
 
-    Only what comes from that very address and port is heard: it is where a vehicle answers from, and PX4
-    answers only the first partner that spoke to it. Nobody need be there yet: refusals are passed over.
+    Only what comes from that very address and port is heard: it is where a vehicle answers from. Nobody need
+    be there yet: refusals are passed over.
+
+    PX4 answers only the address and port that it heard first, until it restarts (`MavlinkReceiver::run`). So
+    the local port follows from the remote address, and is the same in each session. While another program on
+    this computer has it, the system chooses another one.
 
     From a broadcast address nobody answers. There everyone who speaks to the local port is heard and is a
     peer; what is for all peers still goes to the broadcast address.
@@ -263,8 +272,8 @@ class UdpOut(UdpLink):
         family, address = (await self._resolve(socket.SOCK_DGRAM))[0]
         sock = self._new_socket(family, opening)
         try:
-            sock.bind(("", self._local_port))
-        except OSError:  # somebody else has taken it meanwhile
+            sock.bind(("", self._local_port or _usual_port(address)))
+        except OSError:  # another program has it
             sock.bind(("", 0))
         self._local_port = sock.getsockname()[1]
         self._far = address
@@ -316,6 +325,11 @@ class UdpOut(UdpLink):
             sock.send(data)
         except ConnectionRefusedError:
             sock.send(data)  # that was the answer to an earlier datagram; this one had not been sent
+
+
+def _usual_port(address: Address) -> int:
+    """Return the local port from which a remote address is spoken to, one of `LOCAL_PORTS`."""
+    return LOCAL_PORTS.start + crc32(f"{address[0]} {address[1]}".encode()) % len(LOCAL_PORTS)
 
 
 _NO_WAY_OUT = frozenset({errno.EADDRNOTAVAIL, errno.EINVAL, errno.ENETDOWN, errno.ENETUNREACH})
