@@ -16,7 +16,7 @@ from pymavlink.mavparm import MAVParmDict
 
 from paramclient import FileError, FileForm, Identity, Param, ParamFile, ParamSet, ParamType, WrittenParam
 from paramclient.errors import UsageError
-from paramclient.files import dumps, loads
+from paramclient.files import dumps, loads, tables
 from paramclient.values import Encoding, Value, bits_of, decode, from_bits
 
 DATA = Path(__file__).parent / "data"
@@ -872,3 +872,11 @@ def test_a_letter_of_a_higher_plane_in_a_header_can_be_read_again() -> None:
     file = loads("# for the \N{HELICOPTER} of Jo \U0004f78d\n\nRC1_MIN,1100\n".encode())
     for form in (FileForm.YAML, FileForm.JSON):
         assert loads(dumps(file, form=form)).header == file.header
+
+
+def test_lines_that_delete_look_at_so_many_parameters_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tables, "DELETE_LOOKS_MAX", 5)
+    rows = "A 1\nB 2\n"
+    assert len(loads(f"{rows}@delete X\n@delete A\nC 3\n".encode(), source="a.parm").sets[0]) == 2
+    with pytest.raises(FileError, match=r"a\.parm:5: .* look at 5 parameters"):
+        loads(f"{rows}@delete X\n@delete X\n@delete X\n".encode(), source="a.parm")

@@ -13,6 +13,7 @@ from typing import Any
 import anyio
 import httpx
 import pytest
+from fastapi import FastAPI
 
 from paramclient import compare as compare_room
 from paramclient import patterns
@@ -326,6 +327,18 @@ async def test_what_takes_long_is_done_in_a_thread(monkeypatch: pytest.MonkeyPat
                 answer = await browser.post(f"{C}/{path}", content=body, headers=A_JSON)
                 assert answer.status_code == 200
         assert {name: threads for name, threads in seen.items() if threads != {READER}} == {}
+
+
+@swiftly
+async def test_the_document_of_the_api_is_made_once_and_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with service() as (_, browser):
+        with threads_of(monkeypatch, (FastAPI, "openapi")) as seen:
+            documents = [(await browser.get("/openapi.json")).content for _ in range(2)]
+            assert seen == {"openapi": {"paramclient service"}}
+        with threads_of(monkeypatch, (FastAPI, "openapi")) as seen:
+            documents.append((await browser.get("/openapi.json")).content)
+            assert seen == {"openapi": set()}
+        assert len(set(documents)) == 1
 
 
 def test_a_document_is_written_as_pydantic_writes_it() -> None:

@@ -39,6 +39,8 @@ DELETED_SHOWN_MAX: Final = 10
 """Names that the note on one `@delete` line lists."""
 DELETES_MAX: Final = 256
 """`@delete` lines of one file: each looks through all parameters above it."""
+DELETE_LOOKS_MAX: Final = 1_000_000
+"""Parameters that the `@delete` lines of one file look at, one after the other: half a second."""
 _QGC_COLUMNS: Final = "Vehicle-Id Component-Id Name Value Type"
 _QGC_ROW: Final = "vehicle, component, name, value and type, with tabs between them"
 _qgc_nan: Final = re.compile(r"--\.-+").fullmatch
@@ -60,15 +62,18 @@ class _Lines:
         params: the parameters in order, each with the place where it stands, for notes.
         notes: what its `@delete` lines took out.
         deletes: how many such lines it has.
+        looks: how many parameters these have looked at.
     """
 
     params: list[tuple[WrittenParam, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     deletes: int = 0
+    looks: int = 0
 
     def delete(self, pattern: str, place: str) -> None:
         """Take out the parameters so far whose names fit a glob."""
         self.deletes += 1
+        self.looks += len(self.params)
         names = {param.name for param, _ in self.params if fnmatchcase(param.name, pattern)}
         if not names:
             self.notes.append(f"@delete {pattern} in {place} fits no parameter above it.")
@@ -140,10 +145,13 @@ def _read_lines(
             include(line, match[1])
             return
         if match := _delete(line.text):
-            if lines.deletes < DELETES_MAX:
-                lines.delete(match[1], place)
-            else:
+            if lines.deletes >= DELETES_MAX:
                 problems.add(line.number, f"at most {DELETES_MAX} lines with @delete", shown(line.text))
+            elif lines.looks + len(lines.params) > DELETE_LOOKS_MAX:
+                most = f"@delete lines that look at {DELETE_LOOKS_MAX:,} parameters together"
+                problems.add(line.number, f"at most {most}", shown(line.text))
+            else:
+                lines.delete(match[1], place)
             return
         words = _between.split(line.text)
         if words[-1] == "@READONLY":

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import hashlib
+import json
 from collections.abc import MutableMapping
 from dataclasses import dataclass, field
+from functools import cache
 from importlib import resources
 from typing import Any, Final
 
@@ -14,6 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from paramclient.service import problems
 from paramclient.service.access import AccessMiddleware, AccessSettings
+from paramclient.service.feed import COMPACT
 from paramclient.service.hub import Hub
 from paramclient.service.problems import RESPONSES, ServiceError
 from paramclient.service.routes import ROUTERS
@@ -46,6 +49,7 @@ def create_app(hub: Hub, settings: Settings | None = None) -> ASGIApp:
         title="paramclient",
         version=__version__,
         summary="MAVLink parameters of everyone who is heard on the links of this service",
+        openapi_url=None,
         docs_url=None,
         redoc_url=None,
         redirect_slashes=False,
@@ -55,6 +59,7 @@ def create_app(hub: Hub, settings: Settings | None = None) -> ASGIApp:
     problems.install(app)
     for router in ROUTERS:
         app.include_router(router)
+    _add_openapi(app, hub)
     _add_files(app, "page", index="/", prefix="/page/")
     _add_files(app, "reference", index="/docs", prefix="/docs/")
     app.add_api_websocket_route("/{path:path}", _nothing_there)
@@ -119,6 +124,19 @@ class _Stamped:
 async def _nothing_there(socket: WebSocket) -> None:
     """A WebSocket elsewhere is told so like any other request; without a route it would be a bare 403."""
     raise ServiceError(404, "not-found", "There is nothing at this address.")
+
+
+def _add_openapi(app: FastAPI, hub: Hub) -> None:
+    """Serve the document of the API. To make it takes 0.2 s: that is done once, in a thread."""
+
+    @cache
+    def text() -> str:
+        return json.dumps(app.openapi(), separators=COMPACT)
+
+    async def answer(_: Request) -> Response:
+        return Response(await hub.aside(text), media_type="application/json")
+
+    app.add_route("/openapi.json", answer, methods=["GET"], include_in_schema=False)
 
 
 def _add_files(app: FastAPI, folder: str, *, index: str, prefix: str) -> None:
