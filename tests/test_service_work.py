@@ -251,8 +251,8 @@ async def test_of_many_faults_of_one_kind_the_first_is_told(
         await fetched(browser)
         with threads_of(monkeypatch, (json, "loads")) as seen:
             answer = await browser.post(f"{C}/{path}", content=json.dumps(body).encode(), headers=A_JSON)
-        told = problem(answer, 422, "invalid-request")
-        assert [fault["where"] for fault in told["faults"] if fault["where"].startswith(where)] == [where]
+        places = [fault["where"] for fault in problem(answer, 422, "invalid-request")["faults"]]
+        assert [place for place in places if place.startswith(where.rstrip("0"))] == [where]
         assert READER in seen["loads"]
 
 
