@@ -26,9 +26,9 @@ __all__ = ["MOST_PIECES", "SHORT_BODY", "BodyRoute", "check_pieces", "long_reque
 
 SHORT_BODY: Final = 4096
 """Bytes of a body that is parsed at once: that takes less time than to hand it to a thread."""
-MOST_PIECES: Final = 100_000
+MOST_PIECES: Final = 60_000
 """Commas, opening brackets and line ends of a body or a file: no more values, members and lines can be in it.
-A file of ten thousand parameters in JSON, the longest of the forms, has 70,000."""
+A file of eight thousand parameters in JSON, the longest of the forms, has 56,000."""
 
 
 class BodyRoute(APIRoute):
