@@ -24,6 +24,7 @@ from paramclient.errors import (
     ClientClosed,
     CommandRefused,
     CommandResult,
+    ContestedAddress,
     FileError,
     FileErrorCode,
     FileTransferError,
@@ -45,7 +46,18 @@ from paramclient.errors import (
     VehicleArmed,
     VehicleError,
 )
-from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
+from paramclient.events import (
+    Changes,
+    Contested,
+    Event,
+    Events,
+    Found,
+    Heard,
+    Lost,
+    Rebooted,
+    Resynced,
+    Uncontested,
+)
 from paramclient.files import FileForm, ParamFile, read_file, write_file
 from paramclient.ftp import Ftp
 from paramclient.identity import Identity
@@ -53,6 +65,7 @@ from paramclient.params import ParamMap
 from paramclient.paramset import ParamSet, WrittenParam
 from paramclient.protocol.change import Change
 from paramclient.protocol.ftp import DirectoryEntry
+from paramclient.protocol.peers import Contest
 from paramclient.protocol.result import FetchResult, Policy, Progress
 from paramclient.protocol.sampling import Sample
 from paramclient.protocol.sync import SyncState
@@ -78,6 +91,9 @@ __all__ = [
     "CommandResult",
     "Component",
     "ComponentTraffic",
+    "Contest",
+    "Contested",
+    "ContestedAddress",
     "DirectoryEntry",
     "Encoding",
     "Event",
@@ -136,6 +152,7 @@ __all__ = [
     "TrafficReport",
     "Trust",
     "TypeMismatch",
+    "Uncontested",
     "UnknownParameter",
     "UnknownVehicle",
     "UsageError",

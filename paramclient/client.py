@@ -25,9 +25,11 @@ from paramclient.links import Link, ReplayLink, SimLink, create_link
 from paramclient.links.names import names_service
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import (
+    ComponentContested,
     ComponentForgotten,
     ComponentHeard,
     ComponentIdentified,
+    ComponentUncontested,
     Event,
     Fetched,
     ParamChanged,
@@ -306,9 +308,9 @@ class ParamClient:
     def events(self) -> Events:
         """What happens to components from now on: `async for event in client.events()`.
 
-        The events are those of `paramclient.events`: Heard, Lost, Found, Rebooted, Resynced. An absence of
-        the link does not end it; it ends when nobody holds it any more. Whoever is very slow to ask misses
-        the oldest ones. In a log it ends with that.
+        The events are those of `paramclient.events`: Heard, Lost, Found, Rebooted, Resynced, Contested,
+        Uncontested. An absence of the link does not end it; it ends when nobody holds it any more. Whoever is
+        very slow to ask misses the oldest ones. In a log it ends with that.
 
         Raises:
             LinkError: while waiting, when the link failed for good or the client was closed. What had come
@@ -537,6 +539,11 @@ class ParamClient:
                 continue
             if isinstance(event, ComponentHeard):
                 self._meet(machine)
+            elif isinstance(event, ComponentContested):
+                self._writer.let_go(machine)
+                logger.warning("%s: %s", self._link.name, event.contest.error)
+            elif isinstance(event, ComponentUncontested):
+                self._writer.let_go(machine)
             elif isinstance(event, ComponentIdentified):
                 self._carrier.tell()
                 for component in self._components.values():

@@ -23,6 +23,7 @@ from paramclient.protocol.events import ParamChanged, ParamsMoved
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.overhear import OVERHEARING_PATIENCE
+from paramclient.protocol.peers import Contest
 from paramclient.protocol.result import FetchResult, Progress, Sampled
 from paramclient.protocol.sampling import SAMPLE_SIZE
 from paramclient.protocol.station import Station
@@ -68,8 +69,9 @@ class Component:
     that comes back by itself is away, up to `LINK_PATIENCE` of `paramclient.carrier`; then, and when the
     client is closed, they raise LinkError. A component that is lost (see `Lost`) is not asked: calls that
     wait for an answer and new ones raise NoReply at once, but for a `fetch_all` under way, which goes on for
-    a while, as the vehicle may only be starting again. The table stays, and what is in it is *cached* until
-    the vehicle is back and has confirmed it.
+    a while, as the vehicle may only be starting again. A component whose address several vehicles have (see
+    `Contested`) is not asked either: calls raise ContestedAddress. The table stays, and what is in it is
+    *cached* until the vehicle is back and has confirmed it.
 
     Attributes:
         system, component: its address.
@@ -121,13 +123,21 @@ class Component:
 
     @property
     def state(self) -> str:
-        """The table's state in a word: new, cached, fetching, synced, partial, lost."""
+        """The table's state in a word: new, cached, fetching, synced, partial, contested, lost."""
         return self._machine.state
 
     @property
     def sync_state(self) -> SyncState:
         """How the table stands to the vehicle's: up to date, or what is done about it."""
         return self._machine.sync_state
+
+    @property
+    def contest(self) -> Contest | None:
+        """Why it is open which vehicle this is, where several have its address; else None.
+
+        Meanwhile every call raises ContestedAddress, `params` stays as it was, and nothing goes to the cache.
+        """
+        return self._machine.peers.contest
 
     @property
     def is_armed(self) -> bool | None:
@@ -230,6 +240,7 @@ class Component:
             TypeMismatch: it holds the parameter in another type.
             ValueNotApplied: it keeps the value it had and gives no reason.
             NoReply: it did not answer. Whether it has taken the value is not known, as after cancellation.
+            ContestedAddress: several vehicles have its address.
             NotDurable: the vehicle has taken the value, and it could not be written to the disk.
             CacheError: with `durable`, nothing can be written to the disk; nothing was sent.
             LinkError: the link failed, or the client was closed.
@@ -238,6 +249,7 @@ class Component:
             raise UsageError(f"{HASH_CHECK} is no parameter: it can be read, and not written")
         machine = self._machine
         self._client._check_open()
+        machine.check_uncontested()
         if durable:
             await self._wait_until_kept()
         write = machine.write(

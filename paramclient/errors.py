@@ -17,7 +17,8 @@ The tree says who is to blame::
     │   ├── ValueNotApplied           it kept another value and gave no reason
     │   ├── VehicleArmed              it is armed, and nothing is set then unless told otherwise
     │   ├── FileTransferError         it did not do what was asked with a file
-    │   └── AnotherVehicle            it is not the one that was meant
+    │   ├── AnotherVehicle            it is not the one that was meant
+    │   └── ContestedAddress          several vehicles have its address, and none of them is asked
     ├── NoReply(TimeoutError)         nobody answered in time
     ├── LinkError(OSError)            the socket or the device
     │   └── ClientClosed              the client was closed while a call waited, or is not open
@@ -41,6 +42,7 @@ __all__ = [
     "ClientClosed",
     "CommandRefused",
     "CommandResult",
+    "ContestedAddress",
     "FileError",
     "FileErrorCode",
     "FileTransferError",
@@ -372,6 +374,28 @@ class AnotherVehicle(VehicleError):
         super().__init__(message, system=system, component=component)
         self.expected = expected
         self.found = found
+
+
+class ContestedAddress(VehicleError):
+    """Several vehicles have the system and component id, and it is open which one would be meant.
+
+    Nothing is read from them or written to them until all but one have been silent for the heartbeat timeout.
+    What was sent before that is not known to have been taken.
+
+    Attributes:
+        claimants: the peers with the address, in words, and what each says.
+        difference: what tells them apart, in words.
+    """
+
+    def __init__(self, system: int, component: int, claimants: Sequence[str], difference: str) -> None:
+        message = (
+            f"{system}/{component} is contested, so nothing is read, written or cached. Several vehicles "
+            f"have the address: {'; '.join(claimants)}. What tells them apart: {difference}. Give each "
+            "its own system id, or switch one off."
+        )
+        super().__init__(message, system=system, component=component)
+        self.claimants = tuple(claimants)
+        self.difference = difference
 
 
 class NoReply(ParamClientError, TimeoutError):

@@ -16,8 +16,22 @@ from paramclient.protocol.change import Change
 
 if TYPE_CHECKING:
     from paramclient.component import Component
+    from paramclient.protocol.peers import Contest
 
-__all__ = ["Changes", "Event", "Events", "Feed", "Found", "Heard", "Lost", "Rebooted", "Resynced", "told"]
+__all__ = [
+    "Changes",
+    "Contested",
+    "Event",
+    "Events",
+    "Feed",
+    "Found",
+    "Heard",
+    "Lost",
+    "Rebooted",
+    "Resynced",
+    "Uncontested",
+    "told",
+]
 
 MOST_CHANGES: Final = 100_000
 """Changes that wait for a slow listener, one for each name: more than a table can hold, as names may go and
@@ -93,7 +107,32 @@ class Resynced:
     hash: int | None
 
 
-Event: TypeAlias = Heard | Lost | Found | Rebooted | Resynced
+@dataclass(frozen=True, slots=True)
+class Contested:
+    """Several vehicles have the address of a component. Its calls raise ContestedAddress until `Uncontested`,
+    and nothing of it goes to the cache.
+
+    Attributes:
+        component: which one.
+        contest: which vehicles, and what tells them apart.
+    """
+
+    component: Component
+    contest: Contest
+
+
+@dataclass(frozen=True, slots=True)
+class Uncontested:
+    """One vehicle alone has the address of a component again. Who it is and its hash are being asked for.
+
+    Attributes:
+        component: which one.
+    """
+
+    component: Component
+
+
+Event: TypeAlias = Heard | Lost | Found | Rebooted | Resynced | Contested | Uncontested
 
 
 def told(event: protocol.Event, component: Component) -> Event | None:
@@ -107,6 +146,10 @@ def told(event: protocol.Event, component: Component) -> Event | None:
             return Found(component, event.silence)
         case protocol.ComponentRebooted():
             return Rebooted(component)
+        case protocol.ComponentContested(contest=contest):
+            return Contested(component, contest)
+        case protocol.ComponentUncontested():
+            return Uncontested(component)
         case protocol.TableResynced():
             return Resynced(component, event.changed, event.hash)
         case _:

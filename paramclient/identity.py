@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Final
 
-__all__ = ["Identity", "autopilot_name", "reason_against_non_finite"]
+__all__ = ["SHARED_UIDS", "Identity", "autopilot_name", "hardware_id", "reason_against_non_finite"]
 
 SHARED_UIDS: Final = frozenset({"4954414c44494e4f"})
 """Hardware ids that name no single vehicle: every simulated PX4 reports this one (measured). Their system ids
@@ -74,7 +74,7 @@ class Identity:
             git_hash: flight_custom_version, 8 bytes: ArduPilot writes the hash as text, PX4 as a
                 little-endian number (both measured).
         """
-        hardware = uid2.hex() if any(uid2) else f"{uid:016x}" if uid else None
+        hardware = hardware_id(uid, uid2)
         commit = git_hash.rstrip(b"\0")
         if not _HEX_DIGITS.issuperset(commit):
             commit = git_hash[::-1].hex().encode()
@@ -126,6 +126,16 @@ class Identity:
         if self.uid is not None:
             return f"the {autopilot_name(self.autopilot)} {self.uid}"
         return f"a vehicle of type {self.vehicle_type} with {autopilot_name(self.autopilot)}"
+
+
+def hardware_id(uid: int, uid2: bytes) -> str | None:
+    """The hardware id of an AUTOPILOT_VERSION in hexadecimal; None where it gives none.
+
+    Args:
+        uid: the older one, 64 bits; it counts where `uid2` is all zero.
+        uid2: the hardware id, 18 bytes.
+    """
+    return uid2.hex() if any(uid2) else f"{uid:016x}" if uid else None
 
 
 def autopilot_name(number: int) -> str:

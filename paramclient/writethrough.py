@@ -159,10 +159,7 @@ class WriteThrough:
             kept.identity = identity
             return True
         if kept is not None:
-            del self._kept[machine]
-            machine.table.take_dirty()
-            machine.table.take_overwritten()
-            machine.table.take_gone()
+            self.let_go(machine)
         return False
 
     async def bring(self, machine: ComponentMachine, identity: Identity) -> bool:
@@ -211,6 +208,13 @@ class WriteThrough:
             kept.proven_at = self._now() + machine.table.slept
             if is_whole:
                 kept.whole_at = kept.proven_at
+
+    def let_go(self, machine: ComponentMachine) -> None:
+        """Several vehicles have its address, or had it until now: what it has learnt is kept under none."""
+        self._kept.pop(machine, None)
+        machine.table.take_dirty()
+        machine.table.take_overwritten()
+        machine.table.take_gone()
 
     def part_with(self, machine: ComponentMachine) -> None:
         """It is not followed any more."""

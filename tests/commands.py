@@ -16,7 +16,7 @@ from paramclient.cli import run, session
 from paramclient.links import SimLink
 from paramclient.sim import Endpoint
 from paramclient.worker import Worker
-from tests.shell import SwiftLoop, swift_loop
+from tests.shell import PeersLink, SwiftLoop, swift_loop
 
 
 def strict(text: str) -> Any:
@@ -56,7 +56,7 @@ class Outcome:
 
 Command: TypeAlias = Callable[..., Outcome]
 """Takes the words of a command, of any type."""
-Put: TypeAlias = Callable[[Endpoint | SimLink], str]
+Put: TypeAlias = Callable[[Endpoint | SimLink | PeersLink], str]
 """Takes a simulated vehicle, or a link; gives the URL behind which it is."""
 
 
@@ -75,9 +75,10 @@ def in_process(capsys: pytest.CaptureFixture[str], *cache: str) -> Command:
 def behind(monkeypatch: pytest.MonkeyPatch, url: str) -> Put:
     """Puts what it is given behind every URL; gives this one."""
 
-    def place(far_end: Endpoint | SimLink) -> str:
+    def place(far_end: Endpoint | SimLink | PeersLink) -> str:
         def client(url: str, **options: Any) -> ParamClient:
-            return ParamClient(far_end if isinstance(far_end, SimLink) else SimLink(far_end, url), **options)
+            link = far_end if isinstance(far_end, SimLink | PeersLink) else SimLink(far_end, url)
+            return ParamClient(link, **options)
 
         monkeypatch.setattr(session, "ParamClient", client)
         return url

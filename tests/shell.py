@@ -256,6 +256,56 @@ class Radio(Tap):
         return sent + super().data_to_send()
 
 
+class PeersLink:
+    """A link with several peers, as one UDP port is where vehicles send to.
+
+    Attributes:
+        endpoints: who speaks from which peer; may change while it is open.
+    """
+
+    is_stream = False
+    reconnects = False
+
+    def __init__(self, endpoints: Mapping[Peer, Endpoint], name: str = "udpin:peers:14550") -> None:
+        self.name = name
+        self.endpoints = dict(endpoints)
+        self._news: anyio.Event | None = None
+
+    async def open(self) -> None:
+        await anyio.lowlevel.checkpoint()
+        self._news = anyio.Event()
+
+    async def receive(self) -> list[tuple[Peer, bytes]]:
+        while self._news is not None:
+            now = anyio.current_time()
+            for endpoint in self.endpoints.values():
+                endpoint.tick(now)
+            came = [(peer, data) for peer, each in self.endpoints.items() for data in each.data_to_send()]
+            if came:
+                await anyio.lowlevel.checkpoint()
+                return came
+            due = [at for each in self.endpoints.values() if (at := each.next_deadline()) is not None]
+            self._news = anyio.Event()
+            with anyio.move_on_after(max(min(due, default=now + 1.0) - now, 0.0)):
+                await self._news.wait()
+        raise LinkError(f"{self.name}: not open", link=self.name)
+
+    async def send(self, data: bytes, peer: Peer | None) -> None:
+        await anyio.lowlevel.checkpoint()
+        for each, endpoint in self.endpoints.items():
+            if peer in (None, each):
+                endpoint.receive(data, anyio.current_time())
+        self._wake()
+
+    async def close(self) -> None:
+        self._wake()
+        self._news = None
+
+    def _wake(self) -> None:
+        if self._news is not None:
+            self._news.set()
+
+
 class FlakyLink(SimLink):
     """A link to an endpoint that can drop, and be opened again.
 

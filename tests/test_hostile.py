@@ -35,6 +35,7 @@ from paramclient.protocol.ftp import reading as reading_room
 from paramclient.protocol.ftp import transfers as transfers_room
 from paramclient.protocol.ftp.blocks import Blocks
 from paramclient.protocol.ftp.packets import MOST_DATA
+from paramclient.protocol.presence import LOST_AFTER
 from paramclient.protocol.station import Station
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.table import Room, Table
@@ -406,7 +407,7 @@ async def test_one_that_is_another_vehicle_each_time_fills_no_cache(
         for number in range(4):
             liar.say(AutopilotVersion(16, uid=number + 1))
             liar.say(param_value(f"V{number}"))
-            await anyio.sleep(2 * writethrough.FLUSH_INTERVAL)
+            await anyio.sleep(LOST_AFTER + 2 * writethrough.FLUSH_INTERVAL)  # till then it may be two
             assert len(client._writer._bringing) <= 1
     with ParamCache(path) as cache:
         systems = [each.identity.system for each in cache.vehicles()]

@@ -364,14 +364,19 @@ def test_unfinished_streams_have_a_bound(monkeypatch: pytest.MonkeyPatch) -> Non
     assert len(station._framers) == 3
 
 
-def test_answers_go_where_the_system_was_heard_last() -> None:
+def test_requests_go_to_the_peer_that_was_heard_first_until_it_is_silent() -> None:
     station = a_station()
     station.receive(frame(PX4), "here", 0.0)
     station.receive(frame(PX4, 2, 1), "there", 0.0)
     peers = [peer for message, _, peer in sent(station) if isinstance(message, CommandLong)]
     assert peers == ["here", "there"]
     station.receive(frame(PX4), "there", 1.0)
+    sent(station)
     station.components[1, 1].read("A", 1.0)
+    assert [peer for _, _, peer in sent(station)] == ["here"]
+    station.receive(frame(PX4), "there", 3.0)
+    sent(station)
+    station.components[1, 1].read("B", 3.0)
     assert [peer for _, _, peer in sent(station)] == ["there"]
 
 

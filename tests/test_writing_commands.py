@@ -21,7 +21,7 @@ from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4
 from paramclient.values import Param, bits_of
 from tests.caches import NOW, update
 from tests.commands import Command, Put, behind, in_process, leaping
-from tests.shell import Late, Tap
+from tests.shell import Late, PeersLink, Tap
 from tests.ways import ServedClient
 
 URL = "udpin:0.0.0.0:14550"
@@ -54,8 +54,8 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Put:
     """Puts simulated vehicles behind every link."""
     place = behind(monkeypatch, URL)
 
-    def both(far_end: Endpoint | SimLink) -> str:
-        link = far_end if isinstance(far_end, SimLink) else SimLink(far_end, URL)
+    def both(far_end: Endpoint | SimLink | PeersLink) -> str:
+        link = far_end if isinstance(far_end, SimLink | PeersLink) else SimLink(far_end, URL)
         monkeypatch.setattr(signing_commands, "create_link", lambda _: link)
         return place(far_end)
 

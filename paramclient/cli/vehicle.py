@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import AsyncGenerator, Iterable, Sequence
 from contextlib import aclosing, suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Annotated, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
 
 import anyio
 from cyclopts import Parameter
@@ -41,7 +41,18 @@ from paramclient.cli.output import (
 )
 from paramclient.cli.session import Session, connect
 from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError, ValueNotApplied
-from paramclient.events import Changes, Event, Events, Found, Heard, Lost, Rebooted, Resynced
+from paramclient.events import (
+    Changes,
+    Contested,
+    Event,
+    Events,
+    Found,
+    Heard,
+    Lost,
+    Rebooted,
+    Resynced,
+    Uncontested,
+)
 from paramclient.metadata import Metadata
 from paramclient.notation import hash_text, time_text
 from paramclient.protocol.change import Change
@@ -61,6 +72,7 @@ MOST_INDICES: Final = 20
 """Missing indices that are named to people."""
 
 _DEFAULTS: Final = LinkOptions()
+_News: TypeAlias = Lost | Found | Rebooted | Resynced | Contested | Uncontested
 
 
 async def fetch(
@@ -543,7 +555,7 @@ async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | E
                 each.exception()  # both end with the link; one of them is told
 
 
-def _line(news: Change | Lost | Found | Rebooted | Resynced, at: float) -> Document:
+def _line(news: Change | _News, at: float) -> Document:
     """What has happened, for programs."""
     from paramclient.documents.command import ChangeLineDoc, EventLineDoc  # only here: loads pydantic
 
@@ -558,7 +570,7 @@ def _change_text(change: Change) -> str:
     return f"{change.name}  {old} -> {new}  ({change.by})"
 
 
-def _event_text(event: Lost | Found | Rebooted | Resynced) -> str:
+def _event_text(event: _News) -> str:
     match event:
         case Lost():
             what = f"lost: not heard for {event.silence:.1f} s"
@@ -566,6 +578,10 @@ def _event_text(event: Lost | Found | Rebooted | Resynced) -> str:
             what = f"found after {event.silence:.1f} s"
         case Rebooted():
             what = "has started again"
+        case Contested():
+            what = f"contested: {'; '.join(event.contest.claimants)}"
+        case Uncontested():
+            what = "contested no more"
         case Resynced():
             number = len(event.changed)
             what = f"resynced: {number or 'nothing'} had moved"

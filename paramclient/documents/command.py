@@ -6,15 +6,16 @@ from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Final
 
 from paramclient.documents.base import Document, Maybe, Scalar
+from paramclient.documents.component import ContestDoc
 from paramclient.documents.param import ParamDoc
-from paramclient.events import Found, Lost, Resynced
+from paramclient.events import Contested, Found, Lost, Resynced
 from paramclient.identity import autopilot_name
 from paramclient.notation import hash_text, rounded, time_text, value_json
 from paramclient.values import ParamType
 
 if TYPE_CHECKING:
     from paramclient.component import Component
-    from paramclient.events import Rebooted
+    from paramclient.events import Rebooted, Uncontested
     from paramclient.links.ports import SerialPort
     from paramclient.logs import ImportedTable
     from paramclient.metadata import ParamInfo
@@ -26,6 +27,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ChangeLineDoc",
+    "ContestedLineDoc",
     "EventLineDoc",
     "FetchedDoc",
     "ImportDoc",
@@ -192,7 +194,9 @@ class EventLineDoc(Document):
     component: int
 
     @classmethod
-    def of(cls, event: Lost | Found | Rebooted | Resynced, at: float) -> EventLineDoc:
+    def of(
+        cls, event: Lost | Found | Rebooted | Resynced | Contested | Uncontested, at: float
+    ) -> EventLineDoc:
         """An event of this unix time."""
         told: dict[str, Any] = {
             "time": time_text(at),
@@ -202,6 +206,8 @@ class EventLineDoc(Document):
         }
         if isinstance(event, Lost | Found):
             return SilenceLineDoc(**told, silence_s=round(event.silence, 4))
+        if isinstance(event, Contested):
+            return ContestedLineDoc(**told, contest=ContestDoc.of(event.contest))
         if isinstance(event, Resynced):
             return ResyncedLineDoc(**told, changed=list(event.changed), hash=hash_text(event.hash))
         return EventLineDoc(**told)
@@ -211,6 +217,12 @@ class SilenceLineDoc(EventLineDoc):
     """A component that was lost or found, and for how long it was not heard."""
 
     silence_s: float
+
+
+class ContestedLineDoc(EventLineDoc):
+    """A component whose address several vehicles have."""
+
+    contest: ContestDoc
 
 
 class ResyncedLineDoc(EventLineDoc):

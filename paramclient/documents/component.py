@@ -10,9 +10,10 @@ from paramclient.notation import hash_text, rounded
 if TYPE_CHECKING:
     from paramclient.component import Component
     from paramclient.identity import Identity
+    from paramclient.protocol.peers import Contest
     from paramclient.protocol.result import FetchResult, Progress
 
-__all__ = ["ComponentDoc", "ComponentsDoc", "IdentityDoc", "LastFetchDoc", "ProgressDoc"]
+__all__ = ["ComponentDoc", "ComponentsDoc", "ContestDoc", "IdentityDoc", "LastFetchDoc", "ProgressDoc"]
 
 
 class IdentityDoc(Document):
@@ -62,11 +63,24 @@ class LastFetchDoc(Document):
     elapsed_s: float
 
 
+class ContestDoc(Document):
+    """Several vehicles have the address of a component: what each says, and what tells them apart."""
+
+    claimants: list[str]
+    difference: str
+
+    @classmethod
+    def of(cls, contest: Contest) -> ContestDoc:
+        """As `Contest` has it."""
+        return cls(claimants=list(contest.claimants), difference=contest.difference)
+
+
 class ComponentDoc(Document):
     """One component on one link.
 
     `key` is the name under which its table is kept, null until the vehicle has said who it is. `params` is
-    how many are known, `count` how many it says it has, `fetch` how far one is that is under way.
+    how many are known, `count` how many it says it has, `fetch` how far one is that is under way. `contest`
+    says which vehicles have the address where these are several.
     """
 
     link: str
@@ -86,6 +100,7 @@ class ComponentDoc(Document):
     sync_state: str
     is_armed: bool | None
     is_lost: bool
+    contest: ContestDoc | None
     silence_s: float
     round_trip_s: float | None
     fetch: ProgressDoc | None
@@ -131,6 +146,7 @@ class ComponentDoc(Document):
             sync_state=sync.value,
             is_armed=component.is_armed,
             is_lost=sync == "lost",
+            contest=None if component.contest is None else ContestDoc.of(component.contest),
             silence_s=round(component.silence, 3),
             round_trip_s=rounded(component.round_trip),
             fetch=None if progress is None else ProgressDoc.of(progress),

@@ -7,15 +7,17 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Final
 
-from paramclient.errors import LinkError, NoReply, UsageError
+from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.identity import autopilot_name, reason_against_non_finite
 from paramclient.params import parts_of
 from paramclient.protocol import events
 from paramclient.protocol.change import Change
+from paramclient.protocol.claims import Claim
 from paramclient.protocol.events import ParamChanged
 from paramclient.protocol.fetch import Check, Fetch
 from paramclient.protocol.name_search import NameSearch
 from paramclient.protocol.parts import Parts
+from paramclient.protocol.peers import Contest
 from paramclient.protocol.reads import Key, Read
 from paramclient.protocol.restart import SAVING_TIME, Restart
 from paramclient.protocol.result import FetchResult, Policy, Sampled
@@ -63,6 +65,7 @@ class ComponentMachine(Parts):
         link: the link's canonical name, part of an identity without a hardware id.
         send: takes each message for it, in order.
         emit: takes each event.
+        send_to: takes each message that is for one of its peers; None where there is only one.
         encoding: what the user said about its encoding, or None.
         upkeep: what is done for its table without being asked.
         is_link_busy: whether anything is being asked for on the link.
@@ -79,6 +82,7 @@ class ComponentMachine(Parts):
         table: its parameters.
         round_trip: what its answers tell of the link.
         presence: whether it is there.
+        peers: which peers speak for it, and whether several vehicles do.
         following: the list that another station has asked for, while none of ours comes.
         sync: whether the table is still the vehicle's.
         files: its files.
@@ -162,6 +166,12 @@ class ComponentMachine(Parts):
             self.presence.high_latency()
         self.who.heard(now)
         self._follow_identity(now)
+
+    def receive_contested(self, message: Message, now: float, *, version: int = 2) -> None:
+        """Take a message while several vehicles have the address: it shows that one is there."""
+        self._heard(now, version)
+        if isinstance(message, Heartbeat):
+            self.presence.heartbeat(message, now)
 
     def receive_value(
         self, message: ParamValue, now: float, version: int = 2, moment: float | None = None
@@ -454,8 +464,10 @@ class ComponentMachine(Parts):
             sampled: the sample that may settle it where there is no hash, or None.
 
         Raises:
+            ContestedAddress: several vehicles have its address.
             NoReply: the component is lost, and no fetch is under way. Nothing was sent.
         """
+        self.check_uncontested()
         if self.fetch is None and self._policy is not Policy.CACHE_ONLY:
             self.check_present(f"the parameters of {self.system}/{self.component}", now)
         return self.fetches.begin(
@@ -475,22 +487,68 @@ class ComponentMachine(Parts):
 
         Raises:
             UsageError: nothing may be sent.
+            ContestedAddress: several vehicles have its address.
             NoReply: it is lost.
         """
         if self._listens_only:
             raise UsageError(
                 f"{what} cannot be asked for where nothing is sent; what has been heard is in `params`"
             )
+        self.check_uncontested()
         if self.presence.is_lost:
             silence = now - self.presence.heard_at
             raise NoReply(f"{what} (lost)", attempts=0, waited=silence)
+
+    def check_uncontested(self) -> None:
+        """See whether one vehicle alone has the address.
+
+        Raises:
+            ContestedAddress: several have it.
+        """
+        if self.peers.contest is not None:
+            raise self.peers.contest.error
+
+    # peers
+
+    def peer_moved(self, claim: Claim, now: float) -> None:
+        """Another peer has the address now, which is not proven to be the same vehicle: it is asked."""
+        self.who.doubt(now)
+        self._take_claim(claim, now)
+        self.clock_requests.want(now)
+
+    def contest_began(self, contest: Contest, now: float) -> None:
+        """Several vehicles have the address: whoever waits for one of them gets the error."""
+        self._emit(events.ComponentContested(self, contest))
+        self.fail_all(contest.error, now)
+
+    def contest_ended(self, claim: Claim, now: float, *, is_same: bool) -> None:
+        """One vehicle has the address: it is asked who it is before anything counts or is kept."""
+        if is_same:
+            self._doubt()
+        else:
+            self.become_another(now)
+        self._emit(events.ComponentUncontested(self))
+        self._known_as = None
+        self.who.doubt(now)
+        self.sync.check(now)
+        self._take_claim(claim, now)
+        self.clock_requests.want(now)
+
+    def _take_claim(self, claim: Claim, now: float) -> None:
+        """Take what a peer has said of itself before its messages counted."""
+        for message in (claim.heartbeat, claim.version):
+            if message is not None:
+                self.receive(message, now, version=self.version)
 
     # time
 
     def tick(self, now: float) -> None:
         """Do what is due."""
+        self.peers.tick(now)
         if self.presence.lost_at() <= now:
             self._lose(now)
+        if self.peers.contest is not None:
+            return
         self.reads.tick(now)
         self.name_searches.tick(now)
         self.writes.tick(now)
@@ -517,7 +575,9 @@ class ComponentMachine(Parts):
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity. Asked often: what is idle is not asked in turn."""
         fetch = self.fetches.current
-        first = self.presence.lost_at()
+        first = min(self.presence.lost_at(), self.peers.next_deadline())
+        if self.peers.contest is not None:
+            return first
         if fetch is not None:
             first = min(first, fetch.next_deadline())
         if self.restart is not None:
@@ -561,8 +621,8 @@ class ComponentMachine(Parts):
         if self.fetch is not None:
             self.fetch.resume(now)
 
-    def fail_all(self, error: LinkError, now: float) -> None:
-        """The link is gone for good: everyone who waits gets its error."""
+    def fail_all(self, error: ParamClientError, now: float) -> None:
+        """The link is gone for good, or the address is contested: every operation ends with the error."""
         if self.fetch is not None:
             self.fetch.cancel(now)
             self.fetch.fail(error, now)

@@ -10,7 +10,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from paramclient.errors import CommandResult, LinkError, NoReply
+from paramclient.errors import CommandResult, NoReply, ParamClientError
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.timing import RoundTrip
 from paramclient.protocol.wire import (
@@ -127,7 +127,7 @@ class Descriptions:
         if self._asks:
             self._request(now)
 
-    def fail_all(self, error: LinkError, now: float) -> None:
+    def fail_all(self, error: ParamClientError, now: float) -> None:
         """No answer can come any more."""
         asks, self._asks = self._asks, []
         for ask in asks:

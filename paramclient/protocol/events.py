@@ -9,15 +9,18 @@ from paramclient.protocol.change import Change
 
 if TYPE_CHECKING:
     from paramclient.protocol.component import ComponentMachine
+    from paramclient.protocol.peers import Contest
     from paramclient.protocol.result import FetchResult
 
 __all__ = [
+    "ComponentContested",
     "ComponentForgotten",
     "ComponentFound",
     "ComponentHeard",
     "ComponentIdentified",
     "ComponentLost",
     "ComponentRebooted",
+    "ComponentUncontested",
     "Event",
     "Fetched",
     "ParamChanged",
@@ -59,6 +62,23 @@ class ComponentFound:
 @dataclass(frozen=True, slots=True)
 class ComponentRebooted:
     """The vehicle has started again."""
+
+    machine: ComponentMachine
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentContested:
+    """Several vehicles have its address: nothing is taken from them, and nothing is asked of them."""
+
+    machine: ComponentMachine
+    contest: Contest
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentUncontested:
+    """One vehicle alone has its address again, or the peers are proven to be one vehicle. It is asked who it
+    is.
+    """
 
     machine: ComponentMachine
 
@@ -113,6 +133,8 @@ Event: TypeAlias = (
     | ComponentLost
     | ComponentFound
     | ComponentRebooted
+    | ComponentContested
+    | ComponentUncontested
     | ComponentForgotten
     | ParamChanged
     | ParamsMoved

@@ -10,6 +10,7 @@ from paramclient.identity import Identity
 from paramclient.protocol.authors import Authors
 from paramclient.protocol.change import Change
 from paramclient.protocol.check_pace import CheckPace
+from paramclient.protocol.claims import Claim, Peer
 from paramclient.protocol.clock_requests import ClockRequests
 from paramclient.protocol.commands import Commands
 from paramclient.protocol.descriptions import Descriptions
@@ -20,6 +21,7 @@ from paramclient.protocol.following import Following
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.identify import Identification
 from paramclient.protocol.name_search import NameSearches
+from paramclient.protocol.peers import ComponentPeers, Contest
 from paramclient.protocol.presence import Presence
 from paramclient.protocol.reads import Key, Reads
 from paramclient.protocol.refresh import Refresh
@@ -53,6 +55,7 @@ class Parts(ABC):
         link: str,
         send: Callable[[Message], None],
         emit: Callable[[Event], None],
+        send_to: Callable[[Message, Peer], None] | None = None,
         encoding: Encoding | None = None,
         upkeep: Upkeep | None = None,
         is_link_busy: Callable[[], bool] = lambda: False,
@@ -86,6 +89,7 @@ class Parts(ABC):
             trace=trace,
         )
         self.presence = Presence()
+        self.peers = ComponentPeers(target, self, may_ask=not upkeep.listens_only)
         self.files = FileTransfers(
             target,
             own,
@@ -166,6 +170,7 @@ class Parts(ABC):
         self._value_heard = self.reads.heard if overheard is None else overheard.heard
         self._own = own
         self._emit = emit
+        self._send_to = send_to or (lambda message, peer: send(message))
         self._policy = upkeep.policy
         self._is_kept_up = upkeep.interval < math.inf and upkeep.policy is Policy.AUTO
         self._listens_only = upkeep.listens_only
@@ -197,6 +202,18 @@ class Parts(ABC):
         """Wait for it no longer."""
 
     @abstractmethod
+    def peer_moved(self, claim: Claim, now: float) -> None:
+        """Another peer has the address now, which is not proven to be the same vehicle."""
+
+    @abstractmethod
+    def contest_began(self, contest: Contest, now: float) -> None:
+        """Several vehicles have the address."""
+
+    @abstractmethod
+    def contest_ended(self, claim: Claim, now: float, *, is_same: bool) -> None:
+        """One vehicle has the address."""
+
+    @abstractmethod
     def become_another(self, now: float) -> None:
         """Another vehicle has taken this system id."""
 
@@ -212,9 +229,11 @@ class Parts(ABC):
 
     @property
     def state(self) -> str:
-        """The table's state in a word: new, cached, fetching, synced, partial, lost."""
+        """The table's state in a word: new, cached, fetching, synced, partial, contested, lost."""
         if self.presence.is_lost:
             return "lost"
+        if self.peers.contest is not None:
+            return "contested"
         if self.fetch is not None:
             return "fetching"
         if self.sync.synced:
@@ -222,6 +241,24 @@ class Parts(ABC):
         if not self.table.params:
             return "new"
         return "cached" if self.table.complete else "partial"
+
+    @property
+    def is_restarting(self) -> bool:
+        """Whether it was told to start again, and that is awaited."""
+        return self.restart is not None and not self.restart.done
+
+    @property
+    def is_identified(self) -> bool:
+        """Whether it is settled who it is, and that is not being asked for."""
+        return self.who.settled and not self.who.is_asking
+
+    def read_clock(self, now: float) -> None:
+        """Have clocks in telemetry read for a while."""
+        self._read_clock(now)
+
+    def send_to(self, message: Message, peer: Peer) -> None:
+        """Send a message to one of the peers that speak for it."""
+        self._send_to(message, peer)
 
     @property
     def fetch(self) -> Fetch | None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Final
 
-from paramclient.errors import LinkError
+from paramclient.errors import ContestedAddress, LinkError
 from paramclient.protocol.hashing import find_volatile
 from paramclient.protocol.operation import Operation
 from paramclient.protocol.reads import Read, Reads
@@ -77,12 +77,14 @@ class Refresh(Operation[None]):
 
     def _one_ended(self, read: Read) -> None:
         self.in_flight -= 1
-        if isinstance(read.error, LinkError):
+        if isinstance(read.error, LinkError | ContestedAddress):
             self._waiting.clear()  # nothing can be asked any more
         self._ask(read.ended_at)
         if self.in_flight:
             return
-        if not (self._again or self._table.volatile_known or isinstance(read.error, LinkError)):
+        if not (
+            self._again or self._table.volatile_known or isinstance(read.error, LinkError | ContestedAddress)
+        ):
             again = self._reads.ask(HASH_CHECK, read.ended_at)
             again.on_done.append(partial(self._learn, again))
         self.finish(None, read.ended_at)

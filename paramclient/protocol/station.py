@@ -4,19 +4,21 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Hashable, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from heapq import heapify, heappop, heappush
 from typing import Final, TypeAlias
 
 from paramclient.errors import LinkError, UsageError
 from paramclient.identity import Identity
+from paramclient.protocol.claims import Peer
 from paramclient.protocol.clock_sampling import ClockSampling
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.download import present_of
 from paramclient.protocol.events import ComponentForgotten, ComponentHeard, Event
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.file_observer import acknowledges_open, opens_parameter_file
+from paramclient.protocol.peers import NO_PEER
 from paramclient.protocol.result import Policy
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.table import Room
@@ -59,8 +61,6 @@ __all__ = ["Address", "Peer", "Station"]
 
 Address: TypeAlias = tuple[int, int]
 """System and component."""
-Peer: TypeAlias = Hashable
-"""Who sent something, as the link tells them apart."""
 
 HEARTBEAT_INTERVAL: Final = 1.0
 NOBODY: Final = (0, 0)
@@ -152,7 +152,6 @@ class Station:
         self._framer = Framer(HEARD, occasional=_TELEMETRY_CLOCKS, stream=False)
         self._clock_sampling = ClockSampling(self._take_clocks)
         self._framers: dict[Peer, Framer] = {}  # for streams
-        self._peers: dict[int, Peer] = {}
         self._outbox: list[tuple[bytes, Peer | None]] = []
         self._events: list[Event] = []
         self._sequence = 0
@@ -174,6 +173,7 @@ class Station:
         self._awaits_autopilot = not self.listens_only  # none was heard yet
         self._heartbeat_requested_at = -math.inf
         self._heartbeat_requests = 0
+        self._foreign = 0  # of components that are forgotten
         self._looks_for_others = 0  # callers of `looking_for_others`
 
     def begin_signing(self, signer: Signer, verifier: Verifier) -> None:
@@ -186,7 +186,7 @@ class Station:
 
     def send_setup_signing(self, system: int, component: int, key: SigningKey | None, timestamp: int) -> None:
         """Give a vehicle its signing key, in clear, or with None take it away. Nothing answers."""
-        self._send(SetupSigning(system, component, key, timestamp), system, 2)
+        self._send(SetupSigning(system, component, key, timestamp), (system, component), 2)
 
     def receive(self, data: bytes, peer: Peer, now: float, moment: float | None = None) -> bool:
         """Take a datagram, or a chunk of a stream. An empty chunk says that the peer's stream has ended.
@@ -209,17 +209,23 @@ class Station:
             if number == PARAM_VALUE_ID and component == COMP_ID_MISSIONPLANNER and self._is_made_up(machine):
                 continue
             if number == PARAM_VALUE_ID and machine is not None:  # the short way for what comes in thousands
-                self._peers[system] = peer
+                peers = machine.peers
+                if peer == peers.speaker:
+                    peers.heard_at = now
+                elif not self._takes(machine, peer, now):
+                    continue
                 self._touched[machine] = None
                 machine.receive_value(decode_param_value(payload), now, version, moment)
             elif number in _TELEMETRY_CLOCKS:
                 clocks += 1
                 if machine is not None and self._clock_sampling.is_open((system, component)):
-                    self._receive_clock(machine, number, payload, now)
+                    self._receive_clock(machine, number, payload, peer, now)
             else:
                 self._receive_other(frame, peer, now, moment)
         if self._is_stream and not data:
-            self._peers = {system: each for system, each in self._peers.items() if each != peer}
+            for machine in self.components.values():
+                machine.peers.left(peer, now)
+            self._touch_all(self.components.values())
         is_seeking = self._awaits_autopilot or (self._looks_for_others and self.verifier is None)
         if is_seeking and self._request_heartbeat(data, peer, now):
             return True
@@ -269,7 +275,7 @@ class Station:
         if self._heartbeat_at <= now:
             self._heartbeat_at = now + HEARTBEAT_INTERVAL
             beat = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID, system_status=MAV_STATE_ACTIVE)
-            self._send(beat, None, 2)
+            self._transmit(beat, None, 2)
         if not everyone:
             while self._order and self._order[0][0] <= now:
                 _, system, component = heappop(self._order)
@@ -333,7 +339,8 @@ class Station:
             self._retire(peer)
         if self.traffic is not None:
             self.traffic.pause()
-        self._peers.clear()  # the link that comes back has others
+        for machine in self.components.values():
+            machine.peers.forget()
 
     def resume(self, now: float) -> None:
         """The link is back: our heartbeat goes out, and whatever waits is asked for again."""
@@ -358,6 +365,7 @@ class Station:
         """
         for machine in self.components.values():
             machine.presence.age(unseen)
+            machine.peers.age(unseen)
             machine.table.age(unseen)
         if not self._is_paused:
             self._outbox.clear()  # for whoever was there before
@@ -378,6 +386,11 @@ class Station:
             self._skipped + sum(framer.skipped for framer in framers),
             self._damaged + sum(framer.damaged for framer in framers),
         )
+
+    @property
+    def foreign(self) -> int:
+        """Messages that were not taken, as they came from a peer that may be another vehicle."""
+        return self._foreign + sum(machine.peers.foreign for machine in self.components.values())
 
     def bursts(self, now: float) -> tuple[int, int]:
         """Lists that come in bursts, as on a link faster than the program, and that may do so soon."""
@@ -412,9 +425,12 @@ class Station:
     def is_doubted(self, machine: ComponentMachine) -> bool:
         """Whether it is open which vehicle a component belongs to.
 
-        Its autopilot is away, or was and has not said since who it is.
+        Its autopilot is away, or was and has not said since who it is; or several vehicles seem to have the
+        address of either.
         """
         autopilot = self.autopilot_of(machine.system) or machine
+        if autopilot.peers.is_unclear or machine.peers.is_unclear:
+            return True
         is_lost = autopilot is not machine and autopilot.presence.is_lost
         return is_lost or autopilot.who.was_away
 
@@ -468,9 +484,12 @@ class Station:
         if len(machines) > 1 and may_list and is_new and is_fresh and not has_file:
             system = machines[0].system
             known = [m for m in self.components.values() if m.system == system and m.who.has_parameters]
-            if len(known) == len(machines):
+            have_one_peer = len({machine.peers.home for machine in machines}) == 1
+            if len(known) == len(machines) and have_one_peer:
+                for machine in machines:
+                    machine.check_uncontested()
                 version = max(machine.version for machine in machines)
-                self._send(ParamRequestList(system, COMP_ID_ALL), system, version)
+                self._send(ParamRequestList(system, COMP_ID_ALL), (system, COMP_ID_ALL), version)
                 return [machine.begin_fetch(now, refresh=refresh, listed=True) for machine in machines]
         return [machine.begin_fetch(now, refresh=refresh) for machine in machines]
 
@@ -522,10 +541,9 @@ class Station:
                 if self._awaits_autopilot:
                     self._heartbeat_requests += 1
                     self._awaits_autopilot = self._heartbeat_requests < HEARTBEAT_REQUESTS_MAX
-                self._peers[frame.system] = peer
                 request = (float(HEARTBEAT_ID), *[0.0] * 6)
                 command = CommandLong(frame.system, frame.component, MAV_CMD_REQUEST_MESSAGE, request)
-                self._send(command, frame.system, frame.version)
+                self._transmit(command, peer, frame.version)
                 return True
         return False
 
@@ -554,7 +572,6 @@ class Station:
         sender = (frame.system, frame.component)
         if sender == self.own or frame.system == 0 or (message := decode(frame)) is None:
             return
-        self._peers[frame.system] = peer
         if isinstance(message, Heartbeat | HighLatency2) and message.autopilot != MAV_AUTOPILOT_INVALID:
             self._awaits_autopilot = False
         if isinstance(message, ParamSet):
@@ -563,18 +580,30 @@ class Station:
         if isinstance(message, FileTransfer):
             self._receive_foreign_file_request(message, sender, now)
         machine = self.components.get(sender) or self._meet(sender, message, now)
-        if machine is not None:
-            self._touch_all(self._of_system[machine.system])  # what one says of the vehicle counts for all
-            machine.receive(message, now, version=frame.version, moment=moment, sequence=frame.sequence)
-            if isinstance(message, Heartbeat):
-                self._clock_sampling.open(sender, now)
+        if machine is None:
+            return
+        self._touch_all(self._of_system[machine.system])  # what one says of the vehicle counts for all
+        if not machine.who.has_parameters:
+            machine.peers.follow(peer)
+        elif not machine.peers.hears(message, peer, now):
+            if machine.peers.contest is not None and peer == machine.peers.home:
+                machine.receive_contested(message, now, version=frame.version)
+            return
+        machine.receive(message, now, version=frame.version, moment=moment, sequence=frame.sequence)
+        if isinstance(message, Heartbeat):
+            self._clock_sampling.open(sender, now)
 
-    def _receive_clock(self, machine: ComponentMachine, number: int, payload: bytes, now: float) -> None:
+    def _receive_clock(
+        self, machine: ComponentMachine, number: int, payload: bytes, peer: Peer, now: float
+    ) -> None:
         """Take the time since boot in a frame of telemetry. Trailing zeros may be cut off."""
         at = _TELEMETRY_CLOCKS[number]
         self._touched[machine] = None
-        machine.boot_clock(number, int.from_bytes(payload[at : at + 4], "little"), now)
-        if machine.restart is None:
+        boot_ms = int.from_bytes(payload[at : at + 4], "little")
+        if machine.who.has_parameters and not machine.peers.hears_clock(number, boot_ms, peer, now):
+            return
+        machine.boot_clock(number, boot_ms, now)
+        if machine.restart is None and not machine.peers.wants_clocks:
             self._clock_sampling.sampled((machine.system, machine.component), now)
 
     def _take_clocks(self, takes: bool) -> None:
@@ -592,7 +621,10 @@ class Station:
         def send(message: Message) -> None:
             if machine is not None:
                 self.touch(machine)
-            self._send(message, system, 2 if machine is None else machine.version)
+            self._send(message, sender, 2 if machine is None else machine.version)
+
+        def send_to(message: Message, peer: Peer) -> None:
+            self._transmit(message, peer, 2 if machine is None else machine.version)
 
         machine = ComponentMachine(
             system,
@@ -601,6 +633,7 @@ class Station:
             link=self.link,
             send=send,
             emit=self._events.append,
+            send_to=send_to,
             encoding=self._encoding,
             upkeep=self._upkeep,
             is_link_busy=lambda: self._is_busy,
@@ -648,6 +681,7 @@ class Station:
         self._order = [each for each in self._order if each[1:] != address]
         heapify(self._order)
         machine.reads.pace.idle()
+        self._foreign += machine.peers.foreign
         self._events.append(ComponentForgotten(machine))
 
     def _become_another(self, system: int, now: float) -> None:
@@ -683,7 +717,28 @@ class Station:
             return False
         return any(_is_for(request, sender) for request, _ in self._early_requests)
 
-    def _send(self, message: Message, system: int | None, version: int) -> None:
+    def _takes(self, machine: ComponentMachine, peer: Peer, now: float) -> bool:
+        """Whether a message may be taken that does not tell vehicles apart."""
+        if not machine.who.has_parameters:
+            machine.peers.follow(peer)
+            return True
+        self._touched[machine] = None
+        return machine.peers.takes(peer, now)
+
+    def _peer_of(self, address: Address) -> Peer | None:
+        """The peer of a component, else of the system's autopilot, else any of the system; None for all."""
+        system, _ = address
+        own, autopilot = self.components.get(address), self.autopilot_of(system)
+        machines = [each for each in (own, autopilot, *self._of_system.get(system, ())) if each is not None]
+        return next((each.peers.home for each in machines if each.peers.home is not NO_PEER), None)
+
+    def _send(self, message: Message, address: Address, version: int) -> None:
+        if not self.listens_only:
+            self._trace("to system %s: %s", address[0], Told(message))
+            self._transmit(message, self._peer_of(address), version)
+
+    def _transmit(self, message: Message, peer: Peer | None, version: int) -> None:
+        """Have a message sent to a peer, or with None to all."""
         if self.listens_only:
             return
         own_system, own_component = self.own
@@ -695,9 +750,7 @@ class Station:
         self._sequence = (self._sequence + 1) & 0xFF
         self.bytes_sent += len(data)
         self.frames_sent += 1
-        if system is not None:
-            self._trace("to system %s: %s", system, Told(message))
-        self._outbox.append((data, None if system is None else self._peers.get(system)))
+        self._outbox.append((data, peer))
 
 
 def _is_for(message: FileTransfer, address: Address) -> bool:

@@ -12,15 +12,8 @@ from typing import Final
 
 from paramclient.errors import AmbiguousVehicle
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.wire import (
-    AUTOPILOT_COMPONENT,
-    MAV_AUTOPILOT_ARDUPILOTMEGA,
-    MAV_AUTOPILOT_GENERIC,
-    MAV_AUTOPILOT_INVALID,
-    MAV_AUTOPILOT_PX4,
-    MAV_TYPE_GENERIC,
-    enum_word,
-)
+from paramclient.protocol.kinds import kind_in_words
+from paramclient.protocol.wire import AUTOPILOT_COMPONENT, MAV_AUTOPILOT_GENERIC
 
 __all__ = ["LOOK_TIME", "VehicleChoice", "vehicle_in_words"]
 
@@ -28,9 +21,6 @@ LOOK_TIME: Final = 1.2
 """Seconds from the first autopilot heard in which a second one is looked for: the interval of heartbeats, and
 a fifth of it for jitter."""
 
-_AUTOPILOTS: Final = {MAV_AUTOPILOT_ARDUPILOTMEGA: "ArduPilot", MAV_AUTOPILOT_PX4: "PX4"}
-_VEHICLES: Final = {1: "plane", 10: "rover", 11: "boat"}
-"""MAV_TYPE in the words of users, where these differ from those of the enumeration."""
 _PERIPHERALS: Final = frozenset({18, 26, 27, *range(30, 35), *range(36, 43), 44, 48})
 """MAV_TYPE of what is part of a vehicle: onboard computers, gimbals, cameras, batteries, GPS receivers. Some
 of them name the generic autopilot in their heartbeat, where they should name none."""
@@ -124,19 +114,8 @@ class VehicleChoice:
 
 def vehicle_in_words(machine: ComponentMachine) -> str:
     """Return address, autopilot and kind of vehicle: `1/1 PX4 quadrotor`."""
-    autopilot, kind = machine.who.autopilot, machine.who.vehicle_type
-    words = [f"{machine.system}/{machine.component}"]
-    if autopilot not in (None, MAV_AUTOPILOT_GENERIC, MAV_AUTOPILOT_INVALID):
-        words.append(_AUTOPILOTS.get(autopilot) or _word("MAV_AUTOPILOT", "autopilot", autopilot))
-    if kind is not None and (kind != MAV_TYPE_GENERIC or len(words) == 1):
-        words.append(_VEHICLES.get(kind) or _word("MAV_TYPE", "type", kind))
-    return " ".join(words)
-
-
-def _word(enum: str, what: str, number: int) -> str:
-    """Return the name of a number, or the number with a word of what it is."""
-    word = enum_word(enum, number)
-    return f"{what} {word}" if word.isdecimal() else word
+    kind = kind_in_words(machine.who.autopilot, machine.who.vehicle_type)
+    return f"{machine.system}/{machine.component} {kind}".rstrip()
 
 
 def _autopilots(machines: Iterable[ComponentMachine]) -> list[ComponentMachine]:

@@ -18,6 +18,7 @@ from paramclient.events import Changes, Event, Found, Heard, Lost
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
 from paramclient.protocol.change import Change
+from paramclient.protocol.peers import Contest
 from paramclient.protocol.result import FetchResult, Progress
 from paramclient.protocol.sampling import SAMPLE_SIZE
 from paramclient.protocol.sync import SyncState
@@ -135,6 +136,14 @@ class RemoteComponent(Component):
         return (
             SyncState.UNSYNCED if self._client._connection.is_away and state is not SyncState.LOST else state
         )
+
+    @property
+    def contest(self) -> Contest | None:
+        """See `Component.contest`."""
+        told: Document | None = self._document["contest"]
+        if told is None:
+            return None
+        return Contest(self.system, self.component, tuple(told["claimants"]), str(told["difference"]))
 
     @property
     def is_armed(self) -> bool | None:

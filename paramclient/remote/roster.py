@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import anyio
 
 from paramclient.errors import LinkError, NoReply, ParamClientError
-from paramclient.events import Event, Events, Found, Lost, Rebooted, Resynced
+from paramclient.events import Contested, Event, Events, Found, Lost, Rebooted, Resynced, Uncontested
 from paramclient.remote.component import Key, RemoteComponent
 from paramclient.remote.connection import Connection
 from paramclient.remote.reading import Document, hash_of, params_of, understood
@@ -22,7 +22,7 @@ __all__ = ["Roster", "key_of"]
 
 CATCHING_UP: Final = 2.0
 """Seconds for which an answer waits for the events of what it tells; they mostly came before it."""
-UNSURE: Final = ("cached", "lost")
+UNSURE: Final = ("cached", "contested", "lost")
 """States that a table comes into when its values are trusted no longer."""
 MOST_GONE: Final = 1_000
 """Components that the service knows no more and that are the same when it hears them again; of older ones
@@ -128,6 +128,13 @@ class Roster:
                 component._announce(Lost(component, event["silence_s"]))
             case "found":
                 component._announce(Found(component, event["silence_s"]))
+            case "contested":
+                self._doubt(component)
+                if component.contest is not None:
+                    component._announce(Contested(component, component.contest))
+            case "uncontested":
+                self._doubt(component)
+                component._announce(Uncontested(component))
             case "rebooted":
                 self._doubt(component)
                 component._announce(Rebooted(component))

@@ -12,7 +12,7 @@ import anyio
 from paramclient.client import ParamClient
 from paramclient.documents.link import LinkDoc, StatsDoc
 from paramclient.errors import LinkError, ParamClientError, UsageError
-from paramclient.events import Event, Events, Found, Heard, Lost, Rebooted, Resynced
+from paramclient.events import Contested, Event, Events, Found, Heard, Lost, Rebooted, Resynced, Uncontested
 from paramclient.notation import hash_text, rounded
 from paramclient.service.following import Followed
 
@@ -136,6 +136,13 @@ class Line:
             case Rebooted():
                 self.followed[address].look()
                 self.followed[address].tell_of_it("rebooted")
+                self._met(self.followed[address])
+            case Contested():
+                self.followed[address].look()
+                self.followed[address].tell_of_it("contested")
+            case Uncontested():
+                self.followed[address].look()
+                self.followed[address].tell_of_it("uncontested")
                 self._met(self.followed[address])
             case Resynced(changed=changed, hash=crc):
                 self.followed[address].look()

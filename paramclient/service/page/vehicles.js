@@ -14,13 +14,14 @@ const STATES = {
   partial: "not complete",
   synced: "up to date",
   fetching: "fetching",
+  contested: "contested: several vehicles have this address",
   lost: "lost",
 };
 /** A table that has to be fetched first. */
 const SAVE_PATIENCE = 180_000;
 /** A file of descriptions may have 100 kB, and the radio 2 kB a second. */
 const DESCRIPTION_PATIENCE = 300_000;
-const KINDS = { new: "idle", cached: "warn", partial: "warn", synced: "good", fetching: "busy", lost: "bad" };
+const KINDS = { new: "idle", cached: "warn", partial: "warn", synced: "good", fetching: "busy", contested: "bad", lost: "bad" };
 /** The kinds of vehicle of MAV_TYPE that have parameters worth a name. */
 const TYPES = {
   1: "plane",

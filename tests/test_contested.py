@@ -1,0 +1,230 @@
+"""Two vehicles under one address of a link: the client, the cache, the service and the command."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+
+from paramclient import (
+    Contested,
+    ContestedAddress,
+    Heard,
+    ParamCache,
+    ParamClient,
+    Uncontested,
+    writethrough,
+)
+from paramclient.links import create_link, serve_endpoint
+from paramclient.links.udp import UdpIn
+from paramclient.protocol.presence import LOST_AFTER
+from paramclient.sim import ArduPilotVehicle, Endpoint, PX4Vehicle
+from tests.commands import Command, behind, in_process, leaping
+from tests.served import C, met, problem, service
+from tests.shell import Late, PeersLink, outcome, swiftly, until
+from tests.ways import ServedClient
+
+TABLE: dict[str, Any] = {"SHARED_A": 1, "SHARED_B": 2, "PX4_ONLY": 3}
+OTHER: dict[str, Any] = {"SHARED_A": 100.0, "SHARED_B": 200.0, "APM_ONLY": 300.0}
+
+px4 = partial(PX4Vehicle, table=TABLE)
+ardupilot = partial(ArduPilotVehicle, table=OTHER, ftp=False)
+
+
+def two(*, first: Endpoint | None = None, by: float = 0.0, until: float = 1e9) -> PeersLink:
+    """A PX4 and an ArduPilot, both system 1, at two peers of one link."""
+    return PeersLink({("10.0.0.1", 14550): first or px4(), ("10.0.0.2", 14550): Late(ardupilot(), by, until)})
+
+
+def cached(path: Path) -> dict[str, dict[str, float]]:
+    """Every table in a cache, by its vehicle."""
+    with ParamCache(path) as cache:
+        return {
+            vehicle.identity.key: {name: float(p.value) for name, p in table.params.items()}
+            for vehicle in cache.vehicles()
+            for table in [cache.load(vehicle.identity.key, 1)]
+            if table is not None
+        }
+
+
+def lines(path: Path) -> list[Any]:
+    """Every line of history."""
+    with ParamCache(path) as cache:
+        return [line for each in cache.vehicles() for line in cache.history(vehicle=each.identity.key)]
+
+
+@swiftly
+async def test_no_mixed_table_and_no_false_line_reaches_the_cache(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "cache.sqlite3"
+    async with ParamClient(two(), cache=path) as client:
+        events = client.events()
+        vehicle = await client.component()
+        await outcome(vehicle.fetch_all(timeout=10.0))
+        await anyio.sleep(3.0)
+        assert vehicle.contest is not None
+        assert vehicle.state == "contested"
+        calls: list[Callable[[], Any]] = [
+            lambda: vehicle.fetch_all(),
+            lambda: vehicle.get("SHARED_A"),
+            lambda: vehicle.set("SHARED_A", 5),
+            lambda: vehicle.set("SHARED_A", 5, durable=True),
+            lambda: vehicle.reboot(),
+            lambda: client.ftp(vehicle).read("@PARAM/param.pck"),
+        ]
+        for call in calls:
+            with pytest.raises(ContestedAddress) as caught:
+                await call()
+            assert (caught.value.system, caught.value.component) == (1, 1)
+            assert len(caught.value.claimants) == 2
+        told = [await anext(events) for _ in range(2)]
+        assert isinstance(told[1], Contested)
+        assert told[1].contest == vehicle.contest
+    whole = [set(TABLE), set(OTHER)]
+    for table in cached(path).values():
+        assert set(table) in whole, "no table of both"
+        assert table in ({name: float(value) for name, value in each.items()} for each in (TABLE, OTHER))
+    assert lines(path) == []
+    [warning] = [each for each in caplog.records if each.levelno >= logging.WARNING]
+    text = warning.getMessage()
+    for said in ("1/1", "PX4 quadrotor", "10.0.0.1:14550", "ArduPilot quadrotor", "10.0.0.2:14550"):
+        assert said in text
+
+
+@swiftly
+async def test_what_came_in_a_contest_through_one_peer_goes_nowhere(tmp_path: Path) -> None:
+    """Both vehicles behind one radio, with values of both in the table before they are told apart."""
+    path = tmp_path / "cache.sqlite3"
+    link = PeersLink({"radio": px4(), "radio ": Late(ardupilot(), 6.0, 20.0)})
+    link_receive = link.receive
+
+    async def through_one_peer() -> Any:
+        return [("radio", data) for _, data in await link_receive()]
+
+    link.receive = through_one_peer  # type: ignore[method-assign]
+    async with ParamClient(link, cache=path) as client:
+        vehicle = await client.component()
+        await vehicle.fetch_all()
+        await vehicle.set("SHARED_A", 7)
+        await anyio.sleep(4.0)  # all of that is written by now
+        before = cached(path)
+        written = len(lines(path))
+        await until(lambda: vehicle.contest is not None)
+        with pytest.raises(ContestedAddress):
+            await vehicle.set("SHARED_A", 8)
+        await anyio.sleep(1.0)
+        assert cached(path) == before
+        await until(lambda: vehicle.contest is None)
+        await anyio.sleep(1.0)
+        assert (await vehicle.fetch_all()).params["SHARED_A"].value == 7
+        assert set(vehicle.params) == set(TABLE)
+    assert cached(path) == before
+    assert len(lines(path)) == written
+
+
+@swiftly
+async def test_when_one_is_silent_the_other_is_identified_anew_and_written_again(tmp_path: Path) -> None:
+    path = tmp_path / "cache.sqlite3"
+    async with ParamClient(two(by=2.0, until=8.0), cache=path) as client:
+        events = client.events()
+        vehicle = await client.component()
+        await vehicle.fetch_all()
+        await until(lambda: vehicle.contest is not None)
+        began = anyio.current_time()
+        await until(lambda: vehicle.contest is None)
+        assert anyio.current_time() - began < 8.0 + LOST_AFTER
+        told = [await anext(events) for _ in range(3)]
+        assert [type(each) for each in told][1:] == [Contested, Uncontested]
+        assert (await vehicle.set("SHARED_A", 9)).actual == 9
+        await anyio.sleep(2 * writethrough.FLUSH_INTERVAL)
+    [table] = cached(path).values()
+    assert table == {"SHARED_A": 9.0, "SHARED_B": 2.0, "PX4_ONLY": 3.0}
+
+
+@swiftly
+async def test_closing_in_a_contest_writes_nothing(tmp_path: Path) -> None:
+    path = tmp_path / "cache.sqlite3"
+    for table in (TABLE, {**TABLE, "SHARED_A": 50}):
+        async with ParamClient(two(first=px4(table=table)), cache=path) as client:
+            vehicle = await client.component()
+            await until(lambda: vehicle.contest is not None)  # noqa: B023 - awaited at once
+    assert lines(path) == []
+
+
+@swiftly
+async def test_the_service_tells_it_and_answers_409() -> None:
+    async with service(two()) as (_, browser):
+        await met(browser)
+        await anyio.sleep(3.0)
+        document = (await browser.get(C)).json()
+        assert document["state"] == "contested"
+        assert len(document["contest"]["claimants"]) == 2
+        assert "autopilot" in document["contest"]["difference"]
+        answer = await browser.put(f"{C}/params/SHARED_A", json={"value": 5})
+        told = problem(answer, 409, "contested-address")
+        assert told["claimants"] == document["contest"]["claimants"]
+
+
+def test_the_command_says_so_on_stderr(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = "udpin:0.0.0.0:14550"
+    leaping(monkeypatch)
+    put = behind(monkeypatch, url)
+    command: Command = in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
+    put(two())
+    done = command("set", url, "SHARED_A", "5")
+    assert done.code == 1
+    assert "contested" in done.out
+    for peer in ("10.0.0.1:14550", "10.0.0.2:14550"):
+        assert peer in done.err
+
+
+def test_two_autopilots_on_one_udp_port(tmp_path: Path) -> None:
+    """Over sockets: two simulated vehicles that send to one port from two others."""
+    path = tmp_path / "cache.sqlite3"
+
+    async def main() -> None:
+        vehicles = (px4(), ardupilot())
+        async with ParamClient("udpin:127.0.0.1:0", cache=path) as client, anyio.create_task_group() as tasks:
+            assert isinstance(client.link, UdpIn)
+            assert client.link.address is not None
+            name = f"udpout:127.0.0.1:{client.link.address[1]}"
+            for vehicle in vehicles:
+                await tasks.start(serve_endpoint, vehicle, create_link(name))
+            component = await client.component()
+            await outcome(component.fetch_all(timeout=3.0))
+            await until(lambda: component.contest is not None)
+            with pytest.raises(ContestedAddress):
+                await component.set("SHARED_A", 5)
+            assert [vehicle.requests["PARAM_SET"] for vehicle in vehicles] == [0, 0]
+            tasks.cancel_scope.cancel()
+
+    anyio.run(main)
+    for table in cached(path).values():
+        assert set(table) in (set(TABLE), set(OTHER))
+    assert lines(path) == []
+
+
+@swiftly
+async def test_a_client_of_the_service_is_told_as_well() -> None:
+    async with ServedClient(two(by=2.0, until=8.0), cache=False) as client:
+        events = client.events()
+        vehicle = await client.component()
+        await vehicle.get("SHARED_A")
+        await until(lambda: vehicle.contest is not None)
+        assert vehicle.state == "contested"
+        assert vehicle.contest is not None
+        assert "10.0.0.2:14550" in vehicle.contest.claimants[1]
+        with pytest.raises(ContestedAddress, match="is contested") as caught:
+            await vehicle.set("SHARED_A", 5)
+        assert caught.value.claimants == vehicle.contest.claimants
+        await until(lambda: vehicle.contest is None)
+        told = [await anext(events) for _ in range(3)]
+        assert [type(each) for each in told] == [Heard, Contested, Uncontested]
