@@ -7,6 +7,7 @@
 #   make cost       CPU and memory                 make peers      downloads beside other programs
 #   make scale      250 systems on one link        make fuzz       each target of fuzz/ for a while
 #   make soak       10,000 sessions at random      make kills      1,000 programs killed as they write
+#   make attack     hostile clients and services   make fuzz-http  requests at random to the service
 #   make clean      remove all that was made
 #   make screenshots  what the page looks like, into docs/images
 #   make live LINK=udpin:127.0.0.1:14550   checks on a real vehicle, which must be disarmed
@@ -21,7 +22,7 @@ PIP = $(BIN)/python -m pip install --quiet --disable-pip-version-check
 TESTS ?=
 SESSIONS ?= 10000
 KILLS ?= 1000
-TARGETS ?= cache component files framer metadata pack signing tlog
+TARGETS ?= cache component files framer metadata pack service signing tlog
 SECONDS ?= 1800
 LINK ?=
 KIND ?=
@@ -41,7 +42,7 @@ WORKERS ?= $(shell $(BIN)/python -c 'import os; print((os.cpu_count() or 1) + 2)
 # the tests start some hundred processes; without bytecode each would compile paramclient anew, and each worker the tests
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo test coverage soak kills live fuzz lint docs screenshots bench cost scale peers dist clean
+.PHONY: demo test coverage soak kills live fuzz fuzz-http attack lint docs screenshots bench cost scale peers dist clean
 .NOTPARALLEL:
 
 demo: $(VENV)/with-cli
@@ -103,6 +104,13 @@ scale: $(VENV)/with-cli
 peers: $(VENV)/with-peers
 	$(BIN)/python bench/peers.py
 
+attack: $(VENV)/with-cli
+	$(BIN)/python bench/attack.py
+
+# make fuzz-http SECONDS=1200
+fuzz-http: $(VENV)/with-cli $(VENV)/with-fuzz-http
+	$(BIN)/python -m fuzz.over_http --seconds $(SECONDS)
+
 dist: $(VENV)/with-test
 	rm -rf dist
 	$(BIN)/hatchling build
@@ -126,7 +134,7 @@ $(VENV)/with-cli: pyproject.toml $(VENV)/made
 	@touch $@
 
 # dependency groups need pip 25.1, and the pip of the environment is as old as its Python
-$(VENV)/with-test $(VENV)/with-lint $(VENV)/with-docs $(VENV)/with-peers $(VENV)/with-fuzz: $(VENV)/with-%: pyproject.toml $(VENV)/with-cli
+$(VENV)/with-test $(VENV)/with-lint $(VENV)/with-docs $(VENV)/with-peers $(VENV)/with-fuzz $(VENV)/with-fuzz-http: $(VENV)/with-%: pyproject.toml $(VENV)/with-cli
 	@echo "Installing what $* needs into $(VENV)"
 	@$(PIP) 'pip>=25.1'
 	@$(PIP) --group $*

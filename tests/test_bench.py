@@ -32,6 +32,14 @@ def bench(name: str, *arguments: str, code: int = 0) -> str:
     return run.stdout
 
 
+@pytest.mark.parametrize("group", ["handshakes over", "requests", "guesses", "origins", "stuck", "hostile"])
+def test_attacks_are_held(group: str) -> None:
+    """The quick ones, with time for a machine that does other things besides."""
+    text = bench("attack", "--quick", "--slack", "10", "--only", group)
+    assert re.match(r"attack +what +limit +measured +held$", text, re.MULTILINE), text
+    assert " NO" not in text
+
+
 def test_cost_prints_every_figure_beside_its_target() -> None:
     text = bench("cost", "--rounds", "1", "--seconds", "0.2")
     for way in ("pymavlink, parsing only", "in a fetch", "first values", "values known"):

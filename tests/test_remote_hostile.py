@@ -12,12 +12,13 @@ import zlib
 from collections.abc import AsyncIterator, Awaitable, Callable, Iterable
 from typing import Any
 
+import httpx
 import pytest
 
 from paramclient import ParamClient
 from paramclient.errors import LinkError, ParamClientError
 from paramclient.protocol.change import Change
-from paramclient.remote import bounded, mirror, requests, roster
+from paramclient.remote import RemoteClient, bounded, mirror, requests, roster
 from paramclient.remote.bounded import (
     DEEPEST,
     MOST_ANSWER,
@@ -240,6 +241,49 @@ async def test_what_it_answers_in_between_ends_no_program() -> None:
         assert list(client.components) == [(1, 1)]
         with pytest.raises(LinkError, match="cannot be understood"):
             await client.component(timeout=1)
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("changed", [{"name": {}}, {"name": None}, {"bits": []}, {"index": "x"}, {"type": 5}])
+async def test_a_parameter_that_is_none_is_an_error(changed: dict[str, object]) -> None:
+    told = {"name": "A", "value": 1, "type": "INT32", "index": 0, "bits": "1", "trust": "live"}
+    answers = {"/components/1/1/read": document(told | changed), "/find": document(component())}
+    answers["/components/1/1/params"] = document({"run": RUN, "seq": 0, "params": {}})
+
+    async def read(client: ParamClient) -> None:
+        await (await client.component(timeout=5)).get("A", timeout=5)
+
+    with pytest.raises(LinkError, match="cannot be understood"):
+        await opened(dict(answers), read)
+
+
+class Open(httpx.AsyncByteStream):
+    """Events that have no end."""
+
+    async def __aiter__(self) -> AsyncIterator[bytes]:
+        yield b"data: " + HELLO + b"\n\n"
+        await asyncio.sleep(60)
+
+
+@pytest.mark.asyncio
+async def test_a_transport_may_have_read_the_answer() -> None:
+    """As those for tests do."""
+
+    def answer(request: httpx.Request) -> httpx.Response:
+        if request.url.path.endswith("/events"):
+            return httpx.Response(200, headers={"Content-Type": "text/event-stream"}, stream=Open())
+        told = {
+            "links": [],
+            "run": RUN,
+            "seq": 0,
+            "components": [component()],
+            "asker": "local",
+            "params": {},
+        }
+        return httpx.Response(200, json=told)
+
+    async with RemoteClient("http://127.0.0.1:1", transport=httpx.MockTransport(answer)) as client:
+        assert list(client.components) == [(1, 1)]
 
 
 @pytest.mark.asyncio

@@ -6,6 +6,7 @@ import struct
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import fields
+from types import NoneType
 from typing import Any, Final
 
 from paramclient.errors import LinkError, ParamClientError
@@ -36,7 +37,7 @@ __all__ = [
 Document = Mapping[str, Any]
 
 _WORDS: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
-_IDENTITY: Final = {"link": (str,), "git_hash": (str,), "uid": (str, type(None))}
+_IDENTITY: Final = {"link": (str,), "git_hash": (str,), "uid": (str, NoneType)}
 """What those members of an identity are that are no numbers."""
 _FLOAT32: Final = struct.Struct("<f")
 
@@ -85,8 +86,10 @@ def param_of(document: Document, name: str | None = None) -> Param:
     kind = ParamType[named] if named in ParamType.__members__ else int(named.removeprefix("TYPE_"))
     bits = int(document["bits"], 16)
     index, default = document["index"], document.get("default")
+    name = document["name"] if name is None else name
+    check_kind(name, str)
     return Param(
-        document["name"] if name is None else name,
+        name,
         from_bits(bits, kind, is_raw=str(document["value"]).startswith("0x")),
         kind,
         None if index is None else int(index),
@@ -126,7 +129,12 @@ def check_kind(value: object, *kinds: type) -> None:
 
 def progress_of(document: Document) -> Progress:
     """How far a fetch is."""
-    return Progress(*(document[each.name] for each in fields(Progress)))
+    told = Progress(*(document[each.name] for each in fields(Progress)))
+    check_kind(told.received, int)
+    check_kind(told.total, int, NoneType)
+    check_kind(told.rate, int, float)
+    check_kind(told.seconds_left, int, float, NoneType)
+    return told
 
 
 def fetch_result_of(document: Document, params: Mapping[str, Param], elapsed: float) -> FetchResult:

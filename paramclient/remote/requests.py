@@ -179,7 +179,7 @@ class Requests:
                 yield heard
 
     async def _heard(self, response: httpx.Response) -> AsyncGenerator[list[Any], None]:
-        chunks = response.aiter_raw().__aiter__()
+        chunks = _pieces(response)
         reader = EventReader()
         now = anyio.current_time()
         pace, hello_ends = Pace(now), now + HELLO_PATIENCE
@@ -241,9 +241,10 @@ class Requests:
     async def _read(self, response: httpx.Response) -> bytes:
         content = bytearray()
         pace, received = Pace(anyio.current_time()), 0
-        chunks = response.aiter_raw().__aiter__()
+        chunks = _pieces(response)
+        encoding = "" if response.is_stream_consumed else response.headers.get("Content-Encoding", "")
         try:
-            decode = decoder_of(response.headers.get("Content-Encoding", "").strip().lower())
+            decode = decoder_of(encoding.strip().lower())
             while True:
                 with anyio.fail_after(pace.left(received, anyio.current_time())):
                     chunk = await anext(chunks, None)
@@ -294,6 +295,11 @@ class Requests:
 
     def _foreign(self) -> LinkError:
         return LinkError(f"{self.name} answers, but not as a service of paramclient does", link=self.name)
+
+
+def _pieces(response: httpx.Response) -> AsyncIterator[bytes]:
+    """The bytes of an answer as they come; decoded already where the transport has read all of it."""
+    return response.aiter_bytes() if response.is_stream_consumed else response.aiter_raw()
 
 
 def _socket_options() -> list[tuple[int, int, int]]:

@@ -109,6 +109,8 @@ class Gate:
                 patience = connections.HEAD_PATIENCE if self._tls is None else HANDSHAKE_PATIENCE
                 with anyio.fail_after(patience):
                     await anyio.wait_readable(connection)
+                    if not connection.recv(1, socket.MSG_PEEK):
+                        return  # it has left without a word
                     place.stage = Stage.BEGUN
                     protocol = self._protocol(place)
                     is_handed_over = True  # whatever happens, the transport closes the socket

@@ -1,0 +1,644 @@
+"""What hostile hands can do to the service and to its clients: attack, limit, measured, held.
+
+    python bench/attack.py [--quick] [--only TEXT] [--slack N] [--json]
+
+Each group of attacks has a service of its own (`paramclient serve`, with and without TLS, on loopback), and
+each attack says what it measures and what the limit is. 127.0.0.1 is this computer there; other addresses of
+the loopback network play clients beyond it, as the process begins with a notion of its own of what this
+computer is. Nothing else in it is changed, but that the event loop notes how much processor time its longest
+callback has taken.
+
+`--quick` runs those that take about a second each. The exit code is 1 where a limit was not held. Linux only:
+memory is read from /proc.
+"""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import contextlib
+import dataclasses
+import gzip
+import json
+import os
+import re
+import resource
+import shutil
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
+from contextlib import asynccontextmanager, contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Final
+
+from pymavlink.dialects.v20 import common
+
+ROOT: Final = Path(__file__).parent.parent
+CERT: Final = ROOT / "tests" / "data" / "tls_station.pem"
+KEY: Final = ROOT / "tests" / "data" / "tls_station.key"
+HERE, ELSEWHERE, FAR = "127.0.0.1", "127.0.0.2", "127.0.0.3"
+"""This computer, the attacker beyond it, and somebody else beyond it."""
+WRITER, READER = "writer-0123456789abcdef", "reader-0123456789abcdef"
+C: Final = "/api/v1/components/1/1"
+MEGABYTE: Final = 1_000_000
+PATIENCE: Final = 60.0
+"""Seconds for a process to start, and for an answer to come."""
+
+REACHED: Final = 1.0
+"""Seconds within which `/health` is answered."""
+BLOCKED: Final = 50.0
+"""Milliseconds of processor time of the longest callback of the event loop."""
+MEMORY: Final = 64.0
+"""Megabytes by which the memory of the service grows at most."""
+LOG: Final = 10.0
+"""Kilobytes in the log."""
+ENDED: Final = 3.0
+"""Seconds from SIGTERM to the end."""
+
+LAUNCH: Final = """
+import asyncio.events, json, os, signal, sys, time
+from paramclient.service import places
+places.is_loopback = lambda address: address == "127.0.0.1"
+longest, run = 0.0, asyncio.events.Handle._run
+def timed(handle):
+    global longest
+    began = time.thread_time()
+    run(handle)
+    longest = max(longest, time.thread_time() - began)
+asyncio.events.Handle._run = timed
+def tell(*_):
+    global longest
+    with open(told + ".new", "w") as file:
+        json.dump(longest, file)
+    os.replace(told + ".new", told)
+    longest = 0.0
+signal.signal(signal.SIGUSR1, tell)
+told = sys.argv.pop(1)
+from paramclient.__main__ import main
+sys.exit(main())
+"""
+
+
+@dataclass
+class Row:
+    """One line of the table."""
+
+    attack: str
+    what: str
+    limit: float
+    measured: float
+    unit: str
+
+    @property
+    def is_held(self) -> bool:
+        """Whether it stayed within the limit."""
+        return self.measured <= self.limit
+
+
+@dataclass
+class Service:
+    """A service that runs."""
+
+    process: subprocess.Popen[bytes]
+    port: int
+    folder: Path
+    tls: ssl.SSLContext | None
+    rows: list[Row] = field(default_factory=list)
+    attack: str = ""
+    cpu: int = -10
+
+    def note(self, what: str, limit: float, measured: float, unit: str) -> None:
+        """Add a line to the table."""
+        self.rows.append(Row(self.attack, what, limit, round(measured, 3), unit))
+
+    @property
+    def log(self) -> str:
+        """All that it has written on stderr."""
+        return (self.folder / "log").read_text(errors="replace")
+
+    def memory(self, name: str = "VmHWM") -> float:
+        """Megabytes: the most since `forget`, or VmRSS for now."""
+        text = Path(f"/proc/{self.process.pid}/status").read_text()
+        found = re.search(rf"{name}:\s+(\d+) kB", text)
+        assert found is not None
+        return int(found[1]) / 1024
+
+    def forget(self) -> None:
+        """Begin to measure memory and the event loop anew."""
+        Path(f"/proc/{self.process.pid}/clear_refs").write_text("5")
+        self.blocked()
+
+    def blocked(self) -> float:
+        """Milliseconds that the longest callback of the event loop has taken since this was asked last."""
+        told = self.folder / "loop"
+        told.unlink(missing_ok=True)
+        self.process.send_signal(signal.SIGUSR1)
+        deadline = time.monotonic() + PATIENCE
+        while not told.exists() and time.monotonic() < deadline:
+            time.sleep(0.01)
+        return float(json.loads(told.read_text())) * 1_000
+
+    @contextmanager
+    def watched(self, *, memory: float | None = MEMORY, blocked: float | None = BLOCKED) -> Iterator[None]:
+        """Measure what happens in here."""
+        self.forget()
+        before, log = self.memory("VmRSS"), len(self.log)
+        yield
+        if memory is not None:
+            self.note("memory grows", memory, self.memory() - before, "MB")
+        if blocked is not None:
+            self.note("event loop held", blocked, self.blocked(), "ms")
+        self.note("log grows", LOG, (len(self.log) - log) / 1_000, "kB")
+
+    async def ask(
+        self,
+        method: str = "GET",
+        path: str = "/health",
+        body: bytes = b"",
+        *headers: str,
+        source: str = HERE,
+        kind: str = "application/json",
+    ) -> tuple[int, bytes]:
+        """One request on a connection of its own: the status, 0 where there was no answer, and the body."""
+        lines = [f"{method} {path} HTTP/1.1", f"Host: 127.0.0.1:{self.port}", "Connection: close", *headers]
+        lines += [f"Content-Type: {kind}", f"Content-Length: {len(body)}"] if body else []
+        data = b""
+        with contextlib.suppress(OSError, asyncio.TimeoutError):
+            reader, writer = await asyncio.open_connection(
+                "127.0.0.1", self.port, ssl=self.tls, local_addr=(source, 0)
+            )
+            try:
+                writer.write("\r\n".join([*lines, "", ""]).encode() + body)
+                data = await asyncio.wait_for(reader.read(), PATIENCE)
+            finally:
+                writer.transport.abort()
+        head, _, content = data.partition(b"\r\n\r\n")
+        return (int(head.split()[1]) if head else 0), content
+
+    async def reached(self, what: str, source: str = HERE, times: int = 3) -> None:
+        """Note the longest that `/health` takes."""
+        longest = 0.0
+        for _ in range(times):
+            began = time.monotonic()
+            status, _ = await self.ask(source=source)
+            longest = max(longest, time.monotonic() - began if status == 200 else PATIENCE)
+        self.note(what, REACHED, longest, "s")
+
+    def is_busy(self) -> bool:
+        """Whether it has taken processor time since this was asked last."""
+        before, self.cpu = (
+            self.cpu,
+            sum(map(int, Path(f"/proc/{self.process.pid}/stat").read_text().split()[13:15])),
+        )
+        return self.cpu > before + 2
+
+    def end(self) -> float:
+        """SIGTERM; give the seconds until it ended."""
+        began = time.monotonic()
+        self.process.send_signal(signal.SIGTERM)
+        try:
+            self.process.wait(PATIENCE)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+        return time.monotonic() - began
+
+
+@asynccontextmanager
+async def serving(
+    rows: list[Row], *words: str, tls: bool = False, tokens: bool = True, folder: Path | None = None
+) -> AsyncIterator[Service]:
+    """A fresh service."""
+    own = Path(tempfile.mkdtemp()) if folder is None else folder
+    words = (*words, "--listen", "127.0.0.1:0")
+    if tls:
+        words = (*words, "--tls-cert", str(CERT), "--tls-key", str(KEY))
+    if tokens:
+        path = own / "tokens"
+        path.write_text(f"writer write {WRITER}\nreader read {READER}\n")
+        path.chmod(0o600)
+        words = (*words, "--token-file", str(path))
+    command = [sys.executable, "-c", LAUNCH, str(own / "loop"), "serve", *words]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT), "XDG_CACHE_HOME": str(own)}
+    with (own / "log").open("ab") as log:
+        process = subprocess.Popen(  # noqa: ASYNC220 - it takes a millisecond
+            command, stdout=subprocess.PIPE, stderr=log, env=environment, cwd=own
+        )
+    try:
+        assert process.stdout is not None
+        line = await asyncio.to_thread(process.stdout.readline)
+        if not line:
+            raise SystemExit((own / "log").read_text())
+        context = ssl.create_default_context(cafile=str(CERT)) if tls else None
+        yield Service(process, int(line.split(b":")[-1]), own, context, rows)
+    finally:
+        if process.poll() is None:
+            process.kill()
+        process.wait()
+        assert process.stdout is not None
+        process.stdout.close()
+        if folder is None:
+            shutil.rmtree(own, ignore_errors=True)
+
+
+@contextmanager
+def connections(
+    service: Service, count: int, source: str, data: bytes = b""
+) -> Iterator[list[socket.socket]]:
+    """Plain TCP connections that send these bytes and nothing else."""
+    held = []
+    try:
+        for _ in range(count):
+            one = socket.socket()
+            one.bind((source, 0))
+            one.setblocking(False)
+            one.connect_ex(("127.0.0.1", service.port))
+            held.append(one)
+            if data:
+                with contextlib.suppress(OSError):
+                    one.send(data)
+        yield held
+    finally:
+        for one in held:
+            one.close()
+
+
+def token(text: str) -> str:
+    """The header that shows a token."""
+    return f"Authorization: Bearer {text}"
+
+
+# The attacks
+
+
+async def handshakes(service: Service, quick: bool) -> None:
+    """Clause 6."""
+    count = 300 if quick else 2_000
+    for source, data, who in (
+        (ELSEWHERE, b"", "silent, from one address"),
+        (HERE, b"", "silent, from this computer"),
+        (ELSEWHERE, b"\x16\x03\x01", "of 3 bytes, from one address"),
+    ):
+        service.attack = f"{count:,} connections, {who}, {'TLS' if service.tls else 'plain'}"
+        with service.watched(blocked=None), connections(service, count, source, data):
+            await asyncio.sleep(0.2)
+            await service.reached("/health, this computer")
+            await service.reached("/health, another address", FAR)
+    if service.tls is not None:
+        service.attack = f"{count:,} failed handshakes"
+        with service.watched(blocked=None):
+            for _ in range(count):
+                with connections(service, 1, ELSEWHERE, b"GET / HTTP/1.1\r\n\r\n") as [one]:
+                    one.setblocking(True)
+                    one.settimeout(5)
+                    with contextlib.suppress(OSError):
+                        one.sendall(b"GET / HTTP/1.1\r\n\r\n")
+                        one.recv(100)
+            await service.reached("/health, this computer")
+
+
+async def requests(service: Service, quick: bool) -> None:
+    """Clause 7, with a token that may only read."""
+    for path in ("/api/v1/find", f"{C}/fetch"):
+        status, answer = await service.ask("POST", path, b'{"timeout_s": 60}', token(READER))
+        assert status == 200, answer
+    names = [f"X{number:05}" for number in range(60_000)]
+    sets_json = b"[" + b"{}," * (2 * MEGABYTE // 3 - 1) + b"{}]"
+    sets_yaml = b"- {}\n" * (2 * MEGABYTE // 5)
+    octets = "application/octet-stream"
+    diff = {"wanted": {"defaults": True}, "known": True, "timeout_s": 60}
+    unknown = b"{" + b",".join(b'"a%06d":1' % number for number in range(8 * MEGABYTE // 12)) + b"}"
+    posts: list[tuple[str, str, bytes, str]] = [
+        (
+            "/diff with 10,000 patterns",
+            f"{C}/diff",
+            as_json(diff, only=[f"*{n}*" for n in names[:10_000]]),
+            "",
+        ),
+        ("/diff with 10,000 names", f"{C}/diff", as_json(diff, only=names[:10_000]), ""),
+        ("8 MB of unknown members", f"{C}/diff", unknown, ""),
+        ("2 MB of unknown members", f"{C}/diff", unknown[: 2 * MEGABYTE].rpartition(b",")[0] + b"}", ""),
+        ("2 MB of empty sets, JSON", "/api/v1/files?name=a.json", sets_json, octets),
+        ("2 MB of empty sets, YAML", "/api/v1/files?name=a.yaml", sets_yaml, octets),
+        (
+            "a plan with 60,000 names",
+            f"{C}/plan",
+            as_json({"wanted": {"values": dict.fromkeys(names, 1)}}),
+            "",
+        ),
+        ("a deep body", f"{C}/diff", b"[" * 60_000, ""),
+    ]
+    for attack, path, body, kind in posts:
+        service.attack = attack
+        with service.watched():
+            asking = asyncio.create_task(
+                service.ask("POST", path, body, token(READER), kind=kind or "application/json")
+            )
+            await asyncio.sleep(0.05)
+            await service.reached("/health meanwhile", times=1)
+            status, _ = await asking
+            service.note("answered with 5xx", 0, status >= 500, "times")
+    service.attack = "256 jobs of one token"
+    with service.watched():
+        statuses = [
+            (await service.ask("POST", f"{C}/fetch", b'{"wait": false, "refresh": true}', token(READER)))[0]
+            for _ in range(40 if quick else 256)
+        ]
+        service.note("answered with 5xx", 0, sum(s >= 500 for s in statuses), "times")
+        began = time.monotonic()
+        status, _ = await service.ask("GET", f"{C}/params", b"", token(WRITER))
+        service.note(
+            "a read of another token", 2.0, time.monotonic() - began if status == 200 else PATIENCE, "s"
+        )
+    service.attack = "60 open bodies of 1 MB"
+    head = [f"POST {C}/diff HTTP/1.1", f"Host: 127.0.0.1:{service.port}", token(READER)]
+    head += ["Content-Type: application/json", f"Content-Length: {3 * MEGABYTE}", "", ""]
+    with service.watched(), connections(service, 60, ELSEWHERE) as held:
+        data = "\r\n".join(head).encode() + b" " * MEGABYTE
+        loop = asyncio.get_running_loop()
+
+        async def send(one: socket.socket) -> None:
+            with contextlib.suppress(OSError, TimeoutError):
+                await asyncio.wait_for(loop.sock_sendall(one, data), 2.0)
+
+        await asyncio.gather(*map(send, held))
+        await service.reached("/health meanwhile", times=1)
+
+
+async def guesses(service: Service, quick: bool) -> None:
+    """Clause 8, with 127.0.0.2 for a proxy that is trusted."""
+    service.attack = "30 wrong tokens, then a right one"
+    for sources, shown, limit in (
+        ([HERE, HERE], ["", ""], 2.5),
+        ([ELSEWHERE, ELSEWHERE], ["X-Forwarded-For: 198.51.100.1", "X-Forwarded-For: 198.51.100.2"], 0.5),
+    ):
+        proxy = "behind a trusted proxy, another client" if shown[0] else "same address"
+        wrong = [service.ask("GET", "/api/v1/me", b"", token(f"wrong-{n:020}"), *filter(None, [shown[0]]),
+                             source=sources[0]) for n in range(30)]  # fmt: skip
+        await asyncio.gather(*wrong)
+        began = time.monotonic()
+        status, _ = await service.ask(
+            "GET", "/api/v1/me", b"", token(READER), *filter(None, [shown[1]]), source=sources[1]
+        )
+        took = time.monotonic() - began if status == 200 else PATIENCE
+        service.note(f"right token, {proxy}", limit, took, "s")
+
+
+async def origins(service: Service, quick: bool) -> None:
+    """Clause 8, without tokens."""
+    service.attack = "a page of --allow-origin, no tokens"
+    writes = 0
+    for method, path in (("PUT", f"{C}/params/A"), ("PATCH", f"{C}/params"), ("POST", f"{C}/apply")):
+        status, _ = await service.ask(method, path, b"{}", "Origin: https://station.example")
+        writes += status != 403
+    service.note("writes that are let in", 0, writes, "")
+
+
+async def stuck_readers(service: Service, quick: bool) -> None:
+    """Clause 8."""
+    for path in ("/api/v1/find", f"{C}/fetch"):
+        await service.ask("POST", path, b'{"timeout_s": 60}', token(READER))
+    upgrade = ["Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13"]
+    upgrade.append("Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==")
+    run = json.loads((await service.ask("GET", "/api/v1/components", b"", token(READER)))[1])["run"]
+    wanted = [(f"/api/v1/events?after={run}-0", [], 1), (f"/api/v1/ws?after={run}-0", upgrade, 1)]
+    wanted.append(("/openapi.json", [], 90))
+    service.attack = "SIGTERM with 12 readers that are stuck"
+    held = []
+    for path, more, repeats in wanted * 4:
+        one = socket.socket()
+        one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4_096)
+        one.connect(("127.0.0.1", service.port))
+        lines = [f"GET {path} HTTP/1.1", f"Host: 127.0.0.1:{service.port}", token(READER), *more, "", ""]
+        one.sendall("\r\n".join(lines).encode() * repeats)
+        held.append(one)
+    while service.is_busy():  # noqa: ASYNC110 - until the buffers of the system are full
+        await asyncio.sleep(0.25)
+    took = await asyncio.to_thread(service.end)
+    service.note("it ends", ENDED, took, "s")
+    service.note("exit code", 0, abs(service.process.returncode or 0), "")
+    service.note("tracebacks", 0, service.log.count("Traceback"), "")
+    for one in held:
+        one.close()
+
+
+async def killed_apply(rows: list[Row], quick: bool) -> None:
+    """Clause 8: `kill -9` in an apply, and what the next start says."""
+    folder = Path(tempfile.mkdtemp())
+    link = ["sim:px4", "--cache", str(folder / "cache.sqlite3")]
+    try:
+        async with serving(rows, *link, tokens=False, folder=folder) as service:
+            for path in ("/api/v1/find", f"{C}/fetch"):
+                await service.ask("POST", path, b'{"timeout_s": 60}')
+            table = json.loads((await service.ask("GET", f"{C}/params"))[1])["params"]
+            floats = [name for name, each in table.items() if each["type"] == "REAL32"][:300]
+            body = as_json({"wanted": {"values": dict.fromkeys(floats, 0.123)}, "wait": False})
+            status, answer = await service.ask("POST", f"{C}/apply", body)
+            assert status == 202, answer
+            name = json.loads(answer)["id"]
+            deadline = time.monotonic() + PATIENCE
+            while time.monotonic() < deadline:
+                job = json.loads((await service.ask("GET", f"/api/v1/jobs/{name}"))[1])
+                if (job["progress"] or {}).get("done") or job["state"] != "running":
+                    break
+            service.process.kill()
+        async with serving(rows, *link, tokens=False, folder=folder) as service:
+            service.attack = "kill -9 in an apply"
+            jobs = json.loads((await service.ask("GET", "/api/v1/jobs"))[1])["jobs"]
+            is_told = any(job["id"] == name and job["state"] == "cut-off" for job in jobs)
+            service.note("missing in the job list", 0, not is_told, "")
+            service.note("missing in the log", 0, "was cut off" not in service.log, "")
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+CLIENT: Final = """
+import asyncio, re, sys, time
+from pathlib import Path
+from paramclient import ParamClient
+def peak(): return int(re.search(r"VmHWM:\\s+(\\d+)", Path("/proc/self/status").read_text())[1]) / 1024
+async def main():
+    try:
+        async with ParamClient(sys.argv[1]):
+            return "no error"
+    except Exception as error:
+        return type(error).__name__
+began = time.monotonic()
+import httpx, paramclient.remote.client
+before = peak()
+print(asyncio.run(main()), peak() - before, time.monotonic() - began)
+"""
+"""A client that opens a service; it prints the error, the memory that it took, and the seconds."""
+
+
+async def hostile_service(rows: list[Row], quick: bool) -> None:
+    """Clause 9."""
+    stream = b"HTTP/1.1 200 OK\r\nContent-Type: text/event-stream\r\n\r\n"
+    hello = b'data: {"run":"0123456789abcdef","seq":0,"at":0,"type":"hello","resumed":false}\n\n'
+    answer = b"HTTP/1.1 200 OK\r\nContent-Type: application/json\r\n"
+    bomb = gzip.compress(b" " * (64 << 20))
+    wide = b"[" + b"[]," * (4 << 20) + b"1]"
+    keys = b"{" + b",".join(b'"%07d":1.5' % number for number in range(999_000)) + b"}"
+    attacks: list[tuple[str, bytes, bytes, bytes]] = [
+        ("a line without an end", stream, b"x" * 65_536, b""),
+        ("an event without an end", stream, b"data: " + b"x" * 65_000 + b"\n", b""),
+        ("a packed answer of 64 MB", answer + b"Content-Encoding: gzip\r\n\r\n" + bomb, b"", hello),
+        ("an answer without an end", answer + b"\r\n", b" " * 65_536, hello),
+        ("4 million lists", answer + b"\r\n" + wide, b"", hello),
+        ("1 million members", answer + b"\r\n" + keys, b"", hello),
+        ("100,000 levels", answer + b"\r\n" + b"[" * 100_000, b"", hello),
+        ("headers without an end", b"HTTP/1.1 200 OK\r\n", b"X: y\r\n" * 1_000, b""),
+    ]
+    for name, begin, endless, greeting in attacks[: 4 if quick else None]:
+
+        async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            with contextlib.suppress(OSError, asyncio.IncompleteReadError):
+                request = await reader.readuntil(b"\r\n\r\n")
+                if greeting and b"/events" in request:  # noqa: B023
+                    writer.write(stream + greeting)  # noqa: B023
+                    await reader.read()
+                else:
+                    writer.write(begin)  # noqa: B023
+                    while endless:  # noqa: B023
+                        writer.write(endless)  # noqa: B023
+                        await writer.drain()
+            with contextlib.suppress(OSError):
+                writer.close()
+
+        server = await asyncio.start_server(serve, HERE, 0)
+        url = f"http://{HERE}:{server.sockets[0].getsockname()[1]}"
+        client = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-c", CLIENT, url),
+            stdout=subprocess.PIPE,
+            env={**os.environ, "PYTHONPATH": str(ROOT)},
+        )
+        out, _ = await asyncio.wait_for(client.communicate(), 2 * PATIENCE)
+        server.close()
+        kind, memory, seconds = out.decode().split()
+        attack = f"a service sends a client {name}"
+        rows.append(Row(attack, "memory grows", 256.0, round(float(memory), 1), "MB"))
+        rows.append(Row(attack, "it ends", 15.0, round(float(seconds), 1), "s"))
+        rows.append(Row(attack, "another error than LinkError", 0, kind != "LinkError", ""))
+
+
+async def udp(rows: list[Row], quick: bool) -> None:
+    """Clause 10."""
+    with socket.socket(type=socket.SOCK_DGRAM) as free:
+        free.bind((HERE, 0))
+        port = free.getsockname()[1]
+    async with serving(rows, f"udpin:{HERE}:{port}", "--no-cache", tokens=False) as service:
+        service.attack = "garbage from 100 UDP peers"
+        peers = [socket.socket(type=socket.SOCK_DGRAM) for _ in range(100)]
+        with service.watched():
+            for _ in range(20):
+                for peer in peers:
+                    peer.sendto(os.urandom(200), (HERE, port))
+            await asyncio.sleep(1.0 if quick else 3.0)
+        came = 0
+        for peer in peers:
+            peer.setblocking(False)
+            with contextlib.suppress(BlockingIOError, ConnectionError):
+                while peer.recv(2_000):
+                    came += 1
+            peer.close()
+        service.note("datagrams back to them", 0, came, "")
+        if quick:
+            return
+        service.attack = "heartbeats of 65,025 systems on UDP"
+        with service.watched(blocked=None), socket.socket(type=socket.SOCK_DGRAM) as peer:
+            for number in range(255 * 255):
+                mav = common.MAVLink(None, 1 + number % 255, 1 + number // 255)
+                beat = mav.heartbeat_encode(2, 12, 81, 0, 4)
+                peer.sendto(beat.pack(mav), (HERE, port))
+                if not number % 200:
+                    await asyncio.sleep(0.02)
+            await service.reached("/health, this computer")
+
+
+def as_json(document: dict[str, Any], **more: Any) -> bytes:
+    """A document as it is sent."""
+    return json.dumps({**document, **more}).encode()
+
+
+# The run
+
+
+async def attack(quick: bool, only: str) -> list[Row]:
+    """Run the groups whose name holds a text."""
+    rows: list[Row] = []
+
+    async def on_service(
+        group: Callable[[Service, bool], Awaitable[None]], *words: str, **options: Any
+    ) -> None:
+        async with serving(rows, *words, **options) as service:
+            await group(service, quick)
+
+    sim, bare = ("sim:px4", "--no-cache"), ("sim:px4", "--no-cache", "--no-fetch")
+    groups: dict[str, Callable[[], Awaitable[None]]] = {
+        "handshakes over TLS": lambda: on_service(handshakes, *bare, tls=True),
+        "handshakes without TLS": lambda: on_service(handshakes, *bare),
+        "requests": lambda: on_service(requests, *sim),
+        "guesses": lambda: on_service(guesses, *bare, "--trusted-proxy", ELSEWHERE),
+        "origins": lambda: on_service(
+            origins, *bare, "--allow-origin", "https://station.example", tokens=False
+        ),
+        "stuck readers": lambda: on_service(stuck_readers, *sim),
+        "killed apply": lambda: killed_apply(rows, quick),
+        "hostile service": lambda: hostile_service(rows, quick),
+        "udp": lambda: udp(rows, quick),
+    }
+    for name, run in groups.items():
+        if only in name:
+            await run()
+    return rows
+
+
+def table(rows: Iterable[Row]) -> str:
+    """The rows as text."""
+    cells = [("attack", "what", "limit", "measured", "", "held")]
+    cells += [
+        (
+            row.attack,
+            row.what,
+            f"{row.limit:g}",
+            f"{row.measured:.4g}",
+            row.unit,
+            "yes" if row.is_held else "NO",
+        )
+        for row in rows
+    ]
+    widths = [max(len(line[column]) for line in cells) for column in range(len(cells[0]))]
+    lines = []
+    for line in cells:
+        left = [text.ljust(width) for text, width in zip(line[:2], widths[:2], strict=True)]
+        right = [text.rjust(width) for text, width in zip(line[2:], widths[2:], strict=True)]
+        lines.append("  ".join([*left, *right]).rstrip())
+    return "\n".join(lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description="Attack the service and its clients.")
+    parser.add_argument("--quick", action="store_true", help="only what takes about a second each")
+    parser.add_argument("--only", default="", help="only the groups whose name holds this text")
+    parser.add_argument("--json", action="store_true", help="the table as JSON")
+    parser.add_argument("--slack", type=float, default=1.0, help="multiply limits of time, on a busy machine")
+    asked = parser.parse_args()
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(soft, min(hard, 4_096)), hard))
+    rows = asyncio.run(attack(asked.quick, asked.only))
+    for row in rows:
+        row.limit *= asked.slack if row.unit in ("s", "ms") else 1
+    if asked.json:
+        print(json.dumps([{**dataclasses.asdict(row), "held": row.is_held} for row in rows], indent=1))
+    else:
+        print(table(rows))
+    return int(not all(row.is_held for row in rows))
+
+
+if __name__ == "__main__":
+    sys.exit(main())
