@@ -35,7 +35,12 @@ CONFIG: Final = """
 not_a_server_error.expected-statuses = ["2xx", "3xx", "4xx", 503, 504]
 """
 """That of schemathesis: requests go to the vehicle that is there, or most would end with 404."""
-LEFT_OUT: Final = ("/api/v1/events", "/api/v1/find", "/api/v1/components/{system}/{component}/reboot")
+LEFT_OUT: Final = (
+    "/api/v1/events",
+    "/api/v1/find",
+    "/api/v1/components/{system}/{component}/successor",
+    "/api/v1/components/{system}/{component}/reboot",
+)
 """A stream has no end, who is not there is waited for as long as was asked, and a restart takes seconds."""
 WORKERS: Final = 4
 
