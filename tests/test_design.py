@@ -37,7 +37,7 @@ MAY_IMPORT = {
     },
     "sim": {"errors", "values", "protocol.wire", "protocol.ftp.packets", "protocol.pack", "sim"},
     "clocks": set[str](),
-    "links": {"errors", "values", "clocks", "sim", "links"},
+    "links": {"errors", "values", "clocks", "protocol.wire", "sim", "links"},
     "ownership": set[str](),
     "cache": {"errors", "values", "identity", "params", "paramset", "ownership", "cache"},
     "provision.cautions": {"errors", "patterns"},

@@ -190,6 +190,21 @@ def test_ten_thousand_components_cost_what_a_thousand_do() -> None:
     assert held < station_room.MOST_COMPONENTS * 30_000
 
 
+def test_a_flood_of_random_systems_from_random_peers_stays_within_the_page_of_the_bounds() -> None:
+    session = Simulation()
+    tracemalloc.start()
+    for number in range(12_000):
+        data = encode(Heartbeat(2, 12), system=1 + number % 250, component=1 + number // 250, sequence=0)
+        for peer in range(1 + number % 3):
+            session.station.receive(data, ("10.0.0.1", 10_000 * peer + number % 5_000), session.now)
+        session.station.events()
+        session.station.data_to_send()
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(session.station.components) == station_room.MOST_COMPONENTS
+    assert held < station_room.MOST_COMPONENTS * 28_000, "as docs/bounds.md says"
+
+
 def test_changes_that_nobody_takes_are_so_many_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(events_room, "MOST_CHANGES", 3)
     changes = Changes()

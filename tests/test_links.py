@@ -12,7 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
-from contextlib import ExitStack, asynccontextmanager, contextmanager
+from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -668,6 +668,95 @@ async def test_udpin_forgets_who_was_silent_for_longest(monkeypatch: pytest.Monk
             far[1].setblocking(False)
             with pytest.raises(BlockingIOError):
                 far[1].recv(1000)
+
+
+TELEMETRY = wire.build_frame(30, bytes(range(1, 29)), system=1, component=1, sequence=0)
+
+
+async def got(sock: socket.socket) -> list[bytes]:
+    """What has come to a socket."""
+    sock.setblocking(False)
+    came = []
+    with suppress(BlockingIOError):
+        while True:
+            came.append(sock.recv(1000))
+    return came
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("junk", [b"\xfd\xfe and so on", HEARTBEAT[:-1] + b"\0", b"\xfd" * 300])
+async def test_udpin_learns_nobody_from_bytes_that_are_no_frame(junk: bytes) -> None:
+    async with opened("udpin:127.0.0.1:0") as link:
+        with udp_socket(link.address) as odd, udp_socket(link.address) as vehicle:
+            odd.send(junk)
+            vehicle.send(HEARTBEAT)
+            await collect(link, 2)
+            await link.send(frame(1), None)
+            assert await got(vehicle) == [frame(1)]
+            assert await got(odd) == []
+
+
+@pytest.mark.asyncio
+async def test_udpin_forgets_whoever_sends_no_valid_frame_for_a_minute(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with opened("udpin:127.0.0.1:0") as link:
+        with udp_socket(link.address) as one, udp_socket(link.address) as two:
+            for sock in (one, two):
+                sock.send(HEARTBEAT)
+            await collect(link, 2)
+            now = anyio.current_time()
+            monkeypatch.setattr(anyio, "current_time", lambda: now + udp.PEER_SILENCE - 1)
+            one.send(HEARTBEAT)
+            two.send(b"\xfd and so on")
+            await collect(link, 2)
+            await link.send(frame(1), None)
+            monkeypatch.setattr(anyio, "current_time", lambda: now + udp.PEER_SILENCE + 1)
+            await link.send(frame(2), None)
+            assert await got(one) == [frame(1), frame(2)]
+            assert await got(two) == [frame(1)]
+
+
+@pytest.mark.asyncio
+async def test_those_without_heartbeats_share_one_of_ours_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with opened("udpin:127.0.0.1:0") as link:
+        with ExitStack() as stack:
+            vehicle, *strangers = [stack.enter_context(udp_socket(link.address)) for _ in range(4)]
+            vehicle.send(HEARTBEAT)
+            for sock in strangers:
+                sock.send(TELEMETRY)
+            await collect(link, 4)
+            began = anyio.current_time()
+            for step in range(40):  # four a second, in ten seconds
+                at = began + step / 4
+                monkeypatch.setattr(anyio, "current_time", lambda at=at: at)
+                await link.send(HEARTBEAT, None)
+            assert len(await got(vehicle)) == 40
+            assert sorted([len(await got(sock)) for sock in strangers]) == [3, 3, 4]
+            await link.send(frame(9), None)
+            for sock in strangers:
+                assert await got(sock) == [frame(9)], "what is no heartbeat is for them too"
+            strangers[0].send(HEARTBEAT)
+            await collect(link, 1)
+            await link.send(HEARTBEAT, None)
+            assert await got(strangers[0]) == [HEARTBEAT]
+
+
+@pytest.mark.asyncio
+async def test_strangers_take_no_place_from_those_that_send_heartbeats(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(udp, "PEERS", 3)
+    async with opened("udpin:127.0.0.1:0") as link:
+        with ExitStack() as stack:
+            vehicle = stack.enter_context(udp_socket(link.address))
+            vehicle.send(HEARTBEAT)
+            await collect(link, 1)
+            for _ in range(10):
+                stack.enter_context(udp_socket(link.address)).send(TELEMETRY)
+            await collect(link, 10)
+            await link.send(frame(1), None)
+            assert await got(vehicle) == [frame(1)]
 
 
 @pytest.mark.asyncio

@@ -26,6 +26,7 @@ twice that. So the datagrams of a read are told apart only where the first of th
 from __future__ import annotations
 
 import errno
+import math
 import socket
 import struct
 import sys
@@ -41,6 +42,7 @@ from paramclient.clocks import seconds_ahead
 from paramclient.errors import LinkError
 from paramclient.links.base import OPEN_TIMEOUT, Address, Peer, SocketLink, claim, reason
 from paramclient.links.names import LinkSpec
+from paramclient.protocol.wire import HEARTBEAT_ID, Framer
 
 __all__ = ["UdpIn", "UdpOut"]
 
@@ -53,6 +55,17 @@ DATAGRAMS_PER_READ: Final = 128
 PEERS: Final = 256
 """Addresses that a listening link remembers, one for each system id: what is for all goes to those. Strangers
 cannot make it grow, nor come between a vehicle and what is for it alone."""
+
+PEER_SILENCE: Final = 60.0
+"""Seconds without a valid frame after which an address is forgotten."""
+
+PROOF_PACE: Final = 1.0
+"""Seconds after which a frame of an address that has sent heartbeats is checked again here, beside the check
+that the station makes of every frame."""
+
+STRANGERS_PACE: Final = 1.0
+"""Seconds between two heartbeats to addresses that have sent none, all of them together: whoever forges the
+address of another computer has it sent no more than that."""
 
 UNREACHABLE_PATIENCE: Final = 3.0
 """Seconds in which nothing found a way out, after which the socket is made anew: three heartbeats. It has its
@@ -67,6 +80,20 @@ other programs rarely have one of these."""
 
 AT_ONCE: Final = 0.001
 """Seconds within which the first datagram of a read was read at once: the others came later than that one."""
+
+
+class _Known:
+    """What is known of an address.
+
+    Attributes:
+        proven_at: when a valid frame came from it last.
+        served_at: when one that has sent no heartbeat was sent ours last.
+    """
+
+    __slots__ = ("proven_at", "served_at")
+
+    def __init__(self) -> None:
+        self.proven_at = self.served_at = -math.inf
 
 
 class UdpLink(SocketLink):
@@ -95,7 +122,10 @@ class UdpLink(SocketLink):
         self._local_port = 0  # of the opening before
         self._room = memoryview(bytearray(_LARGEST_DATAGRAM))
         self._stuck_since: float | None = None
-        self._peers: dict[Peer, Address] = {}
+        self._peers: dict[Address, _Known] = {}  # that have sent heartbeats; who spoke last is last
+        self._strangers: dict[Address, _Known] = {}  # that have sent other frames
+        self._stranger_served_at = -math.inf
+        self._framer = Framer((HEARTBEAT_ID,), stream=False)
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
         """See `Link.receive`. At most `DATAGRAMS_PER_READ` at a time; empty datagrams are passed over."""
@@ -131,7 +161,7 @@ class UdpLink(SocketLink):
         """See `Link.send`. Does not wait for the network: what cannot go out now is lost, and counted."""
         await anyio.lowlevel.checkpoint()
         sock = self._open_socket()
-        for address in self._destinations(peer):
+        for address in self._for_all(data) if peer is None else self._destinations(peer):
             try:
                 self._transmit(sock, data, address)
             except OSError as error:
@@ -165,18 +195,51 @@ class UdpLink(SocketLink):
         return self.address[0] if self.address else self._host
 
     def _learn(self, batch: list[tuple[Address, bytes]]) -> None:
-        """Remember who spoke MAVLink, the latest last; forget who has been silent for longest."""
-        peers = self._peers
+        """Remember who sends valid frames, the latest last; forget who has been silent for longest."""
+        peers, now = self._peers, anyio.current_time()
         for address, data in batch:
-            if peers.pop(address, None) or any(magic in data for magic in _MAGICS):
-                peers[address] = address
-        while len(peers) > PEERS:
-            del peers[next(iter(peers))]
+            known = peers.pop(address, None)
+            if known is not None:
+                peers[address] = known
+                if now < known.proven_at + PROOF_PACE:
+                    continue
+            self._prove(address, data, now)
 
-    def _destinations(self, peer: Peer | None) -> list[Address]:
-        if peer is None:
-            return list(self._peers.values())
-        return [self._peers[peer]] if peer in self._peers else []
+    def _prove(self, address: Address, data: bytes, now: float) -> None:
+        """See whether a datagram has a valid frame, and whether that is a heartbeat."""
+        before = self._framer.frames
+        beats = self._framer.receive(data)
+        if self._framer.frames == before:
+            return
+        known = self._strangers.pop(address, None) or self._peers.get(address) or _Known()
+        known.proven_at = now
+        if beats or address in self._peers:
+            self._peers[address] = known
+        else:
+            self._strangers[address] = known
+        if len(self._peers) + len(self._strangers) > PEERS:
+            fewest = self._strangers or self._peers
+            del fewest[next(iter(fewest))]
+
+    def _forget_silent(self, now: float) -> None:
+        for known in (self._peers, self._strangers):
+            for address in [each for each, at in known.items() if now - at.proven_at >= PEER_SILENCE]:
+                del known[address]
+
+    def _for_all(self, data: bytes) -> list[Address]:
+        """Where what is for all goes: a heartbeat to one of those that have sent none, in turn."""
+        now = anyio.current_time()
+        self._forget_silent(now)
+        strangers = list(self._strangers)
+        if strangers and self._framer.receive(data):
+            is_due = now >= self._stranger_served_at + STRANGERS_PACE
+            strangers = [min(strangers, key=lambda each: self._strangers[each].served_at)] if is_due else []
+            for address in strangers:
+                self._stranger_served_at = self._strangers[address].served_at = now
+        return [*self._peers, *strangers]
+
+    def _destinations(self, peer: Peer) -> list[Address]:
+        return [each for each in (peer,) if each in self._peers or each in self._strangers]
 
     def _transmit(self, sock: socket.socket, data: bytes, address: Address) -> None:
         sock.sendto(data, address)
@@ -191,7 +254,7 @@ class UdpLink(SocketLink):
                 sock.setsockopt(socket.SOL_SOCKET, option, RECEIVE_BUFFER)
         self.receive_buffer = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         self._tells_arrivals = _note_arrivals(sock)
-        self._peers = {}
+        self._peers, self._strangers = {}, {}
         self._stuck_since = None
         return sock
 
@@ -229,7 +292,9 @@ class UdpIn(UdpLink):
     """`udpin`: bound to a port; speaks to everyone who has spoken MAVLink to it.
 
     Several vehicles may come from different addresses, or one after a restart from a new one. The `PEERS`
-    that were heard last get what is for all; what is for one peer goes there, however many others speak.
+    that sent valid frames last, in the last `PEER_SILENCE` seconds, get what is for all; those that have sent
+    no heartbeat share one of ours a second, in turn. What is for one peer goes there, however many others
+    speak.
     """
 
     async def _open(self, opening: int) -> None:
@@ -242,8 +307,8 @@ class UdpIn(UdpLink):
     def _has_own_address(self) -> bool:
         return self._host not in _EVERY_ADDRESS
 
-    def _destinations(self, peer: Peer | None) -> list[Address]:
-        return [peer] if isinstance(peer, tuple) else super()._destinations(peer)
+    def _destinations(self, peer: Peer) -> list[Address]:
+        return [peer] if isinstance(peer, tuple) else []
 
 
 class UdpOut(UdpLink):
@@ -267,6 +332,7 @@ class UdpOut(UdpLink):
         super().__init__(spec)
         self._group: Address | None = None
         self._far: Address | None = None
+        self._near: Address | None = None  # the same, as datagrams from there name it
 
     async def _open(self, opening: int) -> None:
         family, address = (await self._resolve(socket.SOCK_DGRAM))[0]
@@ -277,15 +343,14 @@ class UdpOut(UdpLink):
             sock.bind(("", 0))
         self._local_port = sock.getsockname()[1]
         self._far = address
-        self._group = None
+        self._group = self._near = None
         try:
             sock.connect(address)
         except PermissionError:  # how the system says that this is a broadcast address
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
             self._group = address
         else:
-            far = sock.getpeername()
-            self._peers = {far: far}
+            self._near = sock.getpeername()
 
     async def _readable(self, waitable: socket.socket | int) -> None:
         while True:
@@ -314,8 +379,17 @@ class UdpOut(UdpLink):
                     self._fail(f"{self._host} is at {found[0][0]} now")
             await anyio.sleep(LOOK_AGAIN)
 
-    def _destinations(self, peer: Peer | None) -> list[Address]:
-        return [self._group] if peer is None and self._group is not None else super()._destinations(peer)
+    def _learn(self, batch: list[tuple[Address, bytes]]) -> None:
+        if self._group is not None:
+            super()._learn(batch)
+
+    def _for_all(self, data: bytes) -> list[Address]:
+        return [each for each in (self._group or self._near,) if each is not None]
+
+    def _destinations(self, peer: Peer) -> list[Address]:
+        if self._group is not None:
+            return super()._destinations(peer)
+        return [] if self._near is None or peer != self._near else [self._near]
 
     def _transmit(self, sock: socket.socket, data: bytes, address: Address) -> None:
         if self._group is not None:
@@ -353,7 +427,6 @@ firewall's refusal."""
 
 _EVERY_ADDRESS = ("0.0.0.0", "::")
 
-_MAGICS = (b"\xfd", b"\xfe")
 _LARGEST_DATAGRAM = 65535
 _SO_RCVBUFFORCE = 33  # Linux, asm-generic/socket.h; the socket module has no name for it
 _SIOCGSTAMP = 0x8906  # Linux, asm-generic/sockios.h
