@@ -88,8 +88,8 @@ async def test_the_service_answers_nothing_from_a_cache_that_lacks_what_was_hear
     vehicle = small_px4()
     async with service(vehicle, cache=path, fetches=True) as (hub, browser):
         await met(browser)
-        await anyio.sleep(5)
-        assert (await browser.get(f"{C}/history")).json()["history"] == []
+        await until(lambda: hub.followed[0].component.sync_state == "synced")
+        assert (await browser.get(f"{C}/history")).json()["history"] == []  # and all of it is written
         [known] = (await browser.get("/api/v1/vehicles")).json()["vehicles"]
         now = repr(time.time())
 
@@ -132,7 +132,7 @@ async def test_what_is_written_late_has_the_times_of_the_observations_and_every_
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.only_component()
         await component.fetch_all()
-        await anyio.sleep(2)
+        await client._writer.write_all()
         began_at = anyio.current_time()
         with unwritable(path):
             heard = []
@@ -159,7 +159,7 @@ async def test_a_client_that_ends_says_what_is_lost(
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.only_component()
         await component.fetch_all()
-        await anyio.sleep(2)
+        await client._writer.write_all()
         key = component.identity.key
         caplog.clear()
         holding = unwritable(path)
@@ -180,7 +180,7 @@ async def test_nothing_is_applied_where_the_state_before_cannot_be_kept(path: Pa
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.only_component()
         await component.fetch_all()
-        await anyio.sleep(2)
+        await client._writer.write_all()
         with locked(path):
             vehicle.set_param("PARAM_02", 9.0)
             await until(lambda: component.params["PARAM_02"].value == 9.0)
