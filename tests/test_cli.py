@@ -84,6 +84,7 @@ def warm_cache(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 def warm(warm_cache: bytes, tmp_path: Path) -> Path:
     """The same for one test alone."""
     path = tmp_path / "warm.sqlite3"
+    path.touch(mode=0o600)
     path.write_bytes(warm_cache)
     return path
 
