@@ -30,6 +30,7 @@ from paramclient.cache import (
 from paramclient.clocks import seconds_ahead
 from paramclient.errors import CacheError, UsageError
 from paramclient.identity import Identity
+from paramclient.params import Params
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.table import Observation
 from paramclient.values import Param
@@ -463,6 +464,7 @@ class WriteThrough:
         state = self._state(machine, kept)
         if not (table.dirty or kept.whole_at is not None or state != kept.state):
             return []
+        changed = table.changed
         dirty = table.take_dirty()
         overwritten = table.take_overwritten()
         gone = table.take_gone()
@@ -472,6 +474,7 @@ class WriteThrough:
         kept.written_at = anyio.current_time()
         volatile = table.volatile if table.volatile or table.volatile_known else None
         known = table.params
+        params = known.copy() if is_whole else known.only(dirty)
         update = TableUpdate(
             identity=kept.identity,
             component=machine.component,
@@ -479,7 +482,7 @@ class WriteThrough:
             at=times.at,
             table=state,
             params=HeardParams(
-                known.copy() if is_whole else known.only(dirty),
+                params,
                 times,
                 volatile=volatile,
                 by=dirty,
@@ -495,7 +498,7 @@ class WriteThrough:
             replace=is_whole,
             whole_at=None if whole_at is None else times(whole_at - table.slept),
         )
-        return [_News(kept, dirty, overwritten, gone, update, proven_at, whole_at)]
+        return [_News(kept, dirty, overwritten, gone, changed, params, update, proven_at, whole_at)]
 
     def _state(self, machine: ComponentMachine, kept: _Kept) -> TableState:
         table = machine.table
@@ -558,20 +561,20 @@ class _News:
     dirty: dict[str, str]
     overwritten: list[Observation]
     gone: dict[str, float]
+    changed: dict[str, tuple[float, str]]
+    params: Params
     update: TableUpdate
     proven_at: float | None
     whole_at: float | None
 
     def take_back(self) -> None:
         """It has not arrived: it is news again."""
-        kept, table = self.kept, self.kept.machine.table
+        kept = self.kept
         if kept.proven_at is None:
             kept.proven_at = self.proven_at
         if kept.whole_at is None:
             kept.whole_at = self.whole_at
-        table.dirty = self.dirty | table.dirty
-        table.overwritten = self.overwritten + table.overwritten
-        table.gone = self.gone | table.gone
+        kept.machine.table.give_back(self.dirty, self.overwritten, self.gone, self.changed, self.params)
         kept.state = None
 
 

@@ -76,6 +76,34 @@ def test_a_change_that_is_heard_again_keeps_the_moment_of_the_change() -> None:
     assert (param.value, by, moment) == (2, "station 254/190", 2.0)
 
 
+def test_what_did_not_reach_the_cache_is_given_back_with_its_moments() -> None:
+    table = Table()
+    heard(table, 1, "vehicle", 1.0)
+    table.take_dirty()
+    heard(table, 2, "vehicle", 2.0)
+    for again in (2.5, 3.0, 3.5):
+        changed, params = table.changed, table.params.copy()
+        news = (table.take_dirty(), table.take_overwritten(), table.take_gone(), changed, params)
+        table.give_back(*news)
+        assert table.dirty == {"A": "vehicle"}
+        heard(table, 2, "vehicle", again)
+    assert [(each.param.value, each.moment) for each in table.take_overwritten()] == [(2, 2.0)]
+
+
+@pytest.mark.parametrize("by", ["vehicle", "us"])
+def test_what_is_replaced_on_its_way_to_a_cache_that_does_not_take_it_is_kept(by: str) -> None:
+    table = Table()
+    heard(table, 1, "vehicle", 1.0)
+    table.take_dirty()
+    heard(table, 2, "vehicle", 2.0)
+    changed, params = table.changed, table.params.copy()
+    news = (table.take_dirty(), table.take_overwritten(), table.take_gone(), changed, params)
+    heard(table, 3, by, 3.0)
+    table.give_back(*news)
+    assert [(each.param.value, each.moment) for each in table.take_overwritten()] == [(2, 2.0)]
+    assert table.take_dirty() == {"A": by}
+
+
 def test_what_is_gone_was_found_missing_when_the_last_value_came() -> None:
     table = Table()
     heard(table, 1, "vehicle", 1.0)

@@ -63,6 +63,12 @@ def is_heard(component: Component, value: float) -> bool:
     return component.params[NAME].value == value
 
 
+async def written(client: ParamClient, component: Component) -> None:
+    """Wait until all that was heard of a component is in the cache."""
+    await until(lambda: client._writer.obstacle(component._machine) is None)
+    await client._writer.write_all()
+
+
 Holding = Callable[[Path], AbstractContextManager[None]]
 UNWRITABLE = pytest.mark.parametrize("unwritable", [locked, full], ids=["locked", "full"])
 ANSWERS = (
@@ -132,7 +138,7 @@ async def test_what_is_written_late_has_the_times_of_the_observations_and_every_
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.only_component()
         await component.fetch_all()
-        await client._writer.write_all()
+        await written(client, component)
         began_at = anyio.current_time()
         with unwritable(path):
             heard = []
@@ -159,7 +165,7 @@ async def test_a_client_that_ends_says_what_is_lost(
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.only_component()
         await component.fetch_all()
-        await client._writer.write_all()
+        await written(client, component)
         key = component.identity.key
         caplog.clear()
         holding = unwritable(path)
@@ -180,7 +186,7 @@ async def test_nothing_is_applied_where_the_state_before_cannot_be_kept(path: Pa
     async with ParamClient(vehicle, cache=path) as client:
         component = await client.only_component()
         await component.fetch_all()
-        await client._writer.write_all()
+        await written(client, component)
         with locked(path):
             vehicle.set_param("PARAM_02", 9.0)
             await until(lambda: component.params["PARAM_02"].value == 9.0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from struct import unpack
 from typing import Final, NamedTuple
 
@@ -646,6 +646,40 @@ class Table:
             if name in self._held and moment < self._moments[name]:
                 overwritten.append(Observation(self.params[name], by, moment))
         return overwritten
+
+    @property
+    def changed(self) -> dict[str, tuple[float, str]]:
+        """When each value has changed since `take_overwritten` was called last, and by whom."""
+        return self._changed.copy()
+
+    def give_back(
+        self,
+        dirty: Mapping[str, str],
+        overwritten: Sequence[Observation],
+        gone: Mapping[str, float],
+        changed: Mapping[str, tuple[float, str]],
+        params: Params,
+    ) -> None:
+        """Take back what the cache was to be told and was not: it is news again, with its moments.
+
+        A value that was replaced meanwhile is kept in `overwritten`.
+
+        Args:
+            dirty, overwritten, gone, changed: as they were taken.
+            params: the dirty parameters as they were then.
+        """
+        replaced = []
+        for name, by in dirty.items():
+            heard_at = params.moments.get(name)
+            if heard_at is None or name not in params.held:
+                continue
+            if name in self._changed or name not in self._held:
+                replaced.append(Observation(params[name], by, heard_at))
+            elif changed.get(name, (math.inf, ""))[0] == heard_at:  # else `overwritten` has it
+                self._changed[name] = changed[name]
+        self.dirty = {**dirty, **self.dirty}
+        self.overwritten = [*overwritten, *replaced, *self.overwritten][-MOST_OVERWRITTEN:]
+        self.gone = {**gone, **self.gone}
 
     def take_gone(self) -> dict[str, float]:
         """Return the moments at which names removed since the last call were found missing."""
