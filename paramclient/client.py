@@ -27,8 +27,10 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import (
     ComponentContested,
     ComponentForgotten,
+    ComponentFound,
     ComponentHeard,
     ComponentIdentified,
+    ComponentLost,
     ComponentUncontested,
     Event,
     Fetched,
@@ -113,6 +115,9 @@ class ParamClient:
         signing: the key with which what is sent is signed and what comes is checked, or a `Signing`, which
             says more. None: nothing is signed, and signatures count for nothing.
         token: what a service wants to see; None for PARAMCLIENT_TOKEN of the environment.
+        split_peers: whether components with equal ids are different ones where they come from different UDP
+            addresses or TCP connections: for vehicles that share a system id. A vehicle with two ways to this
+            computer is then two, and so is one that was restarted with another port.
 
     Attributes:
         cache: where tables are kept, or None.
@@ -147,6 +152,7 @@ class ParamClient:
         tlog: str | os.PathLike[str] | None = None,
         signing: Signing | SigningKey | None = None,
         token: str | None = None,
+        split_peers: bool = False,
     ) -> None:
         if token is not None:
             raise UsageError("a token is for a service, whose name is http://HOST:PORT; a link takes none")
@@ -163,6 +169,7 @@ class ParamClient:
             component=component,
             encoding=encoding,
             upkeep=Upkeep.chosen(watch_interval, policy, listen_only=listen_only, is_log=is_log),
+            split_peers=split_peers,
             counts_traffic=traffic,
             trace=protocol_logger.debug,
         )
@@ -193,20 +200,27 @@ class ParamClient:
         if isinstance(signing, SigningKey):
             signing = Signing(signing)
         self._keeper = None if signing is None else TimestampKeeper(signing)
+        self._splits_peers = split_peers
         self._is_entered = False
         self._opened_at = -math.inf
 
     @property
     def components(self) -> Mapping[Address, Component]:
-        """Every component heard so far, by (system, component)."""
+        """Every component heard so far, by (system, component).
+
+        With `split_peers`, ids may be there several times, and a key stands for the ids at one peer: it is
+        what `Component.address` gives, and the ids alone are none.
+        """
         return MappingProxyType(self._components)
 
     @property
     def autopilots(self) -> list[Component]:
         """The autopilot of each system heard so far, by system id: vehicles, without what they carry."""
-        systems = sorted({system for system, _ in self._components})
-        found = [self._find(system, None) for system in systems]
-        return [component for component in found if component is not None]
+        station = self._station
+        heard = dict.fromkeys(machine.vehicle for machine in station.components.values())
+        vehicles = sorted(heard, key=lambda vehicle: vehicle[0])
+        found = [station.autopilot_of(*vehicle) for vehicle in vehicles]
+        return [self._components[machine.address] for machine in found if machine is not None]
 
     @property
     def link(self) -> Link:
@@ -331,6 +345,7 @@ class ParamClient:
         system: int | None = None,
         component: int | None = None,
         *,
+        peer: str | None = None,
         timeout: float | None = HEARING_PATIENCE,
     ) -> Component:
         """The component with this address, as soon as it has been heard.
@@ -343,6 +358,7 @@ class ParamClient:
         Args:
             system: system id.
             component: component id.
+            peer: the peer that its messages come from, as `Component.peer` says it, or its host alone.
             timeout: seconds; None waits for ever.
 
         Raises:
@@ -352,14 +368,14 @@ class ParamClient:
         self._check_open()
         began = anyio.current_time()
         with anyio.move_on_after(timeout):
-            while (found := self._find(system, component)) is None and not self._station.is_over:
+            while (found := self._find(system, component, peer)) is None and not self._station.is_over:
                 await self._carrier.news.wait()
                 self._check_open()
             if found is not None:
                 await found._wait_for_cache()
         if found is None:
             waited = anyio.current_time() - began
-            wanted = address_in_words(system, component) + refused_in_words(self.signing_report())
+            wanted = address_in_words(system, component, peer) + refused_in_words(self.signing_report())
             raise NoReply(wanted, attempts=0, waited=waited)
         return found
 
@@ -368,6 +384,7 @@ class ParamClient:
         system: int | None = None,
         component: int | None = None,
         *,
+        peer: str | None = None,
         timeout: float | None = HEARING_PATIENCE,
     ) -> Component:
         """Return the component with this address if no other vehicle can be meant; for programs that write.
@@ -385,6 +402,7 @@ class ParamClient:
         Args:
             system: system id.
             component: component id.
+            peer: as in `component`.
             timeout: seconds for everything; None waits for ever.
 
         Raises:
@@ -394,17 +412,17 @@ class ParamClient:
             LinkError: the link failed, or the client was closed.
         """
         if self._has_one_vehicle:
-            return await self.component(system, component, timeout=timeout)
+            return await self.component(system, component, peer=peer, timeout=timeout)
         self._check_open()
         began = anyio.current_time()
-        choice = VehicleChoice(system, component)
+        choice = VehicleChoice(system, component, splits_peers=self._splits_peers)
         station = self._station
         machine = None
         with anyio.move_on_after(timeout), station.looking_for_others():
             while True:
                 news, now = self._carrier.news, anyio.current_time()
                 since = station.listening_since
-                machine = choice.look(station.components.values(), now, listening_since=since)
+                machine = choice.look(station.at_peer(peer), now, listening_since=since)
                 if machine is not None or station.is_over:
                     break
                 with anyio.move_on_after(None if choice.due == math.inf else choice.due - now):
@@ -412,10 +430,10 @@ class ParamClient:
                 await self._carrier.read_up(choice.due)
                 self._check_open()
             if machine is not None:
-                await self._components[machine.system, machine.component]._wait_for_cache()
+                await self._components[machine.address]._wait_for_cache()
         if machine is not None:
-            return self._components[machine.system, machine.component]
-        wanted = address_in_words(system, component) + refused_in_words(self.signing_report())
+            return self._components[machine.address]
+        wanted = address_in_words(system, component, peer) + refused_in_words(self.signing_report())
         if choice.due < math.inf:
             wanted += f", and {LOOK_TIME} s more to see that it is the only one"
         raise NoReply(wanted, attempts=0, waited=anyio.current_time() - began)
@@ -442,7 +460,7 @@ class ParamClient:
         """
         self._check_open()
         began = anyio.current_time()
-        search = Succession(component._machine, (system, component.component))
+        search = Succession(component._machine, component._machine.address_in(system))
         with anyio.move_on_after(timeout):
             while not search.look(self._station.components, anyio.current_time()):
                 self._wake()
@@ -527,7 +545,7 @@ class ParamClient:
         for event in self._station.events():
             machine = event.machine
             if isinstance(event, ParamChanged | ParamsMoved):
-                self._components[machine.system, machine.component]._moved(event)
+                self._components[machine.address]._moved(event)
                 is_to_be_written = True
                 continue
             logger.debug("%s", event)
@@ -535,10 +553,12 @@ class ParamClient:
                 self._cache_hits += event.result.source == "cache"
                 self._downloads += event.result.source != "cache" and event.result.complete
             if isinstance(event, ComponentForgotten):
-                self._components.pop((machine.system, machine.component))._part()
+                self._components.pop(machine.address)._part()
                 continue
             if isinstance(event, ComponentHeard):
                 self._meet(machine)
+            elif isinstance(event, ComponentLost | ComponentFound) and self._splits_peers:
+                self._pass_place_on(machine, is_lost=isinstance(event, ComponentLost))
             elif isinstance(event, ComponentContested):
                 self._writer.let_go(machine)
                 logger.warning("%s: %s", self._link.name, event.contest.error)
@@ -547,7 +567,7 @@ class ParamClient:
             elif isinstance(event, ComponentIdentified):
                 self._carrier.tell()
                 for component in self._components.values():
-                    if component.system == machine.system:
+                    if component._machine.vehicle == machine.vehicle:
                         self._read_cache(component)
             elif isinstance(event, Fetched) and event.result.complete and event.result.is_confirmed:
                 is_whole = event.result.source != "cache" and not event.result.resumed
@@ -565,7 +585,7 @@ class ParamClient:
 
     def _announce(self, event: Event) -> None:
         """Tell those who listen, if it is for them."""
-        news = told(event, self._components[event.machine.system, event.machine.component])
+        news = told(event, self._components[event.machine.address])
         if news is not None:
             for events in list(self._subscriptions):
                 events.push(news)
@@ -573,7 +593,7 @@ class ParamClient:
     def _meet(self, machine: ComponentMachine) -> None:
         address = (machine.system, machine.component)
         now = anyio.current_time()
-        component = self._components[address] = Component(self, machine, now)
+        component = self._components[machine.address] = Component(self, machine, now)
         self._read_cache(component)
         if self._writer.may_hit(*address):
             machine.sync.ask(now)
@@ -585,6 +605,17 @@ class ParamClient:
             return
         assert self._tasks is not None, "nothing is heard before"
         self._tasks.start_soon(self._load, component, identity)
+
+    def _pass_place_on(self, machine: ComponentMachine, *, is_lost: bool) -> None:
+        """A vehicle may have come back at another peer: one of those with equal ids is kept in the cache."""
+        if is_lost:
+            self._writer.let_go(machine)
+        for component in self._components.values():
+            other = component._machine
+            if (other.system, other.component) == (machine.system, machine.component) and (
+                not other.presence.is_lost
+            ):
+                self._read_cache(component)
 
     def _wake(self, machine: ComponentMachine | None = None) -> None:
         self._carrier.wake(machine)
@@ -677,6 +708,6 @@ class ParamClient:
         """Whether no vehicle can be taken for another: there is one, or none is written to."""
         return self.listens_only or (isinstance(self._link, SimLink) and self._link.has_one_vehicle)
 
-    def _find(self, system: int | None, component: int | None) -> Component | None:
-        found = self._station.find(system, component)
-        return None if found is None else self._components[found.system, found.component]
+    def _find(self, system: int | None, component: int | None, peer: str | None) -> Component | None:
+        found = self._station.find(system, component, peer)
+        return None if found is None else self._components[found.address]

@@ -16,6 +16,7 @@ from paramclient.errors import CacheError, NoReply, NotDurable, ParamClientError
 from paramclient.events import Changes
 from paramclient.identity import Identity, autopilot_name
 from paramclient.params import ParamMap
+from paramclient.protocol.addresses import Address
 from paramclient.protocol.authors import check_asker
 from paramclient.protocol.change import Change
 from paramclient.protocol.component import ComponentMachine
@@ -130,6 +131,16 @@ class Component:
     def sync_state(self) -> SyncState:
         """How the table stands to the vehicle's: up to date, or what is done about it."""
         return self._machine.sync_state
+
+    @property
+    def address(self) -> Address:
+        """System and component: its key in `ParamClient.components`; with `split_peers` of this peer."""
+        return self._machine.address
+
+    @property
+    def peer(self) -> str:
+        """Where its messages come from and requests go, as `127.0.0.1:14550`; "" while that is not known."""
+        return self._machine.peer_in_words
 
     @property
     def contest(self) -> Contest | None:
@@ -378,7 +389,9 @@ class Component:
         for _ in range(SETUP_TRIES):
             self._client._check_open()
             timestamp = 0 if key is None else timestamp_now()
-            self._client._station.send_setup_signing(self.system, self.component, key, timestamp)
+            self._client._station.send_setup_signing(
+                self.system, self.component, key, timestamp, peer=self._machine.vehicle[1]
+            )
             self._client._wake()
             await anyio.sleep(SETUP_PAUSE)
 
@@ -581,8 +594,9 @@ def _read_of(machine: ComponentMachine, name: str | int) -> str:
     return f"{what} of {machine.system}/{machine.component}"
 
 
-def address_in_words(system: int | None, component: int | None) -> str:
+def address_in_words(system: int | None, component: int | None, peer: str | None = None) -> str:
     """What is looked for on a link, in words."""
+    at = "" if peer is None else f" at {peer}"
     if component is None:
-        return "an autopilot" if system is None else f"an autopilot with system id {system}"
-    return f"component {'*' if system is None else system}/{component}"
+        return f"an autopilot{at}" if system is None else f"an autopilot with system id {system}{at}"
+    return f"component {'*' if system is None else system}/{component}{at}"

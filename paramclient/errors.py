@@ -224,8 +224,8 @@ class AmbiguousVehicle(UsageError):
 
     Attributes:
         vehicles: the vehicles that fit, in words: `1/1 PX4 quadrotor` on a link.
-        choose_by: the argument that chooses one of them, "system" or "component"; "link" where only the link
-            of a service tells them apart; "" for vehicles in the cache, which have keys.
+        choose_by: the argument that chooses one of them, "system", "component" or "peer"; "link" where only
+            the link of a service tells them apart; "" for vehicles in the cache, which have keys.
         summary: the text of the error without what to do next.
     """
 

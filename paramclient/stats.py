@@ -70,7 +70,7 @@ class ClientStats:
             downloads=downloads,
             cache_hits=cache_hits,
             round_trips={
-                (machine.system, machine.component): machine.round_trip.smoothed
+                machine.address: machine.round_trip.smoothed
                 for machine in machines
                 if machine.round_trip.smoothed is not None
             },

@@ -11,11 +11,11 @@ from typing import Final
 import anyio
 
 from paramclient.component import PROGRESS_INTERVAL, TIME_IS_OVER, Component
-from paramclient.errors import CacheError, NoReply
+from paramclient.errors import CacheError, ContestedAddress, NoReply
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.result import FetchResult, Progress
-from paramclient.protocol.station import Address, Station
+from paramclient.protocol.station import Address, Peer, Station
 
 __all__ = ["FetchTogether", "FetchedAll"]
 
@@ -37,7 +37,7 @@ class FetchedAll:
     """
 
     results: Mapping[Address, FetchResult]
-    silent: Mapping[Address, NoReply | CacheError]
+    silent: Mapping[Address, NoReply | CacheError | ContestedAddress]
 
     @property
     def complete(self) -> bool:
@@ -117,21 +117,23 @@ class FetchTogether:
         Gives whether any has begun.
         """
         self._is_cache_awaited = False
-        ready: dict[int, list[ComponentMachine]] = {}
+        ready: dict[tuple[int, Peer], list[ComponentMachine]] = {}
         for address, component in self._components.items():
             machine = component._machine
             if address in self._fetches or not machine.who.has_parameters:
                 continue
             if self._system not in (None, machine.system) or (machine.presence.is_lost and not machine.fetch):
                 continue
+            if machine.peers.contest is not None:
+                continue
             if self._refresh or component._cache_is_due(now):
-                ready.setdefault(machine.system, []).append(machine)
+                ready.setdefault(machine.vehicle, []).append(machine)
             else:
                 self._is_cache_awaited = True
         for machines in ready.values():
             begun = self._station.begin_fetches(machines, now, refresh=self._refresh)
             for machine, fetch in zip(machines, begun, strict=True):
-                address = machine.system, machine.component
+                address = machine.address
                 self._fetches[address] = self._unanswered[address] = fetch
         return bool(ready)
 
@@ -179,27 +181,30 @@ class FetchTogether:
         """What came in so many seconds, also of those that are not over.
 
         Raises:
-            NoReply, CacheError: nothing came.
+            NoReply, CacheError, ContestedAddress: nothing came.
             LinkError: the link failed, or the client was closed.
         """
         results: dict[Address, FetchResult] = {}
-        silent: dict[Address, NoReply | CacheError] = {}
+        silent: dict[Address, NoReply | CacheError | ContestedAddress] = {}
         for address, fetch in self._fetches.items():
             try:
                 if fetch.error is not None:
                     raise fetch.error
                 results[address] = fetch.result or fetch.partial(now, TIME_IS_OVER)
-            except (NoReply, CacheError) as error:
+            except (NoReply, CacheError, ContestedAddress) as error:
                 silent[address] = error
         for address, component in self._components.items():
             is_wanted = self._system in (None, address[0])
-            if is_wanted and address not in self._fetches and component._machine.presence.is_lost:
+            contest = component._machine.peers.contest
+            if is_wanted and address not in self._fetches and contest is not None:
+                silent[address] = contest.error
+            elif is_wanted and address not in self._fetches and component._machine.presence.is_lost:
                 what = f"the parameters of {address[0]}/{address[1]} (lost)"
                 silent[address] = NoReply(what, attempts=0, waited=component.silence)
         if not results:
             attempts = 0
             for failure in silent.values():
-                if isinstance(failure, CacheError):
+                if not isinstance(failure, NoReply):
                     raise failure
                 attempts = max(attempts, failure.attempts)
             whose = "any component" if self._system is None else f"any component of system {self._system}"

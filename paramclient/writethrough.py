@@ -109,7 +109,7 @@ class WriteThrough:
         self._something_to_write = anyio.Event()
         self._bringing: set[ComponentMachine] = set()
         self._vehicles: dict[tuple[int, int], set[str]] = {}  # that were kept in this session
-        self._has_refused = False
+        self._has_refused = self._has_refused_twin = False
         self._replacements = 0 if cache is None else cache.replacements
         self._has_written = False
         self._are_many = False
@@ -179,7 +179,8 @@ class WriteThrough:
                 if current is None or (current.key == identity.key and self.follow(machine, current)):
                     return False
                 if current.key == identity.key:
-                    self._keep(machine, current, cached)
+                    if self._has_room(machine, current):  # another one may have come first meanwhile
+                        self._keep(machine, current, cached)
                     break
                 identity = current  # another vehicle has taken its place meanwhile
             return True
@@ -199,8 +200,10 @@ class WriteThrough:
         if not (machine.table.complete or (known is not None and machine.table.params)):
             return
         identity = known or machine.identity
-        if not self.follow(machine, identity) and self._has_room(machine, identity):
-            self._keep(machine, identity, await self._load(machine, identity))
+        if not self.follow(machine, identity):
+            cached = await self._load(machine, identity)
+            if self._has_room(machine, identity):
+                self._keep(machine, identity, cached)
 
     def synced(self, machine: ComponentMachine, *, is_whole: bool) -> None:
         """The table was proven to be the vehicle's just now; `is_whole` by a download of all of it."""
@@ -381,6 +384,18 @@ class WriteThrough:
     def _has_room(self, machine: ComponentMachine, identity: Identity) -> bool:
         """Whether a vehicle's table may be kept, beside those of this session that are."""
         address = (machine.system, machine.component)
+        twins = [each for each in self._kept.values() if _is_twin(each, machine, identity)]
+        if twins:
+            if not self._has_refused_twin:
+                logger.warning(
+                    "%d/%d at %s has the identity of the one at %s (%s), so it is not cached",
+                    *address,
+                    machine.peer_in_words,
+                    twins[0].machine.peer_in_words,
+                    identity.key,
+                )
+            self._has_refused_twin = True
+            return False
         vehicles = self._vehicles.get(address, set())
         if identity.key in vehicles:
             return True
@@ -593,6 +608,13 @@ def chosen_cache(
     if cache is False or is_log:
         return None
     return ParamCache(None if cache is None or cache is True else cache)
+
+
+def _is_twin(kept: _Kept, machine: ComponentMachine, identity: Identity) -> bool:
+    """Whether the cache would take a component for one that is kept, with equal ids at another peer."""
+    other = kept.machine
+    has_equal_ids = (other.system, other.component) == (machine.system, machine.component)
+    return has_equal_ids and other is not machine and kept.identity.key == identity.key
 
 
 def _time_of_day() -> float:

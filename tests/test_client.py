@@ -485,7 +485,7 @@ class Mute:
         ({"system": 3, "component": 100}, "component 3/100"),
     ],
 )
-async def test_a_component_that_is_not_there(wanted: dict[str, int], words: str) -> None:
+async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str) -> None:
     async with a_client(generic(autopilot=wire.MAV_AUTOPILOT_INVALID)) as client:
         with pytest.raises(NoReply) as caught:
             await client.component(**wanted, timeout=2.5)

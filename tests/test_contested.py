@@ -12,9 +12,11 @@ import anyio
 import pytest
 
 from paramclient import (
+    AmbiguousVehicle,
     Contested,
     ContestedAddress,
     Heard,
+    NoReply,
     ParamCache,
     ParamClient,
     Uncontested,
@@ -23,7 +25,7 @@ from paramclient import (
 from paramclient.links import create_link, serve_endpoint
 from paramclient.links.udp import UdpIn
 from paramclient.protocol.presence import LOST_AFTER
-from paramclient.sim import ArduPilotVehicle, Endpoint, PX4Vehicle
+from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
 from tests.commands import Command, behind, in_process, leaping
 from tests.served import C, met, problem, service
 from tests.shell import Late, PeersLink, outcome, swiftly, until
@@ -184,6 +186,124 @@ def test_the_command_says_so_on_stderr(
     assert "contested" in done.out
     for peer in ("10.0.0.1:14550", "10.0.0.2:14550"):
         assert peer in done.err
+
+
+@swiftly
+async def test_a_fetch_of_all_vehicles_goes_on_without_the_contested_one() -> None:
+    link = two()
+    link.endpoints["10.0.0.3", 14550] = px4(system=3)
+    async with ParamClient(link, cache=False) as client:
+        await until(lambda: client.components.get((1, 1)) and client.components[1, 1].contest)
+        everything = await client.fetch_all()
+        assert [*everything.results] == [(3, 1)]
+        assert isinstance(everything.silent[1, 1], ContestedAddress)
+        with pytest.raises(ContestedAddress):
+            await client.fetch_all(1)
+
+
+# Kept apart
+
+
+@swiftly
+async def test_split_peers_have_components_of_their_own(tmp_path: Path) -> None:
+    path = tmp_path / "cache.sqlite3"
+    first, second = px4(), ardupilot()
+    link = PeersLink({("10.0.0.1", 14550): first, ("10.0.0.2", 14550): second})
+    async with ParamClient(link, cache=path, split_peers=True) as client:
+        with pytest.raises(AmbiguousVehicle, match="Choose one with the argument peer") as caught:
+            await client.only_component()
+        assert caught.value.vehicles == (
+            "1/1 PX4 quadrotor at 10.0.0.1:14550",
+            "1/1 ArduPilot quadrotor at 10.0.0.2:14550",
+        )
+        one = await client.only_component(peer="10.0.0.1")
+        other = await client.component(1, 1, peer="10.0.0.2:14550")
+        assert (one.peer, other.peer) == ("10.0.0.1:14550", "10.0.0.2:14550")
+        assert one.address != other.address
+        assert [(system, number) for system, number in client.components] == [(1, 1)] * 2
+        assert client.components[one.address] is one
+        assert client.autopilots == [one, other]
+        everything = await client.fetch_all()
+        assert {len(each.params) for each in everything.results.values()} == {3}
+        assert (await other.set("SHARED_A", 7)).actual == 7.0
+        assert (first.requests["PARAM_SET"], second.requests["PARAM_SET"]) == (0, 1)
+        assert (await one.get("SHARED_A")).value == 1
+        await anyio.sleep(10.0)
+        assert one.contest is None
+        assert other.contest is None
+        assert {*client.stats.round_trips} == {one.address, other.address}
+        with pytest.raises(NoReply, match=r"at 10\.0\.0\.9"):
+            await client.component(peer="10.0.0.9", timeout=0.5)
+    assert {frozenset(table) for table in cached(path).values()} == {frozenset(TABLE), frozenset(OTHER)}
+
+
+@swiftly
+async def test_split_vehicles_without_a_hardware_id_are_cached_by_their_peer(tmp_path: Path) -> None:
+    path = tmp_path / "cache.sqlite3"
+    tables: list[dict[str, Any]] = [{"A": 1.0, "B": 2.0}, {"A": 5.0, "B": 6.0}]
+    vehicles = [GenericVehicle(table=table, uid=0) for table in tables]
+    link = PeersLink({(f"10.0.0.{host}", 1): each for host, each in enumerate(vehicles)})
+    async with ParamClient(link, cache=path, split_peers=True) as client:
+        await until(lambda: len(client.components) == 2)
+        await client.fetch_all()
+        await anyio.sleep(10.0)
+    assert sorted(cached(path).values(), key=lambda each: each["A"]) == tables
+    assert lines(path) == []
+
+
+@swiftly
+async def test_of_split_vehicles_that_say_to_be_one_the_first_is_cached(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As two simulated PX4 do, which all have one hardware id; and as a vehicle with a new port does."""
+    path = tmp_path / "cache.sqlite3"
+    first, second = Late(px4(), 0.0, 15.0), Late(px4(table={**TABLE, "SHARED_A": 50}), 2.0)
+    link = PeersLink({("10.0.0.1", 14550): first, ("10.0.0.2", 14550): second})
+    async with ParamClient(link, cache=path, split_peers=True) as client:
+        await until(lambda: len(client.components) == 2)
+        await client.fetch_all()
+        await anyio.sleep(10.0)
+        [table] = cached(path).values()
+        assert table["SHARED_A"] == 1.0
+        assert lines(path) == []
+        [warning] = [each.getMessage() for each in caplog.records if each.levelno >= logging.WARNING]
+        assert "10.0.0.2:14550 has the identity of the one at 10.0.0.1:14550" in warning
+        await until(lambda: client.components[next(iter(client.components))].state == "lost")
+        await anyio.sleep(2.0)
+        [table] = cached(path).values()
+        assert table["SHARED_A"] == 50.0
+
+
+@swiftly
+async def test_a_split_vehicle_is_followed_to_its_new_system_id() -> None:
+    plane = ArduPilotVehicle(kind="plane", ftp=False)
+    link = PeersLink({("10.0.0.1", 1): plane, ("10.0.0.2", 1): ArduPilotVehicle(system=7, ftp=False)})
+    async with ParamClient(link, cache=False, split_peers=True) as client:
+        vehicle = await client.component(peer="10.0.0.1")
+        await outcome(vehicle.set("SYSID_THISMAV", 7))
+        found = await client.successor(vehicle, 7)
+        assert (found.system, found.peer) == (7, "10.0.0.1:1")
+
+
+def test_the_command_speaks_to_one_of_two_peers(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    url = "udpin:0.0.0.0:14550"
+    leaping(monkeypatch)
+    put = behind(monkeypatch, url)
+    command: Command = in_process(capsys, "--cache", str(tmp_path / "cache.sqlite3"))
+    first, second = px4(), ardupilot()
+    put(PeersLink({("10.0.0.1", 14550): first, ("10.0.0.2", 14550): second}))
+    ambiguous = command("set", url, "SHARED_A", "5", "--split-peers")
+    assert ambiguous.code == 2
+    assert ambiguous.err.endswith("Choose one with --peer.\n")
+    done = command("set", url, "SHARED_A", "5", "--split-peers", "--peer", "10.0.0.2")
+    assert done.code == 0, done.err
+    assert (first.requests["PARAM_SET"], second.requests["PARAM_SET"]) == (0, 1)
+    assert command("set", url, "SHARED_A", "5", "--peer", "10.0.0.2").code == 2
+    both = command("save", url, str(tmp_path / "all.params"), "--all", "--split-peers")
+    assert both.code == 2, both.err
+    assert "exclude each other" in both.err
 
 
 def test_two_autopilots_on_one_udp_port(tmp_path: Path) -> None:

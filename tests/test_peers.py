@@ -8,6 +8,7 @@ import pytest
 
 from paramclient.errors import ContestedAddress
 from paramclient.protocol import peers as room
+from paramclient.protocol import station as station_room
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentContested, ComponentUncontested, Event
@@ -472,6 +473,34 @@ def test_where_nothing_is_sent_the_clock_shows_a_second_path() -> None:
 
     assert listening().kinds() == []
     assert listening(booted_at=-50.0).kinds() == ["Contested"]
+
+
+def test_split_peers_are_never_contested() -> None:
+    station = Station(link="tcpin:test", is_stream=False, split_peers=True)
+    net = Net(a=Speaker(PX4), b=Speaker(ARDUPILOT, uid=2, start=0.4, value=7.0), station=station)
+    net.run(8.0)
+    assert net.kinds() == []
+    assert len(station.components) == 2
+    assert len({*station.components, (1, 1)}) == 3, "the ids alone are no key"
+    for machine in station.components.values():
+        machine.read("P", net.now)
+    net.run(0.2)
+    values = {
+        machine.peer_in_words: machine.table.params["P"].value for machine in station.components.values()
+    }
+    assert values == {"a": 1.0, "b": 7.0}
+    assert [each.peer_in_words for each in station.at_peer("b")] == ["b"]
+    assert {repr(address) for address in station.components} == {"1/1 at a", "1/1 at b"}
+
+
+def test_a_split_component_that_is_forgotten_leaves_the_other_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 2)
+    station = Station(link="tcpin:test", is_stream=False, split_peers=True)
+    net = Net(a=Speaker(), b=silent_after(2.0), station=station)
+    net.run(9.0)
+    net.peers["c"] = Speaker(uid=3, start=9.0)
+    net.run(5.0)
+    assert sorted(each.peer_in_words for each in station.components.values()) == ["a", "c"]
 
 
 @pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])

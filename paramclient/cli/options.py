@@ -108,6 +108,12 @@ class LinkOptions(SigningOptions):
     component: Id = None
     """The component to speak to, 1 to 255. Without it, the autopilot."""
 
+    peer: str | None = None
+    """The peer to speak to, HOST or HOST:PORT, where several have equal ids; goes with --split-peers."""
+
+    split_peers: bool = False
+    """Take components with equal ids for different ones where they come from different peers."""
+
     timeout: Seconds = None
     """Seconds for everything together. Without it, 10 to hear the vehicle, then as many as it takes."""
 

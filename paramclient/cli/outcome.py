@@ -51,7 +51,7 @@ def code_of(error: ParamClientError) -> ExitCode:
 
 def text_of(error: ParamClientError) -> str:
     """The text of an error for users of the command, who choose by options in the place of arguments."""
-    if isinstance(error, AmbiguousVehicle) and error.choose_by in ("system", "component"):
+    if isinstance(error, AmbiguousVehicle) and error.choose_by in ("system", "component", "peer"):
         return f"{error.summary} Choose one with --{error.choose_by}."
     return str(error)
 

@@ -103,6 +103,8 @@ async def _fetch(
 ) -> tuple[list[tuple[Component, FetchResult]], list[str]]:
     """The components that are meant, with what their fetches brought; and who has not answered."""
     deadline = session.deadline
+    if all_ and session.options.split_peers:
+        raise UsageError("--all and --split-peers exclude each other: a file has each component once")
     if not all_:
         with progress_bar(f"fetching {session.who}") as progress:
             result = await session.component.fetch_all(

@@ -81,13 +81,15 @@ class Session:
         """
         options, component = self.options, self.component
         patience = self.deadline.left(CHECKING_PATIENCE)
-        found = await self.client.only_component(options.system, options.component, timeout=patience)
+        found = await self.client.only_component(
+            options.system, options.component, peer=options.peer, timeout=patience
+        )
         if found is not component:
             heard = f"{found.system}/{found.component} {found.autopilot}"
             raise AmbiguousVehicle(
                 f"{self.who} was chosen and is not heard any more, {heard} is. Nothing was written.",
                 vehicles=(self.who, heard),
-                choose_by="system" if found.system != component.system else "component",
+                choose_by=_difference(found, component),
             )
 
 
@@ -116,6 +118,8 @@ async def connect(
         NoReply: the component was not heard.
         LinkError: the link cannot be opened, or failed.
     """
+    if options.peer is not None and not options.split_peers:
+        raise UsageError("--peer goes with --split-peers")
     deadline = Deadline(options.timeout)
     async with ParamClient(
         url if is_live else _at_once(url),
@@ -126,10 +130,11 @@ async def connect(
         forward=options.forward,
         tlog=options.tlog,
         signing=options.signing,
+        split_peers=options.split_peers,
     ) as client:
         patience = HEARING_PATIENCE if options.timeout is None else deadline.left()
         find = client.only_component if only else client.component
-        component = await find(options.system, options.component, timeout=patience)
+        component = await find(options.system, options.component, peer=options.peer, timeout=patience)
         yield Session(client, component, deadline, options)
 
 
@@ -144,6 +149,13 @@ def listen(
     if names_service(url):
         raise UsageError("a service does not give the traffic of its links; ask where such a link is")
     return ParamClient(url, cache=False, traffic=True, signing=signing, listen_only=listen_only, tlog=tlog)
+
+
+def _difference(found: Component, chosen: Component) -> str:
+    """Return which argument tells two components apart."""
+    if found.system != chosen.system:
+        return "system"
+    return "component" if found.component != chosen.component else "peer"
 
 
 def _at_once(url: str) -> str:

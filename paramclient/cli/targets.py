@@ -77,6 +77,8 @@ async def targets(
     """
     if everybody and options.system is not None:
         raise UsageError("--all and --system exclude each other")
+    if everybody and options.split_peers:
+        raise UsageError("--all and --split-peers exclude each other: files and results go by system id")
     if expect is not None and not everybody:
         raise UsageError("--expect goes with --all")
     async with connect(url, options, only=only and not everybody) as session:

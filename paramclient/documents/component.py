@@ -78,15 +78,16 @@ class ContestDoc(Document):
 class ComponentDoc(Document):
     """One component on one link.
 
-    `key` is the name under which its table is kept, null until the vehicle has said who it is. `params` is
-    how many are known, `count` how many it says it has, `fetch` how far one is that is under way. `contest`
-    says which vehicles have the address where these are several.
+    `key` is the name under which its table is kept, null until the vehicle has said who it is. `peer` is
+    where its messages come from. `params` is how many are known, `count` how many it says it has, `fetch` how
+    far one is that is under way. `contest` says which vehicles have the address where these are several.
     """
 
     link: str
     link_state: str
     system: int
     component: int
+    peer: str
     autopilot: str
     vehicle_type: int
     key: str | None
@@ -133,6 +134,7 @@ class ComponentDoc(Document):
             link_state=link_state,
             system=component.system,
             component=component.component,
+            peer=component.peer,
             autopilot=component.autopilot,
             vehicle_type=identity.vehicle_type,
             key=key,

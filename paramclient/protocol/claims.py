@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 from collections.abc import Hashable
 from enum import Enum
-from itertools import pairwise
-from typing import Final, Generic, NamedTuple, TypeAlias, TypeVar
+from typing import Final, Generic, NamedTuple, TypeVar
 
 from paramclient.identity import SHARED_UIDS, hardware_id
+from paramclient.protocol.addresses import Peer, peer_in_words
 from paramclient.protocol.kinds import kind_in_words
 from paramclient.protocol.wire import (
     SYSTEM_TIME_ID,
@@ -19,10 +19,7 @@ from paramclient.protocol.wire import (
     SystemTime,
 )
 
-__all__ = ["Claim", "Peer", "Verdict", "Variants", "compare", "peer_in_words"]
-
-Peer: TypeAlias = Hashable
-"""Who sent something, as the link tells them apart."""
+__all__ = ["Claim", "Verdict", "Variants", "compare"]
 
 START_TOLERANCE: Final = 2.0
 """Seconds by which the boot times of one vehicle may differ that were heard over two ways: its messages take
@@ -261,12 +258,3 @@ def _is_one_start(one: _Clock, another: _Clock) -> bool | None:
         return True
     older, newer = sorted((one, another))
     return None if older.told_at <= newer.started_at + CLOCK_DELAY else False
-
-
-def peer_in_words(peer: Peer) -> str:
-    """A peer for people: `127.0.0.1:14550` for the addresses of a link."""
-    if isinstance(peer, tuple):
-        for host, port in pairwise(peer):
-            if isinstance(host, str) and isinstance(port, int):
-                return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
-    return str(peer)

@@ -72,11 +72,14 @@ class ComponentMachine(Parts):
         is_vehicle_doubted: whether it is open which vehicle its autopilot belongs to.
         another: is told that another vehicle has taken the system id; by default `become_another`.
         read_clock: has `boot_clock` called with clocks from its telemetry for a while; see `ClockSampling`.
+        peer: the peer that it is of, where components are kept apart by their peers; else None.
         turns: those of the lists on the link; None for a link that it has for itself.
         room: what the tables of the link may hold together; None likewise.
         trace: is told of each step.
 
     Attributes:
+        address: system and component, and with `peer` that as well.
+        vehicle: what all components of a vehicle have in common: the system, and with `peer` that as well.
         version: the MAVLink version that it speaks, as far as heard.
         who: its identity, and how it writes values.
         table: its parameters.

@@ -7,10 +7,11 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 
 from paramclient.identity import Identity
+from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
 from paramclient.protocol.authors import Authors
 from paramclient.protocol.change import Change
 from paramclient.protocol.check_pace import CheckPace
-from paramclient.protocol.claims import Claim, Peer
+from paramclient.protocol.claims import Claim
 from paramclient.protocol.clock_requests import ClockRequests
 from paramclient.protocol.commands import Commands
 from paramclient.protocol.descriptions import Descriptions
@@ -21,7 +22,7 @@ from paramclient.protocol.following import Following
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.identify import Identification
 from paramclient.protocol.name_search import NameSearches
-from paramclient.protocol.peers import ComponentPeers, Contest
+from paramclient.protocol.peers import NO_PEER, ComponentPeers, Contest
 from paramclient.protocol.presence import Presence
 from paramclient.protocol.reads import Key, Reads
 from paramclient.protocol.refresh import Refresh
@@ -62,6 +63,7 @@ class Parts(ABC):
         is_vehicle_doubted: Callable[[], bool] = lambda: False,
         another: Callable[[float], None] | None = None,
         read_clock: Callable[[float], None] = lambda now: None,
+        peer: Peer | None = None,
         turns: Turns | None = None,
         room: Room | None = None,
         trace: Trace = silent,
@@ -70,6 +72,8 @@ class Parts(ABC):
         upkeep = upkeep or Upkeep()
         self.system = system
         self.component = component
+        self.address: Address = target if peer is None else PeerAddress(system, component, peer)
+        self.vehicle: tuple[int, Peer] = (system, peer)
         self.version = 1
         self.round_trip = RoundTrip()
         self.who = Identification(
@@ -216,6 +220,19 @@ class Parts(ABC):
     @abstractmethod
     def become_another(self, now: float) -> None:
         """Another vehicle has taken this system id."""
+
+    @property
+    def peer_in_words(self) -> str:
+        """Where its messages come from, `127.0.0.1:14550`; "" while that is not known."""
+        if isinstance(self.address, PeerAddress):
+            return peer_in_words(self.address.peer)
+        return "" if self.peers.home is NO_PEER else peer_in_words(self.peers.home)
+
+    def address_in(self, system: int) -> Address:
+        """The address that it has under another system id."""
+        if isinstance(self.address, PeerAddress):
+            return PeerAddress(system, self.component, self.address.peer)
+        return system, self.component
 
     @property
     def identity(self) -> Identity:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Final, Protocol
 
 from paramclient.errors import ContestedAddress
-from paramclient.protocol.claims import Claim, Peer, Verdict, compare
+from paramclient.protocol.addresses import Peer
+from paramclient.protocol.claims import Claim, Verdict, compare
 from paramclient.protocol.presence import LOST_AFTER, Presence
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,

@@ -7,11 +7,11 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from heapq import heapify, heappop, heappush
-from typing import Final, TypeAlias
+from typing import Final
 
 from paramclient.errors import LinkError, UsageError
 from paramclient.identity import Identity
-from paramclient.protocol.claims import Peer
+from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
 from paramclient.protocol.clock_sampling import ClockSampling
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.download import present_of
@@ -59,8 +59,6 @@ from paramclient.values import Encoding
 
 __all__ = ["Address", "Peer", "Station"]
 
-Address: TypeAlias = tuple[int, int]
-"""System and component."""
 
 HEARTBEAT_INTERVAL: Final = 1.0
 NOBODY: Final = (0, 0)
@@ -104,11 +102,13 @@ class Station:
         system, component: who we are.
         encoding: for all components, where the user knows better; None: judged by the evidence.
         upkeep: what is done for tables without being asked; by default nothing.
+        split_peers: whether components with equal ids are different ones where they come from different
+            peers.
         counts_traffic: whether everything on the link is counted, which takes time for each frame.
         trace: is told of each step.
 
     Attributes:
-        components: every component heard, by (system, component).
+        components: every component heard, by (system, component); with `split_peers` by `PeerAddress`.
         bytes_received, bytes_sent, frames_sent: on this link, by this station.
         traffic: the counts, or None where they are not wanted.
         policy: what may be asked to bring tables up to date.
@@ -129,6 +129,7 @@ class Station:
         component: int = 190,
         encoding: Encoding | None = None,
         upkeep: Upkeep | None = None,
+        split_peers: bool = False,
         counts_traffic: bool = False,
         trace: Trace = silent,
     ) -> None:
@@ -161,12 +162,13 @@ class Station:
         self._heartbeat_at = math.inf if self.listens_only else -math.inf
         self._is_paused = False
         self._turns = Turns()
-        self._of_system: dict[int, list[ComponentMachine]] = {}
+        self._splits = split_peers
+        self._of_vehicle: dict[tuple[int, Peer], list[ComponentMachine]] = {}
         self._last_waiting: ComponentMachine | None = None
         self._last_busy: ComponentMachine | None = None
         self._touched: dict[ComponentMachine, None] = {}  # whose deadline may be another than was noted
         self._deadlines: dict[ComponentMachine, float] = {}  # as noted
-        self._order: list[tuple[float, int, int]] = []  # a heap of these, with some that are of the past
+        self._order: list[tuple[float, Address]] = []  # a heap of these, with some that are of the past
         self._room = Room()
         self._early_requests: deque[tuple[FileTransfer, Address]] = deque(maxlen=EARLY_REQUESTS_MAX)
         self._full_until = -math.inf
@@ -184,9 +186,14 @@ class Station:
         self._framer.guard = verifier.accepts
         self._awaits_autopilot = False  # a frame is proven once, and what asks for heartbeats proves none
 
-    def send_setup_signing(self, system: int, component: int, key: SigningKey | None, timestamp: int) -> None:
-        """Give a vehicle its signing key, in clear, or with None take it away. Nothing answers."""
-        self._send(SetupSigning(system, component, key, timestamp), (system, component), 2)
+    def send_setup_signing(
+        self, system: int, component: int, key: SigningKey | None, timestamp: int, *, peer: Peer = None
+    ) -> None:
+        """Give a vehicle its signing key, in clear, or with None take it away. Nothing answers.
+
+        `peer` is the one that the vehicle is of, with `split_peers`; else None.
+        """
+        self._send(SetupSigning(system, component, key, timestamp), self._key(system, component, peer), 2)
 
     def receive(self, data: bytes, peer: Peer, now: float, moment: float | None = None) -> bool:
         """Take a datagram, or a chunk of a stream. An empty chunk says that the peer's stream has ended.
@@ -205,7 +212,8 @@ class Station:
         clocks = 0
         for frame in frames:
             number, system, component, _, payload, version = frame
-            machine = self.components.get((system, component))
+            address = PeerAddress(system, component, peer) if self._splits else (system, component)
+            machine = self.components.get(address)
             if number == PARAM_VALUE_ID and component == COMP_ID_MISSIONPLANNER and self._is_made_up(machine):
                 continue
             if number == PARAM_VALUE_ID and machine is not None:  # the short way for what comes in thousands
@@ -218,7 +226,7 @@ class Station:
                 machine.receive_value(decode_param_value(payload), now, version, moment)
             elif number in _TELEMETRY_CLOCKS:
                 clocks += 1
-                if machine is not None and self._clock_sampling.is_open((system, component)):
+                if machine is not None and self._clock_sampling.is_open(address):
                     self._receive_clock(machine, number, payload, peer, now)
             else:
                 self._receive_other(frame, peer, now, moment)
@@ -245,7 +253,7 @@ class Station:
 
     def touch(self, machine: ComponentMachine) -> None:
         """Something was asked of a component, or is no longer."""
-        if self.components.get((machine.system, machine.component)) is machine:
+        if self.components.get(machine.address) is machine:
             self._touched[machine] = None
 
     def overhear(self, data: bytes, now: float) -> None:
@@ -278,8 +286,7 @@ class Station:
             self._transmit(beat, None, 2)
         if not everyone:
             while self._order and self._order[0][0] <= now:
-                _, system, component = heappop(self._order)
-                self._touched[self.components[system, component]] = None
+                self._touched[self.components[heappop(self._order)[1]]] = None
         done = 0
         for machine in list(self.components.values() if everyone else self._touched):
             is_due = machine.next_deadline() <= now
@@ -310,11 +317,11 @@ class Station:
             deadline = machine.next_deadline()
             if deadline != deadlines.get(machine):
                 deadlines[machine] = deadline
-                heappush(order, (deadline, machine.system, machine.component))
+                heappush(order, (deadline, machine.address))
         self._touched = {each: None for each in self._touched if each.writes.is_held}  # till another speaks
         if len(order) > MOST_PAST * (len(deadlines) + 1):
-            self._order = order = sorted((at, each.system, each.component) for each, at in deadlines.items())
-        while order and deadlines[self.components[order[0][1:]]] != order[0][0]:
+            self._order = order = sorted((at, each.address) for each, at in deadlines.items())
+        while order and deadlines[self.components[order[0][1]]] != order[0][0]:
             heappop(order)
         first = order[0][0] if order else math.inf
         return min(self._heartbeat_at, self._turns.next_deadline(), first)
@@ -419,7 +426,7 @@ class Station:
 
     def identity_of(self, machine: ComponentMachine) -> Identity | None:
         """Who the vehicle is that a component belongs to: its autopilot says. None while that is open."""
-        autopilot = self.autopilot_of(machine.system) or machine
+        autopilot = self.autopilot_of(*machine.vehicle) or machine
         return autopilot.identity if autopilot.who.settled else None
 
     def is_doubted(self, machine: ComponentMachine) -> bool:
@@ -428,32 +435,46 @@ class Station:
         Its autopilot is away, or was and has not said since who it is; or several vehicles seem to have the
         address of either.
         """
-        autopilot = self.autopilot_of(machine.system) or machine
+        autopilot = self.autopilot_of(*machine.vehicle) or machine
         if autopilot.peers.is_unclear or machine.peers.is_unclear:
             return True
         is_lost = autopilot is not machine and autopilot.presence.is_lost
         return is_lost or autopilot.who.was_away
 
-    def autopilot_of(self, system: int) -> ComponentMachine | None:
-        """The component of a system that is its autopilot: the usual id first."""
-        first = self.components.get((system, AUTOPILOT_COMPONENT))
+    def autopilot_of(self, system: int, peer: Peer = None) -> ComponentMachine | None:
+        """The component of a system that is its autopilot: the usual id first.
+
+        Args:
+            system: the system.
+            peer: the peer that it is of, with `split_peers`; else None.
+        """
+        first = self.components.get(self._key(system, AUTOPILOT_COMPONENT, peer))
         if first is not None and first.who.is_autopilot:
             return first
-        for machine in self._of_system.get(system, ()):
+        for machine in self._of_vehicle.get((system, peer), ()):
             if machine.who.is_autopilot:
                 return machine
         return None
 
-    def find(self, system: int | None, component: int | None) -> ComponentMachine | None:
+    def at_peer(self, peer: str | None) -> list[ComponentMachine]:
+        """The components whose messages come from a peer, by its address or the host alone; None for all."""
+        machines = list(self.components.values())
+        if peer is None:
+            return machines
+        said = [(each, each.peer_in_words) for each in machines]
+        return [each for each, words in said if peer in (words, words.rpartition(":")[0])]
+
+    def find(
+        self, system: int | None, component: int | None, peer: str | None = None
+    ) -> ComponentMachine | None:
         """The first component with this address, as far as it is given; without its id, an autopilot."""
-        if component is None:
-            for machine in self.components.values():
-                if system in (None, machine.system) and machine.who.is_autopilot:
-                    return self.autopilot_of(machine.system) or machine
-            return None
-        for address, found in self.components.items():
-            if address[1] == component and system in (None, address[0]) and found.who.has_spoken:
-                return found
+        for machine in self.at_peer(peer):
+            if system not in (None, machine.system):
+                continue
+            if component is None and machine.who.is_autopilot:
+                return self.autopilot_of(*machine.vehicle) or machine
+            if component == machine.component and machine.who.has_spoken:
+                return machine
         return None
 
     def check_refresh(self, refresh: bool) -> None:
@@ -483,13 +504,13 @@ class Station:
         has_file = any(machine.fetches.may_use_file() for machine in machines)
         if len(machines) > 1 and may_list and is_new and is_fresh and not has_file:
             system = machines[0].system
-            known = [m for m in self.components.values() if m.system == system and m.who.has_parameters]
+            known = [each for each in self._of_vehicle[machines[0].vehicle] if each.who.has_parameters]
             have_one_peer = len({machine.peers.home for machine in machines}) == 1
             if len(known) == len(machines) and have_one_peer:
                 for machine in machines:
                     machine.check_uncontested()
                 version = max(machine.version for machine in machines)
-                self._send(ParamRequestList(system, COMP_ID_ALL), (system, COMP_ID_ALL), version)
+                self._send(ParamRequestList(system, COMP_ID_ALL), machines[0].address, version)
                 return [machine.begin_fetch(now, refresh=refresh, listed=True) for machine in machines]
         return [machine.begin_fetch(now, refresh=refresh) for machine in machines]
 
@@ -535,7 +556,7 @@ class Station:
         for frame in Framer(stream=False).receive(data):
             address = (frame.system, frame.component)
             is_autopilot = frame.component == AUTOPILOT_COMPONENT and frame.system != 0
-            known = self.components.get(address)
+            known = self.components.get(self._key(*address, peer))
             if is_autopilot and address != self.own and not (known and known.presence.has_beaten):
                 self._heartbeat_requested_at = now
                 if self._awaits_autopilot:
@@ -579,10 +600,11 @@ class Station:
             return
         if isinstance(message, FileTransfer):
             self._receive_foreign_file_request(message, sender, now)
-        machine = self.components.get(sender) or self._meet(sender, message, now)
+        address = self._key(*sender, peer)
+        machine = self.components.get(address) or self._meet(sender, peer, message, now)
         if machine is None:
             return
-        self._touch_all(self._of_system[machine.system])  # what one says of the vehicle counts for all
+        self._touch_all(self._of_vehicle[machine.vehicle])  # what one says of the vehicle counts for all
         if not machine.who.has_parameters:
             machine.peers.follow(peer)
         elif not machine.peers.hears(message, peer, now):
@@ -591,7 +613,7 @@ class Station:
             return
         machine.receive(message, now, version=frame.version, moment=moment, sequence=frame.sequence)
         if isinstance(message, Heartbeat):
-            self._clock_sampling.open(sender, now)
+            self._clock_sampling.open(address, now)
 
     def _receive_clock(
         self, machine: ComponentMachine, number: int, payload: bytes, peer: Peer, now: float
@@ -604,24 +626,29 @@ class Station:
             return
         machine.boot_clock(number, boot_ms, now)
         if machine.restart is None and not machine.peers.wants_clocks:
-            self._clock_sampling.sampled((machine.system, machine.component), now)
+            self._clock_sampling.sampled(machine.address, now)
 
     def _take_clocks(self, takes: bool) -> None:
         for framer in (self._framer, *self._framers.values()):
             framer.takes_occasional = takes
 
-    def _meet(self, sender: Address, message: Message, now: float) -> ComponentMachine | None:
+    def _key(self, system: int, component: int, peer: Peer) -> Address:
+        return PeerAddress(system, component, peer) if self._splits else (system, component)
+
+    def _meet(self, sender: Address, peer: Peer, message: Message, now: float) -> ComponentMachine | None:
         """A component that was not heard before; only what shows that it has parameters makes it one."""
         is_sign = isinstance(message, Heartbeat | HighLatency2 | ParamValue)
         if not (is_sign or self._is_awaited_file(message, sender)) or not self._has_room(now):
             return None
         system, component = sender
+        address = self._key(system, component, peer)
+        vehicle = (system, peer if self._splits else None)
         machine: ComponentMachine | None = None
 
         def send(message: Message) -> None:
             if machine is not None:
                 self.touch(machine)
-            self._send(message, sender, 2 if machine is None else machine.version)
+            self._send(message, address, 2 if machine is None else machine.version)
 
         def send_to(message: Message, peer: Peer) -> None:
             self._transmit(message, peer, 2 if machine is None else machine.version)
@@ -630,22 +657,23 @@ class Station:
             system,
             component,
             own=self.own,
-            link=self.link,
+            link=f"{self.link}#{peer_in_words(peer)}" if self._splits else self.link,
             send=send,
             emit=self._events.append,
             send_to=send_to,
             encoding=self._encoding,
             upkeep=self._upkeep,
             is_link_busy=lambda: self._is_busy,
-            is_vehicle_doubted=lambda: self._autopilot_is_doubted(system),
-            another=lambda now: self._become_another(system, now),
-            read_clock=lambda now: self._clock_sampling.open(sender, now),
+            is_vehicle_doubted=lambda: self._autopilot_is_doubted(vehicle),
+            another=lambda now: self._become_another(vehicle, now),
+            read_clock=lambda now: self._clock_sampling.open(address, now),
+            peer=peer if self._splits else None,
             turns=self._turns,
             room=self._room,
             trace=self._trace,
         )
-        self.components[sender] = machine
-        self._of_system.setdefault(system, []).append(machine)
+        self.components[address] = machine
+        self._of_vehicle.setdefault(vehicle, []).append(machine)
         self._events.append(ComponentHeard(machine))
         for request, station in self._early_requests:
             if _is_for(request, sender):
@@ -671,26 +699,28 @@ class Station:
 
     def _forget(self, machine: ComponentMachine) -> None:
         """Part with a component, and with what was noted of it: another one may take its address."""
-        address = (machine.system, machine.component)
+        address = machine.address
         del self.components[address]
-        self._of_system[machine.system].remove(machine)
+        self._of_vehicle[machine.vehicle].remove(machine)
+        if not self._of_vehicle[machine.vehicle]:
+            del self._of_vehicle[machine.vehicle]
         self._clock_sampling.close(address)
         self._touched.pop(machine, None)
         self._deadlines.pop(machine, None)
         self._last_waiting = self._last_busy = None
-        self._order = [each for each in self._order if each[1:] != address]
+        self._order = [each for each in self._order if each[1] != address]
         heapify(self._order)
         machine.reads.pace.idle()
         self._foreign += machine.peers.foreign
         self._events.append(ComponentForgotten(machine))
 
-    def _become_another(self, system: int, now: float) -> None:
+    def _become_another(self, vehicle: tuple[int, Peer], now: float) -> None:
         """Another vehicle has taken a system id, with all of its components."""
-        for machine in self._of_system[system]:
+        for machine in self._of_vehicle[vehicle]:
             machine.become_another(now)
 
-    def _autopilot_is_doubted(self, system: int) -> bool:
-        autopilot = self.autopilot_of(system)
+    def _autopilot_is_doubted(self, vehicle: tuple[int, Peer]) -> bool:
+        autopilot = self.autopilot_of(*vehicle)
         return autopilot is not None and autopilot.who.is_doubted
 
     def _receive_foreign_set(self, message: ParamSet, sender: Address, now: float) -> None:
@@ -706,8 +736,9 @@ class Station:
         target = (message.target_system, message.target_component)
         if self.listens_only and target not in self.components and opens_parameter_file(message):
             self._early_requests.append((message, sender))
-        for machine in self._of_system.get(message.target_system, ()):
-            if message.target_component in (machine.component, COMP_ID_ALL):
+        machines = self.components.values() if self._splits else self._of_vehicle.get((target[0], None), ())
+        for machine in machines:
+            if machine.system == target[0] and message.target_component in (machine.component, COMP_ID_ALL):
                 self._touched[machine] = None
                 machine.foreign_file_request(message, sender, now)
 
@@ -727,9 +758,11 @@ class Station:
 
     def _peer_of(self, address: Address) -> Peer | None:
         """The peer of a component, else of the system's autopilot, else any of the system; None for all."""
-        system, _ = address
-        own, autopilot = self.components.get(address), self.autopilot_of(system)
-        machines = [each for each in (own, autopilot, *self._of_system.get(system, ())) if each is not None]
+        if isinstance(address, PeerAddress):
+            return address.peer
+        vehicle = (address[0], None)
+        own, autopilot = self.components.get(address), self.autopilot_of(*vehicle)
+        machines = [each for each in (own, autopilot, *self._of_vehicle.get(vehicle, ())) if each is not None]
         return next((each.peers.home for each in machines if each.peers.home is not NO_PEER), None)
 
     def _send(self, message: Message, address: Address, version: int) -> None:

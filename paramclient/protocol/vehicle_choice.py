@@ -35,6 +35,7 @@ class VehicleChoice:
     Args:
         system, component: the parts of the address that are given.
         spans_links: whether the components are those of several links, which may have equal addresses.
+        splits_peers: whether they are those of several peers, which may have equal addresses too.
 
     Attributes:
         due: when to look again, also if nothing was received; infinity while no vehicle was heard.
@@ -46,11 +47,14 @@ class VehicleChoice:
         component: int | None,
         *,
         spans_links: bool = False,
+        splits_peers: bool = False,
     ) -> None:
         self.due = math.inf
         self._system = system
         self._component = component
         self._spans_links = spans_links
+        self._splits_peers = splits_peers
+        self._is_spread = spans_links or splits_peers
 
     def look(
         self, machines: Iterable[ComponentMachine], now: float, *, listening_since: float
@@ -71,12 +75,12 @@ class VehicleChoice:
             address = (self._system, self._component)
             found = [each for each in machines if (each.system, each.component) == address]
             found = [each for each in found if each.who.has_spoken]
-            return self._decided(found, found, now, listening_since, needs_look=self._spans_links)
+            return self._decided(found, found, now, listening_since, needs_look=self._is_spread)
         autopilots = _autopilots(machines)
         if self._system is not None:
             found = [each for each in autopilots if each.system == self._system]
             usual = [each for each in found if each.component == AUTOPILOT_COMPONENT]
-            needs_look = self._spans_links or not usual
+            needs_look = self._is_spread or not usual
             return self._decided(usual or found, found, now, listening_since, needs_look=needs_look)
         if self._component is None:
             return self._decided(autopilots, autopilots, now, listening_since)
@@ -101,15 +105,31 @@ class VehicleChoice:
         """
         one_of_each = _one_of_each(heard)
         if len(one_of_each) > 1:
-            raise _ambiguous(one_of_each, "vehicles", self._spans_links)
+            raise self._ambiguous(one_of_each, "vehicles")
         if len(found) > 1:
-            raise _ambiguous(found, f"autopilots in system {found[0].system}", self._spans_links)
+            raise self._ambiguous(found, f"autopilots in system {found[0].system}")
         if not found:
             return None
         if needs_look:
             first_heard = min(each.presence.since for each in heard)
             self.due = max(first_heard, listening_since) + LOOK_TIME
         return found[0] if not needs_look or now >= self.due else None
+
+    def _ambiguous(self, machines: Sequence[ComponentMachine], what: str) -> AmbiguousVehicle:
+        """Return the error that lists them."""
+        places = {_place(each, splits_peers=self._splits_peers) for each in machines}
+        words = [
+            vehicle_in_words(each)
+            + (f" {_place(each, splits_peers=self._splits_peers)}" if len(places) > 1 else "")
+            for each in sorted(machines, key=lambda each: (each.system, each.component))
+        ]
+        systems = {each.system for each in machines}
+        way_within = "component" if len(places) == 1 else "peer" if self._splits_peers else "link"
+        choose_by = "system" if len(systems) == len(machines) else way_within
+        where = "on the links of this service" if self._spans_links else "on this link"
+        return AmbiguousVehicle(
+            f"{len(machines)} {what} {where}: {', '.join(words)}.", vehicles=words, choose_by=choose_by
+        )
 
 
 def vehicle_in_words(machine: ComponentMachine) -> str:
@@ -136,17 +156,6 @@ def _one_of_each(machines: Iterable[ComponentMachine]) -> list[ComponentMachine]
     return list(first.values())
 
 
-def _ambiguous(machines: Sequence[ComponentMachine], what: str, spans_links: bool) -> AmbiguousVehicle:
-    """Return the error that lists them."""
-    links = {each.identity.link for each in machines}
-    words = [
-        vehicle_in_words(each) + (f" on {each.identity.link}" if len(links) > 1 else "")
-        for each in sorted(machines, key=lambda each: (each.system, each.component))
-    ]
-    systems = {each.system for each in machines}
-    way_within = "component" if len(links) == 1 else "link"
-    choose_by = "system" if len(systems) == len(machines) else way_within
-    where = "on the links of this service" if spans_links else "on this link"
-    return AmbiguousVehicle(
-        f"{len(machines)} {what} {where}: {', '.join(words)}.", vehicles=words, choose_by=choose_by
-    )
+def _place(machine: ComponentMachine, *, splits_peers: bool) -> str:
+    """Return where a component is, in words."""
+    return f"at {machine.peer_in_words}" if splits_peers else f"on {machine.identity.link}"

@@ -14,7 +14,15 @@ import httpx
 
 from paramclient.client import HEARING_PATIENCE, ParamClient
 from paramclient.component import Component, address_in_words
-from paramclient.errors import CacheError, ClientClosed, LinkError, NoReply, ParamClientError, UsageError
+from paramclient.errors import (
+    CacheError,
+    ClientClosed,
+    ContestedAddress,
+    LinkError,
+    NoReply,
+    ParamClientError,
+    UsageError,
+)
 from paramclient.events import Events
 from paramclient.ftp import Ftp
 from paramclient.links import Link
@@ -229,6 +237,7 @@ class RemoteClient(ParamClient):
         system: int | None = None,
         component: int | None = None,
         *,
+        peer: str | None = None,
         timeout: float | None = HEARING_PATIENCE,
     ) -> RemoteComponent:
         """See `ParamClient.component`. It is waited for also on links that the service cannot open yet.
@@ -237,6 +246,7 @@ class RemoteClient(ParamClient):
             UsageError: it is on several links, and the address of the service names none of them.
             NoReply, LinkError: as there.
         """
+        _check_peer(peer)
         return await self._found({"system": system, "component": component}, timeout)
 
     async def only_component(
@@ -244,6 +254,7 @@ class RemoteClient(ParamClient):
         system: int | None = None,
         component: int | None = None,
         *,
+        peer: str | None = None,
         timeout: float | None = HEARING_PATIENCE,
     ) -> RemoteComponent:
         """See `ParamClient.only_component`. The vehicles on all links of the service count, or on the one
@@ -252,6 +263,7 @@ class RemoteClient(ParamClient):
         Raises:
             AmbiguousVehicle, UsageError, NoReply, LinkError: as there, and as `component`.
         """
+        _check_peer(peer)
         return await self._found({"system": system, "component": component, "only": True}, timeout)
 
     async def _found(self, sought: Document, timeout: float | None) -> RemoteComponent:
@@ -331,11 +343,11 @@ class RemoteClient(ParamClient):
                 for each in answer.document["results"]
                 if (key := key_of(each)) in known
             }
-            silent: dict[Address, NoReply | CacheError] = {}
+            silent: dict[Address, NoReply | CacheError | ContestedAddress] = {}
             for each in answer.document["silent"]:
                 problem = each["problem"]
                 error = error_of(problem, status=problem["status"], link=self._service.name)
-                if isinstance(error, NoReply | CacheError):
+                if isinstance(error, NoReply | CacheError | ContestedAddress):
                     silent[each["system"], each["component"]] = error
         return FetchedAll(results, silent)
 
@@ -382,3 +394,8 @@ class RemoteClient(ParamClient):
 
     def _check_open(self) -> None:
         self._connection.check_open()
+
+
+def _check_peer(peer: str | None) -> None:
+    if peer is not None:
+        raise UsageError("peer is for a client with a link of its own; a service keeps no peers apart")

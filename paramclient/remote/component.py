@@ -17,6 +17,7 @@ from paramclient.errors import NoReply, ParamClientError
 from paramclient.events import Changes, Event, Found, Heard, Lost
 from paramclient.identity import Identity
 from paramclient.params import ParamMap
+from paramclient.protocol.addresses import Address
 from paramclient.protocol.change import Change
 from paramclient.protocol.peers import Contest
 from paramclient.protocol.result import FetchResult, Progress
@@ -136,6 +137,16 @@ class RemoteComponent(Component):
         return (
             SyncState.UNSYNCED if self._client._connection.is_away and state is not SyncState.LOST else state
         )
+
+    @property
+    def address(self) -> Address:
+        """See `Component.address`."""
+        return self.system, self.component
+
+    @property
+    def peer(self) -> str:
+        """See `Component.peer`."""
+        return str(self._document["peer"])
 
     @property
     def contest(self) -> Contest | None:
