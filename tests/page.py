@@ -33,7 +33,7 @@ BROWSER_OPTIONS = [
 ]
 HOSTILE: dict[str, Value | tuple[ParamType, Value]] = {
     "<b>BOLD</b>": 1.0,
-    "<img src=x>": (ParamType.INT32, 2),
+    "<iframe/>": (ParamType.INT32, 2),
     "'\"></script>": (ParamType.INT32, 3),
     "A/../B?c%23d%41": (ParamType.INT32, 4),
     "NOT_A_NUMBER": float("nan"),
