@@ -275,7 +275,9 @@ def test_the_other_one_may_be_left() -> None:
     net.run(0.1)
     net.run(3.5)
     assert net.kinds() == ["Contested"]
-    net.run(LOST_AFTER + 1.5)
+    net.run(LOST_AFTER - 1.5)
+    assert net.kinds() == ["Contested"], "it spoke last at 3 s"
+    net.run(3.0)
     assert net.kinds() == ["Contested", "Uncontested"]
     assert net.machine.peers.home == "b"
     assert net.machine.who.identity.uid == f"{2:016x}"
