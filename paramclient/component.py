@@ -139,7 +139,7 @@ class Component:
 
     @property
     def peer(self) -> str:
-        """Where its messages come from and requests go, as `127.0.0.1:14550`; "" while that is not known."""
+        """The address and port that its messages come from and requests go to; empty while not known."""
         return self._machine.peer_in_words
 
     @property
