@@ -360,6 +360,32 @@ def test_two_paths_to_one_vehicle_stay_as_they_were() -> None:
     assert net.kinds() == []
 
 
+def test_a_path_that_could_not_answer_at_first_is_proven_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second radio that hears nothing for some seconds: it is asked on, and the contest ends."""
+    second = Speaker(start=0.4)
+    net = Net(a=Speaker(), b=second)
+    with monkeypatch.context() as deaf:
+        deaf.setattr(second, "receive", lambda data, now: None)
+        net.run(room.JUDGING_TIME + 3.0)
+        assert net.kinds() == ["Contested"]
+    net.run(room.LATER_PAUSE + 1.0)
+    assert net.kinds() == ["Contested", "Uncontested"]
+    assert net.machine.peers.contest is None
+    net.run(20.0)
+    assert net.kinds() == ["Contested", "Uncontested"]
+
+
+def test_one_that_never_shows_who_it_is_stays_contested_and_is_asked_rarely() -> None:
+    stranger = Speaker(uid=None, booted_at=None, every=0.5)
+    net = Net(a=Speaker(), b=stranger)
+    net.run(room.JUDGING_TIME + 1.0)
+    stranger.heard.clear()
+    net.run(60.0)
+    assert net.kinds() == ["Contested"]
+    asked = [message for message in stranger.heard if isinstance(message, wire.CommandLong)]
+    assert len(asked) <= 3 * (60.0 / room.LATER_PAUSE + 1)
+
+
 def test_a_vehicle_without_id_and_clock_may_have_two_paths() -> None:
     """Nothing tells the two apart, and nothing ever will."""
     camera = Heartbeat(30, MAV_AUTOPILOT_GENERIC)

@@ -29,6 +29,9 @@ ASKS_MAX: Final = 4
 ASK_PAUSES: Final = (0.5, 1.0, 1.5, 2.0)
 """How often a further peer is asked who it is, and the seconds after each time: 5 s in all, in which a radio
 with a round trip of 1 s that loses every second message answers three times out of four."""
+LATER_PAUSE: Final = 5.0
+"""Seconds between further questions to a peer that contests the address and has told nothing that differs:
+its radio may have been deaf. No more often than that, as it may also be a stranger."""
 JUDGING_TIME: Final = sum(ASK_PAUSES)
 """Seconds until a further peer must have shown who it is where nothing can be asked."""
 LOOK_PACE: Final = 0.25
@@ -281,9 +284,17 @@ class ComponentPeers:
             is_over = claim.asks >= ASKS_MAX and now >= claim.asked_at + pause
         else:
             pause, is_over = math.inf, now >= claim.first_at + JUDGING_TIME
+        is_over = is_over or claim.verdict is Verdict.OTHER
         claim.verdict, difference = compare(mine, claim, is_over=is_over, may_ask=self._may_ask)
-        if claim.verdict is Verdict.OPEN and claim.asks < ASKS_MAX and now >= claim.asked_at + pause:
-            claim.asks += 1
+        tells_nothing_else = claim.kind.current == mine.kind.current and claim.uid.current in (
+            None,
+            mine.uid.current,
+        )
+        if claim.asks >= ASKS_MAX:
+            pause = LATER_PAUSE
+        is_unproven = claim.verdict is Verdict.OPEN or (claim.verdict is Verdict.OTHER and tells_nothing_else)
+        if is_unproven and now >= claim.asked_at + pause:
+            claim.asks = min(claim.asks + 1, ASKS_MAX)
             self._ask(claim, now)
             self._host.read_clock(now)
             if self._host.is_identified:  # else an acknowledgement would be taken for that of another request
