@@ -31,6 +31,7 @@ from paramclient.protocol.events import (
     ComponentHeard,
     ComponentIdentified,
     ComponentLost,
+    ComponentReplaced,
     ComponentUncontested,
     Event,
     Fetched,
@@ -562,7 +563,7 @@ class ParamClient:
             elif isinstance(event, ComponentContested):
                 self._writer.let_go(machine)
                 logger.warning("%s: %s", self._link.name, event.contest.error)
-            elif isinstance(event, ComponentUncontested):
+            elif isinstance(event, ComponentUncontested | ComponentReplaced):
                 self._writer.let_go(machine)
             elif isinstance(event, ComponentIdentified):
                 self._carrier.tell()

@@ -16,7 +16,13 @@ from paramclient.cache import CachedComponent, ParamCache, TableUpdate
 from paramclient.identity import Identity
 from paramclient.links.tlog import Record, open_log, read_records
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import ComponentForgotten, ComponentHeard, ComponentIdentified, Fetched
+from paramclient.protocol.events import (
+    ComponentForgotten,
+    ComponentHeard,
+    ComponentIdentified,
+    ComponentReplaced,
+    Fetched,
+)
 from paramclient.protocol.station import Address, Station
 from paramclient.protocol.sync import Upkeep
 from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, HEARTBEAT_ID, Framer
@@ -149,6 +155,8 @@ class _Import:
                     for each in station.components.values():
                         if each.system == machine.system:
                             await self._bring(each)
+                elif isinstance(event, ComponentReplaced):
+                    writer.let_go(machine)
                 elif isinstance(event, ComponentForgotten):
                     writer.part_with(machine)
                 elif isinstance(event, Fetched) and event.result.complete:

@@ -24,11 +24,13 @@ from paramclient import (
 )
 from paramclient.links import create_link, serve_endpoint
 from paramclient.links.udp import UdpIn
+from paramclient.protocol import wire
 from paramclient.protocol.presence import LOST_AFTER
 from paramclient.sim import ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
 from tests.commands import Command, behind, in_process, leaping
 from tests.served import C, met, problem, service
 from tests.shell import Late, PeersLink, outcome, swiftly, until
+from tests.simulation import param_value
 from tests.ways import ServedClient
 
 TABLE: dict[str, Any] = {"SHARED_A": 1, "SHARED_B": 2, "PX4_ONLY": 3}
@@ -199,6 +201,67 @@ async def test_a_fetch_of_all_vehicles_goes_on_without_the_contested_one() -> No
         assert isinstance(everything.silent[1, 1], ContestedAddress)
         with pytest.raises(ContestedAddress):
             await client.fetch_all(1)
+
+
+# One after the other
+
+
+class Telling(Late):
+    """A vehicle without a hardware id that tells the value 99 of A twice a second."""
+
+    def __init__(self, by: float, until: float) -> None:
+        super().__init__(GenericVehicle(table={"A": 99.0, "B": 2.0}, uid=0), by, until)
+        self._tell_at = 0.0
+        self._out: list[bytes] = []
+
+    def tick(self, now: float) -> None:
+        super().tick(now)
+        if self._on_at <= now < self._off_at and now >= self._tell_at:
+            self._tell_at = now + 0.5
+            value = param_value("A", 99.0, index=0, count=2)
+            self._out.append(wire.encode(value, system=1, component=1, sequence=0))
+
+    def next_deadline(self) -> float | None:
+        deadline = super().next_deadline()
+        return None if deadline is None else min(deadline, max(self._tell_at, self._on_at))
+
+    def data_to_send(self) -> list[bytes]:
+        out, self._out = self._out, []
+        return super().data_to_send() + out
+
+
+@swiftly
+@pytest.mark.parametrize("stays", [4.0, 40.0])
+async def test_one_without_a_hardware_id_in_place_of_a_vehicle_leaves_nothing_with_it(
+    tmp_path: Path, stays: float
+) -> None:
+    """It speaks while the vehicle is silent, for so many seconds, and has the same names."""
+    path = tmp_path / "cache.sqlite3"
+    table: dict[str, Any] = {"A": 1.0, "B": 2.0}
+    link = PeersLink(
+        {
+            ("10.0.0.1", 14550): Late(GenericVehicle(table=table, uid=5), 0.0, 8.0),
+            ("10.0.0.2", 14550): Telling(8.5, 8.5 + stays),
+            ("10.0.0.3", 14550): Late(GenericVehicle(table=table, uid=5), 9.5 + stays),
+        }
+    )
+    async with ParamClient(link, cache=path) as client:
+        vehicle = await client.component()
+        await vehicle.fetch_all()
+        for _ in range(30):
+            await anyio.sleep(0.5)
+            held = vehicle.params.get("A")
+            assert held is None or vehicle.identity.uid is None or held.value == 1.0
+        if stays > 10.0:
+            assert vehicle.identity.uid is None
+            assert (await vehicle.set("B", 7.0)).status == "accepted"
+            assert (await vehicle.get("A")).value == 99.0
+        await until(lambda: vehicle.identity.uid == f"{5:016x}" and vehicle.peer.startswith("10.0.0.3"))
+        assert (await vehicle.fetch_all()).params["A"].value == 1.0
+        await anyio.sleep(2 * writethrough.FLUSH_INTERVAL)
+    tables = cached(path)
+    assert tables[f"uid:{5:016x}"] == table
+    assert [line.name for line in lines(path)] == (["B"] if stays > 10.0 else []), "its own alone"
 
 
 # Kept apart

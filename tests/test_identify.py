@@ -304,7 +304,7 @@ def test_one_that_was_away_is_asked_for_five_seconds_and_not_more_than_once_a_se
     assert times[-1] >= 30.0 + DOUBT_PATIENCE
     assert all(after - before >= DOUBT_PACE for before, after in pairwise(times[usual - 1 : -1]))
     assert len(times) <= usual + DOUBT_PATIENCE / DOUBT_PACE + 2
-    assert desk.who.may_be_written, "nothing waits for ever"
-    assert desk.who.was_away, "but it has not said that it is the same"
+    assert desk.who.is_unconfirmed, "it has not said that it is the same"
+    assert not desk.who.may_be_written
     desk.who.version(AutopilotVersion(0, uid=7), 60.0)
     assert not is_so(desk.who.was_away)

@@ -6,12 +6,12 @@ from collections.abc import Callable, Hashable
 
 import pytest
 
-from paramclient.errors import ContestedAddress
+from paramclient.errors import ContestedAddress, NoReply
 from paramclient.protocol import peers as room
 from paramclient.protocol import station as station_room
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import ComponentContested, ComponentUncontested, Event
+from paramclient.protocol.events import ComponentContested, ComponentReplaced, ComponentUncontested, Event
 from paramclient.protocol.presence import LOST_AFTER
 from paramclient.protocol.station import Station
 from paramclient.protocol.sync import Upkeep
@@ -549,3 +549,146 @@ def test_simulated_vehicles_behind_two_paths(make: Callable[[], Endpoint]) -> No
             vehicle.receive(data, now)
         events += station.events()
     assert not any(isinstance(each, ComponentContested) for each in events)
+
+
+# One that is not the vehicle of before
+
+
+def hold(net: Net, *names: str) -> None:
+    """Have the vehicle at the first peer give these, of a table of two."""
+    speaker = next(iter(net.peers.values()))
+    for name in names:
+        speaker.say(param_value(name, 1.0, index=ord(name) - ord("P"), count=2))
+    net.run(STEP)
+
+
+def test_one_that_gives_its_id_first_takes_nothing_over() -> None:
+    """Two of one kind: the id of the first and one of its values were lost, and the table is gone on with."""
+    net = Net(a=Speaker(uid=None), b=Speaker(uid=9, start=0.6, value=9.0))
+    net.run(0.4)
+    fetch = net.machine.begin_fetch(net.now)
+    hold(net, "P")
+    assert [*net.machine.table.params] == ["P"]
+    net.run(1.0)
+    assert net.machine.peers.home == "b"
+    assert net.machine.who.identity.uid == f"{9:016x}"
+    assert dict(net.machine.table.params) == {}
+    assert any(isinstance(each, ComponentReplaced) for each in net.events)
+    net.peers["b"].say(param_value("Q", 9.0, index=1, count=2))
+    net.run(STEP)
+    assert not fetch.done, "P is wanted of this one as well"
+    assert not net.machine.table.complete
+
+
+def test_an_id_that_comes_over_a_second_path_first_changes_nothing() -> None:
+    net = Net(a=Speaker(uid=None), b=Speaker(start=0.2, uid=1))
+    net.run(0.2)
+    hold(net, "P")
+    net.run(room.FIRST_GRACE - STEP)
+    net.peers["a"].say(AutopilotVersion(0, uid=1))
+    net.run(1.0)
+    assert net.machine.peers.home == "a"
+    assert [*net.machine.table.params] == ["P"]
+    assert net.kinds() == []
+
+
+def test_nothing_is_taken_from_one_that_does_not_show_to_be_the_vehicle_that_is_silent() -> None:
+    net = Net(a=silent_after(3.0), b=Speaker(uid=None, booted_at=None, start=3.5, value=99.0))
+    net.run(2.0)
+    hold(net, "P", "Q")
+    net.run(1.8)
+    for _ in range(40):
+        net.peers["b"].say(param_value("P", 99.0, index=0, count=2))
+        net.run(STEP)
+        assert net.machine.table.params["P"].value == 1.0
+    net.peers["b"].end = net.now
+    net.peers["a"].end = 1e9
+    net.run(10.0)
+    assert net.machine.table.params["P"].value == 1.0
+    assert net.machine.peers.home == "a"
+    assert not net.station.is_doubted(net.machine)
+
+
+def test_one_that_stays_and_gives_no_id_is_another_vehicle() -> None:
+    net = Net(a=silent_after(3.0), b=Speaker(uid=None, booted_at=None, start=3.5, value=99.0))
+    net.run(2.0)
+    hold(net, "P", "Q")
+    net.run(1.2)
+    write = net.machine.write("P", 5.0, net.now)
+    net.run(3.5 + room.JUDGING_TIME + 1.0 - net.now)
+    assert isinstance(write.error, NoReply)
+    assert not any(isinstance(each, ParamSet) for each in net.peers["b"].heard)
+    assert net.machine.peers.home == "b"
+    assert not net.machine.who.identity.uid
+    assert dict(net.machine.table.params) == {}
+    write = net.machine.write("P", 6.0, net.now)
+    net.run(8.0)
+    assert write.result is not None, "it is written to as the vehicle that it is"
+    assert not net.station.is_doubted(net.machine)
+    net.peers["a"].end = 1e9
+    net.peers["b"].end = net.now
+    net.run(10.0)
+    assert net.machine.who.identity.uid == f"{1:016x}"
+    assert dict(net.machine.table.params) == {}, "that of the vehicle is in the cache"
+
+
+def test_a_write_does_not_go_to_the_peers_that_are_left_where_a_connection_ends() -> None:
+    station = Station(link="tcpin:test", is_stream=True)
+    net = Net(a=Speaker(obeys=False), station=station)
+    net.run(2.0)
+    hold(net, "P", "Q")
+    write = net.machine.write("P", 5.0, net.now)
+    net.run(0.1)
+    net.peers["b"] = other = Speaker(uid=2, start=net.now)
+    other._beats = 2  # it is connected, and will be silent for 2 s
+    station.receive(b"", "a", net.now)
+    net.peers["a"].end = net.now
+    net.run(1.9)
+    assert {type(each) for each in other.heard} == {Heartbeat}
+    net.run(0.5)
+    assert net.machine.peers.home == "b", "what has ended needs no further silence"
+    net.run(8.0)
+    assert isinstance(write.error, NoReply)
+    assert not any(isinstance(each, ParamSet) for each in net.peers["b"].heard)
+    assert net.machine.who.identity.uid == f"{2:016x}"
+
+
+def test_a_vehicle_that_connects_anew_goes_on() -> None:
+    station = Station(link="tcpin:test", is_stream=True)
+    net = Net(a=Speaker(), station=station)
+    net.run(2.0)
+    hold(net, "P", "Q")
+    station.receive(b"", "a", net.now)
+    net.peers["a"].end = net.now
+    net.run(1.0)
+    assert not station.data_to_send() or all(peer is None for _, peer in station.data_to_send())
+    net.peers["b"] = Speaker(start=net.now)
+    net.run(1.0)
+    assert net.machine.peers.home == "b"
+    assert [*net.machine.table.params] == ["P", "Q"]
+    write = net.machine.write("P", 5.0, net.now)
+    net.run(0.5)
+    assert write.result is not None
+    assert not any(isinstance(each, ComponentReplaced) for each in net.events)
+
+
+def test_one_that_says_no_more_who_it_is_is_not_written_to() -> None:
+    """At a serial port nothing but the id tells whether it is the vehicle that was there before."""
+    speaker = Speaker(end=3.0)
+    net = Net(port=speaker)
+    net.run(2.0)
+    hold(net, "P", "Q")
+    net.run(9.0)
+    speaker.end, speaker.uid = 1e9, None
+    net.run(2.0)
+    write = net.machine.write("P", 5.0, net.now)
+    net.run(6.0)
+    assert isinstance(write.error, NoReply)
+    assert "has not said since it was away which vehicle it is" in str(write.error)
+    again = net.machine.write("P", 5.0, net.now)
+    net.run(0.5)
+    assert not again.done
+    speaker.uid = 1
+    net.run(2.0)
+    assert again.result is not None
+    assert len([each for each in speaker.heard if isinstance(each, ParamSet)]) == 1

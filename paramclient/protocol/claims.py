@@ -10,6 +10,7 @@ from typing import Final, Generic, NamedTuple, TypeVar
 from paramclient.identity import SHARED_UIDS, hardware_id
 from paramclient.protocol.addresses import Peer, peer_in_words
 from paramclient.protocol.kinds import kind_in_words
+from paramclient.protocol.presence import OUT_OF_ORDER
 from paramclient.protocol.wire import (
     SYSTEM_TIME_ID,
     AutopilotVersion,
@@ -19,7 +20,7 @@ from paramclient.protocol.wire import (
     SystemTime,
 )
 
-__all__ = ["Claim", "Verdict", "Variants", "compare"]
+__all__ = ["Claim", "Verdict", "Variants", "compare", "compare_in_turn"]
 
 START_TOLERANCE: Final = 2.0
 """Seconds by which the boot times of one vehicle may differ that were heard over two ways: its messages take
@@ -27,10 +28,8 @@ longer on one of them."""
 CLOCK_DELAY: Final = 5.0
 """Seconds by which a clock may come late over a slow link. One that was told less than that after another
 peer's start may belong to the run before that start."""
-CLOCKS_MAX: Final = 4
+CLAIMED_CLOCKS_MAX: Final = 4
 """Message ids whose time since boot is remembered for one peer."""
-OUT_OF_ORDER: Final = 2.0
-"""Seconds by which a clock may go back because a link brought two messages in the wrong order."""
 VARIANTS_MAX: Final = 8
 """Earlier variants that are remembered, of a peer that says each time that it is another vehicle."""
 
@@ -116,6 +115,7 @@ class Claim:
         asks, asked_at: how often and when it was asked who it is.
         verdict: how it stands to the peer that has the address.
         heartbeat, version: the last ones, to be taken where the peer gets the address.
+        version_at: when the version came; infinity before it did.
     """
 
     __slots__ = (
@@ -130,6 +130,7 @@ class Claim:
         "uid",
         "verdict",
         "version",
+        "version_at",
     )
 
     def __init__(self, peer: Peer, now: float) -> None:
@@ -143,6 +144,7 @@ class Claim:
         self.verdict = Verdict.OPEN
         self.heartbeat: Heartbeat | None = None
         self.version: AutopilotVersion | None = None
+        self.version_at = math.inf
 
     @property
     def is_mixed(self) -> bool:
@@ -162,14 +164,14 @@ class Claim:
                 self.heartbeat = message
         elif isinstance(message, AutopilotVersion):
             self.uid.say(hardware_id(message.uid, message.uid2) or "", now, timeout)
-            self.version = message
+            self.version, self.version_at = message, now
         elif isinstance(message, SystemTime):
             self.take_clock(SYSTEM_TIME_ID, message.time_boot_ms, now)
 
     def take_clock(self, message_id: int, boot_ms: int, now: float) -> None:
         """Note `time_boot_ms` of a message; 0 says nothing."""
         clock = self._clocks.get(message_id)
-        if not boot_ms or (clock is None and len(self._clocks) >= CLOCKS_MAX):
+        if not boot_ms or (clock is None and len(self._clocks) >= CLAIMED_CLOCKS_MAX):
             return
         started_at = now - boot_ms / 1000
         is_same_run = (
@@ -180,6 +182,11 @@ class Claim:
         if clock is not None and is_same_run:
             started_at = min(started_at, clock.started_at)  # delays only ever make it later
         self._clocks[message_id] = _Clock(started_at, now, boot_ms)
+
+    @property
+    def has_own_uid(self) -> bool:
+        """Whether it has given a hardware id that names one vehicle alone."""
+        return bool(self.uid.current) and self.uid.current not in SHARED_UIDS
 
     @property
     def tells_clock(self) -> bool:
@@ -209,6 +216,7 @@ class Claim:
         """So much time has passed that the clock did not count."""
         self.first_at -= seconds
         self.heard_at -= seconds
+        self.version_at -= seconds
         self._clocks = {
             number: _Clock(clock.started_at - seconds, clock.told_at - seconds, clock.boot_ms)
             for number, clock in self._clocks.items()
@@ -251,6 +259,28 @@ def compare(mine: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple
     if kinds[0] == kinds[1] and have_one_start and not may_ask:
         return Verdict.SAME, ""
     return Verdict.OTHER, "nothing that shows them to be one vehicle"
+
+
+def compare_in_turn(mine: Claim, other: Claim, *, may_ask: bool) -> Verdict:
+    """Return whether a claim is of the vehicle that has spoken under another one until it fell silent.
+
+    It may have started again since, so only the hardware id proves that. `OPEN` where there is none to be
+    compared with: the other one has not said it, or neither has one of its own.
+
+    Args:
+        mine: the claim of the one that is silent.
+        other: the claim.
+        may_ask: whether anything could be asked at all.
+    """
+    kinds = mine.kind.current, other.kind.current
+    if None not in kinds and kinds[0] != kinds[1]:
+        return Verdict.OTHER
+    if mine.uid.current == other.uid.current:
+        return Verdict.SAME if mine.has_own_uid else Verdict.OPEN
+    if other.uid.current is None:
+        is_heard = not may_ask and kinds[0] == kinds[1] and mine.has_one_start(other)
+        return Verdict.SAME if is_heard else Verdict.OPEN
+    return Verdict.OTHER if mine.uid.current or other.uid.current else Verdict.OPEN
 
 
 def _is_one_start(one: _Clock, another: _Clock) -> bool | None:

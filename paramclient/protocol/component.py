@@ -12,7 +12,7 @@ from paramclient.identity import autopilot_name, reason_against_non_finite
 from paramclient.params import parts_of
 from paramclient.protocol import events
 from paramclient.protocol.change import Change
-from paramclient.protocol.claims import Claim
+from paramclient.protocol.claims import Claim, Verdict
 from paramclient.protocol.events import ParamChanged
 from paramclient.protocol.fetch import Check, Fetch
 from paramclient.protocol.name_search import NameSearch
@@ -400,6 +400,8 @@ class ComponentMachine(Parts):
             NoReply: the component is lost. Nothing was sent.
         """
         self.check_present(f"PARAM_SET {name} to {self.system}/{self.component}", now)
+        if self.who.is_unconfirmed:
+            self.who.doubt(now)
         name = self.spelling(name)
         known = self.table.params.get(name)
         if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
@@ -513,9 +515,16 @@ class ComponentMachine(Parts):
 
     # peers
 
-    def peer_moved(self, claim: Claim, now: float) -> None:
-        """Another peer has the address now, which is not proven to be the same vehicle: it is asked."""
-        self.who.doubt(now)
+    def peer_moved(self, claim: Claim, now: float, verdict: Verdict) -> None:
+        """Another peer has the address now, and is asked who it is."""
+        if verdict is Verdict.OTHER:
+            self.who.forget(now)
+            self._another(now)
+        else:
+            if verdict is Verdict.OPEN:
+                self._doubt()
+                self.sync.check(now)
+            self.who.doubt(now)
         self._take_claim(claim, now)
         self.clock_requests.want(now)
 
@@ -528,11 +537,12 @@ class ComponentMachine(Parts):
         """One vehicle has the address: it is asked who it is before anything counts or is kept."""
         if is_same:
             self._doubt()
+            self.who.doubt(now)
         else:
+            self.who.forget(now)
             self.become_another(now)
         self._emit(events.ComponentUncontested(self))
         self._known_as = None
-        self.who.doubt(now)
         self.sync.check(now)
         self._take_claim(claim, now)
         self.clock_requests.want(now)
@@ -614,6 +624,8 @@ class ComponentMachine(Parts):
             if self.presence.was_away(silence := self.presence.heard(now)):
                 self._doubt()
                 self.sync.check(now)
+            elif self.identity.uid is not None:
+                self.who.doubt(now)  # it may be another one that was plugged in
             self._was_silent(silence, now)
         self.reads.resume(now)
         self.name_searches.resume(now)
@@ -648,6 +660,7 @@ class ComponentMachine(Parts):
     def become_another(self, now: float) -> None:
         """Another vehicle has taken this system id: nothing that is known is about it."""
         self._report(self.table.forget())
+        self._emit(events.ComponentReplaced(self))
         self.sync.forget()
         self.fetches.forget()
         self.following.forget()
@@ -781,6 +794,10 @@ class ComponentMachine(Parts):
                 self.clock_requests.want_baseline(now)
         if self.writes.is_held and self.may_be_written:
             self.writes.proceed(now)
+        elif self.writes.queues and self.who.is_unconfirmed:
+            what = f"{self.system}/{self.component} has not said since it was away which vehicle it is"
+            error = NoReply(what, attempts=self.who.attempts, waited=now - self.who.doubted_at)
+            self.writes.fail_all(error, now)
 
     def _doubt_identity(self, now: float) -> None:
         """The table is not what it was: it may be another vehicle that answers by now."""

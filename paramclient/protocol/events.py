@@ -20,6 +20,7 @@ __all__ = [
     "ComponentIdentified",
     "ComponentLost",
     "ComponentRebooted",
+    "ComponentReplaced",
     "ComponentUncontested",
     "Event",
     "Fetched",
@@ -62,6 +63,13 @@ class ComponentFound:
 @dataclass(frozen=True, slots=True)
 class ComponentRebooted:
     """The vehicle has started again."""
+
+    machine: ComponentMachine
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentReplaced:
+    """Another vehicle has its address: nothing that was known is about that one."""
 
     machine: ComponentMachine
 
@@ -133,6 +141,7 @@ Event: TypeAlias = (
     | ComponentLost
     | ComponentFound
     | ComponentRebooted
+    | ComponentReplaced
     | ComponentContested
     | ComponentUncontested
     | ComponentForgotten

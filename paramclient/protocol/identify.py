@@ -86,9 +86,12 @@ class Identification:
     Attributes:
         identity: who the vehicle is; without a hardware id until AUTOPILOT_VERSION came.
         known_at: when the version came; minus infinity before that.
+        attempts: how often it was asked for since it was open.
+        doubted_at: since when that is; minus infinity where it was not open but at the beginning.
         settled: whether `identity` is as good as it gets: the version came, or it never will.
         autopilot, vehicle_type: of the heartbeat; None before one came.
-        was_away: whether another vehicle may have taken its place since it said who it is.
+        was_away: whether another vehicle may have taken its place since it said who it is; true as well while
+            one that has is being asked.
         encoding, encoding_reason: how it writes values, and why that is believed.
     """
 
@@ -115,7 +118,8 @@ class Identification:
         self.vehicle_type: int | None = None
         self.capabilities: int | None = None
         self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
-        self._attempts = 0
+        self.attempts = 0
+        self.doubted_at = -math.inf
         self._asked_at = -math.inf
         self._is_asking = False
         self._asks_until = -math.inf  # however often that is
@@ -164,9 +168,14 @@ class Identification:
         return self.was_away and self._is_asking
 
     @property
+    def is_unconfirmed(self) -> bool:
+        """Whether another vehicle may have taken its place, and it was asked in vain."""
+        return self.was_away and not self._is_asking
+
+    @property
     def may_be_written(self) -> bool:
         """Whether it is certain whom a write reaches, and what it makes of it."""
-        return self.encoding_is_certain and not self.is_doubted
+        return self.encoding_is_certain and not self.was_away
 
     @property
     def has_spoken(self) -> bool:
@@ -194,22 +203,38 @@ class Identification:
 
     def heard(self, now: float) -> None:
         """Something came: ask who it is, if that has not been asked."""
-        if not self._attempts and self.has_parameters:
+        if not self.attempts and self.has_parameters:
             self._ask(now)
 
     def doubt(self, now: float) -> None:
         """It was away, or has started again: ask who it is now."""
         if self.has_parameters:
             self.was_away = self.identity.uid is not None
-            self._attempts = 0
+            self.attempts = 0
+            self.doubted_at = now
             if self.was_away:
                 self._asks_until = now + DOUBT_PATIENCE
             self._ask(now)
 
+    def forget(self, now: float) -> None:
+        """Another vehicle has its address: ask that one who it is."""
+        system, link = self.identity.system, self.identity.link
+        self.identity = Identity(system, link)
+        self.settled = False
+        self.known_at = -math.inf
+        self.autopilot = self.vehicle_type = self.capabilities = None
+        self._beat_awaited_until = math.inf
+        self._judge()
+        self.was_away = True
+        self.attempts = 0
+        self.doubted_at = now
+        self._asks_until = now + DOUBT_PATIENCE
+        self._ask(now)
+
     def version(self, message: AutopilotVersion, now: float) -> bool:
         """Take an AUTOPILOT_VERSION; true when it shows another vehicle than the one known so far."""
         if self._is_asking:
-            self._round_trip.answered(self._asked_at, now, self._attempts)
+            self._round_trip.answered(self._asked_at, now, self.attempts)
         self._is_asking = self.was_away = False
         system, _ = self._target
         before = self.identity
@@ -239,7 +264,7 @@ class Identification:
     def ask_again(self, now: float) -> None:
         """Another vehicle may have taken the address: ask, if it has ever been said who it is."""
         if self.identity.uid is not None and not self._is_asking:
-            self._attempts = 0
+            self.attempts = 0
             self._ask(now)
 
     def lose(self) -> None:
@@ -274,8 +299,8 @@ class Identification:
         """When to ask again, or infinity; that follows what other answers tell of the link."""
         if not self._is_asking:
             return math.inf
-        pause = self._round_trip.repeat_timeout(self._attempts)
-        if self._attempts >= self._tries and self._asked_at < self._asks_until:
+        pause = self._round_trip.repeat_timeout(self.attempts)
+        if self.attempts >= self._tries and self._asked_at < self._asks_until:
             pause = max(pause, DOUBT_PACE)
         return min(self._denied_at, self._lost_at, self._asked_at + pause)
 
@@ -287,12 +312,13 @@ class Identification:
     def _ask(self, now: float) -> None:
         if not self._may_ask:
             return
-        if self._attempts >= self._tries and now >= self._asks_until:
+        if self.attempts >= self._tries and now >= self._asks_until:
             self._is_asking = False
             self.settled = True
+            self.was_away = self.was_away and self.identity.uid is not None
             return
         was_refused = self._denied_at < math.inf
-        self._attempts += 1
+        self.attempts += 1
         self._asked_at = now
         self._is_asking = True
         self._denied_at = self._lost_at = math.inf
@@ -301,8 +327,8 @@ class Identification:
             (MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0),
         ]
         if was_refused:
-            ways = [ways[(self._attempts + 1) % 2]]
-        elif self._attempts == 1:
+            ways = [ways[(self.attempts + 1) % 2]]
+        elif self.attempts == 1:
             ways = ways[:1]
         for command, first in ways:  # after silence both: a request or its answer may have been lost
             self._send(CommandLong(*self._target, command, (first, *[0.0] * 6)))

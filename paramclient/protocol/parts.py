@@ -11,7 +11,7 @@ from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_w
 from paramclient.protocol.authors import Authors
 from paramclient.protocol.change import Change
 from paramclient.protocol.check_pace import CheckPace
-from paramclient.protocol.claims import Claim
+from paramclient.protocol.claims import Claim, Verdict
 from paramclient.protocol.clock_requests import ClockRequests
 from paramclient.protocol.commands import Commands
 from paramclient.protocol.descriptions import Descriptions
@@ -206,8 +206,8 @@ class Parts(ABC):
         """Wait for it no longer."""
 
     @abstractmethod
-    def peer_moved(self, claim: Claim, now: float) -> None:
-        """Another peer has the address now, which is not proven to be the same vehicle."""
+    def peer_moved(self, claim: Claim, now: float, verdict: Verdict) -> None:
+        """Another peer has the address now."""
 
     @abstractmethod
     def contest_began(self, contest: Contest, now: float) -> None:

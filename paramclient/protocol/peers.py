@@ -9,7 +9,7 @@ from typing import Final, Protocol
 
 from paramclient.errors import ContestedAddress
 from paramclient.protocol.addresses import Peer
-from paramclient.protocol.claims import Claim, Verdict, compare
+from paramclient.protocol.claims import Claim, Verdict, compare, compare_in_turn
 from paramclient.protocol.presence import LOST_AFTER, Presence
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
@@ -38,6 +38,9 @@ LOOK_PACE: Final = 0.25
 """Seconds between two looks at the peers of a component that has several."""
 RECHECK_PACE: Final = 1.0
 """Seconds between two requests for the hardware id of a peer that has just given two different ones."""
+FIRST_GRACE: Final = 0.25
+"""Seconds for which the peer with the address may still give its hardware id where another one was quicker:
+over two paths to one vehicle the same message comes twice."""
 PATH_SILENCE: Final = 1.5
 """Seconds of silence after which requests go to another path to the same vehicle: a heartbeat was lost."""
 RESTART_SILENCE: Final = 1.5
@@ -96,8 +99,8 @@ class Host(Protocol):
         """Have clocks in telemetry read for a while."""
 
     @abstractmethod
-    def peer_moved(self, claim: Claim, now: float) -> None:
-        """Another peer has the address now, which is not proven to be the same vehicle."""
+    def peer_moved(self, claim: Claim, now: float, verdict: Verdict) -> None:
+        """Another peer has the address now; the verdict is that of `compare_in_turn`."""
 
     @abstractmethod
     def contest_began(self, contest: Contest, now: float) -> None:
@@ -105,7 +108,7 @@ class Host(Protocol):
 
     @abstractmethod
     def contest_ended(self, claim: Claim, now: float, *, is_same: bool) -> None:
-        """One vehicle has the address; `is_same` where it is the peer, and the kind of vehicle, of before."""
+        """One vehicle has the address; `is_same` where it is the one of before, by peer and kind or by id."""
 
 
 class ComponentPeers:
@@ -114,7 +117,8 @@ class ComponentPeers:
     The first peer that was heard has the address, until another one gives a hardware id first. Messages of a
     further peer are not taken before it is proven to be a path to the same vehicle: by autopilot, vehicle
     type, hardware id and boot time, for which it is asked. A peer that has fallen silent loses the address to
-    one that speaks. Two peers that speak and are not proven to be one vehicle contest it, and so do several
+    one that speaks: to the same vehicle by its hardware id, or, where it does not give that when it is asked,
+    to another one. Two peers that speak and are not proven to be one vehicle contest it, and so do several
     vehicles that speak through one peer.
 
     Args:
@@ -124,6 +128,7 @@ class ComponentPeers:
 
     Attributes:
         home: the peer that has the address; NO_PEER before one was heard, or after its connection has ended.
+        has_left: whether that has ended: nothing may be sent until another one has the address.
         speaker: the peer whose messages may be taken without another look: `home`, but for a contest.
         heard_at: when the home was heard last.
         contest: why the address is contested, or None.
@@ -135,6 +140,7 @@ class ComponentPeers:
         self._host = host
         self._may_ask = may_ask
         self.home: Peer = NO_PEER
+        self.has_left = False
         self.speaker: Peer = NO_PEER
         self.heard_at = -math.inf
         self.contest: Contest | None = None
@@ -142,10 +148,7 @@ class ComponentPeers:
         self._mine: Claim | None = None
         self._others: dict[Peer, Claim] = {}
         self._look_at = math.inf
-        self._had_home = False
-        self._began_as: tuple[Peer | None, tuple[int, int] | None] | None = (
-            None  # None where values are mixed
-        )
+        self._began_as: tuple[Claim, tuple[int, int] | None] | None = None  # None where values are mixed
 
     @property
     def is_unclear(self) -> bool:
@@ -154,8 +157,7 @@ class ComponentPeers:
 
     def takes(self, peer: Peer, now: float) -> bool:
         """Whether a message without anything to tell vehicles apart may be taken, such as PARAM_VALUE."""
-        if self._mine is None:
-            self._settle_at(self._others.pop(peer) if peer in self._others else Claim(peer, now), now)
+        self._mine_or(peer, now)
         if peer == self.home:
             self.heard_at = now
             return self.contest is None
@@ -165,19 +167,13 @@ class ComponentPeers:
 
     def hears(self, message: Message, peer: Peer, now: float) -> bool:
         """Take note of a message that may tell vehicles apart; return whether it may be taken."""
-        if self._mine is None:
-            self._settle_at(self._others.pop(peer) if peer in self._others else Claim(peer, now), now)
-        mine = self._mine
+        mine = self._mine_or(peer, now)
         claim = mine if peer == self.home else self._claim_of(peer, now)
-        if claim is None or mine is None:
+        if claim is None:
             return self._is_path(None)
         claim.take(message, now, self._timeout)
         if claim is not mine:
-            is_first = bool(claim.uid.current and not mine.uid.current) and not self._host.is_identified
-            if is_first and self.contest is None:
-                self._swap(claim, now)
-            else:
-                self._review(now)
+            self._review(now)
             return self._is_path(claim)
         self.heard_at = claim.heard_at = now
         if claim.is_moving:
@@ -200,20 +196,22 @@ class ComponentPeers:
     def follow(self, peer: Peer) -> None:
         """Take the messages of this peer whatever it is: those of ground stations are of no account."""
         self.home = self.speaker = peer
+        self.has_left = False
         self._mine = None
 
     def left(self, peer: Peer, now: float) -> None:
         """The connection of a peer has ended."""
         self._others.pop(peer, None)
         if peer == self.home:
-            self.home, self.speaker, self._mine = NO_PEER, NO_PEER, None
+            self.home = self.speaker = NO_PEER
+            self.has_left = True
             self._look_at = min(self._look_at, now)
 
     def forget(self) -> None:
         """The link is away: the one that comes back has others."""
         self._others.clear()
         self.home, self.speaker, self._mine = NO_PEER, NO_PEER, None
-        self._had_home = False
+        self.has_left = False
 
     def age(self, seconds: float) -> None:
         """So much time has passed that the clock did not count."""
@@ -237,6 +235,13 @@ class ComponentPeers:
     def _timeout(self) -> float:
         patience = self._host.presence.patience
         return patience if patience < math.inf else LOST_AFTER
+
+    def _mine_or(self, peer: Peer, now: float) -> Claim:
+        """What the peer with the address says; where none has had it yet, this one gets it."""
+        if self._mine is None:
+            self._settle_at(claim := self._others.pop(peer, None) or Claim(peer, now))
+            return claim
+        return self._mine
 
     def _claim_of(self, peer: Peer, now: float) -> Claim | None:
         """What a further peer says; None where there are too many of them."""
@@ -269,6 +274,7 @@ class ComponentPeers:
         difference = ""
         for claim in list(self._others.values()):
             difference = self._judge(claim, now) or difference
+        self._follow_id(now)
         self._move_on(now)
         self._decide(difference, now)
         is_settled = not self._others and not self.is_unclear
@@ -279,33 +285,34 @@ class ComponentPeers:
         mine = self._mine
         if mine is None:
             return ""
-        if self._may_ask:
-            pause = ASK_PAUSES[claim.asks - 1] if claim.asks else 0.0
-            is_over = claim.asks >= ASKS_MAX and now >= claim.asked_at + pause
-        else:
-            pause, is_over = math.inf, now >= claim.first_at + JUDGING_TIME
-        is_over = is_over or claim.verdict is Verdict.OTHER
+        is_over = claim.verdict is Verdict.OTHER or self._is_over(claim, now)
         claim.verdict, difference = compare(mine, claim, is_over=is_over, may_ask=self._may_ask)
         tells_nothing_else = claim.kind.current == mine.kind.current and claim.uid.current in (
             None,
             mine.uid.current,
         )
-        if claim.asks >= ASKS_MAX:
-            pause = LATER_PAUSE
         is_unproven = claim.verdict is Verdict.OPEN or (claim.verdict is Verdict.OTHER and tells_nothing_else)
-        if is_unproven and now >= claim.asked_at + pause:
-            claim.asks = min(claim.asks + 1, ASKS_MAX)
+        if is_unproven and self._may_ask and now >= claim.asked_at + _pause_after(claim.asks):
+            claim.asks += 1
             self._ask(claim, now)
             self._host.read_clock(now)
-            if self._host.is_identified:  # else an acknowledgement would be taken for that of another request
+            is_here = self.home is not NO_PEER
+            if is_here and self._host.is_identified:  # else an acknowledgement would be another request's
                 self._request(mine, SYSTEM_TIME_ID)
         return difference if claim.verdict is Verdict.OTHER else ""
+
+    def _is_over(self, claim: Claim, now: float) -> bool:
+        """Whether everything was done to learn who a further peer is."""
+        if not self._may_ask:
+            return now >= claim.first_at + JUDGING_TIME
+        has_had_all = claim.asks == ASKS_MAX and now >= claim.asked_at + ASK_PAUSES[-1]
+        return claim.asks > ASKS_MAX or has_had_all
 
     def _decide(self, difference: str, now: float) -> None:
         """Begin a contest, or end it."""
         mine = self._mine
         is_mixed = mine is not None and mine.is_mixed
-        is_here = mine is not None and now - self.heard_at < self._timeout
+        is_here = mine is not None and not self.has_left and now - self.heard_at < self._timeout
         rivals = [
             each
             for each in self._others.values()
@@ -318,7 +325,7 @@ class ComponentPeers:
                 difference = "one peer says both in turn"
             self.contest = Contest(*self._target, claimants, difference)
             self.speaker = NO_PEER
-            self._began_as = None if is_mixed else (self.home, mine.kind.current)
+            self._began_as = None if is_mixed else (mine, mine.kind.current)
             self._host.contest_began(self.contest, now)
         elif self.contest is not None:
             if is_mixed:
@@ -327,12 +334,30 @@ class ComponentPeers:
                 assert mine is not None
                 self.contest = None
                 self.speaker = self.home
-                is_same = (self.home, mine.kind.current) == self._began_as
+                is_same = self._began_as is not None and (
+                    (mine, mine.kind.current) == self._began_as
+                    or self._in_turn(self._began_as[0], mine) is Verdict.SAME
+                )
                 self._host.contest_ended(mine, now, is_same=is_same)
+
+    def _follow_id(self, now: float) -> None:
+        """Give the address to a peer that has given a hardware id before the one that has it: to that go the
+        requests.
+        """
+        mine = self._mine
+        if mine is None or mine.uid.current or self._host.is_identified or self.contest is not None:
+            return
+        for claim in self._others.values():
+            if claim.uid.current and now >= claim.version_at + FIRST_GRACE:
+                self._swap(claim, now)
+                return
 
     def _move_on(self, now: float) -> None:
         """Give the address to a peer that speaks, where the one that has it is silent."""
-        silence = now - self.heard_at
+        mine = self._mine
+        if mine is None:
+            return
+        silence = math.inf if self.has_left and self.contest is None else now - self.heard_at
         for claim in sorted(self._others.values(), key=_preference):
             if claim.heard_at < self.heard_at:
                 continue
@@ -340,9 +365,21 @@ class ComponentPeers:
                 if silence >= PATH_SILENCE:
                     self._swap(claim, now, is_proven=True)
                     return
-            elif silence >= self._silence_before(claim):
+            elif silence >= self._silence_before(claim) and not self._awaits_id(claim, now):
                 self._swap(claim, now)
                 return
+
+    def _awaits_id(self, claim: Claim, now: float) -> bool:
+        """Whether a further peer is still being asked for the hardware id of the vehicle that is silent."""
+        mine = self._mine
+        if mine is None or self.contest is not None or self._is_over(claim, now):
+            return False
+        return self._hides_id(mine, claim) and self._in_turn(mine, claim) is Verdict.OPEN
+
+    @staticmethod
+    def _hides_id(before: Claim, claim: Claim) -> bool:
+        """Whether a peer has not given a hardware id, and the one before it has."""
+        return bool(before.uid.current) and claim.uid.current is None
 
     def _silence_before(self, claim: Claim) -> float:
         """Seconds for which the peer with the address must have been silent for this one to have it."""
@@ -360,21 +397,29 @@ class ComponentPeers:
     def _swap(self, claim: Claim, now: float, *, is_proven: bool = False) -> None:
         """Let a further peer have the address."""
         before = self._mine
+        assert before is not None, "it has the address"
         del self._others[claim.peer]
-        if is_proven and before is not None:
+        if is_proven and not self.has_left:
             before.heard_at, before.verdict = self.heard_at, Verdict.SAME
             self._others[before.peer] = before
         for each in self._others.values():
             each.verdict = each.verdict if is_proven else Verdict.OPEN
-        self._settle_at(claim, now, is_proven=is_proven)
+        self._settle_at(claim)
+        if is_proven or self.contest is not None:
+            return
+        verdict = self._in_turn(before, claim)
+        if verdict is Verdict.OPEN and self._hides_id(before, claim):
+            verdict = Verdict.OTHER  # it was asked in vain
+        self._host.peer_moved(claim, now, verdict)
 
-    def _settle_at(self, claim: Claim, now: float, *, is_proven: bool = False) -> None:
-        is_move = self._had_home and not is_proven and self.contest is None
-        self.home, self._mine, self._had_home = claim.peer, claim, True
+    def _settle_at(self, claim: Claim) -> None:
+        self.home, self._mine = claim.peer, claim
+        self.has_left = False
         self.heard_at = claim.heard_at
         self.speaker = self.home if self.contest is None else NO_PEER
-        if is_move:
-            self._host.peer_moved(claim, now)
+
+    def _in_turn(self, before: Claim, claim: Claim) -> Verdict:
+        return compare_in_turn(before, claim, may_ask=self._may_ask)
 
     def _ask(self, claim: Claim, now: float) -> None:
         """Ask a peer who it is, and when it has started."""
@@ -395,6 +440,11 @@ class ComponentPeers:
     def _request(self, claim: Claim, message_id: int) -> None:
         command = CommandLong(*self._target, MAV_CMD_REQUEST_MESSAGE, (float(message_id), *[0.0] * 6))
         self._host.send_to(command, claim.peer)
+
+
+def _pause_after(asks: int) -> float:
+    """Seconds from a question to the next one, by how many there were."""
+    return 0.0 if not asks else ASK_PAUSES[asks - 1] if asks < ASKS_MAX else LATER_PAUSE
 
 
 def _preference(claim: Claim) -> tuple[bool, float]:

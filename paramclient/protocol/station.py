@@ -757,18 +757,24 @@ class Station:
         return machine.peers.takes(peer, now)
 
     def _peer_of(self, address: Address) -> Peer | None:
-        """The peer of a component, else of the system's autopilot, else any of the system; None for all."""
+        """The peer of a component, else of the system's autopilot, else any of the system; None for all.
+
+        NO_PEER where the connection of the component has ended: another peer would be another vehicle.
+        """
         if isinstance(address, PeerAddress):
             return address.peer
         vehicle = (address[0], None)
         own, autopilot = self.components.get(address), self.autopilot_of(*vehicle)
+        if own is not None and own.peers.has_left:
+            return NO_PEER
         machines = [each for each in (own, autopilot, *self._of_vehicle.get(vehicle, ())) if each is not None]
         return next((each.peers.home for each in machines if each.peers.home is not NO_PEER), None)
 
     def _send(self, message: Message, address: Address, version: int) -> None:
-        if not self.listens_only:
+        peer = self._peer_of(address)
+        if not self.listens_only and peer is not NO_PEER:
             self._trace("to system %s: %s", address[0], Told(message))
-            self._transmit(message, self._peer_of(address), version)
+            self._transmit(message, peer, version)
 
     def _transmit(self, message: Message, peer: Peer | None, version: int) -> None:
         """Have a message sent to a peer, or with None to all."""
