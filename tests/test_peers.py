@@ -441,6 +441,18 @@ def test_components_of_one_system_may_come_from_several_peers() -> None:
     assert targets == {"a", "camera"}
 
 
+def test_a_heartbeat_from_a_forged_address_brings_that_seven_requests_and_no_more() -> None:
+    station = Station(link="udpin:test", is_stream=False, upkeep=Upkeep.chosen(None, "auto"))
+    station.receive(wire.encode(PX4, system=9, component=1, sequence=0), "victim", 0.0)
+    framer, sent = Framer(wire.UNDERSTOOD, stream=False), []
+    for step in range(1200):
+        station.tick(step * STEP)
+        for data, peer in station.data_to_send():
+            if peer == "victim":
+                sent += [wire.decode(frame) for frame in framer.receive(data)]
+    assert len(sent) <= 7
+
+
 # A peer in place of another
 
 

@@ -63,7 +63,10 @@ class ClockRequests:
         self._is_following = False
 
     def want_baseline(self, now: float) -> None:
-        """Request the clock in 2 s, unless the component has told it by then."""
+        """Request the clock in 2 s, unless the component has told it by then, and while it is heard.
+
+        Whoever was heard once may be a forged address, whose owner would get the requests.
+        """
         if self._request_at == math.inf:
             self._begin(-math.inf, now + BASELINE_DELAY)
 
@@ -98,6 +101,9 @@ class ClockRequests:
             return
         pace = REQUEST_PACE if is_quick else SLOW_PACE
         self._request_at = now + pace
+        is_baseline = self._wanted_after == -math.inf and not self._is_following
+        if is_baseline and (self._presence.is_lost or self._presence.is_overdue(now)):
+            return
         if now - self._presence.clock_at >= pace:  # else it is telling its clock anyway
             first = (float(SYSTEM_TIME_ID), *[0.0] * 6)
             self._send(CommandLong(*self._target, MAV_CMD_REQUEST_MESSAGE, first))
