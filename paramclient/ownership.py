@@ -41,12 +41,12 @@ def has_trusted_owner(status: os.stat_result) -> bool:
 
 
 def make_private(path: Path) -> int:
-    """Take everybody's access to a file away but its owner's, and return the mode that it had.
+    """Take everybody's access but its owner's away from a file that others can write; return the mode it had.
 
     Raises:
         OSError: that is not possible.
     """
     mode = mode_of(path.stat())
-    if mode & OF_OTHERS:
+    if mode & OTHERS_WRITE:
         path.chmod(mode & ~OF_OTHERS)
     return mode

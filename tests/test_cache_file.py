@@ -554,12 +554,102 @@ def test_what_is_no_cache_is_an_error_and_left_as_it_is(
     assert not caplog.records
 
 
-def test_a_log_that_is_none_of_sqlite_is_left_as_it_is(path: Path) -> None:
-    notes = path.with_name(f"{path.name}-wal")
-    notes.write_text("my notes")
+def contents(folder: Path) -> dict[str, bytes]:
+    return {each.name: each.read_bytes() for each in folder.iterdir()}
+
+
+def crashed(path: Path) -> dict[str, bytes]:
+    """A database of another program that was killed with all of its work in the log; gives what there is."""
+    original = path.with_name("original")
+    with connect(original) as connection:
+        connection.execute("PRAGMA journal_mode = WAL")
+        connection.execute("PRAGMA wal_autocheckpoint = 0")
+        connection.execute("CREATE TABLE precious AS SELECT 7 AS a")
+        for suffix in ("", "-wal"):
+            shutil.copy(f"{original}{suffix}", f"{path}{suffix}")
+    for each in path.parent.glob("original*"):
+        each.unlink()
+    return contents(path.parent)
+
+
+@pytest.mark.parametrize("text", ["notes", "[settings]\n" * 1000])
+def test_what_stands_beside_a_file_that_is_no_cache_is_left_as_it_is(path: Path, text: str) -> None:
+    """SQLite itself would delete these before it finds that the file is no database."""
+    for suffix in ("", "-wal", "-shm", "-journal"):
+        path.with_name(f"{path.name}{suffix}").write_text(f"{text} {suffix}")
+    before = contents(path.parent)
+    with ParamCache(path) as cache:
+        for use in (cache.vehicles, lambda: cache.save(whole_table(2))):
+            with pytest.raises(CacheError, match="is no cache of paramclient"):
+                use()
+    assert contents(path.parent) == before
+
+
+def test_the_log_of_another_programs_database_is_left_as_it_is(path: Path) -> None:
+    before = crashed(path)
+    assert len(before) == 2
+    with ParamCache(path) as cache:
+        for use in (cache.vehicles, lambda: cache.save(whole_table(2))):
+            with pytest.raises(CacheError, match="another program's database"):
+                use()
+    assert contents(path.parent) == before
+
+
+def test_an_empty_file_beside_the_log_of_another_program_is_left_as_it_is(path: Path) -> None:
+    before = crashed(path) | {path.name: b""}
+    path.write_bytes(b"")
     with ParamCache(path) as cache, pytest.raises(CacheError, match="is no cache of paramclient"):
         cache.save(whole_table(2))
-    assert notes.read_text() == "my notes"
+    assert contents(path.parent) == before
+
+
+@pytest.mark.parametrize("text", [b"my notes", b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x82" + bytes(5000)])
+def test_a_log_that_is_none_of_sqlite_is_left_as_it_is(path: Path, text: bytes) -> None:
+    notes = path.with_name(f"{path.name}-wal")
+    notes.write_bytes(text)
+    with ParamCache(path) as cache, pytest.raises(CacheError, match="is no cache of paramclient"):
+        cache.save(whole_table(2))
+    assert notes.read_bytes() == text
+
+
+def test_a_cache_of_an_early_version_whose_tables_are_in_its_log_alone_is_one(path: Path) -> None:
+    original = path.with_name("original")
+    with ParamCache(original) as cache:
+        cache.save(whole_table(3))
+        with connect(original) as connection:
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+            connection.execute("PRAGMA application_id = 0")
+            connection.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        cache.save(update(stored("PARAM_0", 9)))
+        for suffix in ("", "-wal"):
+            shutil.copy(f"{original}{suffix}", f"{path}{suffix}")
+    with ParamCache(path) as cache:
+        assert values(cache)["PARAM_0"] == 9
+        assert not cache.notes
+
+
+def test_a_new_file_says_whose_it_is_before_it_has_a_log(path: Path) -> None:
+    with ParamCache(path) as cache:
+        cache.save(whole_table(1))
+        assert path.with_name(f"{path.name}-wal").stat().st_size
+        begins = path.read_bytes()[:72]
+    assert begins[68:] == APPLICATION_ID.to_bytes(4, "big")
+
+
+def test_to_open_a_cache_twice_drops_none_of_its_locks(path: Path) -> None:
+    """POSIX drops all locks of a process on a file when it closes any descriptor of it."""
+    ask = (
+        "import sqlite3, sys; print(*sqlite3.connect(sys.argv[1], timeout=0).execute(sys.argv[2]).fetchone())"
+    )
+    with ParamCache(path) as first:
+        first.save(whole_table(3))
+        with ParamCache(path) as second:
+            assert len(values(second)) == 3
+        gc.collect()
+        output, _ = start(ask, path, "PRAGMA journal_mode = DELETE").communicate()
+        assert output.strip() != "delete", "only who is alone may do that"
+    output, _ = start(ask, path, "PRAGMA journal_mode = DELETE").communicate()
+    assert output.strip() == "delete"
 
 
 def test_a_file_of_ours_without_an_application_id_gets_one(path: Path) -> None:
@@ -572,8 +662,20 @@ def test_a_file_of_ours_without_an_application_id_gets_one(path: Path) -> None:
         assert connection.execute("PRAGMA application_id").fetchall() == [(APPLICATION_ID,)]
 
 
-@pytest.mark.parametrize("mode", [0o666, 0o640, 0o604, 0o620])
-def test_a_file_that_others_can_get_at_is_made_its_owners_alone(
+@pytest.mark.parametrize("mode", [0o640, 0o604, 0o644])
+def test_a_file_that_others_can_read_stays_so(
+    path: Path, mode: int, caplog: pytest.LogCaptureFixture
+) -> None:
+    path.write_bytes(sound_file())
+    path.chmod(mode)
+    with ParamCache(path) as cache:
+        works(cache)
+    assert path.stat().st_mode & 0o777 == mode
+    assert caplog.messages == []
+
+
+@pytest.mark.parametrize("mode", [0o666, 0o664, 0o602, 0o620])
+def test_a_file_that_others_can_write_is_made_its_owners_alone(
     path: Path, mode: int, caplog: pytest.LogCaptureFixture
 ) -> None:
     path.write_bytes(sound_file())
@@ -583,14 +685,16 @@ def test_a_file_that_others_can_get_at_is_made_its_owners_alone(
         assert path.stat().st_mode & 0o777 == 0o600
         works(cache)
     [told] = caplog.messages
-    assert told.startswith(f"others than its owner could get at the cache {path} (mode {mode:o})")
+    assert told.startswith(f"others than its owner could write to the cache {path} (mode {mode:o})")
     assert told.endswith("it is mode 600 now")
 
 
+@pytest.mark.parametrize("may_write", [True, False])
 @pytest.mark.parametrize(("mode", "is_refused"), [(0o666, True), (0o620, True), (0o644, False)])
 def test_a_file_that_others_can_write_and_that_cannot_be_mended_is_refused(
-    path: Path, mode: int, is_refused: bool, monkeypatch: pytest.MonkeyPatch
+    path: Path, mode: int, is_refused: bool, may_write: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(Database, "_may_write", lambda _: may_write)
     path.write_bytes(sound_file())
     path.chmod(mode)
 

@@ -7,11 +7,13 @@ committed before (SQLite, "PRAGMA synchronous").
 
 The structure of the file is checked when it is opened; each table has a checksum of its own, checked when it
 is read. Only a file that is empty, or a database with our application id, is ever changed or renamed;
-anything else under the path is an error. Under an open connection, another process may find the file damaged
+anything else under the path is an error. That is seen before SQLite opens it, which would take up, empty or
+delete any log that stands beside it. Under an open connection, another process may find the file damaged
 and rename it, or somebody may delete it: every operation looks whether its file still stands under the path.
 SQLite does so too before it would touch the `-wal` of the file that came in its place. Opening, creating,
 upgrading and renaming happen under a lock on the folder (`flock`), so that two processes never do it at once.
-The file itself is opened by SQLite alone: to close another descriptor of it would drop SQLite's locks.
+The file itself is opened by SQLite alone while any cache of this process has it open: to close another
+descriptor of it would drop SQLite's locks (POSIX, fcntl).
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ import sys
 import threading
 import time
 import weakref
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
 from functools import cache
@@ -47,7 +50,8 @@ _MAGIC: Final = b"SQLite format 3\0"
 _ID_AT: Final = slice(68, 72)
 """How a database of SQLite begins, and where its application id stands (SQLite, "Database File Format")."""
 _LOG_MAGICS: Final = (b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
-"""How a write-ahead log of SQLite begins."""
+_LOG_HEADER, _FRAME_HEADER = 32, 24
+"""How a write-ahead log of SQLite begins, and the bytes before the first page in it and before each page."""
 
 _TRIES: Final = 3
 """Rounds of one operation: the file may be renamed under it by another process, and be damaged, once each."""
@@ -68,6 +72,10 @@ _VFS_WITHOUT_LOCKS: Final = "win32-none" if sys.platform == "win32" else "unix-n
 _DAMAGE: Final = frozenset({sqlite3.SQLITE_CORRUPT, sqlite3.SQLITE_NOTADB})
 
 _log = logging.getLogger("paramclient.cache")
+
+_IN_USE: Final[Counter[tuple[int, int]]] = Counter()
+"""How often each file, by device and number, is open in this process: they are known to be caches."""
+_IN_USE_LOCK: Final = threading.Lock()
 
 T = TypeVar("T")
 Work: TypeAlias = Callable[[sqlite3.Connection], T]
@@ -92,7 +100,7 @@ class Database:
 
     A file that is damaged, or newer than this version, is renamed to say why and when (with its `-wal` and
     `-shm`), a warning is logged and remembered, and a fresh one takes its place. Nothing is ever deleted. A
-    file that others can get at is made its owner's alone, with a warning.
+    file that others can write to is made its owner's alone, with a warning, or is an error.
 
     Args:
         path: the file, absolute, with links followed.
@@ -114,6 +122,7 @@ class Database:
         self._closed = False
         self._connection: sqlite3.Connection | None = None
         self._close_connection: Callable[[], object] = _nothing
+        self._end_use: Callable[[], object] = _nothing
         self._file: tuple[int, int] | None = None
         self._for_once = False
         self._without_locks = False
@@ -170,7 +179,6 @@ class Database:
                     self.replacements += 1
                     self._drop()
                 except Damaged as damage:
-                    self._check_ours(damage)
                     self._set_aside(damage)
                 except OSError as error:
                     self._drop()
@@ -220,12 +228,12 @@ class Database:
                 if not writing:
                     raise _Moved
                 if _size(self._companion("-wal")):
+                    self._check_log()
                     raise Damaged("only its write-ahead log is left")
                 os.close(os.open(self.path, os.O_CREAT | os.O_WRONLY, 0o600))
                 self.replacements += 1
                 self._file = self._which()
-            if _size(self.path) == 1:  # SQLite would take it for empty and write over it
-                raise Damaged("file is not a database")
+            self._check_file()
             may_write = self._may_write()
             if writing and not may_write:
                 raise PermissionError("it is read-only")
@@ -242,11 +250,13 @@ class Database:
             return self._open_without_locks()
 
     def _open_with_locks(self, *, writing: bool) -> sqlite3.Connection:
-        connection = self._connect("mode=rw")
+        connection = self._keep(self._connect("mode=rw"))
         version = self._inspect(connection)
         if not (version or writing):
             raise _Empty
         self._make_private()
+        if not version:  # before there is a log: so the file itself says at any moment whose it is
+            connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
         connection.execute("PRAGMA journal_mode = WAL")
         connection.execute("PRAGMA synchronous = NORMAL")
         connection.execute("PRAGMA fullfsync = ON")  # of macOS, whose fsync leaves data in the drive's cache
@@ -266,29 +276,36 @@ class Database:
         None is in use, so nobody else is writing. Made for a read-only file, they would be read-only too and
         stay behind.
         """
-        if _size(self._companion("-wal")):
-            # A killed process left transactions in it. Without locks, SQLite reads it with no -shm.
-            connection = self._connect(f"mode=ro&vfs={_VFS_WITHOUT_LOCKS}")
-            connection.execute("PRAGMA locking_mode = EXCLUSIVE")
-        else:
-            connection = self._connect("mode=ro&immutable=1")
+        connection = self._keep(self._connect_without_locks())
         version = self._inspect(connection)
         if not version:
             raise _Empty
+        self._make_private()
         if version < len(MIGRATIONS):
             raise CacheError(
                 f"the cache {self.path} is of an older version and cannot be upgraded where it is"
             )
         return connection
 
+    def _connect_without_locks(self) -> sqlite3.Connection:
+        """Connect so that nothing is written, not beside the file either."""
+        if _size(self._companion("-wal")):
+            # A killed process left transactions in it. Without locks, SQLite reads it with no -shm.
+            connection = self._connect(f"mode=ro&vfs={_VFS_WITHOUT_LOCKS}")
+            connection.execute("PRAGMA locking_mode = EXCLUSIVE")
+            return connection
+        return self._connect("mode=ro&immutable=1")
+
     def _connect(self, how: str) -> sqlite3.Connection:
-        connection = sqlite3.connect(
+        return sqlite3.connect(
             f"{self.path.as_uri()}?{how}",
             uri=True,
             timeout=BUSY_TIMEOUT,
             isolation_level=None,
             check_same_thread=False,
         )
+
+    def _keep(self, connection: sqlite3.Connection) -> sqlite3.Connection:
         self._connection = connection
         self._close_connection = weakref.finalize(self, connection.close)
         return connection
@@ -296,10 +313,18 @@ class Database:
     def _inspect(self, connection: sqlite3.Connection) -> int:
         """The schema version of the file, 0 for one that is still empty; `Damaged` where it is that.
 
-        A file without an application id counts as ours by its tables. The integrity check takes a few
-        milliseconds for each megabyte. Without it a flipped bit can make SQLite miss a row that is there, and
-        nothing would tell.
+        The integrity check takes a few milliseconds for each megabyte. Without it a flipped bit can make
+        SQLite miss a row that is there, and nothing would tell.
         """
+        version = self._version_of(connection)
+        if version:
+            [(verdict,)] = connection.execute("PRAGMA integrity_check(1)")
+            if verdict != "ok":
+                raise Damaged(verdict)
+        return version
+
+    def _version_of(self, connection: sqlite3.Connection) -> int:
+        """The same by the tables alone. A file without an application id counts as ours by these."""
         [(application,)] = connection.execute("PRAGMA application_id")
         self._is_ours = application == APPLICATION_ID
         [(version,)] = connection.execute("PRAGMA user_version")
@@ -309,21 +334,15 @@ class Database:
             if _code(error) != sqlite3.SQLITE_ERROR:
                 raise
             raise Damaged(str(error)) from error  # the statement cannot be wrong: the header is
-        if not (application or version or tables):
+        if application in (0, APPLICATION_ID) and not (version or tables):
             return 0
         looks_like_ours = 1 <= version <= len(MIGRATIONS) and _schema_after(MIGRATIONS[:version]) <= tables
         if not (self._is_ours or (application == 0 and looks_like_ours)):
-            raise CacheError(
-                f"{self.path} is another program's database (its application id is {application:#x}), and was"
-                " left as it is; name another file"
-            )
+            raise self._is_of_another_program(application)
         if version > len(MIGRATIONS):
             raise _Newer(f"its schema has version {version}, this program knows {len(MIGRATIONS)}")
         if not looks_like_ours:
             raise Damaged(f"its tables are not those of version {version}")
-        [(verdict,)] = connection.execute("PRAGMA integrity_check(1)")
-        if verdict != "ok":
-            raise Damaged(verdict)
         return int(version)
 
     def _judged(self, error: sqlite3.Error) -> Exception:
@@ -335,29 +354,63 @@ class Database:
             return Damaged("its header forbids writing")
         return CacheError(f"the cache {self.path} cannot be used: {error}")
 
-    def _check_ours(self, damage: Damaged) -> None:
-        """See that what is damaged is a cache, by its first bytes where SQLite cannot read it.
+    def _check_file(self) -> None:
+        """See that the file is a cache, or empty, and note that it is in use.
 
-        Nobody in this process uses a file that SQLite cannot read, so to close it costs nobody's locks.
+        It is looked at without SQLite's locks, where nobody in this process has any to lose.
 
         Raises:
-            CacheError: it is something else, which is left as it is.
+            CacheError: it is something else.
         """
-        if self._is_ours or self._which() != self._file:
+        assert self._file is not None, "it exists"
+        with _IN_USE_LOCK:
+            if not _IN_USE[self._file]:
+                self._look()
+            _IN_USE[self._file] += 1
+        self._end_use = weakref.finalize(self, _end_use, self._file)
+
+    def _look(self) -> None:
+        with self.path.open("rb") as file:
+            begins = file.read(_ID_AT.stop)
+        application = int.from_bytes(begins[_ID_AT], "big")
+        if not begins or (begins.startswith(_MAGIC) and application == APPLICATION_ID):
             return
-        size = _size(self.path)
-        try:
-            with (self.path if size else self._companion("-wal")).open("rb") as file:
-                begins = file.read(_ID_AT.stop)
-        except OSError:
-            begins = b""
-        is_file = begins.startswith(_MAGIC) and begins[_ID_AT] == APPLICATION_ID.to_bytes(4, "big")
-        if is_file if size else begins.startswith(_LOG_MAGICS):
-            return
-        self._drop()
-        text = " ".join(str(damage).split())
-        raise CacheError(
+        if not begins.startswith(_MAGIC) or len(begins) < _ID_AT.stop:
+            raise self._is_no_cache("file is not a database")
+        if application:
+            raise self._is_of_another_program(application)
+        # one of an early version has no id: its tables tell, also where they stand in its log alone
+        with closing(self._connect_without_locks()) as connection:
+            try:
+                self._version_of(connection)
+            except (sqlite3.DatabaseError, Damaged) as error:
+                raise self._is_no_cache(error) from error
+
+    def _check_log(self) -> None:
+        """See by the first page, if it has that, that a log whose file is gone or empty is of a cache.
+
+        Raises:
+            CacheError: nothing shows that.
+        """
+        with self._companion("-wal").open("rb") as file:
+            begins = file.read(_LOG_HEADER)
+            size = int.from_bytes(begins[8:12], "big")
+            while begins.startswith(_LOG_MAGICS) and len(frame := file.read(_FRAME_HEADER + size)) > size:
+                page = frame[_FRAME_HEADER:]
+                if page.startswith(_MAGIC) and page[_ID_AT] == APPLICATION_ID.to_bytes(4, "big"):
+                    return
+        raise self._is_no_cache("there is only a write-ahead log")
+
+    def _is_no_cache(self, why: object) -> CacheError:
+        text = " ".join(str(why).split())
+        return CacheError(
             f"{self.path} is no cache of paramclient ({text:.200}), and was left as it is; name another file"
+        )
+
+    def _is_of_another_program(self, application: int) -> CacheError:
+        return CacheError(
+            f"{self.path} is another program's database (its application id is {application:#x}), and was"
+            " left as it is; name another file"
         )
 
     def _check_link(self) -> None:
@@ -375,10 +428,10 @@ class Database:
             )
 
     def _make_private(self) -> None:
-        """Make the file its owner's alone, with a warning.
+        """Make a file that others can write to its owner's alone, with a warning.
 
         Raises:
-            CacheError: others can write to it, and that cannot be ended.
+            CacheError: that is not possible.
         """
         for file in filter(Path.exists, map(self._companion, ("", "-wal", "-shm"))):
             try:
@@ -393,9 +446,9 @@ class Database:
                         f"{error.strerror}"
                     ) from error
                 continue
-            if mode & OF_OTHERS and file == self.path:
+            if mode & OTHERS_WRITE and file == self.path:
                 _log.warning(
-                    "others than its owner could get at the cache %s (mode %o); it is mode %o now",
+                    "others than its owner could write to the cache %s (mode %o); it is mode %o now",
                     *(file, mode, mode & ~OF_OTHERS),
                 )
 
@@ -444,9 +497,17 @@ class Database:
 
     def _drop(self) -> None:
         self._close_connection()
+        self._end_use()
         self._connection = None
-        self._close_connection = _nothing
+        self._close_connection = self._end_use = _nothing
         self._for_once = self._without_locks = self._is_ours = False
+
+
+def _end_use(file: tuple[int, int]) -> None:
+    with _IN_USE_LOCK:
+        _IN_USE[file] -= 1
+        if not _IN_USE[file]:
+            del _IN_USE[file]
 
 
 def _nothing() -> None:
