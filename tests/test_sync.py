@@ -10,6 +10,7 @@ import pytest
 
 from paramclient.errors import CacheError, NoReply, UsageError
 from paramclient.protocol import wire
+from paramclient.protocol.check_pace import RESERVE_SHARE
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import (
     ComponentFound,
@@ -41,6 +42,8 @@ from tests.shell import Tap
 from tests.simulation import Memory, Simulation, is_so, listed
 
 INTERVAL = 30.0
+DUE = INTERVAL * (1.0 - RESERVE_SHARE)
+"""Seconds from one check to the next, less what the last ones took."""
 NAMES = [f"P{number:02d}" for number in range(40)]
 TABLE = [
     *(SimParam(name, ParamType.INT32, number) for number, name in enumerate(NAMES)),
@@ -160,7 +163,7 @@ def test_as_long_as_nothing_moves_an_interval_costs_one_question_and_the_volatil
     assert len(times) == 10
     assert world.requests() == 10 * (1 + VOLATILE)
     apart = [after - before for before, after in pairwise(times)]
-    assert apart == pytest.approx([INTERVAL - last.elapsed] * 9), "a fetch would end within the interval"
+    assert apart == pytest.approx([DUE - last.elapsed] * 9), "a fetch would end within the interval"
     assert world.events == []
 
 
@@ -187,7 +190,7 @@ def test_nothing_is_asked_while_the_link_is_busy() -> None:
     world.fetch()
     fetched_at = world.now  # the fetch itself asks for the hash beside the list
     other = world.station.components[2, 1]
-    world.run(INTERVAL - 1.0)
+    world.run(DUE - 1.0)
     world.taps[1].is_deaf = True
     fetch = other.begin_fetch(world.now)
     assert world.hashes(fetched_at) == []
@@ -427,7 +430,7 @@ def test_one_that_beats_every_ten_seconds_is_not_flapping() -> None:
     world.fetch()
     world.run(300.0)
     assert len(world.told(ComponentLost)) <= 1, "before it was known how rarely it beats"
-    assert len(world.hashes()) <= 300.0 / INTERVAL + 1, "and what lies between its heartbeats is no gap"
+    assert len(world.hashes()) <= 300.0 / DUE + 2, "and what lies between its heartbeats is no gap"
 
 
 class Heartless(Tap):

@@ -236,11 +236,11 @@ def took(seconds: float, source: str = "ftp", missing: tuple[int, ...] = ()) -> 
 def test_the_median_of_the_last_times_counts() -> None:
     pace = CheckPace(30.0, is_chosen=False)
     assert pace.interval(may_use_file=False) == math.inf
-    assert pace.interval(may_use_file=True) == 30.0
+    assert pace.interval(may_use_file=True) == 28.5
     assert is_so(not pace.file_is_quick)
     for seconds in (0.4, 0.4, 0.4, 20.0, 0.4):
         pace.fetched(took(seconds), 0.0)
-    assert pace.interval(may_use_file=False) == 29.6, "the check ends within the interval"
+    assert pace.interval(may_use_file=False) == 28.1, "the check ends within the interval"
     assert is_so(pace.file_is_quick)
     for _ in range(FETCHES_KEPT):
         pace.fetched(took(5.0), 2.0)
@@ -256,24 +256,24 @@ def test_the_median_of_the_last_times_counts() -> None:
 
 def test_a_chosen_interval_is_stretched_less() -> None:
     pace = CheckPace(10.0, is_chosen=True)
-    assert pace.interval(may_use_file=False) == 10.0
+    assert pace.interval(may_use_file=False) == 9.5
     for _ in range(3):
         pace.fetched(took(35.0, "stream"), 0.0)
     assert pace.interval(may_use_file=False) == 70.0
     assert pace.shortest_pause == 35.0
     pace.fetched(took(3.0), 0.0)
-    assert pace.interval(may_use_file=False) == 7.0
+    assert pace.interval(may_use_file=False) == 6.5
 
 
 def test_the_hash_is_asked_for_so_early_that_a_fetch_ends_within_the_interval() -> None:
     pace = CheckPace(30.0, is_chosen=False)
-    assert pace.hash_interval == 30.0
+    assert pace.hash_interval == 28.5
     for _ in range(3):
         pace.fetched(took(0.9, "stream"), 0.0)
-    assert pace.hash_interval == 29.1
+    assert pace.hash_interval == 27.6
     for _ in range(3):
         pace.fetched(took(20.0), 0.0)
-    assert pace.hash_interval == 28.5, "a twentieth of the interval, at most"
+    assert pace.hash_interval == 27.0, "a twentieth of the interval, at most"
 
 
 @pytest.mark.parametrize("after", [0.01, 0.5, 1.2])

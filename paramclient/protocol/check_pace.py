@@ -20,6 +20,9 @@ CHOSEN_SHARE: Final = 0.5
 take at once, because a sign has come that the table moved."""
 SHORTEST_PAUSE: Final = 1.0
 """Seconds from the end of one fetch to a check at the earliest: a count may move all the time."""
+RESERVE_SHARE: Final = 0.05
+"""The share of the interval by which a check begins earlier than the last ones say that it must to end within
+it: the next one may take longer (measured on an ArduCopter: up to 0.9 s longer than the median)."""
 FETCHES_KEPT: Final = 5
 """Fetches of one kind of which the median time counts: one that took long for once changes nothing."""
 UNCONFIRMED_INTERVALS: Final = 4
@@ -79,7 +82,7 @@ class CheckPace:
         """Seconds from one answer with the hash to the next question, so early that the fetch which may
         follow ends within the interval, where that takes no more than a small share of it."""
         times = self._times.get("ftp") or self._times.get("stream") or (0.0,)
-        return self._interval - min(median_low(times), FILE_SHARE * self._interval)
+        return self._aim - min(median_low(times), FILE_SHARE * self._interval)
 
     def interval(self, *, may_use_file: bool) -> float:
         """Return the seconds from the start of one check to that of the next: it ends within the interval.
@@ -97,7 +100,12 @@ class CheckPace:
         """The interval less the time of a check, or longer: checks take no more than that share of it."""
         times, took = self._last_times, self._time
         longest = UNCONFIRMED_INTERVALS * self._interval if len(times) == 1 else math.inf
-        return max(self._interval - took, min(took / share, longest))
+        return max(self._aim - took, min(took / share, longest))
+
+    @property
+    def _aim(self) -> float:
+        """Seconds from one check to the next in which that should end."""
+        return self._interval * (1.0 - RESERVE_SHARE)
 
     @property
     def shortest_pause(self) -> float:

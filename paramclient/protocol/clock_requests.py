@@ -25,8 +25,8 @@ when its main loop runs (measured: 1.8 to 2.6 s after it went off)."""
 QUICK_TIME: Final = 6.0
 """Seconds for which requests are sent at that pace."""
 SLOW_PACE: Final = 1.0
-"""Seconds between two requests after that, while a restart on command is awaited; and of those for a baseline,
-as nobody waits for it: of 250 vehicles whose lists come at once, the answers stand behind the values."""
+"""Seconds between two requests after that, while a restart on command is awaited; and between those for a
+baseline. Nobody waits for it, and where 250 lists come at once, the answers stand behind the values."""
 
 
 class ClockRequests:
