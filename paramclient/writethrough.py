@@ -39,7 +39,8 @@ from paramclient.worker import Worker
 __all__ = ["WriteThrough", "chosen_cache"]
 
 FLUSH_INTERVAL: Final = 0.25
-"""Seconds that changes are gathered for before they are written. A download fills several batches."""
+"""Seconds after which a change is on the disk, as long as the machine keeps up: changes are gathered for so
+long, less what the last commit took. A download fills several batches."""
 DOWNLOAD_INTERVAL: Final = 10.0
 FEW_FETCHES: Final = 8
 """Seconds for which what a fetch under way brings is gathered, and the number of fetches above which that is
@@ -107,6 +108,8 @@ class WriteThrough:
         self._syncs_begun = self._synced = 0  # the number of the last one that has succeeded
         self._tables: dict[tuple[int, int], bool] = {}
         self._something_to_write = anyio.Event()
+        self._waiting_since = -math.inf  # as long as that is set
+        self._commit_time = 0.0
         self._bringing: set[ComponentMachine] = set()
         self._vehicles: dict[tuple[int, int], set[str]] = {}  # that were kept in this session
         self._has_refused = self._has_refused_twin = False
@@ -231,19 +234,24 @@ class WriteThrough:
 
     def wake(self) -> None:
         """There may be something to write."""
-        self._something_to_write.set()
+        if not self._something_to_write.is_set():
+            self._waiting_since = anyio.current_time()
+            self._something_to_write.set()
 
     async def run(self) -> None:
         """Write whatever is new, in batches, until cancelled."""
         while True:
             await self._something_to_write.wait()
+            pause = FLUSH_INTERVAL - min(self._commit_time, FLUSH_INTERVAL / 2)
+            await anyio.sleep_until(self._waiting_since + pause)
             self._something_to_write = anyio.Event()
-            await anyio.sleep(FLUSH_INTERVAL)
-            if self.is_held_back:
-                self._something_to_write.set()
-            if not await self.flush(is_last=False):
+            begun_at = anyio.current_time()
+            is_written = await self.flush(is_last=False)
+            self._commit_time = anyio.current_time() - begun_at
+            if not is_written:
                 await anyio.sleep(RETRY_INTERVAL)
-                self._something_to_write.set()
+            if self.is_held_back or not is_written:
+                self.wake()
             await self._take_news()
 
     async def flush(self, *, is_last: bool = True) -> bool:
@@ -303,7 +311,7 @@ class WriteThrough:
         self._are_many = fetches > (0 if self._are_many else FEW_FETCHES)  # the last ones of many count too
         for kept in list(self._kept.values()) if self._cache is not None else ():
             if self._are_many and not is_last and self._is_for_later(kept):
-                self._something_to_write.set()
+                self.wake()
             elif self._kept.get(kept.machine) is kept:
                 for new in self._news_of(kept, times):
                     portion.append(new)
