@@ -499,13 +499,13 @@ async def hostile_service(rows: list[Row], quick: bool) -> None:
         async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             with contextlib.suppress(OSError, asyncio.IncompleteReadError):
                 request = await reader.readuntil(b"\r\n\r\n")
-                if greeting and b"/events" in request:  # noqa: B023
-                    writer.write(stream + greeting)  # noqa: B023
+                if greeting and b"/events" in request:  # noqa: B023 - called in this turn alone
+                    writer.write(stream + greeting)  # noqa: B023 - called in this turn alone
                     await reader.read()
                 else:
-                    writer.write(begin)  # noqa: B023
-                    while endless:  # noqa: B023
-                        writer.write(endless)  # noqa: B023
+                    writer.write(begin)  # noqa: B023 - called in this turn alone
+                    while endless:  # noqa: B023 - called in this turn alone
+                        writer.write(endless)  # noqa: B023 - called in this turn alone
                         await writer.drain()
             with contextlib.suppress(OSError):
                 writer.close()

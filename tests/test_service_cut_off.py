@@ -19,23 +19,16 @@ from paramclient.errors import CacheError
 from paramclient.links import create_link, serve_endpoint
 from paramclient.protocol import wire
 from tests.commands import in_process
-from tests.shell import PATIENCE, Tap, small_px4, swiftly
+from tests.shell import PATIENCE, Clock, Tap, small_px4, swiftly
 from tests.test_service_process import C, ended, served
 from tests.test_service_setup import HERE, TUNE, Checked, Quiet, px4, serving
 
 # Notes
 
 
-class Clock:
-    now = 1_000.0
-
-    def __call__(self) -> float:
-        return self.now
-
-
 @pytest.fixture
 def clock() -> Clock:
-    return Clock()
+    return Clock(1_000.0)
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ from paramclient.service import Listening, gate, places
 from paramclient.service.addresses import is_loopback, network_of
 from paramclient.service.log_limit import MINUTE, MOST_KINDS, LogLimit
 from paramclient.service.places import KEPT_FOR_LOOPBACK, MOST_FROM_ONE, Place, Places, Stage
-from tests.shell import PATIENCE, until
+from tests.shell import PATIENCE, Clock, until
 from tests.test_service_attacks import Answer, Served, over_tls, served, taken, trusting
 
 # Places
@@ -122,13 +122,6 @@ def test_a_place_is_given_back_once() -> None:
 
 
 # Lines of the log
-
-
-class Clock:
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 @pytest.fixture

@@ -6,12 +6,11 @@ from collections.abc import Mapping
 from typing import Final
 
 from paramclient.protocol.change import Change
+from paramclient.protocol.table import MOST_NAMES
 from paramclient.values import Param, Trust
 
 __all__ = ["MOST_WAITING", "Mirror"]
 
-MOST_NAMES: Final = 65_535
-"""Names in a table, as in that of the service."""
 MOST_WAITING: Final = 20_000
 """Changes that are kept while a table is being loaded; with more it is loaded again instead."""
 

@@ -20,7 +20,7 @@ import anyio
 
 from paramclient.errors import UsageError
 from paramclient.protocol.authors import LONGEST_ASKER
-from paramclient.service.addresses import is_in, network
+from paramclient.service.addresses import is_in, is_loopback, network
 from paramclient.service.held_bodies import HeldBodies, HeldBody
 from paramclient.service.log_limit import LogLimit
 from paramclient.service.request import (
@@ -98,7 +98,7 @@ class AccessSettings:
                 "behind a proxy the service would let everyone who reaches that change parameters: it needs "
                 "a token. Make one with `paramclient token NAME --file FILE` and start with --token-file FILE"
             )
-        beyond = [name for name in (self.listen, *sorted(self.hosts)) if not _is_loopback(name)]
+        beyond = [name for name in (self.listen, *sorted(self.hosts)) if not _is_only_here(name)]
         if self.tokens is None and beyond:
             raise UsageError(
                 f"as {beyond[0]} the service would let everyone on the network change parameters: it needs a "
@@ -182,7 +182,7 @@ class AccessMiddleware:
         except ValueError:
             pass
         else:  # an address is no name that could be led elsewhere
-            if address.is_loopback or not _is_loopback(self._settings.listen):
+            if address.is_loopback or not _is_only_here(self._settings.listen):
                 return
         raise Denied(
             421,
@@ -459,14 +459,9 @@ def _origin(text: str) -> str:
     return f"{scheme}://{host}"
 
 
-def _is_loopback(listen: str) -> bool:
+def _is_only_here(listen: str) -> bool:
     """Whether only this machine can connect there. Of another name than localhost nothing is known."""
-    if listen.lower() == "localhost":
-        return True
-    try:
-        return ip_address(listen.strip("[]")).is_loopback
-    except ValueError:
-        return False
+    return listen.lower() == "localhost" or is_loopback(listen.strip("[]"))
 
 
 _LOOPBACK_NAMES: Final = frozenset({"localhost"})
