@@ -193,10 +193,14 @@ class Mute(Tap):
 
 @pytest.mark.asyncio
 async def test_an_apply_whose_process_is_killed_is_told_at_the_next_start(tmp_path: Path) -> None:
+    await told_after_a_kill(str(tmp_path / "cache.sqlite3"))
+
+
+async def told_after_a_kill(cache: str) -> None:
+    """A service with this cache is killed while it applies values; the next one tells that."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    cache = str(tmp_path / "cache.sqlite3")
     async with anyio.create_task_group() as tasks:
         await tasks.start(serve_endpoint, Mute(small_px4()), create_link(f"tcpin:127.0.0.1:{port}"))
         async with served(f"tcp:127.0.0.1:{port}", "--cache", cache) as (process, browser):

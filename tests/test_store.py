@@ -40,6 +40,7 @@ from tests.commands import in_process
 from tests.postgres import GIVEN, PROGRAMS, WHY_NONE, Server, database_on, server
 from tests.shell import Tap, small_px4, swiftly
 from tests.test_moments import interleaved
+from tests.test_service_cut_off import told_after_a_kill
 from tests.test_service_process import served
 
 PATIENCE = 60.0
@@ -916,3 +917,14 @@ class Told(ParamCache):
     def tell(self, change: CacheChange) -> None:
         for listener in self.listeners:
             listener(change)
+
+
+@pytest.mark.asyncio
+async def test_an_apply_whose_process_is_killed_is_told_with_a_shared_database_too(
+    server_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The notes stand beside the copy on this computer: they are about what it has begun."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    with database_on(server_url) as url:
+        await told_after_a_kill(url)
+    assert len([*tmp_path.rglob("*.setups")]) == 1  # noqa: ASYNC240 - nothing runs beside
