@@ -603,6 +603,20 @@ def test_an_empty_file_beside_the_log_of_another_program_is_left_as_it_is(path: 
     assert contents(path.parent) == before
 
 
+@pytest.mark.parametrize("suffix", ["-journal", "-shm", "-wal"])
+@pytest.mark.parametrize("is_empty", [True, False])
+def test_files_that_only_are_named_like_those_of_a_cache_are_left(
+    path: Path, suffix: str, is_empty: bool
+) -> None:
+    path.with_name(f"{path.name}{suffix}").write_text("my flight")
+    if is_empty:
+        path.touch()
+    before = contents(path.parent)
+    with ParamCache(path) as cache, pytest.raises(CacheError, match="is no cache of paramclient"):
+        cache.save(whole_table(2))
+    assert contents(path.parent) == before
+
+
 @pytest.mark.parametrize("text", [b"my notes", b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x82" + bytes(5000)])
 def test_a_log_that_is_none_of_sqlite_is_left_as_it_is(path: Path, text: bytes) -> None:
     notes = path.with_name(f"{path.name}-wal")

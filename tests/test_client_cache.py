@@ -443,6 +443,11 @@ async def test_an_identity_that_comes_long_after_the_values(path: Path, fetched:
         tap.is_mute = False
         await asyncio.sleep(2.0)
         assert component.identity.key.startswith("uid:")
+        assert component.params["PARAM_01"].value == 1, "it may be another one that was heard before"
+        if fetched:
+            assert (await component.fetch_all()).source == "stream"
+        else:
+            await component.get("PARAM_01")
     with ParamCache(path) as cache:
         cached = cache.load(component.identity.key, 1)
         assert cached is not None

@@ -82,7 +82,7 @@ def differing(world: Simulation, vehicle: Vehicle) -> set[str]:
     return {name for name, param in world.machine.table.params.items() if param.value != values[name]}
 
 
-def nothing_is_asked_any_more(world: Simulation, seconds: float = 18.0) -> None:
+def nothing_is_asked_any_more(world: Simulation, seconds: float = 16.0) -> None:
     """No request is without an end: once what changed was looked at, there are heartbeats and little else."""
     world.run(10.0)
     assert not world.station.is_waiting

@@ -609,7 +609,7 @@ def test_a_file_that_comes_quickly_is_read_again_every_half_minute() -> None:
     session.run(0.1)
     server.is_mute = False
     opened = len(server.opened)
-    session.run(29.0)
+    session.run(27.0)
     assert len(server.opened) == opened
     session.run(3.0)
     assert len(server.opened) == opened + 1
@@ -628,7 +628,7 @@ def test_a_file_that_takes_long_is_not_read_unasked() -> None:
 
 
 def test_values_that_move_by_themselves_and_say_so_are_no_news_of_the_watch() -> None:
-    server = Server(vehicle := ArduPilotVehicle(live_period=8.0))
+    server = Server(vehicle := ArduPilotVehicle(live_period=11.0))
     session = upkept(server)
     session.fetch()
     session.events.clear()

@@ -641,7 +641,7 @@ def test_one_that_stays_and_gives_no_id_is_another_vehicle() -> None:
     net.peers["b"].end = net.now
     net.run(10.0)
     assert net.machine.who.identity.uid == f"{1:016x}"
-    assert dict(net.machine.table.params) == {}, "that of the vehicle is in the cache"
+    assert {param.value for param in net.machine.table.params.values()} <= {1.0}, "nothing of the other one"
 
 
 def test_a_write_does_not_go_to_the_peers_that_are_left_where_a_connection_ends() -> None:
@@ -704,3 +704,175 @@ def test_one_that_says_no_more_who_it_is_is_not_written_to() -> None:
     net.run(2.0)
     assert again.result is not None
     assert len([each for each in speaker.heard if isinstance(each, ParamSet)]) == 1
+
+
+def test_another_kind_through_one_peer_is_asked_who_it_is() -> None:
+    """As where another vehicle was plugged in within the heartbeat timeout."""
+    port = Speaker(PX4, end=3.0)
+    net = Net(port=port)
+    net.run(2.5)
+    hold(net, "P", "Q")
+    net.run(2.0)
+    port._heartbeats, port.uid, port.end = (ARDUPILOT,), 2, 1e9
+    net.run(2.0)
+    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert dict(net.machine.table.params) == {}
+
+
+def test_another_kind_that_gives_no_id_is_not_written_to() -> None:
+    port = Speaker(PX4)
+    net = Net(port=port)
+    net.run(2.5)
+    hold(net, "P", "Q")
+    port._heartbeats, port.uid = (ARDUPILOT,), None
+    net.run(1.5)
+    write = net.machine.write("P", 5.0, net.now)
+    net.run(8.0)
+    assert isinstance(write.error, NoReply)
+    assert net.station.is_doubted(net.machine)
+    port._heartbeats, port.uid = (PX4,), 1
+    net.run(room.LATER_PAUSE + 3.0)
+    assert not net.station.is_doubted(net.machine)
+    assert any(isinstance(each, ComponentReplaced) for each in net.events), "what came meanwhile is not its"
+
+
+@pytest.mark.parametrize("first", [None, 0])
+def test_one_that_gives_an_id_after_one_without_is_another(first: int | None) -> None:
+    port = Speaker(uid=first, end=6.0)
+    net = Net(port=port)
+    net.run(5.0)
+    hold(net, "P", "Q")
+    write = net.machine.write("P", 5.0, net.now)
+    port._obeys = False
+    net.run(8.0)
+    assert write.done
+    port.end, port.uid, port._obeys = 1e9, 2, True
+    net.run(3.0)
+    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert {param.value for param in net.machine.table.params.values()} <= {port.value}
+    assert any(isinstance(each, ComponentReplaced) for each in net.events)
+
+
+def test_a_vehicle_that_could_not_answer_for_a_while_is_confirmed_later() -> None:
+    port = Speaker(end=3.0)
+    net = Net(port=port)
+    net.run(9.0)
+    port.end, port.uid = 1e9, None  # its radio hears nothing
+    net.run(20.0)
+    assert net.station.is_doubted(net.machine)
+    port.uid = 1
+    net.run(6.0)
+    assert not net.station.is_doubted(net.machine)
+
+
+def test_two_of_one_kind_behind_one_radio_are_told_apart_by_their_clocks() -> None:
+    radio = Speaker()
+    net = Net(radio=radio)
+    net.run(5.0)
+    for step in range(20):
+        radio.say(SystemTime(0, int(1000 * (net.now + (100.0 if step % 2 else 900.0)))))
+        net.run(0.5)
+    assert net.kinds() == ["Contested"]
+    assert net.machine.peers.contest is not None
+    assert "two times since boot" in net.machine.peers.contest.claimants[0]
+    net.run(30.0)
+    assert net.kinds() == ["Contested", "Uncontested"]
+
+
+def test_what_comes_late_after_a_restart_is_no_second_vehicle() -> None:
+    radio = Speaker()
+    net = Net(radio=radio)
+    net.run(5.0)
+    for booted_at in (-100.0, 5.0, -100.0, 5.0, 5.0, 5.0):
+        radio.say(SystemTime(0, int(1000 * (net.now - booted_at))))
+        net.run(0.1)
+    net.run(20.0)
+    assert net.kinds() == []
+
+
+def test_a_slow_clock_is_no_other_vehicle() -> None:
+    """That of a simulation on a busy computer: 5 % slow, and a second path is found after some minutes."""
+    first, second = Speaker(), Speaker(start=301.0)
+    net = Net(a=first, b=second)
+    for _ in range(400):
+        for speaker in (first, second):
+            speaker.booted_at = -100.0 + 0.05 * net.now
+            if net.now >= speaker.start:
+                speaker.say(SystemTime(0, int(1000 * (net.now - speaker.booted_at))))
+        net.run(1.0)
+    assert net.kinds() == []
+
+
+def test_a_satellite_path_contests_nothing() -> None:
+    net = Net(a=Speaker())
+    for _ in range(30):
+        data = wire.encode(wire.HighLatency2(PX4.type, PX4.autopilot), system=1, component=1, sequence=0)
+        net.station.receive(data, "satellite", net.now)
+        net.run(1.0)
+    assert net.kinds() == []
+    assert net.machine.peers.home == "a"
+
+
+def test_a_restart_at_a_new_port_may_take_its_time_to_answer() -> None:
+    after = Speaker(uid=None, booted_at=None, start=4.0)
+    net = Net(a=silent_after(3.0), b=after)
+    net.run(2.0)
+    hold(net, "P", "Q")
+    net.machine.begin_restart(net.now)
+    net.run(10.0)
+    after.uid, after.booted_at = 1, 3.5
+    net.run(6.0)
+    assert net.machine.peers.home == "b"
+    assert not any(isinstance(each, ComponentReplaced) for each in net.events)
+    assert [*net.machine.table.params] == ["P", "Q"]
+
+
+def camera(net: Net, peer: str, value: float) -> ComponentMachine:
+    """One of the same system, which has told a value."""
+    for message in (Heartbeat(30, 8), param_value("CAM", value, index=0, count=1)):
+        net.station.receive(wire.encode(message, system=1, component=100, sequence=0), peer, net.now)
+    net.run(STEP)
+    return net.station.components[1, 100]
+
+
+def test_the_other_components_go_with_the_autopilot_that_loses_a_contest() -> None:
+    net = Net(a=silent_after(5.0, uid=1), b=Speaker(uid=2, start=1.0))
+    net.run(0.5)
+    other = camera(net, "a", 7.0)
+    assert [*other.table.params] == ["CAM"]
+    net.run(15.0)
+    assert net.kinds() == ["Contested", "Uncontested"]
+    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert dict(other.table.params) == {}
+
+
+def test_a_component_at_the_peer_of_a_rival_is_neither_kept_nor_written_to() -> None:
+    net = Net(a=Speaker(uid=1), b=silent_after(12.0, uid=2, start=2.0))
+    net.run(2.2)
+    other = camera(net, "b", 9.0)
+    assert net.station.is_doubted(other)
+    assert not other.may_be_written
+    net.run(room.JUDGING_TIME)
+    assert net.machine.peers.contest is not None
+    with pytest.raises(ContestedAddress):
+        other.write("CAM", 1.0, net.now)
+    camera(net, "b", 9.0)
+    assert net.station.is_doubted(other)
+    net.run(15.0)
+    assert net.machine.who.identity.uid == f"{1:016x}"
+    assert dict(other.table.params) == {}, "it was heard from the rival's peer"
+
+
+def test_the_components_of_an_autopilot_that_does_not_say_who_it_is_are_not_written_to() -> None:
+    port = Speaker(end=3.0)
+    net = Net(port=port)
+    net.run(2.0)
+    other = camera(net, "port", 9.0)
+    net.run(9.0)
+    port.end, port.uid = 1e9, None
+    net.run(10.0)
+    camera(net, "port", 9.0)
+    write = other.write("CAM", 5.0, net.now)
+    net.run(15.0)
+    assert isinstance(write.error, NoReply)
+    assert not any(isinstance(each, ParamSet) for each in port.heard)

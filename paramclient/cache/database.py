@@ -52,6 +52,8 @@ _ID_AT: Final = slice(68, 72)
 _LOG_MAGICS: Final = (b"\x37\x7f\x06\x82", b"\x37\x7f\x06\x83")
 _LOG_HEADER, _FRAME_HEADER = 32, 24
 """How a write-ahead log of SQLite begins, and the bytes before the first page in it and before each page."""
+_JOURNAL_MAGIC: Final = b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7"
+"""How a rollback journal of SQLite begins, once it counts."""
 
 _TRIES: Final = 3
 """Rounds of one operation: the file may be renamed under it by another process, and be damaged, once each."""
@@ -227,9 +229,7 @@ class Database:
             if self._is_absent():
                 if not writing:
                     raise _Moved
-                if _size(self._companion("-wal")):
-                    self._check_log()
-                    raise Damaged("only its write-ahead log is left")
+                self._check_alone()
                 os.close(os.open(self.path, os.O_CREAT | os.O_WRONLY, 0o600))
                 self.replacements += 1
                 self._file = self._which()
@@ -385,6 +385,26 @@ class Database:
                 self._version_of(connection)
             except (sqlite3.DatabaseError, Damaged) as error:
                 raise self._is_no_cache(error) from error
+
+    def _check_alone(self) -> None:
+        """See that where there is no file, or an empty one, nothing of another program stands beside it.
+
+        SQLite would delete it. A cache whose program was killed as it made it has a journal.
+
+        Raises:
+            Damaged: it is the log of a cache.
+            CacheError: it is something else.
+        """
+        if _size(self._companion("-wal")):
+            self._check_log()
+            raise Damaged("only its write-ahead log is left")
+        if self._companion("-shm").exists():
+            raise self._is_no_cache("there is only an index of a write-ahead log")
+        if _size(journal := self._companion("-journal")):
+            with journal.open("rb") as file:
+                begins = file.read(len(_JOURNAL_MAGIC))
+            if begins.strip(b"\0") and begins != _JOURNAL_MAGIC:
+                raise self._is_no_cache("there is only a rollback journal")
 
     def _check_log(self) -> None:
         """See by the first page, if it has that, that a log whose file is gone or empty is of a cache.

@@ -22,12 +22,20 @@ from paramclient.protocol.wire import (
 
 __all__ = ["Claim", "Verdict", "Variants", "compare", "compare_in_turn"]
 
+ANOTHER_START: Final = 10.0
+"""Seconds by which two starts must differ to be those of two vehicles, where one peer tells both in turn:
+more than by what a clock may come late."""
+TURNS: Final = 4
+TURNS_WINDOW: Final = 15.0
+"""How often one must follow the other in so many seconds: what comes late after a restart does so twice."""
 START_TOLERANCE: Final = 2.0
 """Seconds by which the boot times of one vehicle may differ that were heard over two ways: its messages take
 longer on one of them."""
 CLOCK_DELAY: Final = 5.0
 """Seconds by which a clock may come late over a slow link. One that was told less than that after another
 peer's start may belong to the run before that start."""
+CLOCK_DRIFT: Final = 0.05
+"""The share by which a vehicle's clock may go slower than ours: that of a simulation on a busy computer."""
 CLAIMED_CLOCKS_MAX: Final = 4
 """Message ids whose time since boot is remembered for one peer."""
 VARIANTS_MAX: Final = 8
@@ -104,6 +112,34 @@ class _Clock(NamedTuple):
     boot_ms: int
 
 
+class _Starts:
+    """The starts that messages of one id imply, as far as they lie apart.
+
+    Attributes:
+        turns: when the start was another one than in the message before, in the last 15 s.
+    """
+
+    __slots__ = ("_current", "turns")
+
+    def __init__(self) -> None:
+        self._current: float | None = None
+        self.turns: list[float] = []
+
+    def tell(self, started_at: float, now: float) -> None:
+        if self._current is not None and abs(started_at - self._current) > ANOTHER_START:
+            self.turns.append(now)
+        self._current = started_at
+        self.settle(now)
+
+    def settle(self, now: float) -> None:
+        self.turns = [at for at in self.turns if now - at < TURNS_WINDOW]
+
+    def age(self, seconds: float) -> None:
+        self.turns.clear()
+        if self._current is not None:
+            self._current -= seconds
+
+
 class Claim:
     """What one peer says under one address.
 
@@ -120,6 +156,7 @@ class Claim:
 
     __slots__ = (
         "_clocks",
+        "_starts",
         "asked_at",
         "asks",
         "first_at",
@@ -139,6 +176,7 @@ class Claim:
         self.kind: Variants[tuple[int, int]] = Variants()
         self.uid: Variants[str] = Variants()
         self._clocks: dict[int, _Clock] = {}
+        self._starts: dict[int, _Starts] = {}
         self.asks = 0
         self.asked_at = -math.inf
         self.verdict = Verdict.OPEN
@@ -149,7 +187,19 @@ class Claim:
     @property
     def is_mixed(self) -> bool:
         """Whether several vehicles speak through this peer."""
-        return self.kind.is_mixed or self.uid.is_mixed
+        return self.kind.is_mixed or self.uid.is_mixed or self.has_two_starts
+
+    @property
+    def has_two_starts(self) -> bool:
+        """Whether the times since boot are those of several vehicles."""
+        return any(len(each.turns) >= TURNS for each in self._starts.values())
+
+    def settle(self, now: float, timeout: float) -> None:
+        """Forget what was not said for the timeout."""
+        self.kind.settle(now, timeout)
+        self.uid.settle(now, timeout)
+        for each in self._starts.values():
+            each.settle(now)
 
     @property
     def is_moving(self) -> bool:
@@ -174,14 +224,20 @@ class Claim:
         if not boot_ms or (clock is None and len(self._clocks) >= CLAIMED_CLOCKS_MAX):
             return
         started_at = now - boot_ms / 1000
+        self._starts.setdefault(message_id, _Starts()).tell(started_at, now)
         is_same_run = (
             clock is not None
             and boot_ms + 1000 * OUT_OF_ORDER >= clock.boot_ms
             and started_at <= clock.started_at + CLOCK_DELAY
         )
-        if clock is not None and is_same_run:
-            started_at = min(started_at, clock.started_at)  # delays only ever make it later
+        if clock is not None and is_same_run:  # delays only ever make it later
+            started_at = min(started_at, clock.started_at + CLOCK_DRIFT * (now - clock.told_at))
         self._clocks[message_id] = _Clock(started_at, now, boot_ms)
+
+    @property
+    def is_by_satellite(self) -> bool:
+        """Whether nothing but HIGH_LATENCY2 tells what it is: that path is not asked, and no contest."""
+        return self.kind.current is not None and self.heartbeat is None
 
     @property
     def has_own_uid(self) -> bool:
@@ -217,6 +273,8 @@ class Claim:
         self.first_at -= seconds
         self.heard_at -= seconds
         self.version_at -= seconds
+        for each in self._starts.values():
+            each.age(seconds)
         self._clocks = {
             number: _Clock(clock.started_at - seconds, clock.told_at - seconds, clock.boot_ms)
             for number, clock in self._clocks.items()
@@ -227,7 +285,9 @@ class Claim:
         kinds = [kind_in_words(*kind) or "an unknown kind" for kind in self.kind.all]
         words = " and ".join(dict.fromkeys(kinds)) or "no heartbeat"
         ids = " and ".join(uid for uid in self.uid.all if uid)
-        return f"{words}{f' with the id {ids}' if ids else ''} from {peer_in_words(self.peer)}"
+        words += f" with the id {ids}" if ids else ""
+        words += " that tells two times since boot in turn" if self.has_two_starts else ""
+        return f"{words} from {peer_in_words(self.peer)}"
 
 
 def compare(mine: Claim, other: Claim, *, is_over: bool, may_ask: bool) -> tuple[Verdict, str]:

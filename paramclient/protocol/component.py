@@ -69,7 +69,7 @@ class ComponentMachine(Parts):
         encoding: what the user said about its encoding, or None.
         upkeep: what is done for its table without being asked.
         is_link_busy: whether anything is being asked for on the link.
-        is_vehicle_doubted: whether it is open which vehicle its autopilot belongs to.
+        vehicle: gives all components of its vehicle.
         another: is told that another vehicle has taken the system id; by default `become_another`.
         read_clock: has `boot_clock` called with clocks from its telemetry for a while; see `ClockSampling`.
         peer: the peer that it is of, where components are kept apart by their peers; else None.
@@ -125,7 +125,7 @@ class ComponentMachine(Parts):
         if sequence is not None and self.presence.numbering_begins(sequence):
             self._numbering_began(silent_since, now)
         if isinstance(message, Heartbeat):
-            self.who.heartbeat(message)
+            self._kind_told(message, now)
             state = self.presence.state
             if self.presence.heartbeat(message, now):
                 self._rebooted(now)
@@ -165,10 +165,17 @@ class ComponentMachine(Parts):
         elif isinstance(message, ComponentMetadata):
             self.descriptions.heard(message, now)
         elif isinstance(message, HighLatency2):
-            self.who.heartbeat(message)
+            self._kind_told(message, now)
             self.presence.high_latency()
         self.who.heard(now)
         self._follow_identity(now)
+
+    def _kind_told(self, message: Heartbeat | HighLatency2, now: float) -> None:
+        """Another autopilot or vehicle type is another vehicle's, or the same one has other firmware."""
+        if self.who.heartbeat(message) and self.who.settled:
+            self._doubt()
+            self.sync.check(now)
+            self.who.doubt(now)
 
     def receive_contested(self, message: Message, now: float, *, version: int = 2) -> None:
         """Take a message while several vehicles have the address: it shows that one is there."""
@@ -400,8 +407,9 @@ class ComponentMachine(Parts):
             NoReply: the component is lost. Nothing was sent.
         """
         self.check_present(f"PARAM_SET {name} to {self.system}/{self.component}", now)
-        if self.who.is_unconfirmed:
-            self.who.doubt(now)
+        for each in (self, *self._autopilots()):
+            if each.who.is_unconfirmed:
+                each.who.doubt(now)
         name = self.spelling(name)
         known = self.table.params.get(name)
         if known is not None and known.trust is not Trust.CACHED and self.may_be_written:
@@ -505,21 +513,21 @@ class ComponentMachine(Parts):
             raise NoReply(f"{what} (lost)", attempts=0, waited=silence)
 
     def check_uncontested(self) -> None:
-        """See whether one vehicle alone has the address.
+        """See whether one vehicle alone has the address, and that of its autopilot.
 
         Raises:
             ContestedAddress: several have it.
         """
-        if self.peers.contest is not None:
-            raise self.peers.contest.error
+        for each in (self, *self._autopilots()):
+            if each.peers.contest is not None:
+                raise each.peers.contest.error
 
     # peers
 
     def peer_moved(self, claim: Claim, now: float, verdict: Verdict) -> None:
         """Another peer has the address now, and is asked who it is."""
         if verdict is Verdict.OTHER:
-            self.who.forget(now)
-            self._another(now)
+            self._replaced(now)
         else:
             if verdict is Verdict.OPEN:
                 self._doubt()
@@ -532,20 +540,39 @@ class ComponentMachine(Parts):
         """Several vehicles have the address: whoever waits for one of them gets the error."""
         self._emit(events.ComponentContested(self, contest))
         self.fail_all(contest.error, now)
+        self._forget_companions(contest.error, now)
 
     def contest_ended(self, claim: Claim, now: float, *, is_same: bool) -> None:
         """One vehicle has the address: it is asked who it is before anything counts or is kept."""
         if is_same:
             self._doubt()
             self.who.doubt(now)
+            what = f"the components of system {self.system}: it is being asked which vehicle it is"
+            self._forget_companions(NoReply(what, attempts=0, waited=0.0), now)
         else:
-            self.who.forget(now)
-            self.become_another(now)
+            self._replaced(now)
         self._emit(events.ComponentUncontested(self))
         self._known_as = None
         self.sync.check(now)
         self._take_claim(claim, now)
         self.clock_requests.want(now)
+
+    def _forget_companions(self, error: ParamClientError, now: float) -> None:
+        """Where the autopilot was contested, its other components may have been heard from either vehicle."""
+        if self.who.is_autopilot:
+            for each in self._vehicle():
+                if each is not self and each.who.has_parameters:
+                    each.fail_all(error, now)
+                    each.become_another(now)
+
+    def _replaced(self, now: float) -> None:
+        """Another vehicle has the address: with an autopilot go the components of its vehicle."""
+        is_autopilot = self.who.is_autopilot
+        self.who.forget(now)
+        if is_autopilot:
+            self._another(now)
+        else:
+            self.become_another(now)
 
     def _take_claim(self, claim: Claim, now: float) -> None:
         """Take what a peer has said of itself before its messages counted."""
@@ -794,10 +821,16 @@ class ComponentMachine(Parts):
                 self.clock_requests.want_baseline(now)
         if self.writes.is_held and self.may_be_written:
             self.writes.proceed(now)
-        elif self.writes.queues and self.who.is_unconfirmed:
-            what = f"{self.system}/{self.component} has not said since it was away which vehicle it is"
-            error = NoReply(what, attempts=self.who.attempts, waited=now - self.who.doubted_at)
-            self.writes.fail_all(error, now)
+        elif self.writes.queues:
+            self._fail_unconfirmed(now)
+
+    def _fail_unconfirmed(self, now: float) -> None:
+        """Nothing is written where it was asked in vain which vehicle it is, or that of its autopilot."""
+        for each in (self, *self._autopilots()):
+            if each.who.is_unconfirmed:
+                what = f"{each.system}/{each.component} has not said since it was away which vehicle it is"
+                waited = now - each.who.doubted_at
+                self.writes.fail_all(NoReply(what, attempts=each.who.attempts, waited=waited), now)
 
     def _doubt_identity(self, now: float) -> None:
         """The table is not what it was: it may be another vehicle that answers by now."""

@@ -50,6 +50,16 @@ DOUBT_PATIENCE: Final = 5.0
 """Seconds for which one that has said it before is asked at the least: it may only be starting."""
 DOUBT_PACE: Final = 1.0
 """Seconds between two questions when the usual number of them has not helped."""
+LATER_PACE: Final = 5.0
+"""Seconds between two questions to one that has given its hardware id before and did not in that time, while
+it is heard: its radio may have been deaf."""
+
+
+_WAYS: Final = (
+    (MAV_CMD_REQUEST_MESSAGE, float(AUTOPILOT_VERSION_ID)),
+    (MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0),
+)
+"""The commands that bring AUTOPILOT_VERSION, and their first parameters."""
 
 
 def judge_encoding(
@@ -126,6 +136,8 @@ class Identification:
         self._denied_at = math.inf  # when the last way of asking was refused
         self._lost_at = math.inf  # when the answer counts as lost, as the request was acknowledged
         self._beat_awaited_until = math.inf  # while a heartbeat may still tell the encoding
+        self._heard_at = -math.inf
+        self._was_doubted = False  # since the last version
 
     @property
     def has_parameters(self) -> bool:
@@ -170,7 +182,7 @@ class Identification:
     @property
     def is_unconfirmed(self) -> bool:
         """Whether another vehicle may have taken its place, and it was asked in vain."""
-        return self.was_away and not self._is_asking
+        return self.was_away and not self._is_asking and self._may_ask
 
     @property
     def may_be_written(self) -> bool:
@@ -192,27 +204,33 @@ class Identification:
         """Whether its AUTOPILOT_VERSION is awaited."""
         return self._is_asking
 
-    def heartbeat(self, message: Heartbeat | HighLatency2) -> None:
-        """Take a heartbeat, or what stands for it."""
+    def heartbeat(self, message: Heartbeat | HighLatency2) -> bool:
+        """Take a heartbeat, or what stands for it; true when it shows another kind than was known."""
         self._beat_awaited_until = math.inf
+        is_another_kind = False
         if (message.autopilot, message.type) != (self.autopilot, self.vehicle_type):
+            is_another_kind = self.vehicle_type is not None
             self.autopilot = message.autopilot
             self.vehicle_type = message.type
             self.identity = replace(self.identity, autopilot=message.autopilot, vehicle_type=message.type)
             self._judge()
+        return is_another_kind
 
     def heard(self, now: float) -> None:
         """Something came: ask who it is, if that has not been asked."""
+        self._heard_at = now
         if not self.attempts and self.has_parameters:
             self._ask(now)
 
     def doubt(self, now: float) -> None:
         """It was away, or has started again: ask who it is now."""
         if self.has_parameters:
-            self.was_away = self.identity.uid is not None
+            is_open = self._may_ask and (self.settled or self.was_away)
+            self.was_away = self.identity.uid is not None or is_open
+            self._was_doubted = self._was_doubted or self.settled
             self.attempts = 0
             self.doubted_at = now
-            if self.was_away:
+            if self.identity.uid is not None:
                 self._asks_until = now + DOUBT_PATIENCE
             self._ask(now)
 
@@ -226,13 +244,19 @@ class Identification:
         self._beat_awaited_until = math.inf
         self._judge()
         self.was_away = True
+        self._was_doubted = False
         self.attempts = 0
         self.doubted_at = now
         self._asks_until = now + DOUBT_PATIENCE
         self._ask(now)
 
     def version(self, message: AutopilotVersion, now: float) -> bool:
-        """Take an AUTOPILOT_VERSION; true when it shows another vehicle than the one known so far."""
+        """Take an AUTOPILOT_VERSION; true when what is known may not be of the vehicle that has sent it.
+
+        So it is with another hardware id, with the first one where there may have been another vehicle, and
+        with any where it was open for a while who speaks.
+        """
+        was_unconfirmed = self.is_unconfirmed
         if self._is_asking:
             self._round_trip.answered(self._asked_at, now, self.attempts)
         self._is_asking = self.was_away = False
@@ -256,10 +280,12 @@ class Identification:
         self._judge()
         if self.autopilot is None and not message.capabilities & ENCODING_CAPABILITIES:
             self._beat_awaited_until = now + HEARTBEAT_PATIENCE
-        is_another = self.settled and before.uid is not None and before.key != self.identity.key
+        is_known = before.uid is not None or self._was_doubted
+        is_another = self.settled and is_known and before.key != self.identity.key
+        self._was_doubted = False
         self.settled = True
         self.known_at = now
-        return is_another
+        return is_another or was_unconfirmed
 
     def ask_again(self, now: float) -> None:
         """Another vehicle may have taken the address: ask, if it has ever been said who it is."""
@@ -297,6 +323,8 @@ class Identification:
 
     def _next_request_at(self) -> float:
         """When to ask again, or infinity; that follows what other answers tell of the link."""
+        if self.is_unconfirmed:
+            return self._asked_at + LATER_PACE if self._heard_at > self._asked_at else math.inf
         if not self._is_asking:
             return math.inf
         pause = self._round_trip.repeat_timeout(self.attempts)
@@ -312,6 +340,9 @@ class Identification:
     def _ask(self, now: float) -> None:
         if not self._may_ask:
             return
+        if self.is_unconfirmed and self.attempts:
+            self._request(now, _WAYS)
+            return
         if self.attempts >= self._tries and now >= self._asks_until:
             self._is_asking = False
             self.settled = True
@@ -319,18 +350,18 @@ class Identification:
             return
         was_refused = self._denied_at < math.inf
         self.attempts += 1
-        self._asked_at = now
         self._is_asking = True
-        self._denied_at = self._lost_at = math.inf
-        ways = [
-            (MAV_CMD_REQUEST_MESSAGE, float(AUTOPILOT_VERSION_ID)),
-            (MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0),
-        ]
+        ways: tuple[tuple[int, float], ...] = _WAYS
         if was_refused:
-            ways = [ways[(self.attempts + 1) % 2]]
+            ways = (_WAYS[(self.attempts + 1) % 2],)
         elif self.attempts == 1:
-            ways = ways[:1]
-        for command, first in ways:  # after silence both: a request or its answer may have been lost
+            ways = _WAYS[:1]
+        self._request(now, ways)  # after silence both: a request or its answer may have been lost
+
+    def _request(self, now: float, ways: tuple[tuple[int, float], ...]) -> None:
+        self._asked_at = now
+        self._denied_at = self._lost_at = math.inf
+        for command, first in ways:
             self._send(CommandLong(*self._target, command, (first, *[0.0] * 6)))
 
     def _judge(self) -> None:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 
+from paramclient.errors import ParamClientError
 from paramclient.identity import Identity
 from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
 from paramclient.protocol.authors import Authors
@@ -60,7 +61,7 @@ class Parts(ABC):
         encoding: Encoding | None = None,
         upkeep: Upkeep | None = None,
         is_link_busy: Callable[[], bool] = lambda: False,
-        is_vehicle_doubted: Callable[[], bool] = lambda: False,
+        vehicle: Callable[[], Iterable[Parts]] = lambda: (),
         another: Callable[[float], None] | None = None,
         read_clock: Callable[[float], None] = lambda now: None,
         peer: Peer | None = None,
@@ -180,7 +181,7 @@ class Parts(ABC):
         self._listens_only = upkeep.listens_only
         self._another = another or self.become_another
         self._read_clock = read_clock
-        self._is_vehicle_doubted = is_vehicle_doubted
+        self._vehicle = vehicle
         self._known_as: str | None = None  # the key of the identity that was reported
         self._saved_at = -math.inf  # when all that we have written will have been saved
         self._authors = Authors()
@@ -218,6 +219,10 @@ class Parts(ABC):
         """One vehicle has the address."""
 
     @abstractmethod
+    def fail_all(self, error: ParamClientError, now: float) -> None:
+        """Every operation ends with the error."""
+
+    @abstractmethod
     def become_another(self, now: float) -> None:
         """Another vehicle has taken this system id."""
 
@@ -242,7 +247,9 @@ class Parts(ABC):
     @property
     def may_be_written(self) -> bool:
         """Whether it is certain whom a write reaches, and what it makes of it."""
-        return self.who.may_be_written and not self._is_vehicle_doubted()
+        home = self.peers.home
+        is_open = any(each.who.was_away or each.peers.is_rival(home) for each in self._autopilots())
+        return self.who.may_be_written and not is_open
 
     @property
     def state(self) -> str:
@@ -258,6 +265,10 @@ class Parts(ABC):
         if not self.table.params:
             return "new"
         return "cached" if self.table.complete else "partial"
+
+    def _autopilots(self) -> Iterator[Parts]:
+        """The autopilot that it belongs to, where that is another component."""
+        return (each for each in self._vehicle() if each is not self and each.who.is_autopilot)
 
     @property
     def is_restarting(self) -> bool:

@@ -153,7 +153,13 @@ class ComponentPeers:
     @property
     def is_unclear(self) -> bool:
         """Whether it is open which vehicle speaks: nothing may be kept that came meanwhile."""
-        return self.contest is not None or (self._mine is not None and self._mine.is_moving)
+        mine = self._mine
+        return self.contest is not None or (mine is not None and (mine.is_moving or mine.is_mixed))
+
+    def is_rival(self, peer: Peer) -> bool:
+        """Whether a peer speaks for the component too, and is not proven to be the same vehicle."""
+        claim = self._others.get(peer)
+        return claim is not None and claim.verdict is not Verdict.SAME
 
     def takes(self, peer: Peer, now: float) -> bool:
         """Whether a message without anything to tell vehicles apart may be taken, such as PARAM_VALUE."""
@@ -176,7 +182,7 @@ class ComponentPeers:
             self._review(now)
             return self._is_path(claim)
         self.heard_at = claim.heard_at = now
-        if claim.is_moving:
+        if claim.is_moving or claim.is_mixed:
             self._review(now)
         return self.contest is None
 
@@ -186,7 +192,9 @@ class ComponentPeers:
         claim = self._mine if peer == self.home else self._others.get(peer)
         if claim is not None:
             claim.take_clock(message_id, boot_ms, now)
-        return is_taken
+            if claim is self._mine and claim.is_mixed and self.contest is None:
+                self._review(now)
+        return is_taken and self.contest is None
 
     @property
     def wants_clocks(self) -> bool:
@@ -267,8 +275,7 @@ class ComponentPeers:
         self._others = {p: each for p, each in self._others.items() if now - each.heard_at < timeout}
         mine = self._mine
         if mine is not None:
-            mine.kind.settle(now, timeout)
-            mine.uid.settle(now, timeout)
+            mine.settle(now, timeout)
             if mine.uid.is_moving:
                 self._ask_again(mine, now)
         difference = ""
@@ -316,7 +323,10 @@ class ComponentPeers:
         rivals = [
             each
             for each in self._others.values()
-            if each.verdict is Verdict.OTHER and is_here and self.heard_at > each.first_at
+            if each.verdict is Verdict.OTHER
+            and is_here
+            and self.heard_at > each.first_at
+            and not (each.is_by_satellite and mine is not None and each.kind.current == mine.kind.current)
         ]
         if self.contest is None and (is_mixed or rivals):
             assert mine is not None
@@ -372,7 +382,8 @@ class ComponentPeers:
     def _awaits_id(self, claim: Claim, now: float) -> bool:
         """Whether a further peer is still being asked for the hardware id of the vehicle that is silent."""
         mine = self._mine
-        if mine is None or self.contest is not None or self._is_over(claim, now):
+        is_over = self._is_over(claim, now) and not self._host.is_restarting
+        if mine is None or self.contest is not None or is_over:
             return False
         return self._hides_id(mine, claim) and self._in_turn(mine, claim) is Verdict.OPEN
 

@@ -438,6 +438,8 @@ class Station:
         autopilot = self.autopilot_of(*machine.vehicle) or machine
         if autopilot.peers.is_unclear or machine.peers.is_unclear:
             return True
+        if autopilot is not machine and autopilot.peers.is_rival(machine.peers.home):
+            return True
         is_lost = autopilot is not machine and autopilot.presence.is_lost
         return is_lost or autopilot.who.was_away
 
@@ -610,6 +612,8 @@ class Station:
         elif not machine.peers.hears(message, peer, now):
             if machine.peers.contest is not None and peer == machine.peers.home:
                 machine.receive_contested(message, now, version=frame.version)
+                if isinstance(message, Heartbeat):
+                    self._clock_sampling.open(address, now)  # it may be clocks that tell them apart
             return
         machine.receive(message, now, version=frame.version, moment=moment, sequence=frame.sequence)
         if isinstance(message, Heartbeat):
@@ -664,7 +668,7 @@ class Station:
             encoding=self._encoding,
             upkeep=self._upkeep,
             is_link_busy=lambda: self._is_busy,
-            is_vehicle_doubted=lambda: self._autopilot_is_doubted(vehicle),
+            vehicle=lambda: self._of_vehicle.get(vehicle, ()),
             another=lambda now: self._become_another(vehicle, now),
             read_clock=lambda now: self._clock_sampling.open(address, now),
             peer=peer if self._splits else None,
@@ -718,10 +722,6 @@ class Station:
         """Another vehicle has taken a system id, with all of its components."""
         for machine in self._of_vehicle[vehicle]:
             machine.become_another(now)
-
-    def _autopilot_is_doubted(self, vehicle: tuple[int, Peer]) -> bool:
-        autopilot = self.autopilot_of(*vehicle)
-        return autopilot is not None and autopilot.who.is_doubted
 
     def _receive_foreign_set(self, message: ParamSet, sender: Address, now: float) -> None:
         station = f"station {sender[0]}/{sender[1]}"
