@@ -42,8 +42,8 @@ sys.path.insert(0, str(Path(__file__).parent.parent))
 import anyio
 
 from paramclient import ParamCache, ParamClient, service
+from paramclient.client.cache_writer import FLUSH_INTERVAL
 from paramclient.sim import PX4Vehicle
-from paramclient.writethrough import FLUSH_INTERVAL
 from tests.postgres import PROGRAMS, Server, database_on, server
 
 LONGEST_LIFE = 1.0

@@ -24,8 +24,8 @@ from typing import Any
 
 from oracle import FILE_FRAME, TellingLink, file_oracle_time, oracle_time
 
-from paramclient.protocol.fetch import Fetch
-from paramclient.protocol.result import FetchResult
+from paramclient.protocol.params.fetch import Fetch
+from paramclient.protocol.params.fetch_result import FetchResult
 from paramclient.protocol.station import Station
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
 

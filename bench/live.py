@@ -37,9 +37,9 @@ from peers import TITLES, firmware, machine
 
 from paramclient import Component, FetchResult, ParamClient, ParamSet, WrittenParam
 from paramclient.errors import LinkError, NoReply, ParamClientError, UsageError, VehicleArmed
+from paramclient.model.values import Param
 from paramclient.protocol.wire import AUTOPILOT_COMPONENT, CommandAck, CommandLong, Framer, decode, encode
 from paramclient.provision import apply
-from paramclient.values import Param
 from paramclient.version import __version__
 from tests.live.choice import another_value
 from tests.live.journal import Journal, check_disarmed

@@ -24,7 +24,7 @@ from typing import Any, Final
 
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
-from paramclient.protocol.packfetch import PARAMETER_FILE, WITH_DEFAULTS
+from paramclient.protocol.params.file_download import PARAMETER_FILE, WITH_DEFAULTS
 from paramclient.sim import Air, Endpoint, FaultyLink
 
 __all__ = ["FILE_FRAME", "TellingLink", "file_oracle_time", "oracle_time"]

@@ -45,8 +45,8 @@ from typing import Any
 import anyio
 
 from paramclient import Identity, ParamClient
-from paramclient.identity import autopilot_name
 from paramclient.links import create_link, serve_endpoint
+from paramclient.model.identity import autopilot_name
 from paramclient.protocol import wire
 from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
 from paramclient.version import __version__

@@ -49,10 +49,10 @@ from paramclient import FetchedAll, FetchResult, ParamCache, ParamClient
 from paramclient.cache import CachedComponent, TableUpdate
 from paramclient.links import Peer, parse_link
 from paramclient.links.udp import UdpIn
+from paramclient.model.values import ParamType
 from paramclient.protocol.station import HEARD
 from paramclient.protocol.wire import Framer
 from paramclient.sim import PX4Vehicle, SimParam, px4_table
-from paramclient.values import ParamType
 
 SYSTEMS = (1, 10, 50, 250)
 LINKS = 20

@@ -25,9 +25,9 @@ from pathlib import Path
 sys.path.insert(0, str(Path(__file__).parent.parent))
 
 from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
-from paramclient.identity import Identity
-from paramclient.paramset import ParamSet
-from paramclient.values import Param, ParamType, bits_of
+from paramclient.model.identity import Identity
+from paramclient.model.paramset import ParamSet
+from paramclient.model.values import Param, ParamType, bits_of
 from tests.postgres import PROGRAMS, database_on, server
 
 NOW = 1_795_000_000.0

@@ -22,11 +22,11 @@ from unittest import mock
 
 from fuzz.draw import Draw
 from paramclient.cache import ParamCache, StoredParam, TableState, TableUpdate
-from paramclient.cache.packed import pack, row_checksum, unpack
+from paramclient.cache.packed_table import pack, row_checksum, unpack
 from paramclient.cache.rows import Damaged
 from paramclient.errors import CacheError, UnknownVehicle
-from paramclient.identity import Identity
-from paramclient.values import Param, ParamType, Trust
+from paramclient.model.identity import Identity
+from paramclient.model.values import Param, ParamType, Trust
 
 __all__ = ["LONGEST", "run"]
 

@@ -13,21 +13,23 @@ from unittest import mock
 
 from fuzz.draw import Draw
 from paramclient.errors import ContestedAddress, NoReply, ParamClientError, UsageError
-from paramclient.protocol import authors, station, table, traffic, wire
+from paramclient.model.values import Encoding, Param, Trust, Value, known_type
+from paramclient.protocol import station, wire
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.descriptions import DescriptionAsk
-from paramclient.protocol.fetch import Fetch
 from paramclient.protocol.ftp import FileRead
-from paramclient.protocol.operation import Operation
-from paramclient.protocol.overhear import Overhearing
-from paramclient.protocol.reads import Read
-from paramclient.protocol.restart import Restart
-from paramclient.protocol.result import Policy, Sampled
+from paramclient.protocol.params import change_origin, table
+from paramclient.protocol.params.fetch import Fetch
+from paramclient.protocol.params.fetch_result import Policy, Sampled
+from paramclient.protocol.params.passive import Overhearing
+from paramclient.protocol.params.reads import Read
+from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.writes import Write
+from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.station import Station
-from paramclient.protocol.sync import Upkeep
+from paramclient.protocol.stats import traffic
+from paramclient.protocol.vehicle.metadata_location import DescriptionAsk
+from paramclient.protocol.vehicle.reboot import Restart
 from paramclient.protocol.wire import HASH_CHECK, NO_INDEX, Framer, Message
-from paramclient.protocol.writes import Write
-from paramclient.values import Encoding, Param, Trust, Value, known_type
 
 __all__ = ["LONGEST", "run"]
 
@@ -40,10 +42,10 @@ BOUNDS: Final = (
     (table, "MOST_NAMES", 12),
     (table, "ENOUGH_NAMES", 6),
     (table, "MOST_NAMES_OF_LINK", 25),
-    (authors, "MOST_CHANGES", 5),
+    (change_origin, "MOST_CHANGES", 5),
     (traffic, "MOST_COMPONENTS", 4),
     (traffic, "MOST_PEERS", 3),
-    (authors, "MOST_FOREIGN_SETS", 4),
+    (change_origin, "MOST_FOREIGN_SETS", 4),
 )
 LISTENS: Final = 0xE0
 """First bytes of an input from here on mean a station that sends nothing."""

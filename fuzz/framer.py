@@ -9,7 +9,7 @@ from pymavlink.generator.mavcrc import x25crc
 
 from fuzz.draw import Draw
 from paramclient.protocol import wire
-from paramclient.protocol.sniff import MOST_KEPT, Sniffer
+from paramclient.protocol.stats.sniffer import MOST_KEPT, Sniffer
 from paramclient.protocol.wire import Frame, Framer, Signer, SigningKey, SigningPolicy, Verifier
 
 __all__ = ["LONGEST", "run"]

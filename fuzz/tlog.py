@@ -20,10 +20,10 @@ from paramclient.links import tlog
 from paramclient.links.names import LinkKind, LinkSpec
 from paramclient.links.replay import ReplayLink
 from paramclient.links.tlog import Record, open_log, read_records
-from paramclient.logs import ImportedTable, import_log
+from paramclient.logs.telemetry import ImportedTable, import_log
+from paramclient.model.values import Encoding, bits_of, decode
 from paramclient.protocol import wire
 from paramclient.protocol.wire import NO_INDEX, Framer, Message
-from paramclient.values import Encoding, bits_of, decode
 
 __all__ = ["LONGEST", "run"]
 

@@ -15,8 +15,23 @@ from paramclient.cache import (
     Snapshot,
     SnapshotSummary,
 )
-from paramclient.client import FetchedAll, ParamClient
-from paramclient.component import Component
+from paramclient.client.client import FetchedAll, ParamClient
+from paramclient.client.component import Component
+from paramclient.client.events import (
+    Changes,
+    Contested,
+    Event,
+    Events,
+    Found,
+    Heard,
+    Lost,
+    Rebooted,
+    Resynced,
+    Uncontested,
+)
+from paramclient.client.files import Ftp
+from paramclient.client.signing import Signing, key_from_environment, read_key
+from paramclient.client.stats import ClientStats
 from paramclient.errors import (
     AmbiguousVehicle,
     AnotherVehicle,
@@ -46,35 +61,29 @@ from paramclient.errors import (
     VehicleArmed,
     VehicleError,
 )
-from paramclient.events import (
-    Changes,
-    Contested,
-    Event,
-    Events,
-    Found,
-    Heard,
-    Lost,
-    Rebooted,
-    Resynced,
-    Uncontested,
-)
 from paramclient.files import FileForm, ParamFile, read_file, write_file
-from paramclient.ftp import Ftp
-from paramclient.identity import Identity
-from paramclient.params import ParamMap
-from paramclient.paramset import ParamSet, WrittenParam
-from paramclient.protocol.change import Change
+from paramclient.model.comparison import (
+    Comparison,
+    Difference,
+    Moved,
+    Standing,
+    compare,
+    defaults_of,
+    same_value,
+)
+from paramclient.model.identity import Identity
+from paramclient.model.params import ParamMap
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import Encoding, Param, ParamType, Trust
 from paramclient.protocol.ftp import DirectoryEntry
-from paramclient.protocol.peers import Contest
-from paramclient.protocol.result import FetchResult, Policy, Progress
-from paramclient.protocol.sampling import Sample
-from paramclient.protocol.sync import SyncState
-from paramclient.protocol.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport
+from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.fetch_result import FetchResult, Policy, Progress
+from paramclient.protocol.params.sampling import Sample
+from paramclient.protocol.params.sync import SyncState
+from paramclient.protocol.params.writes import SetResult
+from paramclient.protocol.stats.traffic import ComponentTraffic, MessageTraffic, RadioStatus, TrafficReport
+from paramclient.protocol.vehicle.peers import Contest
 from paramclient.protocol.wire import Refusal, SigningKey, SigningPolicy, SigningReport, SigningStream
-from paramclient.protocol.writes import SetResult
-from paramclient.signing import Signing, key_from_environment, read_key
-from paramclient.stats import ClientStats
-from paramclient.values import Encoding, Param, ParamType, Trust
 from paramclient.version import __version__
 
 __all__ = [
@@ -89,11 +98,13 @@ __all__ = [
     "ClientStats",
     "CommandRefused",
     "CommandResult",
+    "Comparison",
     "Component",
     "ComponentTraffic",
     "Contest",
     "Contested",
     "ContestedAddress",
+    "Difference",
     "DirectoryEntry",
     "Encoding",
     "Event",
@@ -118,6 +129,7 @@ __all__ = [
     "Lost",
     "MessageTraffic",
     "MetadataError",
+    "Moved",
     "NameSpread",
     "NoReply",
     "NotDurable",
@@ -148,6 +160,7 @@ __all__ = [
     "SigningStream",
     "Snapshot",
     "SnapshotSummary",
+    "Standing",
     "SyncState",
     "TrafficReport",
     "Trust",
@@ -161,8 +174,11 @@ __all__ = [
     "VehicleError",
     "WrittenParam",
     "__version__",
+    "compare",
+    "defaults_of",
     "key_from_environment",
     "read_key",
     "read_file",
+    "same_value",
     "write_file",
 ]

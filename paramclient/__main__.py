@@ -21,7 +21,7 @@ def main() -> NoReturn:
     """Run the command with the arguments of the process, and leave with its exit code.
 
     130 after Ctrl-C, 143 after SIGTERM and 141 when nobody reads the output any more, as for programs that
-    die of these signals; the other codes stand in `paramclient.cli.outcome`.
+    die of these signals; the other codes stand in `paramclient.cli.exit_codes`.
     """
     if missing := [name for name in LIBRARIES if find_spec(name) is None]:
         print(

@@ -15,9 +15,9 @@ from typing import Any
 
 import paramclient
 from paramclient.cache import BY_VEHICLE, ParamCache, StoredParam, TableState, TableUpdate
-from paramclient.cache.database import APPLICATION_ID
-from paramclient.identity import Identity
-from paramclient.values import Param, ParamType, from_bits
+from paramclient.cache.sqlite_file import APPLICATION_ID
+from paramclient.model.identity import Identity
+from paramclient.model.values import Param, ParamType, from_bits
 
 NOW = 1_795_000_000.0
 """20 November 2026, a time when nothing else happens."""

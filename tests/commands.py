@@ -12,10 +12,10 @@ import anyio.to_thread
 import pytest
 
 from paramclient import ParamClient
-from paramclient.cli import run, session
+from paramclient.cli import connection, run
+from paramclient.client.worker_thread import Worker
 from paramclient.links import SimLink
 from paramclient.sim import Endpoint
-from paramclient.worker import Worker
 from tests.shell import PeersLink, SwiftLoop, swift_loop
 
 
@@ -80,7 +80,7 @@ def behind(monkeypatch: pytest.MonkeyPatch, url: str) -> Put:
             link = far_end if isinstance(far_end, SimLink | PeersLink) else SimLink(far_end, url)
             return ParamClient(link, **options)
 
-        monkeypatch.setattr(session, "ParamClient", client)
+        monkeypatch.setattr(connection, "ParamClient", client)
         return url
 
     return place

@@ -6,9 +6,9 @@ import struct
 from collections.abc import Sequence
 from typing import TypeVar
 
+from paramclient.model.values import Encoding, ParamType, Value, encode
 from paramclient.protocol import wire
 from paramclient.sim import Endpoint
-from paramclient.values import Encoding, ParamType, Value, encode
 
 __all__ = ["LIST", "SIGNS_OF_LIFE", "SMALL", "Station", "cast", "indices", "names", "read", "write"]
 

@@ -17,11 +17,11 @@ import anyio.from_thread
 
 from paramclient import ParamCache, ParamClient
 from paramclient.links import SimLink
+from paramclient.model.values import ParamType, Value
 from paramclient.service import Hub, Listening, Settings, serve
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
-from paramclient.sim.table import Entry
+from paramclient.sim.param_table import Entry
 from paramclient.testing import SimVehicle
-from paramclient.values import ParamType, Value
 
 __all__ = ["BROWSER", "BROWSER_OPTIONS", "Bench", "at_work"]
 

@@ -37,10 +37,10 @@ from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple, TypeAlias
 
+from paramclient.model.values import Value
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.sim import Vehicle
-from paramclient.values import Value
 
 Messages: TypeAlias = list[tuple[float, wire.Message]]
 """Messages, each with the seconds since the log's first frame."""

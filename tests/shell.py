@@ -14,13 +14,14 @@ from unittest import mock
 
 import anyio
 
-from paramclient import Component, Param, ParamClient, ParamType, writethrough
+from paramclient import Component, Param, ParamClient, ParamType
+from paramclient.client import cache_writer
+from paramclient.client.worker_thread import Worker
 from paramclient.errors import LinkError
 from paramclient.links import Peer, SimLink
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.sim import Endpoint, GenericVehicle, PX4Vehicle, SimParam
-from paramclient.worker import Worker
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -141,7 +142,7 @@ def swiftly(test: Callable[P, Coroutine[Any, Any, T]]) -> Callable[P, T]:
             loop = runner.get_loop()
             assert isinstance(loop, SwiftLoop)
             clock = SimpleNamespace(time=lambda: loop.now + loop.ahead)
-            with mock.patch.object(Worker, "run", counted), mock.patch.object(writethrough, "time", clock):
+            with mock.patch.object(Worker, "run", counted), mock.patch.object(cache_writer, "time", clock):
                 return runner.run(test(*args, **kwargs))
 
     return run

@@ -8,18 +8,18 @@ from functools import partial
 from typing import TypedDict, TypeVar
 
 from paramclient.errors import ParamClientError
+from paramclient.model.values import Encoding, Param, ParamType, Trust, Value, encode
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import Event
-from paramclient.protocol.fetch import Fetch
-from paramclient.protocol.operation import Operation
-from paramclient.protocol.result import FetchResult
+from paramclient.protocol.params.fetch import Fetch
+from paramclient.protocol.params.fetch_result import FetchResult
+from paramclient.protocol.params.table import Table
+from paramclient.protocol.params.writes import SetResult
+from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.station import Station
-from paramclient.protocol.table import Table
 from paramclient.protocol.wire import NO_INDEX, Framer, Message, ParamValue
-from paramclient.protocol.writes import SetResult
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint
-from paramclient.values import Encoding, Param, ParamType, Trust, Value, encode
 
 __all__ = ["Memory", "Simulation", "is_so", "known", "listing_ardupilot", "param_value"]
 

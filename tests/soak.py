@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from hypothesis import Phase, seed, settings
 from hypothesis.stateful import run_state_machine_as_test
 
-from tests.test_machine import SETTINGS, Sessions
+from tests.protocol.test_state_machine import SETTINGS, Sessions
 
 PER_SEED = 100
 """Sessions that one seed stands for."""

@@ -8,9 +8,9 @@ from typing import Self
 
 from paramclient.errors import FileErrorCode
 from paramclient.links.tlog import packed_time
+from paramclient.model.values import Encoding, ParamType, encode
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
-from paramclient.values import Encoding, ParamType, encode
 from tests.simulation import param_value
 
 NOW = 1_700_000_000.0

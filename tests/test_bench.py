@@ -11,8 +11,8 @@ from pathlib import Path
 
 import pytest
 
+from paramclient.model.values import ParamType
 from paramclient.sim import ArduPilotVehicle, PX4Vehicle
-from paramclient.values import ParamType
 from tests.flying import flying
 
 ROOT = Path(__file__).parent.parent

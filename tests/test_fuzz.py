@@ -10,7 +10,8 @@ from unittest import mock
 
 import pytest
 
-from paramclient.protocol import component, reads, table
+from paramclient.protocol import component
+from paramclient.protocol.params import reads, table
 
 ROOT = Path(__file__).parent.parent
 FUZZ = ROOT / "fuzz"

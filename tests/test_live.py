@@ -14,10 +14,10 @@ import anyio.from_thread
 import anyio.lowlevel
 import pytest
 
+from paramclient.model.values import Param, ParamType, Value
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle, Vehicle
-from paramclient.values import Param, ParamType, Value
 from tests.flying import flying
 from tests.live import __main__ as suite
 from tests.live.checks import checks

@@ -14,9 +14,8 @@ and the local copy with its `outbox`. `transfer` copies tables.
 
 from __future__ import annotations
 
-from paramclient.cache.earlier import CLOCK_SLACK, SNAPSHOTS
 from paramclient.cache.fleet import FleetDiff, FleetValue, FleetVehicle, Holder, NameSpread
-from paramclient.cache.heard import HeardParams, UnixTimes
+from paramclient.cache.observed_table import HeardParams, UnixTimes
 from paramclient.cache.records import (
     BY_US,
     BY_VEHICLE,
@@ -33,6 +32,7 @@ from paramclient.cache.records import (
     by_station,
 )
 from paramclient.cache.setups import CutOff, RunningSetup, SetupNotes
+from paramclient.cache.snapshots import CLOCK_SLACK, SNAPSHOTS
 from paramclient.cache.store import ParamCache, default_path
 from paramclient.cache.tables import HISTORY_LINES
 from paramclient.cache.transfer import CopyResult

@@ -14,9 +14,9 @@ from fnmatch import fnmatchcase
 from typing import Final, TypeAlias
 
 from paramclient.cache.rows import cells, read_param
-from paramclient.cache.session import Session
-from paramclient.paramset import WrittenParam
-from paramclient.values import Param, same_bits
+from paramclient.cache.transaction import Session
+from paramclient.model.paramset import WrittenParam
+from paramclient.model.values import Param, same_bits
 
 __all__ = [
     "FleetDiff",

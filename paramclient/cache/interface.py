@@ -8,7 +8,7 @@ from typing import Protocol, TypeVar
 
 from paramclient.cache.operations import Operation
 from paramclient.cache.records import CacheChange
-from paramclient.cache.session import Session
+from paramclient.cache.transaction import Session
 
 __all__ = ["Store"]
 

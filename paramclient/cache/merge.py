@@ -8,8 +8,8 @@ from typing import Final
 
 from paramclient.cache.records import BY_VEHICLE, CachedSummary, CachedVehicle, StoredParam, TableUpdate
 from paramclient.cache.rows import Row
-from paramclient.cache.session import Line, Session
 from paramclient.cache.tables import HISTORY_LINES, applied, hashed, save
+from paramclient.cache.transaction import Line, Session
 
 __all__ = ["merge"]
 

@@ -7,16 +7,16 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Generic, TypeVar
 
-from paramclient.cache import earlier
+from paramclient.cache import snapshots
 from paramclient.cache.merge import merge
+from paramclient.cache.reconciliation import settle
 from paramclient.cache.records import Snapshot, TableUpdate
 from paramclient.cache.rows import read_param
-from paramclient.cache.session import Session
-from paramclient.cache.settle import settle
+from paramclient.cache.transaction import Session
 from paramclient.errors import NotInCache
-from paramclient.identity import Identity
-from paramclient.paramset import ParamSet
-from paramclient.values import is_portable_name
+from paramclient.model.identity import Identity
+from paramclient.model.paramset import ParamSet
+from paramclient.model.values import is_portable_name
 
 __all__ = ["Merge", "Operation", "Remove", "Save", "SetDown"]
 
@@ -122,7 +122,7 @@ class SetDown(Operation[Snapshot]):
         identity = kept.identity if isinstance(self.vehicle, str) else self.vehicle
         shown = self.resolved(session)
         assert shown.params is not None
-        return earlier.store(
+        return snapshots.store(
             session,
             owner,
             replace(shown.params, identity=identity),
@@ -137,10 +137,10 @@ class SetDown(Operation[Snapshot]):
         """The snapshot of this time."""
         [(key, _)] = self.tables
         owner = session.owner_of(key, self.component)
-        number = None if owner is None else session.snapshot_at(owner, earlier.kept_time(self.at))
+        number = None if owner is None else session.snapshot_at(owner, snapshots.kept_time(self.at))
         if owner is None or number is None:
             raise NotInCache(f"the table of {key}, component {self.component}, has just been removed")
-        return earlier.snapshot(session, owner, number)
+        return snapshots.snapshot(session, owner, number)
 
     def resolved(self, session: Session) -> SetDown:
         """The same with the parameters that the table has now, where it has none of its own."""

@@ -9,15 +9,15 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Any, Final, TypeVar
 
-from paramclient.cache.database import Database
-from paramclient.cache.earlier import read_written, written_cells
 from paramclient.cache.operations import Merge, Operation, Save, SetDown
 from paramclient.cache.records import StoredParam, TableState, TableUpdate
 from paramclient.cache.rows import Damaged, Row, identity_cells, read_identity, read_param
-from paramclient.cache.session import Session
+from paramclient.cache.snapshots import read_written, written_cells
 from paramclient.cache.sqlite import SqliteSession
+from paramclient.cache.sqlite_file import Database
+from paramclient.cache.transaction import Session
 from paramclient.cache.transfer import Whole, put_shots, put_whole
-from paramclient.paramset import ParamSet
+from paramclient.model.paramset import ParamSet
 
 __all__ = ["Entry", "LocalCopy", "packed", "unpacked"]
 

@@ -17,11 +17,11 @@ from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 from uuid import uuid4
 
-from paramclient.cache.address import Address
+from paramclient.cache.database_url import Address
 from paramclient.cache.migrations import CHANNEL, MIGRATIONS, SCHEMA
 from paramclient.cache.operations import Operation
 from paramclient.cache.rows import Damaged, Row, cells, checksum, read_rows
-from paramclient.cache.session import Session
+from paramclient.cache.transaction import Session
 from paramclient.cache.transfer import OWN_NUMBERS
 from paramclient.errors import CacheError, UsageError
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from typing import Final
 
-from paramclient.identity import Identity, autopilot_name
-from paramclient.params import ParamMap
-from paramclient.paramset import ParamSet
-from paramclient.values import Param
+from paramclient.model.identity import Identity, autopilot_name
+from paramclient.model.params import ParamMap
+from paramclient.model.paramset import ParamSet
+from paramclient.model.values import Param
 
 __all__ = [
     "BY_US",

@@ -10,9 +10,9 @@ from operator import itemgetter
 from typing import Any, Final, NamedTuple
 
 from paramclient.errors import UsageError
-from paramclient.identity import Identity
-from paramclient.params import CACHED, NOWHERE, Params, to_hold
-from paramclient.values import Param, ParamType, Trust, Value, bits_of, from_bits, known_type, same_bits
+from paramclient.model.identity import Identity
+from paramclient.model.params import CACHED, NOWHERE, Params, to_hold
+from paramclient.model.values import Param, ParamType, Trust, Value, bits_of, from_bits, known_type, same_bits
 
 __all__ = [
     "Damaged",

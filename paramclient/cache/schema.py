@@ -6,7 +6,7 @@ import sqlite3
 from collections.abc import Callable
 from typing import Final, TypeAlias
 
-from paramclient.cache.packed import packed_row, row_checksum
+from paramclient.cache.packed_table import packed_row, row_checksum
 from paramclient.cache.rows import Damaged, checksum, read_rows
 from paramclient.errors import UsageError
 

@@ -25,12 +25,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 from uuid import uuid4
 
-from paramclient.cache.address import Address
+from paramclient.cache.database_url import Address
 from paramclient.cache.operations import Operation, Remove, SetDown
 from paramclient.cache.outbox import Entry, LocalCopy
 from paramclient.cache.postgres import Away, PostgresDatabase, Revisions
 from paramclient.cache.records import CacheChange, Snapshot
-from paramclient.cache.session import Session
+from paramclient.cache.transaction import Session
 from paramclient.cache.transfer import OWN_NUMBERS, Join, take_whole
 from paramclient.errors import CacheError, UsageError
 

@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Final, TypeVar
 
-from paramclient.cache.database import Database
 from paramclient.cache.operations import Operation
-from paramclient.cache.packed import Packed, packed_row, row_checksum
+from paramclient.cache.packed_table import Packed, packed_row, row_checksum
 from paramclient.cache.records import CacheChange
 from paramclient.cache.rows import Damaged, Row, cells, checksum
-from paramclient.cache.session import Session
-from paramclient.params import Params
+from paramclient.cache.sqlite_file import Database
+from paramclient.cache.transaction import Session
+from paramclient.model.params import Params
 
 __all__ = ["SqliteSession", "SqliteStore"]
 

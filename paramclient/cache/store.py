@@ -10,8 +10,8 @@ from types import TracebackType
 
 import platformdirs
 
-from paramclient.cache import earlier, fleet, tables
-from paramclient.cache.address import Address, is_address
+from paramclient.cache import fleet, snapshots, tables
+from paramclient.cache.database_url import Address, is_address
 from paramclient.cache.fleet import FleetDiff
 from paramclient.cache.interface import Store
 from paramclient.cache.lookup import find_vehicle
@@ -26,12 +26,12 @@ from paramclient.cache.records import (
     SnapshotSummary,
     TableUpdate,
 )
-from paramclient.cache.session import Session
 from paramclient.cache.sqlite import SqliteStore
+from paramclient.cache.transaction import Session
 from paramclient.cache.transfer import CopyResult, copy_store
 from paramclient.errors import CacheError, NotInCache
-from paramclient.identity import Identity
-from paramclient.paramset import ParamSet
+from paramclient.model.identity import Identity
+from paramclient.model.paramset import ParamSet
 
 __all__ = ["ParamCache", "default_path"]
 
@@ -349,10 +349,10 @@ class ParamCache:
         def work(session: Session) -> ParamSet:
             key, owner = self._table(session, vehicle, component)
             if isinstance(when, int):
-                return earlier.snapshot(session, owner, when).params
+                return snapshots.snapshot(session, owner, when).params
             [(_, state)] = session.summaries(key, component)
             rows = session.table(owner)
-            return earlier.state_at(session, owner, state.identity, rows, when)
+            return snapshots.state_at(session, owner, state.identity, rows, when)
 
         return self._store.read(work)
 

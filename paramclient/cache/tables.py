@@ -13,8 +13,8 @@ from dataclasses import fields
 from types import MappingProxyType
 from typing import Final
 
-from paramclient.cache import earlier
-from paramclient.cache.heard import HeardParams
+from paramclient.cache import snapshots
+from paramclient.cache.observed_table import HeardParams
 from paramclient.cache.records import (
     BY_VEHICLE,
     CachedComponent,
@@ -24,10 +24,10 @@ from paramclient.cache.records import (
     TableUpdate,
 )
 from paramclient.cache.rows import Row, time_cell
-from paramclient.cache.session import Line, Session
-from paramclient.identity import Identity
-from paramclient.params import ParamMap
-from paramclient.values import is_portable_name
+from paramclient.cache.transaction import Line, Session
+from paramclient.model.identity import Identity
+from paramclient.model.params import ParamMap
+from paramclient.model.values import is_portable_name
 
 __all__ = [
     "HISTORY_LINES",
@@ -50,7 +50,7 @@ def save(session: Session, updates: Iterable[TableUpdate]) -> None:
     """Write what was learnt, in the order given: whatever is kept is older."""
     for update in updates:
         forget_other_firmware(session, update.identity)
-        earlier.watch_clock(session, update.identity.key, update.component, time_cell(update.at))
+        snapshots.watch_clock(session, update.identity.key, update.component, time_cell(update.at))
         owner = session.make(update)
         before: Mapping[str, Row] = {}
         after = before

@@ -7,12 +7,12 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Final
 
-from paramclient.cache.earlier import SNAPSHOTS
 from paramclient.cache.operations import Operation
 from paramclient.cache.records import CachedSummary, CachedVehicle, TableState, TableUpdate
 from paramclient.cache.rows import Row
-from paramclient.cache.session import Line, Session
+from paramclient.cache.snapshots import SNAPSHOTS
 from paramclient.cache.tables import HISTORY_LINES, hashed, write_state
+from paramclient.cache.transaction import Line, Session
 from paramclient.errors import CacheError, UsageError
 
 if TYPE_CHECKING:

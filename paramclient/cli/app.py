@@ -15,7 +15,7 @@ from typing import Final
 import anyio
 from cyclopts import App, CycloptsError, Parameter
 
-from paramclient.cli.outcome import ExitCode, code_of, text_of
+from paramclient.cli.exit_codes import ExitCode, code_of, text_of
 from paramclient.cli.output import printable, report, say
 from paramclient.errors import ParamClientError
 from paramclient.version import __version__
@@ -185,20 +185,20 @@ _fleet: Final = App(
 # By name: a command loads its own modules only, which halves the time until it opens its link.
 
 _app.command(
-    "paramclient.cli.vehicle:fetch",
+    "paramclient.cli.parameters:fetch",
     name="fetch",
     help_epilogue=_examples(
         "fetch udpin:0.0.0.0:14550", "fetch sim:px4 --json", "fetch tcp:127.0.0.1:5760 --system 3"
     ),
 )
 _app.command(
-    "paramclient.cli.vehicle:get",
+    "paramclient.cli.parameters:get",
     name="get",
     usage="Usage: paramclient get [OPTIONS] URL NAME [NAME...]",
     help_epilogue=_examples("get udpin:0.0.0.0:14550 MC_ROLL_P MC_PITCH_P", "get sim:ardupilot RTL_ALT"),
 )
 _app.command(
-    "paramclient.cli.vehicle:set_",
+    "paramclient.cli.parameters:set_",
     name="set",
     usage="Usage: paramclient set [OPTIONS] URL NAME VALUE|NAME=VALUE [NAME VALUE|NAME=VALUE...]",
     help_epilogue=_examples(
@@ -207,7 +207,7 @@ _app.command(
     ),
 )
 _app.command(
-    "paramclient.cli.vehicle:watch",
+    "paramclient.cli.parameters:watch",
     name="watch",
     usage="Usage: paramclient watch [OPTIONS] URL [NAME...]",
     help_epilogue=_examples("watch udpin:0.0.0.0:14550", "watch udpin:0.0.0.0:14550 MC_ROLL_P --json"),

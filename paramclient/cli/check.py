@@ -13,8 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import Parameter
 
+from paramclient.cli.connection import HEARING_PATIENCE, Deadline, listen
+from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import Id, Seconds, SigningOptions
-from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import (
     Coloured,
     milliseconds,
@@ -24,7 +25,6 @@ from paramclient.cli.output import (
     printable,
     say,
 )
-from paramclient.cli.session import HEARING_PATIENCE, Deadline, listen
 from paramclient.diagnosis import Finding, Severity, VehicleReport, check_vehicle, findings_of
 from paramclient.errors import UsageError
 from paramclient.version import __version__

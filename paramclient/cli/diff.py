@@ -7,19 +7,19 @@ from typing import Annotated, Final
 
 from cyclopts import Parameter
 
+from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_sets, meaning_of, units_of
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import Coloured, print_document, print_table, printable, say
+from paramclient.cli.param_rows import described, value_text
 from paramclient.cli.sources import resolve_all
-from paramclient.cli.written import described, value_text
-from paramclient.compare import Comparison, Difference, Moved, Standing, compare, defaults_of
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata
-from paramclient.notation import bits_written
-from paramclient.paramset import ParamSet, WrittenParam
-from paramclient.taken import NO_DEFAULTS
-from paramclient.values import type_name
+from paramclient.model.comparison import Comparison, Difference, Moved, Standing, compare, defaults_of
+from paramclient.model.notation import bits_written
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import type_name
+from paramclient.provision.vehicle_params import NO_DEFAULTS
 
 __all__ = ["diff"]
 

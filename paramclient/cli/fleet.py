@@ -7,13 +7,13 @@ from pathlib import Path
 from typing import Final
 
 from paramclient.cache import FleetDiff, FleetVehicle, Holder, NameSpread, ParamCache
+from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import CacheOptions, Id
-from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import print_document, print_table, report, say
 from paramclient.errors import UsageError
-from paramclient.notation import time_text
-from paramclient.paramset import ParamSet, WrittenParam
-from paramclient.values import Param, ParamType, check_name, format_value
+from paramclient.model.notation import time_text
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import Param, ParamType, check_name, format_value
 
 __all__ = ["fleet_diff"]
 

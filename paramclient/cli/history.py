@@ -10,14 +10,14 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.cache import CutOff, HistoryEntry, ParamCache, SetupNotes, SnapshotSummary
+from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.moments import parse_time
 from paramclient.cli.options import CacheOptions, Id
-from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import print_document, print_table
 from paramclient.cli.sources import tables_in
-from paramclient.cli.when import parse_time
 from paramclient.errors import UsageError
-from paramclient.notation import hash_text, time_text
-from paramclient.values import Param, check_name, format_value
+from paramclient.model.notation import hash_text, time_text
+from paramclient.model.values import Param, check_name, format_value
 
 __all__ = ["history"]
 
@@ -75,7 +75,7 @@ def history(
 
 def _print_entries(entries: Sequence[HistoryEntry], cut_off: Sequence[CutOff], options: CacheOptions) -> None:
     if options.json:
-        from paramclient.documents.past import HistoryDoc  # only here: loads pydantic
+        from paramclient.documents.history import HistoryDoc  # only here: loads pydantic
 
         print_document(HistoryDoc.of(entries, cut_off=cut_off))
         return
@@ -87,7 +87,7 @@ def _print_entries(entries: Sequence[HistoryEntry], cut_off: Sequence[CutOff], o
 
 def _print_snapshots(kept: Sequence[SnapshotSummary], options: CacheOptions) -> None:
     if options.json:
-        from paramclient.documents.past import SnapshotsDoc  # only here: loads pydantic
+        from paramclient.documents.history import SnapshotsDoc  # only here: loads pydantic
 
         print_document(SnapshotsDoc.of(kept))
         return

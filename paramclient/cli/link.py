@@ -11,15 +11,15 @@ from typing import Annotated, Final
 import anyio
 from cyclopts import Parameter
 
+from paramclient.cli.connection import Deadline, listen
+from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import Seconds, SigningOptions
-from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import live_view, milliseconds, print_document, print_line, print_table
-from paramclient.cli.session import Deadline, listen
-from paramclient.client import ParamClient
-from paramclient.component import Component
+from paramclient.client.client import ParamClient
+from paramclient.client.component import Component
 from paramclient.errors import NoReply, ParamClientError
-from paramclient.identity import autopilot_name
-from paramclient.protocol.traffic import ComponentTraffic, TrafficReport
+from paramclient.model.identity import autopilot_name
+from paramclient.protocol.stats.traffic import ComponentTraffic, TrafficReport
 from paramclient.protocol.wire import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, enum_word
 
 __all__ = ["link"]

@@ -11,14 +11,14 @@ from typing import Final
 import anyio
 
 from paramclient.cache import ParamCache
+from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.options import CacheOptions
-from paramclient.cli.outcome import ExitCode, code_of
 from paramclient.cli.output import print_document, print_table, report
 from paramclient.errors import ParamClientError
-from paramclient.identity import autopilot_name
 from paramclient.links import LinkKind, parse_link
-from paramclient.logs import ImportedTable, import_log
-from paramclient.notation import hash_text
+from paramclient.logs.telemetry import ImportedTable, import_log
+from paramclient.model.identity import autopilot_name
+from paramclient.model.notation import hash_text
 
 __all__ = ["cache_of_log", "import_"]
 

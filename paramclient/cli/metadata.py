@@ -12,14 +12,14 @@ import anyio.to_thread
 from cyclopts import Parameter
 
 from paramclient.cache import CachedComponent, ParamCache
+from paramclient.cli.connection import Session
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import print_line, printable, say
-from paramclient.cli.session import Session
 from paramclient.errors import UsageError
 from paramclient.metadata import Metadata, MetadataStore, ParamInfo, metadata_of, read_metadata
 from paramclient.metadata.info import number_of
-from paramclient.paramset import ParamSet
-from paramclient.values import Param, Value, check_name, format_value
+from paramclient.model.paramset import ParamSet
+from paramclient.model.values import Param, Value, check_name, format_value
 
 __all__ = [
     "DESCRIBED_COLUMNS",

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 from paramclient.cache import CachedComponent, CachedSummary, ParamCache
-from paramclient.cache.address import is_address
+from paramclient.cache.database_url import is_address
+from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.logs import cache_of_log
 from paramclient.cli.metadata import (
     DESCRIBED_COLUMNS,
@@ -20,7 +21,6 @@ from paramclient.cli.metadata import (
     print_descriptions,
 )
 from paramclient.cli.options import CacheOptions, Id
-from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import (
     by_index,
     default_text,
@@ -31,14 +31,14 @@ from paramclient.cli.output import (
     report,
     say,
 )
+from paramclient.cli.param_rows import show_file
 from paramclient.cli.sources import is_file, open_file, tables_in
-from paramclient.cli.written import show_file
 from paramclient.errors import NotInCache, UsageError
-from paramclient.identity import autopilot_name
 from paramclient.metadata import Metadata
-from paramclient.notation import hash_text, time_or_none, time_text
-from paramclient.taken import NO_DEFAULTS, left_out_note
-from paramclient.values import Param, check_name, format_value, type_name
+from paramclient.model.identity import autopilot_name
+from paramclient.model.notation import hash_text, time_or_none, time_text
+from paramclient.model.values import Param, check_name, format_value, type_name
+from paramclient.provision.vehicle_params import NO_DEFAULTS, left_out_note
 
 if TYPE_CHECKING:
     from paramclient.documents.cached import CachedTableDoc

@@ -12,10 +12,10 @@ from typing import Annotated, ClassVar, TypeAlias
 from cyclopts import Parameter
 from cyclopts.validators import Number
 
+from paramclient.client.signing import Signing, key_from_environment, read_key
 from paramclient.errors import UsageError
+from paramclient.model.values import Encoding
 from paramclient.protocol.wire import SigningKey, SigningPolicy
-from paramclient.signing import Signing, key_from_environment, read_key
-from paramclient.values import Encoding
 
 __all__ = ["CacheOptions", "Id", "KeyOptions", "LinkOptions", "Seconds", "SigningOptions"]
 

@@ -13,13 +13,13 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from paramclient.protocol.result import Progress
-from paramclient.values import Param, format_value
+from paramclient.model.values import Param, format_value
+from paramclient.protocol.params.fetch_result import Progress
 
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from paramclient.documents.base import Document
+    from paramclient.documents.document import Document
 
 __all__ = [
     "Coloured",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from paramclient.cli.outcome import ExitCode
+from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.output import print_document, print_table, say
 from paramclient.links import SerialPort, list_ports
 

@@ -6,9 +6,10 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final, TypeAlias
 
-from paramclient.cli.outcome import ExitCode, code_of
+from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.output import Coloured, print_table, printable, report, say
-from paramclient.notation import typed
+from paramclient.model.notation import typed
+from paramclient.model.values import Value, format_value
 from paramclient.provision import (
     MISSING,
     ApplyResult,
@@ -18,7 +19,6 @@ from paramclient.provision import (
     PlanRow,
     PlanStatus,
 )
-from paramclient.values import Value, format_value
 
 if TYPE_CHECKING:
     from paramclient.documents.setup import ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc

@@ -10,20 +10,20 @@ import anyio
 import anyio.to_thread
 from cyclopts import Parameter
 
+from paramclient.cli.connection import Session, connect
+from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import CacheOptions, LinkOptions
-from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
-from paramclient.cli.session import Session, connect
 from paramclient.cli.sources import check_link, confirmed, names_vehicle
-from paramclient.component import Component
+from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.files import FileForm, write_file
-from paramclient.files.model import AUTOPILOT, address, form_of_name
-from paramclient.paramset import ParamSet
-from paramclient.protocol.result import FetchResult
-from paramclient.taken import differing, set_of
-from paramclient.values import Param
+from paramclient.files.param_file import AUTOPILOT, address, form_of_name
+from paramclient.model.paramset import ParamSet
+from paramclient.model.values import Param
+from paramclient.protocol.params.fetch_result import FetchResult
+from paramclient.provision.vehicle_params import differing, set_of
 
 __all__ = ["save"]
 

@@ -15,8 +15,8 @@ from typing import Annotated, Final
 import anyio
 from cyclopts import Parameter
 
+from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import Id, SigningOptions
-from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import print_line
 from paramclient.errors import UsageError
 

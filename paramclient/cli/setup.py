@@ -16,10 +16,12 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.cache import ParamCache
+from paramclient.cli.exit_codes import ExitCode, code_of
 from paramclient.cli.metadata import MetadataChoice, from_file, known_of_session
+from paramclient.cli.moments import parse_when
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.outcome import ExitCode, code_of
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
+from paramclient.cli.param_rows import described
 from paramclient.cli.results import (
     Vehicle,
     applied_code,
@@ -45,19 +47,17 @@ from paramclient.cli.targets import (
     targets,
     who,
 )
-from paramclient.cli.when import parse_when
-from paramclient.cli.written import described
-from paramclient.component import Component
+from paramclient.client.component import Component
 from paramclient.errors import NoReply, NotInCache, ParamClientError, UnknownVehicle, UsageError
 from paramclient.metadata import Metadata
-from paramclient.paramset import ParamSet
-from paramclient.protocol.result import Progress
+from paramclient.model.paramset import ParamSet
+from paramclient.protocol.params.fetch_result import Progress
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, verify_all
 from paramclient.provision import apply_all as apply_to_all
 from paramclient.provision import restore as restore_to
-from paramclient.provision.applying import restored
-from paramclient.provision.looking import identified
-from paramclient.taken import before_last_apply
+from paramclient.provision.inspection import identified
+from paramclient.provision.set_up import restored
+from paramclient.provision.vehicle_params import before_last_apply
 
 if TYPE_CHECKING:
     from paramclient.documents.setup import SetUpDoc

@@ -11,16 +11,16 @@ from typing import Annotated, Final
 
 from cyclopts import Parameter
 
+from paramclient.cli.connection import HEARING_PATIENCE, Deadline
+from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import Id, KeyOptions, Seconds
-from paramclient.cli.outcome import ExitCode
 from paramclient.cli.output import print_document, print_line, printable
-from paramclient.cli.session import HEARING_PATIENCE, Deadline
-from paramclient.client import ParamClient
-from paramclient.component import Component
+from paramclient.client.client import ParamClient
+from paramclient.client.component import Component
+from paramclient.client.signing import Signing, read_key
 from paramclient.errors import NoReply, UsageError, VehicleError
 from paramclient.links import Link, create_link
 from paramclient.protocol.wire import SigningKey, SigningPolicy
-from paramclient.signing import Signing, read_key
 
 __all__ = ["disable", "setup"]
 

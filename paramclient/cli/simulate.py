@@ -12,11 +12,11 @@ from cyclopts import Parameter
 from cyclopts.validators import Number
 
 from paramclient.cli.output import print_line
+from paramclient.client.signing import read_key, timestamp_now
 from paramclient.errors import UsageError
 from paramclient.links import Link, LinkKind, LinkSpec, create_link, parse_link, serve_endpoint
 from paramclient.links.tcp import TcpIn
 from paramclient.links.udp import UdpIn
-from paramclient.signing import read_key, timestamp_now
 
 if TYPE_CHECKING:
     from paramclient.sim import OtherStation, Vehicle

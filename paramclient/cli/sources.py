@@ -21,18 +21,18 @@ import anyio
 
 from paramclient.cache import CachedSummary, ParamCache
 from paramclient.cache.lookup import is_vehicle_name
+from paramclient.cli.connection import Deadline, connect
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.output import progress_bar, report
-from paramclient.cli.session import Deadline, connect
-from paramclient.component import Component
+from paramclient.client.component import Component
 from paramclient.errors import UnknownVehicle, UsageError
 from paramclient.files import ParamFile, read_file
-from paramclient.files.model import AUTOPILOT
+from paramclient.files.param_file import AUTOPILOT
 from paramclient.links import FORMS, parse_link
 from paramclient.links.names import names_service
-from paramclient.paramset import ParamSet
-from paramclient.protocol.result import FetchResult
-from paramclient.taken import Taken, cached_set, incomplete, taken
+from paramclient.model.paramset import ParamSet
+from paramclient.protocol.params.fetch_result import FetchResult
+from paramclient.provision.vehicle_params import Taken, cached_set, incomplete, taken
 
 __all__ = [
     "check_link",

@@ -10,16 +10,16 @@ from typing import Final, TypeAlias
 
 import anyio
 
+from paramclient.cli.connection import HEARING_PATIENCE, Deadline, Session, connect
 from paramclient.cli.options import LinkOptions
-from paramclient.cli.session import HEARING_PATIENCE, Deadline, Session, connect
 from paramclient.cli.sources import choose, is_file, open_file, resolve
-from paramclient.client import ParamClient
-from paramclient.component import Component
+from paramclient.client.client import ParamClient
+from paramclient.client.component import Component
 from paramclient.errors import FileError, NoReply, UsageError
 from paramclient.files import ParamFile
-from paramclient.paramset import ParamSet
+from paramclient.model.paramset import ParamSet
 from paramclient.provision import overlay
-from paramclient.provision.looking import identified
+from paramclient.provision.inspection import identified
 
 __all__ = ["Address", "Source", "Targets", "check_new", "check_pattern", "of_vehicle", "targets", "who"]
 

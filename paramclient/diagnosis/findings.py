@@ -9,7 +9,7 @@ from statistics import median
 from typing import Final
 
 from paramclient.diagnosis.report import LinkReport, VehicleReport
-from paramclient.identity import SHARED_UIDS
+from paramclient.model.identity import SHARED_UIDS
 
 __all__ = ["Finding", "Severity", "findings_of"]
 

@@ -9,8 +9,8 @@ from typing import Final, TypeVar
 
 import anyio
 
-from paramclient.client import ParamClient
-from paramclient.component import Component
+from paramclient.client.client import ParamClient
+from paramclient.client.component import Component
 from paramclient.diagnosis.report import (
     FileService,
     HashService,
@@ -30,9 +30,9 @@ from paramclient.errors import (
     VehicleError,
 )
 from paramclient.metadata.download import announced_metadata
-from paramclient.protocol import pack
-from paramclient.protocol.result import Progress
-from paramclient.protocol.traffic import ComponentTraffic
+from paramclient.protocol.ftp import param_pck
+from paramclient.protocol.params.fetch_result import Progress
+from paramclient.protocol.stats.traffic import ComponentTraffic
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
     CAPABILITY_FTP,
@@ -291,7 +291,7 @@ class _Diagnosis:
             elapsed = anyio.current_time() - began
             is_serving = True
             size = len(data)
-            content = pack.decode(data)
+            content = param_pck.decode(data)
             parameters = len(content.entries)
             defaults = parameters if content.with_defaults else 0
         except FileTransferError as refusal:

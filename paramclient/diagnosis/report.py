@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from paramclient.identity import Identity
-from paramclient.values import Encoding
+from paramclient.model.identity import Identity
+from paramclient.model.values import Encoding
 
 __all__ = [
     "FileService",

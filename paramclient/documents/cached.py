@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING
 
-from paramclient.documents.base import Document
+from paramclient.documents.document import Document
 from paramclient.documents.param import ParamDoc
-from paramclient.identity import autopilot_name
-from paramclient.notation import hash_text, time_or_none
+from paramclient.model.identity import autopilot_name
+from paramclient.model.notation import hash_text, time_or_none
 
 if TYPE_CHECKING:
     from paramclient.cache import CachedComponent, CachedSummary, CachedVehicle
     from paramclient.metadata import Metadata
-    from paramclient.values import Param
+    from paramclient.model.values import Param
 
 __all__ = [
     "CachedListDoc",

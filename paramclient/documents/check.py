@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from statistics import median
 from typing import TYPE_CHECKING, Literal
 
-from paramclient.documents.base import Document
 from paramclient.documents.component import IdentityDoc
-from paramclient.notation import hash_text, rounded
+from paramclient.documents.document import Document
+from paramclient.model.notation import hash_text, rounded
 
 if TYPE_CHECKING:
     from paramclient.diagnosis import (

@@ -5,25 +5,25 @@ from __future__ import annotations
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any, Final
 
-from paramclient.documents.base import Document, Maybe, Scalar
+from paramclient.client.events import Contested, Found, Lost, Resynced
 from paramclient.documents.component import ContestDoc
+from paramclient.documents.document import Document, Maybe, Scalar
 from paramclient.documents.param import ParamDoc
-from paramclient.events import Contested, Found, Lost, Resynced
-from paramclient.identity import autopilot_name
-from paramclient.notation import hash_text, rounded, time_text, value_json
-from paramclient.values import ParamType
+from paramclient.model.identity import autopilot_name
+from paramclient.model.notation import hash_text, rounded, time_text, value_json
+from paramclient.model.values import ParamType
 
 if TYPE_CHECKING:
-    from paramclient.component import Component
-    from paramclient.events import Rebooted, Uncontested
+    from paramclient.client.component import Component
+    from paramclient.client.events import Rebooted, Uncontested
     from paramclient.links.ports import SerialPort
-    from paramclient.logs import ImportedTable
+    from paramclient.logs.telemetry import ImportedTable
     from paramclient.metadata import ParamInfo
-    from paramclient.paramset import ParamSet
-    from paramclient.protocol.change import Change
-    from paramclient.protocol.result import FetchResult
-    from paramclient.protocol.sampling import Sample
-    from paramclient.values import Param, Value
+    from paramclient.model.paramset import ParamSet
+    from paramclient.model.values import Param, Value
+    from paramclient.protocol.params.change import Change
+    from paramclient.protocol.params.fetch_result import FetchResult
+    from paramclient.protocol.params.sampling import Sample
 
 __all__ = [
     "ChangeLineDoc",

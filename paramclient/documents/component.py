@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from paramclient.documents.base import Document
-from paramclient.notation import hash_text, rounded
+from paramclient.documents.document import Document
+from paramclient.model.notation import hash_text, rounded
 
 if TYPE_CHECKING:
-    from paramclient.component import Component
-    from paramclient.identity import Identity
-    from paramclient.protocol.peers import Contest
-    from paramclient.protocol.result import FetchResult, Progress
+    from paramclient.client.component import Component
+    from paramclient.model.identity import Identity
+    from paramclient.protocol.params.fetch_result import FetchResult, Progress
+    from paramclient.protocol.vehicle.peers import Contest
 
 __all__ = ["ComponentDoc", "ComponentsDoc", "ContestDoc", "IdentityDoc", "LastFetchDoc", "ProgressDoc"]
 

@@ -6,16 +6,16 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from paramclient.compare import Moved, Standing
-from paramclient.documents.base import Document, Maybe, Scalar
-from paramclient.documents.written import OriginDoc
-from paramclient.notation import bits_written, value_written
-from paramclient.values import type_name
+from paramclient.documents.document import Document, Maybe, Scalar
+from paramclient.documents.paramset import OriginDoc
+from paramclient.model.comparison import Moved, Standing
+from paramclient.model.notation import bits_written, value_written
+from paramclient.model.values import type_name
 
 if TYPE_CHECKING:
-    from paramclient.compare import Comparison, Difference
     from paramclient.metadata import Metadata
-    from paramclient.paramset import WrittenParam
+    from paramclient.model.comparison import Comparison, Difference
+    from paramclient.model.paramset import WrittenParam
 
 __all__ = ["ComparedDoc", "DiffDoc", "DifferenceDoc"]
 

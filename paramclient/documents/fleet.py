@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from paramclient.documents.base import Document, Scalar
-from paramclient.notation import bits_text, time_or_none, value_json
-from paramclient.values import ParamType, type_name
+from paramclient.documents.document import Document, Scalar
+from paramclient.model.notation import bits_text, time_or_none, value_json
+from paramclient.model.values import ParamType, type_name
 
 if TYPE_CHECKING:
     from paramclient.cache import FleetDiff, FleetValue, Holder, NameSpread

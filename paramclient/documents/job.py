@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Literal
 
-from paramclient.documents.base import Document
 from paramclient.documents.component import ProgressDoc
+from paramclient.documents.document import Document
 from paramclient.documents.problem import Problem
 
 if TYPE_CHECKING:

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Literal
 
-from paramclient.documents.base import Document, Maybe
+from paramclient.documents.document import Document, Maybe
 
 if TYPE_CHECKING:
-    from paramclient.stats import ClientStats
+    from paramclient.client.stats import ClientStats
 
 __all__ = ["HealthDoc", "HealthLinkDoc", "LinkDoc", "LinksDoc", "MeDoc", "StatsDoc"]
 

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
-from paramclient.documents.base import Document, Maybe, Scalar
-from paramclient.notation import bits_text, bits_written, value_json, value_written
-from paramclient.values import Param, ParamType, format_value, type_name
+from paramclient.documents.document import Document, Maybe, Scalar
+from paramclient.model.notation import bits_text, bits_written, value_json, value_written
+from paramclient.model.values import Param, ParamType, format_value, type_name
 
 if TYPE_CHECKING:
     from paramclient.errors import ParamClientError
     from paramclient.metadata import Metadata, ParamInfo
-    from paramclient.paramset import WrittenParam
+    from paramclient.model.paramset import WrittenParam
 
 __all__ = ["DescribedDoc", "GotDoc", "InfoDoc", "InfosDoc", "ParamDoc", "WrittenParamDoc"]
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import ConfigDict
 
-from paramclient.documents.base import Document, Maybe
+from paramclient.documents.document import Document, Maybe
 
 __all__ = ["Problem"]
 

@@ -7,16 +7,16 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from pydantic import Field
 
-from paramclient.documents.base import Document, Scalar
-from paramclient.notation import typed, value_json
-from paramclient.provision.outcome import ApplyStatus
+from paramclient.documents.document import Document, Scalar
+from paramclient.model.notation import typed, value_json
+from paramclient.model.values import Value, type_name
 from paramclient.provision.planning import PlanStatus, RowStanding
-from paramclient.values import Value, type_name
+from paramclient.provision.results import ApplyStatus
 
 if TYPE_CHECKING:
     from paramclient.errors import ParamClientError
-    from paramclient.provision.outcome import ApplyProgress, ApplyResult, ApplyRow
     from paramclient.provision.planning import Plan, PlanRow, Stage, Step
+    from paramclient.provision.results import ApplyProgress, ApplyResult, ApplyRow
 
 __all__ = [
     "AddressDoc",

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING
 
 from pydantic import Field
 
-from paramclient.documents.base import Document
-from paramclient.identity import autopilot_name
-from paramclient.notation import rounded
+from paramclient.documents.document import Document
+from paramclient.model.identity import autopilot_name
+from paramclient.model.notation import rounded
 from paramclient.protocol.wire import MAV_TYPE_GCS, enum_word
 
 if TYPE_CHECKING:
-    from paramclient.protocol.traffic import ComponentTraffic, TrafficReport
+    from paramclient.protocol.stats.traffic import ComponentTraffic, TrafficReport
     from paramclient.protocol.wire import SigningReport
 
 __all__ = ["ComponentTrafficDoc", "MessageTrafficDoc", "RadioDoc", "SigningDoc", "TrafficDoc"]

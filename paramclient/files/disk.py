@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Final
 
 from paramclient.errors import FileError
-from paramclient.files.forms import LARGEST_FILE, Content, dumps, loads
+from paramclient.files.formats import LARGEST_FILE, Content, dumps, loads
 from paramclient.files.includes import Includes
-from paramclient.files.model import FileForm, ParamFile, as_form, form_of_name
+from paramclient.files.param_file import FileForm, ParamFile, as_form, form_of_name
 
 __all__ = ["read_file", "write_file"]
 

@@ -20,10 +20,10 @@ from importlib.util import find_spec
 from typing import Any, Final, NoReturn
 
 from paramclient.errors import FileError, UsageError
-from paramclient.files.model import FileForm, ParamFile
+from paramclient.files.param_file import FileForm, ParamFile
 from paramclient.files.text import is_plain, shown, time_of
-from paramclient.paramset import ParamSet, WrittenParam
-from paramclient.values import ParamType, Value, format_value, shortest_float, type_name
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import ParamType, Value, format_value, shortest_float, type_name
 
 __all__ = ["is_document", "read_json", "read_yaml", "write_json", "write_yaml"]
 
@@ -144,7 +144,7 @@ def write_yaml(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
 
 
 def _file(content: object, form: FileForm, source: str, text: str) -> ParamFile:
-    from paramclient.files.schema import Wrong, parse  # only here: loads pydantic
+    from paramclient.files.document_schema import Wrong, parse  # only here: loads pydantic
 
     try:
         sets, header = parse(content, source)

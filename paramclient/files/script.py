@@ -12,10 +12,10 @@ import re
 from typing import Final
 
 from paramclient.errors import UsageError
-from paramclient.files.model import FileForm, ParamFile
+from paramclient.files.param_file import FileForm, ParamFile
 from paramclient.files.text import Builder, Line, Problems, lines_of, parse_number, shown
-from paramclient.paramset import WrittenParam
-from paramclient.values import check_name
+from paramclient.model.paramset import WrittenParam
+from paramclient.model.values import check_name
 
 __all__ = ["is_script_line", "read_script"]
 

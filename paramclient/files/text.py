@@ -12,8 +12,8 @@ from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
 from paramclient.errors import FileError, UsageError
-from paramclient.paramset import ParamSet, WrittenParam
-from paramclient.values import ParamType, Value, bits_of, format_value, from_bits, type_name
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import ParamType, Value, bits_of, format_value, from_bits, type_name
 
 __all__ = [
     "ANY_MARK",

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from paramclient.errors import UsageError
-from paramclient.links.base import Link, Peer
+from paramclient.links.link import Link, Peer
 from paramclient.links.names import FORMS, LinkKind, LinkSpec, parse_link
 from paramclient.links.ports import SerialPort, list_ports
 from paramclient.links.replay import ReplayLink

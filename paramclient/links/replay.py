@@ -9,7 +9,7 @@ import anyio
 import anyio.lowlevel
 
 from paramclient.errors import LinkError
-from paramclient.links.base import Peer, reason
+from paramclient.links.link import Peer, reason
 from paramclient.links.names import LinkSpec
 from paramclient.links.tlog import Record, open_log, read_records
 

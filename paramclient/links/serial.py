@@ -28,7 +28,7 @@ import anyio.from_thread
 import anyio.lowlevel
 
 from paramclient.errors import LinkError, UsageError
-from paramclient.links.base import OPEN_TIMEOUT, Peer, reason
+from paramclient.links.link import OPEN_TIMEOUT, Peer, reason
 from paramclient.links.names import LinkSpec
 
 if sys.platform != "win32":

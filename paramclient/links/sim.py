@@ -16,7 +16,7 @@ from paramclient.errors import LinkError
 from paramclient.links.names import LinkSpec
 
 if TYPE_CHECKING:
-    from paramclient.links.base import Link, Peer
+    from paramclient.links.link import Link, Peer
     from paramclient.sim import Endpoint
 
 __all__ = ["SimLink", "serve_endpoint", "simulated"]

@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import anyio
 import anyio.lowlevel
 
-from paramclient.links.base import OPEN_TIMEOUT, Address, Peer, SocketLink, claim, close_socket, reason
+from paramclient.links.link import OPEN_TIMEOUT, Address, Peer, SocketLink, claim, close_socket, reason
 from paramclient.links.names import LinkSpec
 
 __all__ = ["Connection", "TcpIn", "TcpOut"]

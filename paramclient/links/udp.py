@@ -38,9 +38,9 @@ from zlib import crc32
 import anyio
 import anyio.lowlevel
 
-from paramclient.clocks import seconds_ahead
 from paramclient.errors import LinkError
-from paramclient.links.base import OPEN_TIMEOUT, Address, Peer, SocketLink, claim, reason
+from paramclient.links.clock_offset import seconds_ahead
+from paramclient.links.link import OPEN_TIMEOUT, Address, Peer, SocketLink, claim, reason
 from paramclient.links.names import LinkSpec
 from paramclient.protocol.wire import HEARTBEAT_ID, Framer
 

@@ -6,8 +6,8 @@ Nothing depends on it. It comes from a file (`read_metadata`) or from the vehicl
 from __future__ import annotations
 
 from paramclient.metadata.download import metadata_of
+from paramclient.metadata.formats import read_content, read_metadata
 from paramclient.metadata.info import Metadata, ParamInfo
-from paramclient.metadata.reading import read_content, read_metadata
-from paramclient.metadata.store import MetadataStore
+from paramclient.metadata.metadata_cache import MetadataStore
 
 __all__ = ["Metadata", "MetadataStore", "ParamInfo", "metadata_of", "read_content", "read_metadata"]

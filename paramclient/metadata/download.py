@@ -15,15 +15,15 @@ from typing import TYPE_CHECKING, Final, ParamSpec, TypeVar
 import anyio
 import anyio.to_thread
 
+from paramclient.client.files import Ftp
 from paramclient.errors import MetadataError, UsageError
-from paramclient.ftp import Ftp
+from paramclient.metadata.formats import LARGEST_PACKED, json_of, read_content, unpacked
 from paramclient.metadata.info import Metadata
-from paramclient.metadata.reading import LARGEST_PACKED, json_of, read_content, unpacked
-from paramclient.metadata.store import MetadataStore, has_checksum
+from paramclient.metadata.metadata_cache import MetadataStore, has_checksum
 from paramclient.protocol.wire import ComponentMetadata
 
 if TYPE_CHECKING:
-    from paramclient.component import Component
+    from paramclient.client.component import Component
 
 __all__ = ["announced_metadata", "metadata_of"]
 

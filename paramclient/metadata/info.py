@@ -14,7 +14,7 @@ from types import MappingProxyType
 from typing import Final, TypeVar
 
 from paramclient.errors import UsageError
-from paramclient.values import ParamType, Value, format_value, shortest_float
+from paramclient.model.values import ParamType, Value, format_value, shortest_float
 
 __all__ = ["Metadata", "ParamInfo", "number_of"]
 

@@ -15,7 +15,7 @@ from typing_extensions import TypedDict  # pydantic, whose own it is, takes no o
 
 from paramclient.errors import MetadataError
 from paramclient.metadata.info import MOST_BITS, Metadata, ParamInfo
-from paramclient.values import ParamType
+from paramclient.model.values import ParamType
 
 __all__ = ["MetadataFile", "read_general", "read_parameters", "told", "whole"]
 

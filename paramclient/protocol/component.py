@@ -8,20 +8,22 @@ from collections.abc import Iterable, Mapping
 from typing import Final
 
 from paramclient.errors import NoReply, ParamClientError, UsageError
-from paramclient.identity import autopilot_name, reason_against_non_finite
-from paramclient.params import parts_of
+from paramclient.model.identity import autopilot_name, reason_against_non_finite
+from paramclient.model.params import parts_of
+from paramclient.model.values import Param, ParamType, Trust, Value, as_sent, encode, is_portable_name
 from paramclient.protocol import events
-from paramclient.protocol.change import Change
-from paramclient.protocol.claims import Claim, Verdict
 from paramclient.protocol.events import ParamChanged
-from paramclient.protocol.fetch import Check, Fetch
-from paramclient.protocol.name_search import NameSearch
+from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.fetch import Check, Fetch
+from paramclient.protocol.params.fetch_result import FetchResult, Policy, Sampled
+from paramclient.protocol.params.name_search import NameSearch
+from paramclient.protocol.params.reads import Key, Read
+from paramclient.protocol.params.value_check import LATER_CHANGE_TIME
+from paramclient.protocol.params.writes import Write
 from paramclient.protocol.parts import Parts
-from paramclient.protocol.peers import Contest
-from paramclient.protocol.reads import Key, Read
-from paramclient.protocol.restart import SAVING_TIME, Restart
-from paramclient.protocol.result import FetchResult, Policy, Sampled
-from paramclient.protocol.value_check import LATER_CHANGE_TIME
+from paramclient.protocol.vehicle.claims import Claim, Verdict
+from paramclient.protocol.vehicle.peers import Contest
+from paramclient.protocol.vehicle.reboot import SAVING_TIME, Restart
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -40,8 +42,6 @@ from paramclient.protocol.wire import (
     StatusText,
     SystemTime,
 )
-from paramclient.protocol.writes import Write
-from paramclient.values import Param, ParamType, Trust, Value, as_sent, encode, is_portable_name
 
 __all__ = ["ComponentMachine"]
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple, TypeAlias
 
-from paramclient.protocol.change import Change
+from paramclient.protocol.params.change import Change
 
 if TYPE_CHECKING:
     from paramclient.protocol.component import ComponentMachine
-    from paramclient.protocol.peers import Contest
-    from paramclient.protocol.result import FetchResult
+    from paramclient.protocol.params.fetch_result import FetchResult
+    from paramclient.protocol.vehicle.peers import Contest
 
 __all__ = [
     "ComponentContested",

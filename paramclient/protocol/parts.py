@@ -7,38 +7,38 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator
 
 from paramclient.errors import ParamClientError
-from paramclient.identity import Identity
+from paramclient.model.identity import Identity
+from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
-from paramclient.protocol.authors import Authors
-from paramclient.protocol.change import Change
-from paramclient.protocol.check_pace import CheckPace
-from paramclient.protocol.claims import Claim, Verdict
-from paramclient.protocol.clock_requests import ClockRequests
-from paramclient.protocol.commands import Commands
-from paramclient.protocol.descriptions import Descriptions
 from paramclient.protocol.events import Event
-from paramclient.protocol.fetch import Check, Fetch
-from paramclient.protocol.fetches import Fetches
-from paramclient.protocol.following import Following
 from paramclient.protocol.ftp import FileTransfers
-from paramclient.protocol.identify import Identification
-from paramclient.protocol.name_search import NameSearches
-from paramclient.protocol.peers import NO_PEER, ComponentPeers, Contest
-from paramclient.protocol.presence import Presence
-from paramclient.protocol.reads import Key, Reads
-from paramclient.protocol.refresh import Refresh
-from paramclient.protocol.restart import Restart
-from paramclient.protocol.result import FetchResult, Means, Policy, Sampled
-from paramclient.protocol.start_values import StartValues
-from paramclient.protocol.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
-from paramclient.protocol.table import Room, Table
-from paramclient.protocol.timing import RoundTrip
-from paramclient.protocol.trace import Trace, silent
-from paramclient.protocol.turns import Turns
-from paramclient.protocol.value_check import ValueChecks
+from paramclient.protocol.params.boot_values import StartValues
+from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.change_origin import Authors
+from paramclient.protocol.params.fetch import Check, Fetch
+from paramclient.protocol.params.fetch_queue import Fetches
+from paramclient.protocol.params.fetch_result import FetchResult, Means, Policy, Sampled
+from paramclient.protocol.params.foreign_list import Following
+from paramclient.protocol.params.name_search import NameSearches
+from paramclient.protocol.params.reads import Key, Reads
+from paramclient.protocol.params.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
+from paramclient.protocol.params.sync_interval import CheckPace
+from paramclient.protocol.params.table import Room, Table
+from paramclient.protocol.params.value_check import ValueChecks
+from paramclient.protocol.params.volatile_values import Refresh
+from paramclient.protocol.params.writes import Writes
+from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.scheduler import Turns
+from paramclient.protocol.stats.trace import Trace, silent
+from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
+from paramclient.protocol.vehicle.claims import Claim, Verdict
+from paramclient.protocol.vehicle.commands import Commands
+from paramclient.protocol.vehicle.identification import Identification
+from paramclient.protocol.vehicle.metadata_location import Descriptions
+from paramclient.protocol.vehicle.peers import NO_PEER, ComponentPeers, Contest
+from paramclient.protocol.vehicle.presence import Presence
+from paramclient.protocol.vehicle.reboot import Restart
 from paramclient.protocol.wire import MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4, Message
-from paramclient.protocol.writes import Writes
-from paramclient.values import Encoding
 
 __all__ = ["Parts"]
 

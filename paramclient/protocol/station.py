@@ -10,21 +10,22 @@ from heapq import heapify, heappop, heappush
 from typing import Final
 
 from paramclient.errors import LinkError, UsageError
-from paramclient.identity import Identity
+from paramclient.model.identity import Identity
+from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
-from paramclient.protocol.clock_sampling import ClockSampling
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.download import present_of
 from paramclient.protocol.events import ComponentForgotten, ComponentHeard, Event
-from paramclient.protocol.fetch import Fetch
-from paramclient.protocol.file_observer import acknowledges_open, opens_parameter_file
-from paramclient.protocol.peers import NO_PEER
-from paramclient.protocol.result import Policy
-from paramclient.protocol.sync import Upkeep
-from paramclient.protocol.table import Room
-from paramclient.protocol.trace import Told, Trace, silent
-from paramclient.protocol.traffic import Traffic
-from paramclient.protocol.turns import Turns
+from paramclient.protocol.params.fetch import Fetch
+from paramclient.protocol.params.fetch_result import Policy
+from paramclient.protocol.params.list_download import present_of
+from paramclient.protocol.params.passive_file import acknowledges_open, opens_parameter_file
+from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.table import Room
+from paramclient.protocol.scheduler import Turns
+from paramclient.protocol.stats.trace import Told, Trace, silent
+from paramclient.protocol.stats.traffic import Traffic
+from paramclient.protocol.vehicle.boot_time_sampling import ClockSampling
+from paramclient.protocol.vehicle.peers import NO_PEER
 from paramclient.protocol.wire import (
     AUTOPILOT_COMPONENT,
     BOOT_CLOCK_OFFSETS,
@@ -55,7 +56,6 @@ from paramclient.protocol.wire import (
     encode,
     sign_frame,
 )
-from paramclient.values import Encoding
 
 __all__ = ["Address", "Peer", "Station"]
 

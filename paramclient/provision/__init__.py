@@ -2,18 +2,9 @@
 
 from __future__ import annotations
 
-from paramclient.provision.applying import apply, restore
 from paramclient.provision.cautions import CATEGORIES
 from paramclient.provision.fleet import apply_all, verify_all
-from paramclient.provision.looking import prepare, verify
-from paramclient.provision.outcome import (
-    ApplyProgress,
-    ApplyResult,
-    ApplyRow,
-    ApplyStatus,
-    FleetApplied,
-    FleetVerified,
-)
+from paramclient.provision.inspection import prepare, verify
 from paramclient.provision.planning import (
     MISSING,
     WRONG,
@@ -27,6 +18,15 @@ from paramclient.provision.planning import (
     overlay,
     plan,
 )
+from paramclient.provision.results import (
+    ApplyProgress,
+    ApplyResult,
+    ApplyRow,
+    ApplyStatus,
+    FleetApplied,
+    FleetVerified,
+)
+from paramclient.provision.set_up import apply, restore
 
 __all__ = [
     "CATEGORIES",

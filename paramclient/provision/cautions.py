@@ -12,7 +12,7 @@ from importlib import resources
 from typing import Any, Final
 
 from paramclient.errors import UsageError
-from paramclient.patterns import NameChoice
+from paramclient.model.patterns import NameChoice
 
 __all__ = ["CATEGORIES", "OUT_OF_RANGE", "READ_ONLY", "Caution", "Cautions", "Choice", "cautions_for"]
 

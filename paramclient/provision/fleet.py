@@ -9,13 +9,13 @@ from typing import TypeAlias, TypeVar
 
 import anyio
 
-from paramclient.component import Component
+from paramclient.client.component import Component
 from paramclient.errors import ParamClientError, UsageError
-from paramclient.paramset import ParamSet
-from paramclient.provision.applying import apply
-from paramclient.provision.looking import verify
-from paramclient.provision.outcome import ApplyProgress, ApplyResult, FleetApplied, FleetVerified
+from paramclient.model.paramset import ParamSet
+from paramclient.provision.inspection import verify
 from paramclient.provision.planning import ParamInfo, Plan
+from paramclient.provision.results import ApplyProgress, ApplyResult, FleetApplied, FleetVerified
+from paramclient.provision.set_up import apply
 
 __all__ = ["apply_all", "verify_all"]
 

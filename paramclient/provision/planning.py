@@ -11,11 +11,9 @@ from enum import StrEnum
 from typing import Final, Protocol
 
 from paramclient.errors import UsageError
-from paramclient.identity import Identity, autopilot_name, reason_against_non_finite
-from paramclient.paramset import ParamSet, WrittenParam
-from paramclient.provision.cautions import OUT_OF_RANGE, READ_ONLY, Cautions, Choice, cautions_for
-from paramclient.provision.nearest import nearest_names
-from paramclient.values import (
+from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import (
     Encoding,
     Param,
     ParamType,
@@ -26,6 +24,8 @@ from paramclient.values import (
     same_bits,
     type_name,
 )
+from paramclient.provision.cautions import OUT_OF_RANGE, READ_ONLY, Cautions, Choice, cautions_for
+from paramclient.provision.similar_names import nearest_names
 
 __all__ = [
     "MISSING",

@@ -12,8 +12,12 @@ import anyio
 import anyio.abc
 import httpx
 
-from paramclient.client import HEARING_PATIENCE, ParamClient
-from paramclient.component import Component, address_in_words
+from paramclient.client.client import HEARING_PATIENCE, ParamClient
+from paramclient.client.component import Component, address_in_words
+from paramclient.client.events import Events
+from paramclient.client.fetch_all import FetchedAll
+from paramclient.client.files import Ftp
+from paramclient.client.stats import ClientStats
 from paramclient.errors import (
     CacheError,
     ClientClosed,
@@ -23,22 +27,18 @@ from paramclient.errors import (
     ParamClientError,
     UsageError,
 )
-from paramclient.events import Events
-from paramclient.ftp import Ftp
 from paramclient.links import Link
-from paramclient.protocol.result import Progress
+from paramclient.protocol.params.fetch_result import Progress
 from paramclient.protocol.station import Address
 from paramclient.protocol.wire import AUTOPILOT_COMPONENT
-from paramclient.remote.address import ServiceAddress, chosen_token
 from paramclient.remote.component import Key, RemoteComponent
 from paramclient.remote.connection import telling
+from paramclient.remote.decoding import Document, fetch_result_of, stats_of, understood
+from paramclient.remote.http import Answer, Requests, Unreached
 from paramclient.remote.link import ServiceLink, not_given
 from paramclient.remote.problems import error_of
-from paramclient.remote.reading import Document, fetch_result_of, stats_of, understood
-from paramclient.remote.requests import Answer, Requests, Unreached
 from paramclient.remote.roster import Roster, key_of
-from paramclient.stats import ClientStats
-from paramclient.together import FetchedAll
+from paramclient.remote.service_address import ServiceAddress, chosen_token
 
 __all__ = ["RemoteClient"]
 

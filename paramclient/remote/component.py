@@ -11,25 +11,23 @@ from typing import TYPE_CHECKING, Any, Final, NoReturn, SupportsFloat, SupportsI
 
 import anyio
 
-from paramclient.asked import check_accepted, check_asked, check_asked_name, check_settle
-from paramclient.component import Component
+from paramclient.client.arguments import check_accepted, check_asked, check_asked_name, check_settle
+from paramclient.client.component import Component
+from paramclient.client.events import Changes, Event, Found, Heard, Lost
 from paramclient.errors import NoReply, ParamClientError
-from paramclient.events import Changes, Event, Found, Heard, Lost
-from paramclient.identity import Identity
-from paramclient.params import ParamMap
+from paramclient.model.identity import Identity
+from paramclient.model.params import ParamMap
+from paramclient.model.values import Encoding, Param, check_value
 from paramclient.protocol.addresses import Address
-from paramclient.protocol.change import Change
-from paramclient.protocol.peers import Contest
-from paramclient.protocol.result import FetchResult, Progress
-from paramclient.protocol.sampling import SAMPLE_SIZE
-from paramclient.protocol.sync import SyncState
+from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.fetch_result import FetchResult, Progress
+from paramclient.protocol.params.sampling import SAMPLE_SIZE
+from paramclient.protocol.params.sync import SyncState
+from paramclient.protocol.params.writes import SetResult
+from paramclient.protocol.vehicle.peers import Contest
 from paramclient.protocol.wire import MAV_TYPE_GCS, MOST_PARAMETERS, SigningKey
-from paramclient.protocol.writes import SetResult
 from paramclient.remote.connection import telling
-from paramclient.remote.link import not_given
-from paramclient.remote.mirror import Mirror
-from paramclient.remote.problems import NotHeard, error_of
-from paramclient.remote.reading import (
+from paramclient.remote.decoding import (
     Document,
     check_kind,
     fetch_result_of,
@@ -41,8 +39,10 @@ from paramclient.remote.reading import (
     understood,
     value_as_sent,
 )
-from paramclient.remote.requests import Answer
-from paramclient.values import Encoding, Param, check_value
+from paramclient.remote.http import Answer
+from paramclient.remote.link import not_given
+from paramclient.remote.mirror import Mirror
+from paramclient.remote.problems import NotHeard, error_of
 
 if TYPE_CHECKING:
     from paramclient.remote.client import RemoteClient

@@ -9,11 +9,11 @@ from typing import Any, Final, Protocol, TypeVar
 
 import anyio
 
-from paramclient import carrier
-from paramclient.component import PROGRESS_INTERVAL
+from paramclient.client import link_task
+from paramclient.client.component import PROGRESS_INTERVAL
 from paramclient.errors import ClientClosed, LinkError, NoReply, ParamClientError
-from paramclient.remote.reading import understood
-from paramclient.remote.requests import Answer, Place, Requests, Unreached
+from paramclient.remote.decoding import understood
+from paramclient.remote.http import Answer, Place, Requests, Unreached
 
 __all__ = ["Connection", "Follower", "telling"]
 
@@ -48,8 +48,8 @@ class Follower(Protocol):
 class Connection:
     """Follows the events of a service, and carries calls to it.
 
-    Like a link that drops, it is made again with back-off; calls wait for that up to
-    `paramclient.carrier.LINK_PATIENCE` seconds, then they and new ones raise LinkError until it is back.
+    Like a link that drops, it is made again with back-off; calls wait for that up to `LINK_PATIENCE` seconds
+    (in `client.link_task`), then they and new ones raise LinkError until it is back.
 
     Args:
         requests: how requests travel.
@@ -141,12 +141,12 @@ class Connection:
                         if is_write and failure.may_be_done:
                             raise self._unknown(awaited, failure) from failure.error.__cause__
                         now = anyio.current_time()
-                        if now - asked_at > carrier.LINK_PATIENCE:  # it had been reached
+                        if now - asked_at > link_task.LINK_PATIENCE:  # it had been reached
                             failing_since = now
                         failing_since = min(failing_since, now)
-                        if now - failing_since >= carrier.LINK_PATIENCE:
+                        if now - failing_since >= link_task.LINK_PATIENCE:
                             raise failure.error from failure.error.__cause__
-                        await anyio.sleep(carrier.FIRST_BACKOFF)
+                        await anyio.sleep(link_task.FIRST_BACKOFF)
             finally:
                 self._scopes.discard(scope)
         self.check_open()
@@ -225,8 +225,8 @@ class Connection:
         if not self.is_away:
             logger.warning("%s; trying to reach it again", error)
             self.is_away = True
-            self._patience_ends = now + carrier.LINK_PATIENCE
-            self._backoff = carrier.FIRST_BACKOFF
+            self._patience_ends = now + link_task.LINK_PATIENCE
+            self._backoff = link_task.FIRST_BACKOFF
             self._follower.leave()
             self.tell()
         elif now >= self._patience_ends:
@@ -235,7 +235,7 @@ class Connection:
             self._fail_calls()
         patience = self._patience_ends - now
         await anyio.sleep(min(self._backoff, patience) if patience > 0 else self._backoff)
-        self._backoff = min(self._backoff * 2, carrier.LONGEST_BACKOFF)
+        self._backoff = min(self._backoff * 2, link_task.LONGEST_BACKOFF)
 
     async def _is_reached(self, deadline: float) -> bool:
         """Wait until it is; false when the time is over."""

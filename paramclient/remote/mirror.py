@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Final
 
-from paramclient.protocol.change import Change
-from paramclient.protocol.table import MOST_NAMES
-from paramclient.values import Param, Trust
+from paramclient.model.values import Param, Trust
+from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.table import MOST_NAMES
 
 __all__ = ["MOST_WAITING", "Mirror"]
 

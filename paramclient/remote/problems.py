@@ -26,7 +26,7 @@ from paramclient.errors import (
     ValueNotApplied,
     VehicleArmed,
 )
-from paramclient.remote.reading import number_of
+from paramclient.remote.decoding import number_of
 
 __all__ = ["NotHeard", "error_of"]
 

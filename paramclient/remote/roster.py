@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Final
 
 import anyio
 
+from paramclient.client.events import Contested, Event, Events, Found, Lost, Rebooted, Resynced, Uncontested
 from paramclient.errors import LinkError, NoReply, ParamClientError
-from paramclient.events import Contested, Event, Events, Found, Lost, Rebooted, Resynced, Uncontested
 from paramclient.remote.component import Key, RemoteComponent
 from paramclient.remote.connection import Connection
-from paramclient.remote.reading import Document, hash_of, params_of, understood
-from paramclient.remote.requests import Answer, Place, Requests, Unreached
+from paramclient.remote.decoding import Document, hash_of, params_of, understood
+from paramclient.remote.http import Answer, Place, Requests, Unreached
 
 if TYPE_CHECKING:
     from paramclient.remote.client import RemoteClient

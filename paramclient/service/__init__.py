@@ -8,7 +8,7 @@ from __future__ import annotations
 from paramclient.service.access import AccessSettings
 from paramclient.service.app import Settings, create_app
 from paramclient.service.hub import Hub
-from paramclient.service.run import Listening, serve
+from paramclient.service.server import Listening, serve
 from paramclient.service.tokens import Tokens, tokens_from
 
 __all__ = ["AccessSettings", "Hub", "Listening", "Settings", "Tokens", "create_app", "serve", "tokens_from"]

@@ -19,7 +19,7 @@ from typing import Any, Final, TypeAlias
 import anyio
 
 from paramclient.errors import UsageError
-from paramclient.protocol.authors import LONGEST_ASKER
+from paramclient.protocol.params.change_origin import LONGEST_ASKER
 from paramclient.service.addresses import is_in, is_loopback, network
 from paramclient.service.held_bodies import HeldBodies, HeldBody
 from paramclient.service.log_limit import LogLimit

@@ -8,8 +8,8 @@ from typing import Any, Final, TypeAlias
 
 from fastapi import Response
 
-from paramclient.documents.base import Document
-from paramclient.service.feed import COMPACT
+from paramclient.documents.document import Document
+from paramclient.service.event_feed import COMPACT
 
 __all__ = ["JSON", "Aside", "document_answer", "written_out"]
 

@@ -16,7 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from paramclient.service import problems
 from paramclient.service.access import AccessMiddleware, AccessSettings
-from paramclient.service.feed import COMPACT
+from paramclient.service.event_feed import COMPACT
 from paramclient.service.hub import Hub
 from paramclient.service.problems import RESPONSES, ServiceError
 from paramclient.service.routes import ROUTERS

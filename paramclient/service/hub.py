@@ -17,24 +17,24 @@ import anyio.abc
 import anyio.lowlevel
 
 from paramclient.cache import SetupNotes
-from paramclient.client import ParamClient
-from paramclient.component import address_in_words
-from paramclient.documents.call import FetchResultDoc
+from paramclient.client.cache_writer import chosen_cache
+from paramclient.client.client import ParamClient
+from paramclient.client.component import address_in_words
+from paramclient.client.worker_thread import Worker
 from paramclient.documents.component import ProgressDoc
 from paramclient.documents.job import far_text
+from paramclient.documents.results import FetchResultDoc
 from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.links import Link, create_link
-from paramclient.metadata.store import MetadataStore
-from paramclient.notation import time_text
-from paramclient.protocol.vehicle_choice import LOOK_TIME, VehicleChoice
-from paramclient.service.feed import Feed
-from paramclient.service.following import Followed
+from paramclient.metadata.metadata_cache import MetadataStore
+from paramclient.model.notation import time_text
+from paramclient.protocol.vehicle_selection import LOOK_TIME, VehicleChoice
+from paramclient.service.event_feed import Feed
+from paramclient.service.followed_component import Followed
 from paramclient.service.jobs import Job, Jobs
-from paramclient.service.line import Line
+from paramclient.service.link import Line
 from paramclient.service.problems import ServiceError
 from paramclient.service.quota import LONG_REQUESTS_MAX, LONG_REQUESTS_OF_ONE, Quota
-from paramclient.worker import Worker
-from paramclient.writethrough import chosen_cache
 
 if TYPE_CHECKING:
     from paramclient.cache import CutOff, ParamCache, RunningSetup

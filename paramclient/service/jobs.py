@@ -12,15 +12,15 @@ from typing import TYPE_CHECKING, Final, Literal
 import anyio
 import anyio.abc
 
-from paramclient.documents.base import Document
+from paramclient.documents.document import Document
 from paramclient.documents.job import JobDoc
 from paramclient.errors import ParamClientError
 from paramclient.service.problems import ServiceError, problem_of
 
 if TYPE_CHECKING:
     from paramclient.cache import CutOff
-    from paramclient.service.feed import Feed
-    from paramclient.service.following import Followed
+    from paramclient.service.event_feed import Feed
+    from paramclient.service.followed_component import Followed
 
 __all__ = ["Job", "Jobs", "Kind", "Work"]
 

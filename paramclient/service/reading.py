@@ -16,7 +16,7 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.routing import APIRoute
 from pydantic import ValidationError
 
-from paramclient.documents.base import Body
+from paramclient.documents.document import Body
 from paramclient.service.problems import MOST_FAULTS, ServiceError
 
 if TYPE_CHECKING:

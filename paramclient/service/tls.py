@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NoReturn
 
+from paramclient.cache.file_ownership import OTHERS_WRITE, has_trusted_owner, mode_of
 from paramclient.errors import UsageError
-from paramclient.ownership import OTHERS_WRITE, has_trusted_owner, mode_of
 
 __all__ = ["Tls", "tls_of"]
 

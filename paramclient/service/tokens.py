@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, Literal, TypeAlias
 
+from paramclient.client.signing import read_private
 from paramclient.errors import UsageError
 from paramclient.service.addresses import network_of
-from paramclient.signing import read_private
 
 __all__ = [
     "Guesses",

@@ -25,8 +25,8 @@ from paramclient.sim.air import Air, Endpoint, FaultyLink
 from paramclient.sim.ardupilot import ArduPilotVehicle
 from paramclient.sim.generic import GenericVehicle
 from paramclient.sim.other import OtherStation
+from paramclient.sim.param_table import SimParam, Table, ardupilot_table, px4_table
 from paramclient.sim.px4 import PX4Vehicle
-from paramclient.sim.table import SimParam, Table, ardupilot_table, px4_table
 from paramclient.sim.vehicle import Vehicle
 
 __all__ = [

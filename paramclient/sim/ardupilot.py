@@ -11,13 +11,13 @@ from collections.abc import Iterable, Mapping
 from typing import Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
+from paramclient.model.values import Encoding, ParamType, bits_of, from_bits
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
-from paramclient.protocol.pack import PackedParam
+from paramclient.protocol.ftp.param_pck import PackedParam
 from paramclient.sim.ftp import PARAM_FILE, Address, FileServer
-from paramclient.sim.table import Entry, Table, ardupilot_table, as_table, ek2_group, with_system_id
+from paramclient.sim.param_table import Entry, Table, ardupilot_table, as_table, ek2_group, with_system_id
 from paramclient.sim.vehicle import Vehicle, VehicleOptions
-from paramclient.values import Encoding, ParamType, bits_of, from_bits
 
 __all__ = ["ArduPilotVehicle"]
 

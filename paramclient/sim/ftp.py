@@ -9,10 +9,10 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple, TypeAlias
 
 from paramclient.errors import FileErrorCode, PackError, UsageError
-from paramclient.protocol import pack
+from paramclient.model.values import crc32_px4
+from paramclient.protocol.ftp import param_pck
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
-from paramclient.protocol.pack import PackedParam
-from paramclient.values import crc32_px4
+from paramclient.protocol.ftp.param_pck import PackedParam
 
 __all__ = ["PARAM_FILE", "Address", "FileServer"]
 
@@ -305,7 +305,7 @@ class FileServer:
                 self.files[session.path] = bytes(session.written)
                 return _Answer(Opcode.ACK)
             try:
-                self.apply(pack.decode_upload(bytes(session.written)))
+                self.apply(param_pck.decode_upload(bytes(session.written)))
             except PackError:
                 return _no(FileErrorCode.FAIL_ERRNO, EINVAL)
         return _Answer(Opcode.ACK)
@@ -325,7 +325,9 @@ class FileServer:
             key = (start, count, with_defaults, aligned, rows)
             if self._packed is None or self._packed[0] != key:
                 part = rows[start:] if count is None else rows[start : start + count]
-                content = pack.encode(part, total=len(rows), with_defaults=with_defaults, read_size=aligned)
+                content = param_pck.encode(
+                    part, total=len(rows), with_defaults=with_defaults, read_size=aligned
+                )
                 self._packed = (key, content)
             return self._packed[1][offset : offset + size]
 

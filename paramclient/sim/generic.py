@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Unpack
 
 from paramclient.errors import ParamErrorCode
+from paramclient.model.values import Encoding, ParamType
 from paramclient.protocol import wire
-from paramclient.sim.table import Entry, Table, as_table
+from paramclient.sim.param_table import Entry, Table, as_table
 from paramclient.sim.vehicle import Vehicle, VehicleOptions
-from paramclient.values import Encoding, ParamType
 
 __all__ = ["BytewiseVehicle", "GenericVehicle"]
 

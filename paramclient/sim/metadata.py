@@ -8,8 +8,8 @@ import math
 from functools import cache
 from typing import Any, Final
 
-from paramclient.sim.table import SimParam
-from paramclient.values import ParamType, crc32_px4
+from paramclient.model.values import ParamType, crc32_px4
+from paramclient.sim.param_table import SimParam
 
 __all__ = ["GENERAL_FILE", "PARAMETER_FILE", "metadata_files"]
 

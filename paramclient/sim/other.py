@@ -6,9 +6,9 @@ import math
 from collections.abc import Iterable
 
 from paramclient.errors import UsageError
+from paramclient.model.values import Encoding
 from paramclient.protocol import wire
-from paramclient.sim.table import Entry, SimParam
-from paramclient.values import Encoding
+from paramclient.sim.param_table import Entry, SimParam
 
 __all__ = ["OtherStation"]
 

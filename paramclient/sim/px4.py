@@ -8,13 +8,21 @@ from collections.abc import Iterable, Mapping
 from typing import Final, Unpack
 
 from paramclient.errors import ParamErrorCode, UsageError
+from paramclient.model.values import Encoding, ParamType, Value, bits_of, crc32_px4, from_bits, px4_hash
 from paramclient.protocol import wire
 from paramclient.sim.ftp import FileServer
 from paramclient.sim.generic import BytewiseVehicle
 from paramclient.sim.metadata import GENERAL_FILE, metadata_files
-from paramclient.sim.table import FLT_EPSILON, Entry, SimParam, Table, as_table, px4_table, with_system_id
+from paramclient.sim.param_table import (
+    FLT_EPSILON,
+    Entry,
+    SimParam,
+    Table,
+    as_table,
+    px4_table,
+    with_system_id,
+)
 from paramclient.sim.vehicle import VehicleOptions
-from paramclient.values import Encoding, ParamType, Value, bits_of, crc32_px4, from_bits, px4_hash
 
 __all__ = ["PX4Vehicle"]
 

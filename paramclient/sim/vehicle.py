@@ -8,12 +8,12 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import TypedDict
 
 from paramclient.errors import ParamErrorCode, UsageError
+from paramclient.model.values import Encoding, Param, Value, bits_of
 from paramclient.protocol import wire
-from paramclient.protocol.pack import PackedParam
+from paramclient.protocol.ftp.param_pck import PackedParam
 from paramclient.sim.device import Device
 from paramclient.sim.ftp import FileServer
-from paramclient.sim.table import Entry, SimParam
-from paramclient.values import Encoding, Param, Value, bits_of
+from paramclient.sim.param_table import Entry, SimParam
 
 __all__ = ["Vehicle", "VehicleOptions"]
 

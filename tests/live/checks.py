@@ -15,6 +15,7 @@ from typing import Final
 import anyio
 
 from paramclient import Component, FetchResult, Ftp, ParamCache, ParamClient, Rebooted
+from paramclient.client.events import Events
 from paramclient.errors import (
     FileTransferError,
     NoReply,
@@ -24,16 +25,15 @@ from paramclient.errors import (
     UsageError,
     ValueNotApplied,
 )
-from paramclient.events import Events
-from paramclient.logs import import_log
+from paramclient.logs.telemetry import import_log
 from paramclient.metadata import ParamInfo
-from paramclient.paramset import ParamSet, WrittenParam
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import Param, ParamType, from_bits, type_name
 from paramclient.protocol.ftp.packets import MOST_DATA
-from paramclient.protocol.restart import SAVING_TIME
-from paramclient.protocol.small_change import CHANGE_MIN
+from paramclient.protocol.params.write_resolution import CHANGE_MIN
+from paramclient.protocol.vehicle.reboot import SAVING_TIME
 from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, message_name
 from paramclient.provision import MISSING, ApplyStatus, apply, restore, verify
-from paramclient.values import Param, ParamType, from_bits, type_name
 from tests.live.choice import another_value
 from tests.live.journal import check_disarmed
 from tests.live.relay import FILE_TRANSFER_ID, LIST_REQUEST_ID, Conditions

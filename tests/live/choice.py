@@ -12,7 +12,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Final
 
-from paramclient.values import Param, ParamType, bits_of, from_bits
+from paramclient.model.values import Param, ParamType, bits_of, from_bits
 
 __all__ = ["MANY", "Choice", "another_value", "choose"]
 

@@ -14,9 +14,9 @@ import anyio
 
 from paramclient import Component, ParamSet, write_file
 from paramclient.errors import ParamClientError, VehicleArmed
-from paramclient.protocol.writes import SetResult
+from paramclient.model.values import Param, Value, format_value
+from paramclient.protocol.params.writes import SetResult
 from paramclient.provision.cautions import cautions_for
-from paramclient.values import Param, Value, format_value
 
 __all__ = ["Journal", "check_disarmed"]
 

@@ -29,11 +29,11 @@ import anyio.lowlevel
 
 from paramclient.errors import FileErrorCode, LinkError
 from paramclient.links import create_link, parse_link
-from paramclient.links.base import Peer
+from paramclient.links.link import Peer
 from paramclient.links.udp import UdpIn
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.packets import Opcode, Packet
-from paramclient.protocol.sniff import FrameCutter
+from paramclient.protocol.stats.sniffer import FrameCutter
 from paramclient.sim import Air, FaultyLink
 
 __all__ = ["CLEAN", "Conditions", "Counts", "RealVehicle", "Relay"]

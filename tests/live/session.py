@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Final
 
 from paramclient import Component, FetchResult, ParamClient
-from paramclient.values import Param
+from paramclient.model.values import Param
 from tests.live.choice import Choice
 from tests.live.journal import Journal
 from tests.live.relay import CLEAN, Conditions, Relay

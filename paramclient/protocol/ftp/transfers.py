@@ -12,10 +12,10 @@ from collections.abc import Callable
 from typing import Any, Final, NamedTuple, TypeVar
 
 from paramclient.errors import FileErrorCode, NoReply, UsageError
-from paramclient.protocol.ftp.jobs import Job, Line
+from paramclient.protocol.ftp.file_read import LARGEST_FILE, FileRead
+from paramclient.protocol.ftp.operations import Job, Line
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
-from paramclient.protocol.ftp.reading import LARGEST_FILE, FileRead
-from paramclient.protocol.timing import RoundTrip
+from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.wire import FileTransfer, Message
 
 __all__ = ["DirectoryEntry", "FileChecksum", "FileList", "FileRead", "FileTransfers", "FileWrite"]
@@ -235,7 +235,7 @@ class FileTransfers:
         return self._begin(FileList(self._line_at(now), path, now), now)
 
     def checksum(self, path: str, now: float) -> FileChecksum:
-        """Let the server compute the CRC-32 of a file, which is that of `paramclient.values.crc32_px4`.
+        """Let the server compute the CRC-32 of a file, which is that of `paramclient.model.values.crc32_px4`.
 
         Raises:
             UsageError: the path cannot be.

@@ -1,6 +1,6 @@
 """Frames to messages, and messages to bytes: the few of this protocol, on raw bytes.
 
-A parameter's value must not pass through a Python float on its way (see `paramclient.values`).
+A parameter's value must not pass through a Python float on its way (see `paramclient.model.values`).
 """
 
 from __future__ import annotations

@@ -8,13 +8,13 @@ from fastapi import APIRouter
 
 from paramclient.service.routes import (
     components,
-    described,
-    fetching,
+    events,
+    fetches,
     files,
+    history,
+    metadata,
     params,
-    past,
     setup,
-    stream,
     system,
 )
 
@@ -24,10 +24,10 @@ ROUTERS: Final[tuple[APIRouter, ...]] = (
     system.router,
     components.router,
     params.router,
-    described.router,
-    fetching.router,
+    metadata.router,
+    fetches.router,
     setup.router,
     files.router,
-    past.router,
-    stream.router,
+    history.router,
+    events.router,
 )

@@ -8,14 +8,14 @@ import anyio.lowlevel
 from fastapi import APIRouter, Depends, Request, Response
 from pydantic import Field
 
-from paramclient.client import HEARING_PATIENCE
-from paramclient.component import Component
-from paramclient.documents.base import Body
+from paramclient.client.client import HEARING_PATIENCE
+from paramclient.client.component import Component
 from paramclient.documents.component import ComponentDoc, ComponentsDoc
+from paramclient.documents.document import Body
 from paramclient.service.answering import document_answer
-from paramclient.service.asking import LinkName, Seconds, Target, TheHub, answered, may_write
-from paramclient.service.following import Followed
+from paramclient.service.followed_component import Followed
 from paramclient.service.reading import BodyRoute
+from paramclient.service.route_context import LinkName, Seconds, Target, TheHub, answered, may_write
 
 __all__ = ["router"]
 

@@ -8,17 +8,16 @@ from typing import Annotated, Any, Final
 
 from fastapi import APIRouter, Query, Request, Response
 
-from paramclient.documents.written import FormDoc, FormsDoc, UploadedDoc
+from paramclient.documents.paramset import FormDoc, FormsDoc, UploadedDoc
 from paramclient.errors import UsageError
 from paramclient.files import FileForm, dumps
-from paramclient.files.model import ENDINGS
-from paramclient.identity import autopilot_name
-from paramclient.paramset import ParamSet
+from paramclient.files.param_file import ENDINGS
+from paramclient.model.identity import autopilot_name
+from paramclient.model.paramset import ParamSet
+from paramclient.provision.vehicle_params import differing, whole_set
 from paramclient.service.answering import document_answer
-from paramclient.service.asking import Target, TheHub, answered
 from paramclient.service.hub import Hub
-from paramclient.service.reading import long_request
-from paramclient.service.wanted import (
+from paramclient.service.param_sources import (
     LARGEST_UPLOAD,
     LONGEST_NAME,
     check_size,
@@ -27,7 +26,8 @@ from paramclient.service.wanted import (
     state,
     when_of,
 )
-from paramclient.taken import differing, whole_set
+from paramclient.service.reading import long_request
+from paramclient.service.route_context import Target, TheHub, answered
 
 __all__ = ["RAW_BODY", "attachment", "body_of", "moment", "router"]
 

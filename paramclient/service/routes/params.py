@@ -14,14 +14,19 @@ import anyio.lowlevel
 from fastapi import APIRouter, Depends, Query, Request, Response
 from pydantic import Field
 
-from paramclient.asked import SETTLE_MAX
-from paramclient.documents.base import Body, Document, InParts
-from paramclient.documents.call import NotSetDoc, SetManyDoc, SetResultDoc
+from paramclient.client.arguments import SETTLE_MAX
+from paramclient.documents.document import Body, Document, InParts
 from paramclient.documents.param import ParamDoc
+from paramclient.documents.results import NotSetDoc, SetManyDoc, SetResultDoc
 from paramclient.errors import ParamClientError, UnknownParameter, UsageError
-from paramclient.patterns import NameChoice
+from paramclient.model.patterns import NameChoice
+from paramclient.model.values import Param
 from paramclient.service.answering import JSON
-from paramclient.service.asking import (
+from paramclient.service.followed_component import Followed, param_text
+from paramclient.service.param_sources import MOST_PATTERNS, MOST_VALUES
+from paramclient.service.problems import problem_of
+from paramclient.service.reading import BodyRoute
+from paramclient.service.route_context import (
     Seconds,
     Target,
     TheHub,
@@ -31,11 +36,6 @@ from paramclient.service.asking import (
     may_write,
     value_of,
 )
-from paramclient.service.following import Followed, param_text
-from paramclient.service.problems import problem_of
-from paramclient.service.reading import BodyRoute
-from paramclient.service.wanted import MOST_PATTERNS, MOST_VALUES
-from paramclient.values import Param
 
 if TYPE_CHECKING:
     from paramclient.metadata import Metadata

@@ -10,27 +10,35 @@ import anyio
 from fastapi import APIRouter, Depends, Request, Response
 from pydantic import model_validator
 
-from paramclient.compare import compare, defaults_of
-from paramclient.documents.base import Body, Document
 from paramclient.documents.diff import DiffDoc
+from paramclient.documents.document import Body, Document
 from paramclient.documents.job import JobDoc
 from paramclient.documents.setup import ApplyProgressDoc, ApplyResultDoc, InterruptedDoc, PlanDoc, VerifiedDoc
 from paramclient.errors import NoReply, UsageError
 from paramclient.metadata import Metadata, MetadataStore
-from paramclient.paramset import ParamSet
+from paramclient.model.comparison import compare, defaults_of
+from paramclient.model.paramset import ParamSet
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, apply, overlay, prepare, restore
-from paramclient.provision.applying import restored
-from paramclient.provision.looking import prepare_aside
+from paramclient.provision.inspection import prepare_aside
+from paramclient.provision.set_up import restored
+from paramclient.provision.vehicle_params import NO_DEFAULTS, whole_set
 from paramclient.service.answering import document_answer
-from paramclient.service.asking import Seconds, Target, TheHub, answered, asker_of, holder_of, may_write
-from paramclient.service.following import Followed
+from paramclient.service.followed_component import Followed
 from paramclient.service.hub import Hub
 from paramclient.service.jobs import Job, Kind
+from paramclient.service.param_sources import Moment, Number, Patterns, Source, known_set, resolved, state
 from paramclient.service.problems import ServiceError
 from paramclient.service.reading import BodyRoute, long_request
-from paramclient.service.routes.fetching import accepted, awaited
-from paramclient.service.wanted import Moment, Number, Patterns, Source, known_set, resolved, state
-from paramclient.taken import NO_DEFAULTS, whole_set
+from paramclient.service.route_context import (
+    Seconds,
+    Target,
+    TheHub,
+    answered,
+    asker_of,
+    holder_of,
+    may_write,
+)
+from paramclient.service.routes.fetches import accepted, awaited
 
 __all__ = ["router"]
 

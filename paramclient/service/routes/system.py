@@ -5,8 +5,8 @@ from __future__ import annotations
 from fastapi import APIRouter, Request, Response
 
 from paramclient.documents.link import HealthDoc, HealthLinkDoc, LinksDoc, MeDoc
-from paramclient.service.asking import TheHub, asker_of
 from paramclient.service.metrics import MEDIA_TYPE, metrics_text
+from paramclient.service.route_context import TheHub, asker_of
 from paramclient.version import __version__
 
 __all__ = ["router"]

@@ -1,0 +1,257 @@
+"""Earlier states of a table: snapshots, and what can be told of any other moment.
+
+A state is worked backwards from the present table. Each line of history takes back one change. A name leaves
+no line when it appears, so from the moment on when a table was first complete, every new name is noted with
+its time (`birth`). That moment is `known_since`; it moves on as lines of history are dropped. Before it,
+nothing is claimed. Nor is anything of a time that the clock of this computer went through twice, because it
+was set back in between (`setback`). Of a name in the first table, `birth` has when its value there was
+observed, once that has changed.
+
+Each function works inside its caller's transaction.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from datetime import UTC, datetime
+from typing import Any, Final
+
+from paramclient.cache.records import Snapshot
+from paramclient.cache.rows import Damaged, Row, identity_cells, read_identity, read_param, time_cell
+from paramclient.cache.transaction import Session
+from paramclient.errors import NotInCache
+from paramclient.model.identity import Identity
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import Value, is_portable_name, known_type
+
+__all__ = [
+    "CLOCK_SLACK",
+    "SNAPSHOTS",
+    "kept_time",
+    "read_written",
+    "snapshot",
+    "state_at",
+    "store",
+    "watch_clock",
+    "written_cells",
+]
+
+SNAPSHOTS: Final = 50
+"""Snapshots kept for each table, the newest ones: one is made before each file that is applied, so they are
+weeks of work on one vehicle. One of a thousand parameters takes about 10 kB."""
+
+CLOCK_SLACK: Final = 5.0
+"""Seconds that a time may lie before the one written last without the clock having been set back: so long may
+one process wait for another before it writes (`BUSY_TIMEOUT`)."""
+
+
+def watch_clock(session: Session, key: str, component: int, at: float) -> None:
+    """Note it where a table is written to at an earlier time than the last time."""
+    written_at = session.updated_at(key, component)
+    if written_at is not None and written_at > at + CLOCK_SLACK:
+        owner = session.owner_of(key, component)
+        assert owner is not None
+        session.add_setback(owner, at, written_at)
+
+
+def store(
+    session: Session,
+    owner: int,
+    params: ParamSet,
+    *,
+    at: float,
+    reason: str,
+    hash: int | None,  # noqa: A002  # the word of the record
+    complete: bool,
+    number: int | None = None,
+) -> Snapshot:
+    """Set a table down, and drop the oldest snapshots of it beyond `SNAPSHOTS`.
+
+    Args:
+        params: with the identity of the vehicle.
+        number: the one that it was given elsewhere; None for the next one.
+    """
+    assert params.identity is not None
+    blob = _packed(params.identity, params)
+    text = reason.encode("utf-8", "backslashreplace").decode()  # a file's name need not be UTF-8
+    text = text.replace("\0", "\\x00")  # PostgreSQL's text cannot hold it
+    row = (kept_time(at), text, len(params), hash, int(complete))
+    number = session.add_snapshot(owner, row, blob, _checksum(row, blob), number)
+    session.trim_snapshots(owner, SNAPSHOTS)
+    return snapshot(session, owner, number)
+
+
+def snapshot(session: Session, owner: int, number: int) -> Snapshot:
+    """One snapshot of a table.
+
+    Raises:
+        CacheError: there is none of this number, or it is damaged.
+    """
+    found = session.snapshot(owner, number)
+    if found is None:
+        raise NotInCache(_no_such(session, owner, number))
+    summary, row, blob, expected = found
+    try:
+        if not isinstance(blob, bytes) or _checksum(row, blob) != expected:
+            raise ValueError("it is not what was written")
+        identity, params = _unpacked(blob)
+    except (ArithmeticError, LookupError, TypeError, ValueError, Damaged, struct.error, zlib.error) as error:
+        raise NotInCache(
+            f"snapshot {number} of {summary.key}, component {summary.component}, is damaged: {error}"
+        ) from error
+    return Snapshot(
+        **{field.name: getattr(summary, field.name) for field in fields(summary)},
+        params=ParamSet(
+            {name: each for name, each in params.items() if is_portable_name(name)},
+            summary.component,
+            identity.system,
+            identity,
+            summary.at,
+            f"snapshot {number} of {summary.key}",
+        ),
+    )
+
+
+def kept_time(at: float) -> float:
+    """The time of a snapshot as it is kept: to the millisecond."""
+    return round(time_cell(at), 3)
+
+
+def state_at(
+    session: Session, owner: int, identity: Identity, rows: Mapping[str, Row], when: float
+) -> ParamSet:
+    """A table as it was last known at a moment.
+
+    Args:
+        identity: the vehicle, as it was last seen.
+        rows: the present table.
+        when: unix seconds.
+
+    Raises:
+        CacheError: that cannot be told.
+    """
+    when = time_cell(when)
+    _, number, since = session.described(owner)
+    exact = session.snapshot_at(owner, when)
+    if exact is not None:
+        return snapshot(session, owner, exact).params
+    who = f"{identity.key}, component {number}"
+    if since is None or when < since:
+        reach = (
+            "is not known: its table was never complete"
+            if since is None
+            else f"at {_text(when)} is not known: what is kept of its history begins at {_text(since)}"
+        )
+        raise NotInCache(f"the state of {who} {reach}{_older(session, owner, when)}")
+    twice = session.setback_over(owner, when)
+    if twice is not None:
+        back, until = twice
+        raise NotInCache(
+            f"the state of {who} at {_text(when)} cannot be told: the clock of this computer was set back"
+            f" from {_text(until)} to {_text(back)}{_older(session, owner, when)}"
+        )
+    first = _first_events_after(session, owner, when)
+    state = {name: first.get(name, row.value) for name, row in rows.items()} | first
+    params = {}
+    for name, value in state.items():
+        if value is not None and is_portable_name(name):
+            params[name] = WrittenParam.of(read_param(name, *value))
+    then = replace(identity, firmware=0, git_hash="", capabilities=0)
+    return ParamSet(params, number, identity.system, then, when, f"history of {identity.key}")
+
+
+# The value that the first event after a moment took away: None where there was no such name.
+_Taken = tuple[int, int, int] | None
+
+
+def _first_events_after(session: Session, owner: int, when: float) -> dict[str, _Taken]:
+    """By name, what was there before the first thing that happened after a moment."""
+    events: list[tuple[int, int, str, _Taken]] = [
+        (line, 0, name, (old_type, old_bits, old_is_raw))
+        for line, (_, name, _, old_type, old_bits, old_is_raw, *_) in session.lines(owner, when)
+    ]
+    for line, name in session.births_after(owner, when):
+        events.append((line, 1, name, None))  # after the line that was the last one then
+    first: dict[str, _Taken] = {}
+    for _, _, name, value in sorted(events, key=lambda event: event[:2]):
+        first.setdefault(name, value)
+    return first
+
+
+def _older(session: Session, owner: int, when: float) -> str:
+    """What snapshots there are where history does not help: those next to the moment."""
+    found = session.snapshots_around(owner, when)
+    listed = " and ".join(f"snapshot {number} of {_text(at)}" for number, at in found)
+    return f"; there is {listed}" if listed else "; there is no snapshot"
+
+
+def _no_such(session: Session, owner: int, number: int) -> str:
+    key, component, _ = session.described(owner)
+    kept = [str(each.id) for each in session.snapshots(key, component)]
+    listed = f"those kept are {', '.join(kept)}" if kept else "none is kept"
+    return f"there is no snapshot {number} of {key}, component {component}: {listed}"
+
+
+def _text(at: float) -> str:
+    return f"{datetime.fromtimestamp(at, UTC):%Y-%m-%dT%H:%M:%SZ}"
+
+
+def _checksum(described: Sequence[object], blob: bytes) -> int:
+    return zlib.crc32(blob, zlib.crc32(repr(tuple(described)).encode()))
+
+
+def _packed(identity: Identity, params: Mapping[str, WrittenParam]) -> bytes:
+    """Strict JSON, compressed: who the vehicle is, and name, type, value, default of each parameter."""
+    rows = [written_cells(each) for each in params.values()]
+    text = json.dumps([identity_cells(identity), rows], separators=(",", ":"), allow_nan=False)
+    return zlib.compress(text.encode("ascii"))
+
+
+def _unpacked(blob: bytes) -> tuple[Identity, dict[str, WrittenParam]]:
+    identity, rows = json.loads(zlib.decompress(blob))
+    found = [read_written(each) for each in rows]
+    return read_identity(identity), {each.name: each for each in found}
+
+
+def written_cells(param: WrittenParam) -> tuple[str, int | None, int | str | None, int | str | None]:
+    """A parameter's name, type, value and default, as JSON can hold them."""
+    number = None if param.type is None else int(param.type)
+    return param.name, number, _cell(param.value), _cell(param.default)
+
+
+def read_written(cells: Sequence[Any]) -> WrittenParam:
+    """The inverse of `written_cells`."""
+    name, number, value, default = cells
+    kind = None if number is None else known_type(number)
+    written = _written(value)
+    assert written is not None
+    return WrittenParam(str(name), written, kind, _written(default))
+
+
+def _cell(value: Value | None) -> int | str | None:
+    """A value so that it comes back to the last bit: a float by its bytes, four where a float32 holds it."""
+    if value is None or isinstance(value, int):
+        return value
+    if isinstance(value, bytes):
+        return f"x{value.hex()}"
+    wide = struct.pack("<d", value)
+    try:
+        narrow = struct.pack("<f", value)
+    except OverflowError:
+        return f"d{wide.hex()}"
+    is_whole = struct.pack("<d", *struct.unpack("<f", narrow)) == wide
+    return f"f{narrow.hex()}" if is_whole else f"d{wide.hex()}"
+
+
+def _written(cell: Any) -> Value | None:
+    if cell is None or isinstance(cell, int):
+        return cell
+    kind, data = cell[0], bytes.fromhex(cell[1:])
+    if kind == "x":
+        return data
+    value: float = struct.unpack({"f": "<f", "d": "<d"}[kind], data)[0]
+    return value

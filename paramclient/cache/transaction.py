@@ -1,0 +1,577 @@
+"""One transaction on the tables of a cache: rows in, rows out.
+
+The statements are SQL that SQLite and PostgreSQL both understand, with `?` for each value. What the two say
+differently is left to `sqlite` and `postgres`. What the rows mean is the business of the rooms above; none of
+them speaks SQL.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any, ClassVar, Final, TypeAlias
+
+from paramclient.cache.records import CachedSummary, CachedVehicle, HistoryEntry, SnapshotSummary, TableUpdate
+from paramclient.cache.rows import (
+    Row,
+    cells,
+    checksum,
+    identity_cells,
+    read_identity,
+    read_param,
+    read_params,
+    time_cell,
+)
+from paramclient.model.params import Params
+
+__all__ = ["Line", "NumberedLine", "Session"]
+
+Line: TypeAlias = tuple[Any, ...]
+"""A line of history: at, name, by; type, bits, is_raw of the old value, and of the new one, or three None."""
+NumberedLine: TypeAlias = tuple[int, Line]
+
+# In the order of `identity_cells`.
+_IDENTITY: Final = (
+    "system, link, uid, autopilot, vehicle_type, firmware, git_hash,"
+    " board, vendor_id, product_id, capabilities"
+)
+_LINE: Final = "at, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
+_SUMMARY: Final = "s.id, vehicle, component, at, reason, size, s.hash, s.complete"
+
+
+class Session(ABC):
+    """The tables within one transaction. An `owner` is the id of a component's table in this database.
+
+    Attributes:
+        is_shared: several stations write here, each with its own clock and its own view of a vehicle.
+    """
+
+    is_shared: bool = False
+
+    # vehicles and their tables
+
+    def make(self, update: TableUpdate) -> int:
+        """Write whose table it is; give the id of the table, which is made where there is none."""
+        at = time_cell(update.at)
+        key = update.identity.key
+        columns = f"{_IDENTITY}, last_seen"
+        values = ", ".join(f"excluded.{column}" for column in columns.split(", "))
+        self._do(
+            f"INSERT INTO vehicle (key, first_seen, {columns}) VALUES (?{', ?' * 13})"
+            f" ON CONFLICT (key) DO UPDATE SET ({columns}) = ({values})",
+            (key, at, *identity_cells(update.identity), at),
+        )
+        self._do(
+            "INSERT INTO component (vehicle, component, own_autopilot, checksum, updated_at)"
+            " VALUES (?, ?, ?, ?, ?)"
+            " ON CONFLICT (vehicle, component) DO UPDATE"
+            " SET own_autopilot = excluded.own_autopilot, updated_at = excluded.updated_at",
+            (key, update.component, update.autopilot, checksum({}), at),
+        )
+        owner = self.owner_of(key, update.component)
+        assert owner is not None
+        return owner
+
+    def owner_of(self, key: str, component: int) -> int | None:
+        """The id of a table, or None where there is none."""
+        found = self._all("SELECT id FROM component WHERE vehicle = ? AND component = ?", (key, component))
+        return int(found[0][0]) if found else None
+
+    def described(self, owner: int) -> tuple[str, int, float | None]:
+        """Whose table it is: key and component id; and since when its states are known."""
+        [row] = self._all("SELECT vehicle, component, known_since FROM component WHERE id = ?", (owner,))
+        key, component, since = cells(row, "siF")
+        return key, component, since
+
+    def vehicles(self, key: str | None = None) -> list[CachedVehicle]:
+        """Every vehicle, the one seen last first; or the one of this key."""
+        components: dict[str, list[int]] = {}
+        which = (key,)
+        for row in self._all(
+            "SELECT vehicle, component FROM component WHERE vehicle = coalesce(?, vehicle)"
+            " ORDER BY component",
+            which,
+        ):
+            key, component = cells(row, "si")
+            components.setdefault(key, []).append(component)
+        found = []
+        for row in self._all(
+            f"SELECT key, first_seen, last_seen, {_IDENTITY} FROM vehicle WHERE key = coalesce(?, key)"
+            " ORDER BY last_seen DESC, key",
+            which,
+        ):
+            key, first, last = cells(row[:3], "sff")
+            known = tuple(components.get(key, ()))
+            found.append(CachedVehicle(key, read_identity(row[3:]), first, last, known))
+        return found
+
+    def seen(self, key: str, first: float, last: float) -> None:
+        """Say when a vehicle was seen for the first and for the last time."""
+        self._do("UPDATE vehicle SET first_seen = ?, last_seen = ? WHERE key = ?", (first, last, key))
+
+    def summaries(
+        self, key: str | None = None, component: int | None = None
+    ) -> list[tuple[int, CachedSummary]]:
+        """Tables with their ids, without parameters; of one vehicle or component where given."""
+        rows = self._all(
+            f"SELECT id, component, own_autopilot, {self.SIZE}, hash,"
+            f" count, complete, volatile_known, synced_at, updated_at, file_works, key, {_IDENTITY}"
+            " FROM component c JOIN vehicle ON key = vehicle"
+            " WHERE key = coalesce(?, key) AND component = coalesce(?, component)"
+            " ORDER BY last_seen DESC, key, component",
+            (key, component),
+        )
+        return [_summary(row) for row in rows]
+
+    def updated_at(self, key: str, component: int) -> float | None:
+        """When a table was last written; None where there is none."""
+        found = self._all(
+            "SELECT updated_at FROM component WHERE vehicle = ? AND component = ?", (key, component)
+        )
+        if not found:
+            return None
+        [at] = cells(found[0], "f")
+        return float(at)
+
+    def of_other_firmware(self, key: str, firmware: int, git_hash: str) -> list[int]:
+        """The tables of a vehicle, if it had another firmware when it was last seen."""
+        found = self._all(
+            "SELECT c.id FROM vehicle JOIN component c ON vehicle = key"
+            " WHERE key = ? AND (firmware != ? OR git_hash != ?)",
+            (key, firmware, git_hash),
+        )
+        return [int(owner) for (owner,) in found]
+
+    def describe(self, owner: int, **cells_: object) -> None:
+        """Change what is said of a table as a whole; the names are those of the columns."""
+        named = ", ".join(f"{name} = ?" for name in cells_)
+        values = (int(cell) if isinstance(cell, bool) else cell for cell in cells_.values())
+        self._do(f"UPDATE component SET {named} WHERE id = ?", (*values, owner))
+
+    def remove(self, key: str, component: int | None) -> int:
+        """Delete tables with all that belongs to them; give their number."""
+        removed = self._do(
+            "DELETE FROM component WHERE vehicle = ? AND component = coalesce(?, component)", (key, component)
+        )
+        self._do("DELETE FROM vehicle WHERE key NOT IN (SELECT vehicle FROM component)")
+        return removed
+
+    # parameters
+
+    SIZE: ClassVar[str]
+    """What says in a statement how many parameters the table of `c.id` has."""
+
+    @abstractmethod
+    def table(self, owner: int) -> dict[str, Row]:
+        """A table's parameters by index, then name, those without an index last.
+
+        Raises:
+            Damaged: they are not what was written.
+        """
+
+    def params(self, owner: int) -> tuple[Params, frozenset[str], dict[str, float]]:
+        """The same as parameters: those, the names of the volatile ones, and when each was heard.
+
+        Raises:
+            Damaged: they are not what was written.
+        """
+        rows = self.table(owner)
+        volatile = frozenset(name for name, row in rows.items() if row.volatile)
+        return read_params(rows), volatile, {name: row.heard_at for name, row in rows.items()}
+
+    @abstractmethod
+    def put_table(self, owner: int, before: Mapping[str, Row] | None, after: Mapping[str, Row]) -> None:
+        """Make a table's parameters these.
+
+        Args:
+            before: what it has; None where that is not known, and may not be what was written.
+            after: what it is to have; something else.
+
+        Raises:
+            UsageError: something that cannot be kept.
+        """
+
+    @abstractmethod
+    def heard_last(self, owner: int) -> float:
+        """When any value of a table was heard last; minus infinity where it has none."""
+
+    # history
+
+    def history(
+        self, key: str, component: int | None, name: str | None, limit: int | None, since: float | None
+    ) -> list[HistoryEntry]:
+        """The lines of a vehicle, newest last."""
+        end = "" if limit is None or limit < 0 else f" LIMIT {int(limit)}"
+        rows = self._all(
+            "SELECT at, component, name, by, old_type, old_bits, old_is_raw, new_type, new_bits, new_is_raw"
+            " FROM history h JOIN component c ON c.id = owner"
+            " WHERE vehicle = ? AND component = coalesce(?, component) AND name = coalesce(?, name)"
+            f" AND at >= coalesce(?, at) ORDER BY h.id DESC{end}",
+            (key, component, name, since),
+        )
+        return [_entry(row) for row in reversed(rows)]
+
+    def lines(self, owner: int, after: float | None = None) -> list[NumberedLine]:
+        """The lines of a table with their numbers, in order; those of a later time than `after` only."""
+        if after is None:
+            return self._lines("", (owner,))
+        return self._lines(" AND at > ?", (owner, after))
+
+    def lines_from(self, owner: int, since: float) -> list[NumberedLine]:
+        """The lines from the first one on that is of a later time than `since`, in order."""
+        where = " AND id >= (SELECT min(id) FROM history WHERE owner = ? AND at > ?)"
+        return self._lines(where, (owner, owner, since))
+
+    def add_lines(self, owner: int, lines: Sequence[Line]) -> None:
+        """Append lines of history, in this order."""
+        self._many(
+            f"INSERT INTO history (owner, {_LINE}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            [(owner, *line) for line in lines],
+        )
+
+    def trim_lines(self, owner: int, keep: int) -> float | None:
+        """Delete all but the newest lines of a table; give the latest time of those that went, if any did."""
+        found = self._all(
+            f"SELECT id FROM history WHERE owner = ? ORDER BY id DESC LIMIT 1 OFFSET {int(keep)}", (owner,)
+        )
+        if not found:
+            return None
+        [(last,)] = found
+        [(at,)] = self._all("SELECT max(at) FROM history WHERE owner = ? AND id <= ?", (owner, last))
+        self._do("DELETE FROM history WHERE owner = ? AND id <= ?", (owner, last))
+        return float(at)
+
+    def replace_lines(self, owner: int, lines: Sequence[tuple[int | None, Line]], *, start: int = 0) -> None:
+        """Put these lines into the place of those that a table has, in this order, under new numbers.
+
+        Args:
+            lines: each with the number that it had, or None for a new one. Names that appeared behind a line
+                go with it.
+            start: the number from which on lines are replaced.
+        """
+        [(ahead,)] = self._all(
+            "SELECT coalesce(max(id), 0) FROM history WHERE owner = ? AND id < ?", (owner, start)
+        )
+        numbers = self._put_lines(owner, [line for _, line in lines], start)
+        places = {old: number for number, (old, _) in zip(numbers, lines, strict=True) if old is not None}
+        behind = self._all("SELECT DISTINCT line FROM birth WHERE owner = ? AND line >= ?", (owner, start))
+        # from the last one on: a new number is above every old one
+        for (line,) in sorted(behind, reverse=True):
+            place = max((new for old, new in places.items() if old <= line), default=ahead)
+            if place == line:
+                continue
+            self._do(
+                "DELETE FROM birth WHERE owner = ? AND line = ?"
+                " AND name IN (SELECT name FROM birth WHERE owner = ? AND line = ?)",
+                (owner, place, owner, line),
+            )
+            self._do("UPDATE birth SET line = ? WHERE owner = ? AND line = ?", (place, owner, line))
+
+    def became(self, owner: int, name: str, after: float, until: float) -> list[tuple[Any, ...]]:
+        """What a parameter became in a time, by its lines: type, bits, is_raw."""
+        return self._all(
+            "SELECT new_type, new_bits, new_is_raw FROM history"
+            " WHERE owner = ? AND name = ? AND at > ? AND at <= ?",
+            (owner, name, after, until),
+        )
+
+    def last_became(self, owner: int, name: str, until: float) -> tuple[Any, ...] | None:
+        """What the last line of a parameter up to a time made of it, as in `became`; None without a line."""
+        found = self._all(
+            "SELECT new_type, new_bits, new_is_raw FROM history"
+            " WHERE owner = ? AND name = ? AND at <= ? ORDER BY id DESC LIMIT 1",
+            (owner, name, until),
+        )
+        return found[0] if found else None
+
+    def last_line_at(self, owner: int) -> float:
+        """The time of the last line of a table; minus infinity where it has none."""
+        found = self._all("SELECT at FROM history WHERE owner = ? ORDER BY id DESC LIMIT 1", (owner,))
+        return max((float(at) for (at,) in found), default=float("-inf"))
+
+    def gone(self, owner: int) -> Mapping[str, float]:
+        """By name, when a parameter went last, of those that did and have left a line."""
+        found = self._all(
+            "SELECT name, max(at) FROM history WHERE owner = ? AND new_type IS NULL GROUP BY name", (owner,)
+        )
+        return dict(cells(row, "sf") for row in found)
+
+    def gone_at(self, owner: int, name: str) -> float:
+        """When a name went last, by its lines; minus infinity where it never did."""
+        [(at,)] = self._all(
+            "SELECT max(at) FROM history WHERE owner = ? AND name = ? AND new_type IS NULL", (owner, name)
+        )
+        return float("-inf") if at is None else float(at)
+
+    # what is known of the past beside the lines
+
+    def begin(self, owner: int, at: float) -> None:
+        """The states of a table are known from now on, unless they are already."""
+        self._do("UPDATE component SET known_since = ? WHERE id = ? AND known_since IS NULL", (at, owner))
+
+    def forget(self, owner: int, at: float) -> None:
+        """The states of a table are not known any more up to this time."""
+        self._do(
+            "UPDATE component SET known_since = CASE WHEN known_since > ? THEN known_since ELSE ? END"
+            " WHERE id = ? AND known_since IS NOT NULL",
+            (at, at, owner),
+        )
+        for table, column in (("birth", "at"), ("setback", "until")):
+            self._do(
+                f"DELETE FROM {table} WHERE owner = ?"
+                f" AND {column} <= (SELECT known_since FROM component WHERE id = ?)",
+                (owner, owner),
+            )
+
+    def add_births(self, owner: int, births: Iterable[tuple[str, float]]) -> None:
+        """Note names that appeared behind the last line, where the states of the table are known."""
+        _, _, known_since = self.described(owner)
+        if known_since is not None:
+            self.add_first_times(owner, births)
+
+    def add_first_times(self, owner: int, times: Iterable[tuple[str, float]]) -> None:
+        """Note names and since when they are known, behind the last line.
+
+        The earlier time counts where one is noted there already.
+        """
+        self._many(
+            "INSERT INTO birth (owner, name, line, at)"
+            " VALUES (?, ?, coalesce((SELECT max(id) FROM history WHERE owner = ?), 0), ?)"
+            " ON CONFLICT (owner, name, line) DO UPDATE"
+            " SET at = CASE WHEN excluded.at < birth.at THEN excluded.at ELSE birth.at END",
+            [(owner, name, owner, at) for name, at in times],
+        )
+
+    def first_times(self, owner: int) -> dict[str, float]:
+        """By name, the earliest time that is noted, of those that have one."""
+        found = self._all("SELECT name, min(at) FROM birth WHERE owner = ? GROUP BY name", (owner,))
+        return dict(cells(row, "sf") for row in found)
+
+    def births(self, owner: int) -> list[tuple[str, int, float]]:
+        """Every name that has appeared, behind which line, and when."""
+        found = self._all("SELECT name, line, at FROM birth WHERE owner = ? ORDER BY line, name", (owner,))
+        return [(name, line, at) for name, line, at in (cells(row, "sif") for row in found)]
+
+    def setbacks(self, owner: int) -> list[tuple[float, float]]:
+        """The times, from and until, that the clock went through twice."""
+        found = self._all("SELECT since, until FROM setback WHERE owner = ? ORDER BY id", (owner,))
+        return [(since, until) for since, until in (cells(row, "ff") for row in found)]
+
+    def put_past(
+        self, owner: int, lines: Sequence[Line], setbacks: Iterable[tuple[float, float]]
+    ) -> Sequence[int]:
+        """Put another past into the place of a table's; give the numbers of the lines."""
+        for table in ("history", "birth", "setback"):
+            self._do(f"DELETE FROM {table} WHERE owner = ?", (owner,))
+        for since, until in setbacks:
+            self.add_setback(owner, since, until)
+        return self._put_lines(owner, lines)
+
+    def put_births(self, owner: int, births: Iterable[tuple[str, float, int]]) -> None:
+        """Note names that appeared: when, and behind the line of which number."""
+        self._many(
+            "INSERT INTO birth (owner, name, at, line) VALUES (?, ?, ?, ?)",
+            [(owner, *birth) for birth in births],
+        )
+
+    def births_after(self, owner: int, when: float) -> list[tuple[int, str]]:
+        """The names that appeared after a moment, each with the line that was the last one then."""
+        found = self._all("SELECT line, name FROM birth WHERE owner = ? AND at > ?", (owner, when))
+        return [(line, name) for line, name in (cells(row, "is") for row in found)]
+
+    def add_setback(self, owner: int, since: float, until: float) -> None:
+        """Note that the clock went through a time twice."""
+        self._do("INSERT INTO setback (owner, since, until) VALUES (?, ?, ?)", (owner, since, until))
+
+    def setback_over(self, owner: int, when: float) -> tuple[float, float] | None:
+        """The time, from and until, that the clock went through twice and that a moment is in, if any."""
+        found = self._all(
+            "SELECT since, until FROM setback WHERE owner = ? AND since <= ? AND until > ?",
+            (owner, when, when),
+        )
+        return (float(found[0][0]), float(found[0][1])) if found else None
+
+    # snapshots
+
+    SNAPSHOT_ORDER: ClassVar[str] = "s.id"
+
+    def add_snapshot(
+        self, owner: int, row: Sequence[object], blob: bytes, crc: int, number: int | None = None
+    ) -> int:
+        """Write a snapshot; give its number.
+
+        Args:
+            row: at, reason, size, hash, complete.
+            number: the one that it was given elsewhere; None for the next one.
+        """
+        given = () if number is None else (number,)
+        return self._insert(
+            f"INSERT INTO snapshot ({'id, ' * len(given)}owner, at, reason, size, hash, complete, params,"
+            f" checksum) VALUES ({'?, ' * len(given)}?, ?, ?, ?, ?, ?, ?, ?)",
+            (*given, owner, *row, blob, crc),
+        )
+
+    def trim_snapshots(self, owner: int, keep: int) -> None:
+        """Delete all but the newest snapshots of a table."""
+        found = self._all(
+            f"SELECT s.id FROM snapshot s WHERE owner = ? ORDER BY {self._newest_first}", (owner,)
+        )
+        self._many("DELETE FROM snapshot WHERE id = ?", found[keep:])
+
+    def drop_snapshots(self, numbers: Iterable[int]) -> None:
+        """Delete snapshots."""
+        self._many("DELETE FROM snapshot WHERE id = ?", [(number,) for number in numbers])
+
+    def has_snapshot(self, number: int) -> bool:
+        """Whether a snapshot of any table has this number."""
+        return bool(self._all("SELECT 1 FROM snapshot WHERE id = ?", (number,)))
+
+    def snapshots(self, key: str, component: int | None) -> list[SnapshotSummary]:
+        """The snapshots of a vehicle's tables, newest last."""
+        rows = self._all(
+            f"SELECT {_SUMMARY} FROM snapshot s JOIN component c ON c.id = owner"
+            f" WHERE vehicle = ? AND component = coalesce(?, component) ORDER BY {self.SNAPSHOT_ORDER}",
+            (key, component),
+        )
+        return [_snapshot(row) for row in rows]
+
+    def snapshot(
+        self, owner: int, number: int
+    ) -> tuple[SnapshotSummary, Sequence[object], object, object] | None:
+        """One snapshot: its summary, the row that was written, its parameters and its checksum; or None."""
+        found = self._all(
+            f"SELECT {_SUMMARY}, params, s.checksum FROM snapshot s JOIN component c ON c.id = owner"
+            " WHERE s.id = ? AND owner = ?",
+            (number, owner),
+        )
+        if not found:
+            return None
+        *described, blob, expected = found[0]
+        return _snapshot(described), described[3:], blob, expected
+
+    def snapshots_around(self, owner: int, when: float) -> list[tuple[int, float]]:
+        """Number and time of the last snapshot that is not later than a moment, and of the first that is."""
+        return [
+            (number, at)
+            for order in ("at <= ? ORDER BY at DESC, id DESC", "at > ? ORDER BY at, id")
+            for number, at in (
+                cells(row, "if")
+                for row in self._all(
+                    f"SELECT id, at FROM snapshot WHERE owner = ? AND {order} LIMIT 1", (owner, when)
+                )
+            )
+        ]
+
+    def snapshot_at(self, owner: int, when: float) -> int | None:
+        """The last snapshot that was made at exactly this time."""
+        [(number,)] = self._all("SELECT max(id) FROM snapshot WHERE owner = ? AND at = ?", (owner, when))
+        return None if number is None else int(number)
+
+    # many vehicles beside each other
+
+    def tables_of(self, component: int) -> list[tuple[int, str, int, bool]]:
+        """The tables of a component: id, key, system, complete; the vehicle seen last first."""
+        found = self._all(
+            "SELECT c.id, key, system, complete FROM component c JOIN vehicle ON key = vehicle"
+            " WHERE component = ? ORDER BY last_seen DESC, key",
+            (component,),
+        )
+        return [
+            (o, key, system, bool(done)) for o, key, system, done in (cells(row, "isii") for row in found)
+        ]
+
+    @abstractmethod
+    def names_between(self, component: int, first: str, end: str) -> list[str]:
+        """The names from one to below another that any table of a component has."""
+
+    @abstractmethod
+    def holders(self, owners: Sequence[int], names: Sequence[str]) -> Mapping[tuple[Any, ...], list[int]]:
+        """Which of these tables have which of these names with what value: by name, type, bits, is_raw.
+
+        The tables of one value are in no particular order.
+        """
+
+    @abstractmethod
+    def since(self, named: Mapping[int, Sequence[str]]) -> list[tuple[int, str, str, int, float]]:
+        """What tells since when some parameters of some tables are as they are.
+
+        Rows of owner, name, what, line, at: of "heard", when the value was heard; of "line", the last line
+        of history; of "birth", when the name last appeared, behind which line; of "known" with an empty
+        name, since when the states of the table are known.
+        """
+
+    # the two databases
+
+    @abstractmethod
+    def _all(self, sql: str, values: Sequence[object] = ()) -> list[tuple[Any, ...]]:
+        """Do a statement; give every row."""
+
+    @abstractmethod
+    def _do(self, sql: str, values: Sequence[object] = ()) -> int:
+        """Do a statement; give the number of rows that it touched."""
+
+    @abstractmethod
+    def _many(self, sql: str, rows: Iterable[Sequence[object]]) -> None:
+        """Do a statement for each row, in order."""
+
+    @abstractmethod
+    def _insert(self, sql: str, values: Sequence[object]) -> int:
+        """Insert a row into a table with an `id`; give that."""
+
+    def _put_lines(self, owner: int, lines: Sequence[Line], start: int = 0) -> Sequence[int]:
+        numbers = self._numbers(len(lines))  # above those that go: a birth behind one is told from others
+        self._do("DELETE FROM history WHERE owner = ? AND id >= ?", (owner, start))
+        self._many(
+            f"INSERT INTO history (id, owner, {_LINE}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+            [(number, owner, *line) for number, line in zip(numbers, lines, strict=True)],
+        )
+        return numbers
+
+    def _lines(self, where: str, values: Sequence[object]) -> list[NumberedLine]:
+        found = self._all(f"SELECT id, {_LINE} FROM history WHERE owner = ?{where} ORDER BY id", values)
+        return [(number, tuple(line)) for number, *line in (cells(row, "ifssiiiIII") for row in found)]
+
+    @abstractmethod
+    def _numbers(self, count: int) -> Sequence[int]:
+        """So many numbers for lines of history, rising, above all that were given."""
+
+    @property
+    def _newest_first(self) -> str:
+        return ", ".join(f"{column} DESC" for column in self.SNAPSHOT_ORDER.split(", "))
+
+
+def _summary(row: Sequence[object]) -> tuple[int, CachedSummary]:
+    owner, component, autopilot, size, *state, key = cells(row[:12], "iiiiIIiiFfIs")
+    crc, count, complete, volatile_known, synced_at, updated_at, file_works = state
+    return owner, CachedSummary(
+        key=key,
+        identity=read_identity(row[12:]),
+        component=component,
+        autopilot=autopilot,
+        size=size,
+        hash=crc,
+        count=count,
+        complete=bool(complete),
+        volatile_known=bool(volatile_known),
+        synced_at=synced_at,
+        updated_at=updated_at,
+        file_works=None if file_works is None else bool(file_works),
+    )
+
+
+def _entry(row: Sequence[object]) -> HistoryEntry:
+    at, component, name, by, *values = cells(row, "fissiiiIII")
+    old, new = values[:3], values[3:]
+    return HistoryEntry(
+        at=at,
+        component=component,
+        name=name,
+        old=read_param(name, *old),
+        new=None if None in new else read_param(name, *new),
+        by=by,
+    )
+
+
+def _snapshot(row: Sequence[object]) -> SnapshotSummary:
+    number, key, component, at, reason, size, crc, complete = cells(row, "isifsiIi")
+    return SnapshotSummary(number, key, component, at, reason, size, crc, bool(complete))

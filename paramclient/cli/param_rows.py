@@ -1,0 +1,101 @@
+"""How parameters without a vehicle are shown: those of a file, and whatever is compared."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+from paramclient.cli.exit_codes import ExitCode
+from paramclient.cli.output import print_document, print_table, printable, report, say
+from paramclient.files import ParamFile
+from paramclient.files.param_file import address
+from paramclient.model.comparison import same_value
+from paramclient.model.identity import autopilot_name
+from paramclient.model.notation import time_text
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import ParamType, Value, format_value, type_name
+from paramclient.provision.vehicle_params import NO_DEFAULTS
+
+__all__ = ["described", "show_file", "value_text"]
+
+
+def show_file(file: ParamFile, component: int | None, *, changed: bool, json: bool) -> ExitCode:
+    """Print what a parameter file holds; see `paramclient show`."""
+    sets = file.sets if component is None else [file.choose(component)]
+    if changed:
+        shown = [_changed(each) for each in sets if any(param.default is not None for param in each.values())]
+    else:
+        shown = [*sets]
+    if json:
+        from paramclient.documents.paramset import FileDoc  # only here: loads pydantic
+
+        print_document(FileDoc.of(file, shown))
+    else:
+        for each in shown:
+            _print_set(each, changed=changed)
+    if changed and not shown:
+        report(NO_DEFAULTS)
+        return ExitCode.INCOMPLETE
+    return ExitCode.DONE
+
+
+def described(params: ParamSet) -> str:
+    """A set in words: `903 parameters of 1/1 px4 from link sim:px4, 2026-11-20T18:00:00.000Z`."""
+    who = [
+        "" if params.component is None and params.system is None else f"of {address(params)}",
+        "" if params.identity is None else autopilot_name(params.identity.autopilot),
+        f"from {params.source}" if params.source else "",
+    ]
+    at = "" if params.at is None else f", {time_text(params.at)}"
+    return " ".join(filter(None, [_counted(len(params)), *who])) + at
+
+
+def value_text(param: WrittenParam) -> str:
+    """A parameter's value for people."""
+    return _text(param.value, param)
+
+
+_COLUMNS: Final = ("name", "value", "default", "type", "comment")
+
+
+def _print_set(params: ParamSet, *, changed: bool) -> None:
+    """A table of a set; columns that would be empty are left out."""
+    rows = [
+        (
+            param.name,
+            value_text(param),
+            None if param.default is None else _text(param.default, param),
+            None if param.type is None else type_name(param.type),
+            param.comment or None,
+        )
+        for param in params.values()
+    ]
+    kept = [
+        place
+        for place, column in enumerate(_COLUMNS)
+        if place < 2 or any(row[place] is not None for row in rows)
+    ]
+    print_table(
+        [_COLUMNS[place] for place in kept],
+        ([row[place] for place in kept] for row in rows),
+        right="value default",
+    )
+    say(printable(f"{described(params)}{', those that differ from their default' if changed else ''}"))
+
+
+def _changed(params: ParamSet) -> ParamSet:
+    """Those whose value differs from the firmware's default."""
+    differing = {
+        name: param
+        for name, param in params.items()
+        if param.default is not None and not same_value(param, replace(param, value=param.default))
+    }
+    return replace(params, params=differing)
+
+
+def _text(value: Value, param: WrittenParam) -> str:
+    return format_value(value, ParamType.REAL32 if param.type is None else param.type)
+
+
+def _counted(number: int) -> str:
+    return f"{number} {'parameter' if number == 1 else 'parameters'}"

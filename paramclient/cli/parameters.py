@@ -1,0 +1,588 @@
+"""The commands that speak to a vehicle: fetch, get, set, watch."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncGenerator, Iterable, Sequence
+from contextlib import aclosing, suppress
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeAlias
+
+import anyio
+from cyclopts import Parameter
+from cyclopts.validators import Number
+
+from paramclient.cli.connection import Session, connect
+from paramclient.cli.exit_codes import ExitCode, code_of, status_of
+from paramclient.cli.metadata import (
+    DESCRIBED_COLUMNS,
+    MetadataChoice,
+    described_cells,
+    from_file,
+    info_of,
+    known_of_session,
+    needs_reboot,
+    parse_pairs,
+    problems,
+    resolved,
+)
+from paramclient.cli.options import LinkOptions
+from paramclient.cli.output import (
+    by_index,
+    default_text,
+    milliseconds,
+    print_document,
+    print_line,
+    print_table,
+    printable,
+    progress_bar,
+    report,
+    say,
+)
+from paramclient.client.arguments import SETTLE_MAX
+from paramclient.client.events import (
+    Changes,
+    Contested,
+    Event,
+    Events,
+    Found,
+    Heard,
+    Lost,
+    Rebooted,
+    Resynced,
+    Uncontested,
+)
+from paramclient.errors import CacheError, NoReply, ParamClientError, UsageError, ValueNotApplied
+from paramclient.metadata import Metadata
+from paramclient.model.notation import hash_text, time_text
+from paramclient.model.values import Param, ParamType, Trust, Value, check_name, format_value, type_name
+from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.fetch_result import FetchResult, Policy
+from paramclient.protocol.params.sampling import SAMPLE_SIZE, Sample
+
+if TYPE_CHECKING:
+    from paramclient.documents.command import FetchedDoc, SetDoneDoc
+    from paramclient.documents.document import Document
+
+__all__ = ["fetch", "get", "set_", "watch"]
+
+REFRESH_PATIENCE: Final = 10.0
+"""Seconds for the values that no hash covers, where the user sets no limit."""
+MOST_INDICES: Final = 20
+"""Missing indices that are named to people."""
+
+_DEFAULTS: Final = LinkOptions()
+_News: TypeAlias = Lost | Found | Rebooted | Resynced | Contested | Uncontested
+
+
+async def fetch(
+    url: str,
+    /,
+    *,
+    refresh: bool = False,
+    changed: bool = False,
+    accept: Literal["verified", "sampled"] = "verified",
+    sample: Annotated[int | None, Parameter(validator=Number(gte=1))] = None,
+    policy: Policy = Policy.AUTO,
+    options: LinkOptions = _DEFAULTS,
+) -> int:
+    """Bring every parameter: from the cache where the vehicle's hash confirms it, else by download.
+
+    Exit code 1 says that some are missing, or with --changed that the firmware's defaults are not known.
+
+    Args:
+        url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
+        refresh: Download even what the cache has.
+        changed: Print only what differs from the firmware's defaults.
+        accept: With "sampled", a cached table of a vehicle without a hash is believed when a sample of it
+            agrees, and it is said what that is worth.
+        sample: How many parameters are read for that, 30 without it.
+        policy: What the vehicle may be asked: whatever is needed, only for its hash, or nothing.
+    """
+    if sample is not None and accept != "sampled":
+        raise UsageError("--sample goes with --accept sampled")
+    async with connect(url, options, policy=policy) as session:
+        result = await _fetch_all(session, refresh=refresh, accept=accept, sample=sample or SAMPLE_SIZE)
+        with suppress(NoReply):
+            await session.component.refreshed(timeout=session.deadline.left(REFRESH_PATIENCE))
+        fetched = _Fetched.of(session, result, policy)
+    has_defaults = any(param.default is not None for param in fetched.params)
+    if changed:
+        fetched = replace(fetched, params=[param for param in fetched.params if param.is_changed])
+    for note in result.notes:
+        report(note)
+    if result.sample is not None:
+        report(_confidence(result.sample))
+    if options.json:
+        print_document(fetched.document())
+    else:
+        if not changed:
+            rows = ((*_cells(param), param.trust) for param in fetched.params)
+            print_table([*_COLUMNS, "trust"], rows, right="value index")
+        elif has_defaults:
+            rows = ((*_cells(param), param.trust, default_text(param)) for param in fetched.params)
+            print_table([*_COLUMNS, "trust", "default"], rows, right="value index default")
+        say(printable(fetched.summary))
+    if changed and not has_defaults:
+        from paramclient.provision.vehicle_params import NO_DEFAULTS  # only here: brings set-up along
+
+        report(NO_DEFAULTS)
+        return ExitCode.INCOMPLETE
+    if fetched.missing:
+        report(f"incomplete: {_named(fetched.missing)} did not come")
+        return ExitCode.INCOMPLETE
+    return ExitCode.DONE
+
+
+async def get(
+    url: str,
+    name: str,
+    /,
+    *names: str,
+    metadata: MetadataChoice = None,
+    options: LinkOptions = _DEFAULTS,
+) -> int:
+    """Ask the vehicle for single parameters.
+
+    Args:
+        url: The link.
+        name: The parameter.
+        names: More of them.
+        metadata: A file that describes parameters; or vehicle, to ask the vehicle for what it says of them.
+    """
+    described = from_file(metadata)
+    wanted = [check_name(each) for each in dict.fromkeys((name, *names))]
+    async with connect(url, options) as session:
+        params, errors = await _get_all(session, wanted)
+        if described is None:
+            described = await known_of_session(session, metadata)
+    if options.json:
+        from paramclient.documents.param import GotDoc  # only here: loads pydantic
+
+        print_document(GotDoc.of(params, described, errors))
+    elif params and described is None:
+        print_table(_COLUMNS, map(_cells, params), right="value index")
+    elif params and described is not None:
+        rows = ((*_cells(param), *described_cells(described, param)) for param in params)
+        print_table([*_COLUMNS, *DESCRIBED_COLUMNS], rows, right="value index")
+    return _report_all(errors.values())
+
+
+async def set_(
+    url: str,
+    /,
+    *pairs: Annotated[str, Parameter(name="NAME VALUE", allow_leading_hyphen=True)],
+    settle: Annotated[float, Parameter(validator=Number(gte=0, lte=SETTLE_MAX))] = 0.0,
+    force: bool = False,
+    durable: bool = False,
+    metadata: MetadataChoice = None,
+    options: LinkOptions = _DEFAULTS,
+) -> int:
+    """Write parameters, in the order given, and prove by its value that the vehicle has taken each.
+
+    A value is a decimal number, a hexadecimal one (0x1F), nan or inf. Written as NAME=VALUE it may also be
+    the name of a value, or names of bits with | between them, where the parameter is described: the vehicle
+    is asked for that, unless --metadata names a file. All are tried even if one is refused. Where several
+    vehicles are heard, --system has to choose one.
+
+    Args:
+        url: The link.
+        pairs: A parameter and its value, as often as wanted; NAME=VALUE is one too.
+        settle: Seconds after the last of them until all are read once more. 1.2 shows what PX4's modules
+            clamp.
+        force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
+        durable: Go on only when the value and its line of history are on the disk, past a loss of power.
+        metadata: A file that describes parameters; or vehicle, to ask the vehicle for what it says of them.
+    """
+    wanted = parse_pairs(pairs)
+    described = from_file(metadata)
+    if described is not None:
+        wanted = [*resolved(wanted, described)]
+    async with connect(url, options, only=True) as session:
+        if described is None:
+            has_names = any(isinstance(value, str) for _, value in wanted)
+            described = await known_of_session(session, metadata, must=has_names)
+        writes = resolved(wanted, described)
+        for problem in problems(writes, described):
+            report(problem)
+        await session.check_only()
+        began = anyio.current_time()
+        outcomes = [
+            await _write(session, name, value, force=force, durable=durable) for name, value in writes
+        ]
+        if settle:
+            await anyio.sleep(settle)
+            outcomes = [await _read_again(session, outcome) for outcome in outcomes]
+        client = session.client
+        summary = (
+            f"{sum(not outcome.reason for outcome in outcomes)} of {len(outcomes)} set on {session.who} in "
+            f"{anyio.current_time() - began:.2f} s, "
+            f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent"
+        )
+    if options.json:
+        from paramclient.documents.command import SetsDoneDoc  # only here: loads pydantic
+
+        print_document(SetsDoneDoc(results=[outcome.document(described) for outcome in outcomes]))
+    else:
+        print_table(
+            ["name", "requested", "actual", "status"],
+            (outcome.cells() for outcome in outcomes),
+            right="requested actual",
+        )
+        say(summary)
+    late = {each.name: None for each in outcomes if not each.reason and needs_reboot(each.name, described)}
+    if late:
+        say(printable(f"to count when the vehicle has started again: {', '.join(late)}"))
+    for outcome in outcomes:
+        if outcome.note:
+            say(printable(f"{outcome.name}: {outcome.note}"))
+        if outcome.reason:
+            report(f"{outcome.name}: {outcome.reason}")
+    return max(outcome.code for outcome in outcomes)
+
+
+async def watch(
+    url: str, /, *names: str, policy: Policy = Policy.AUTO, options: LinkOptions = _DEFAULTS
+) -> int:
+    """Print every change of a value as it happens, whoever caused it, until Ctrl-C.
+
+    What is known is brought up to date first; what has changed since the cache was written is printed too,
+    and so is when the vehicle is lost, found, has started again, or its table agrees with the one here again.
+    With --timeout it ends by itself.
+
+    Args:
+        url: The link.
+        names: The parameters to watch; without any, all of them.
+        policy: What the vehicle may be asked beside NAMES: whatever is needed, only for its hash, or nothing.
+    """
+    wanted = [check_name(each) for each in dict.fromkeys(names)]
+    async with connect(url, options, policy=policy, is_live=True) as session:
+        changes, events = session.component.changes(), session.client.events()
+        listens = session.client.listens_only
+        if wanted and not listens:
+            _, errors = await _get_all(session, wanted)
+            if errors:
+                return _report_all(errors.values())
+        elif not listens:
+            with suppress(CacheError):  # there may be nothing in it: then all that is heard is new
+                await _fetch_all(session)
+        known = None if listens else set(session.component.params)
+        what = ", ".join(wanted) if wanted else f"{len(session.component.params)} parameters"
+        say(printable(f"watching {what} of {session.who}"))
+        with anyio.move_on_after(session.deadline.left()):
+            await _print_news(
+                session, changes, events, known, frozenset(wanted), as_lines_of_json=options.json
+            )
+    return ExitCode.DONE
+
+
+# fetch
+
+
+@dataclass(frozen=True, slots=True)
+class _Fetched:
+    """What the vehicle has given or confirmed in this session.
+
+    A value that only the cache knows is left out, and its index is missing like one that did not come; but
+    where the policy keeps it from being asked for, or a sample speaks for it, it is among the others, and
+    named in `cached`.
+    """
+
+    session: Session
+    result: FetchResult
+    params: list[Param]
+    missing: list[int]
+    cached: list[str]
+    bytes_received: int
+    bytes_sent: int
+
+    @classmethod
+    def of(cls, session: Session, result: FetchResult, policy: Policy) -> _Fetched:
+        params = by_index(session.component.params.values())
+        cached = [param for param in params if param.trust is Trust.CACHED]
+        missing = set(result.missing)
+        if policy is Policy.AUTO and result.sample is None:
+            if result.source == "cache":
+                missing = {param.index for param in cached if param.index is not None}
+            params = [param for param in params if param.trust is not Trust.CACHED]
+            cached = []
+        return cls(
+            session,
+            result,
+            params=params,
+            missing=sorted(missing),
+            cached=[param.name for param in cached],
+            bytes_received=session.client.bytes_received,
+            bytes_sent=session.client.bytes_sent,
+        )
+
+    @property
+    def received(self) -> int:
+        return self.result.count - len(self.missing)
+
+    @property
+    def summary(self) -> str:
+        result = self.result
+        of = f" of {result.count}" if self.missing else ""
+        crc = "" if result.hash is None else f"; hash {hash_text(result.hash)}"
+        lost = "" if result.source == "cache" else f"{result.lost} lost, {result.repeated} repeated, "
+        trip = "" if result.round_trip is None else f"round trip {milliseconds(result.round_trip)}, "
+        return (
+            f"{self.received}{of} parameters of {self.session.who} from {result.source} in "
+            f"{result.elapsed:.2f} s, {lost}{trip}{self.bytes_received:,} bytes received, "
+            f"{self.bytes_sent:,} sent{crc}"
+        )
+
+    def document(self) -> FetchedDoc:
+        """The same for programs."""
+        from paramclient.documents.command import FetchedDoc  # only here: loads pydantic
+
+        return FetchedDoc.of(
+            self.session.component,
+            self.result,
+            self.params,
+            missing=self.missing,
+            cached=self.cached,
+            bytes_received=self.bytes_received,
+            bytes_sent=self.bytes_sent,
+        )
+
+
+async def _fetch_all(
+    session: Session, *, refresh: bool = False, accept: str = "verified", sample: int = SAMPLE_SIZE
+) -> FetchResult:
+    with progress_bar(f"fetching {session.who}") as progress:
+        return await session.component.fetch_all(
+            refresh=refresh,
+            accept=accept,
+            sample=sample,
+            timeout=session.deadline.left(),
+            progress=progress,
+        )
+
+
+def _confidence(sample: Sample) -> str:
+    """What a sample that agreed is worth, in words."""
+    chances = " and ".join(f"{sample.confidence(each):.0%} for {each}" for each in _SUPPOSED)
+    return (
+        f"{sample.size} of {sample.count} parameters were read and agreed. If others had changed, the chance "
+        f"to see it so is {chances} of them."
+    )
+
+
+def _named(indices: Sequence[int]) -> str:
+    shown = ", ".join(map(str, indices[:MOST_INDICES]))
+    more = len(indices) - MOST_INDICES
+    return f"ind{'ex' if len(indices) == 1 else 'ices'} {shown}{f' and {more} more' if more > 0 else ''}"
+
+
+_SUPPOSED: Final = (1, 10, 100)  # parameters that may have changed
+
+# get
+
+_COLUMNS: Final = ("name", "value", "type", "index")
+
+
+def _cells(param: Param) -> tuple[object, ...]:
+    return param.name, format_value(param.value, param.type), type_name(param.type), param.index
+
+
+async def _get_all(session: Session, names: Sequence[str]) -> tuple[list[Param], dict[str, ParamClientError]]:
+    """Read several side by side; what came and what did not, both in the order of the names."""
+    found: dict[str, Param] = {}
+    errors: dict[str, ParamClientError] = {}
+
+    async def read(name: str) -> None:
+        try:
+            found[name] = await session.component.get(name, timeout=session.deadline.left())
+        except ParamClientError as error:
+            errors[name] = error
+
+    async with anyio.create_task_group() as tasks:
+        for name in names:
+            tasks.start_soon(read, name)
+    return (
+        [found[name] for name in names if name in found],
+        {name: errors[name] for name in names if name in errors},
+    )
+
+
+def _report_all(errors: Iterable[ParamClientError]) -> int:
+    """Tell every error; the exit code for all of them."""
+    worst = ExitCode.DONE
+    for error in errors:
+        report(str(error))
+        worst = max(worst, code_of(error))
+    return worst
+
+
+# set
+
+
+@dataclass(frozen=True, slots=True)
+class _Written:
+    """What became of one set; `reason` is empty where it was done, and `param` is what was acknowledged.
+
+    `note` says what else is to be known of it.
+    """
+
+    name: str
+    type: ParamType | int
+    requested: Value
+    actual: Value | None
+    status: str
+    reason: str = ""
+    code: ExitCode = ExitCode.DONE
+    param: Param | None = None
+    note: str = ""
+
+    def document(self, metadata: Metadata | None) -> SetDoneDoc:
+        """The same for programs."""
+        from paramclient.documents.command import SetDoneDoc  # only here: loads pydantic
+
+        return SetDoneDoc.of(
+            self.name,
+            self.type,
+            self.requested,
+            self.actual,
+            status=self.status,
+            reason=self.reason,
+            note=self.note,
+            info=info_of(metadata, self.name),
+        )
+
+    def cells(self) -> tuple[object, ...]:
+        actual = None if self.actual is None else format_value(self.actual, self.type)
+        return self.name, format_value(self.requested, ParamType.REAL64), actual, self.status
+
+
+async def _write(session: Session, name: str, value: int | float, *, force: bool, durable: bool) -> _Written:
+    left = session.deadline.left()
+    try:
+        done = await session.component.set(name, value, timeout=left, force=force, durable=durable)
+    except ParamClientError as error:
+        known = session.component.params.get(name)
+        return _Written(
+            name,
+            ParamType.REAL32 if known is None else known.type,
+            requested=value,
+            actual=error.actual if isinstance(error, ValueNotApplied) else None,
+            status=status_of(error),
+            reason=str(error),
+            code=code_of(error),
+        )
+    return _Written(
+        name,
+        done.param.type,
+        requested=value,
+        actual=done.actual,
+        status=done.status,
+        param=done.param,
+        note=done.note,
+    )
+
+
+async def _read_again(session: Session, written: _Written) -> _Written:
+    """What has become of a value since it was acknowledged."""
+    if written.param is None:
+        return written
+    try:
+        param = await session.component.get(written.name, timeout=session.deadline.left())
+    except ParamClientError as error:
+        reason = f"acknowledged, and not read once more: {error}"
+        return replace(written, actual=None, status=status_of(error), reason=reason, code=code_of(error))
+    if param.same_value(written.param):
+        return written
+    return replace(written, actual=param.value, status="adjusted")
+
+
+# watch
+
+
+async def _print_news(
+    session: Session,
+    changes: Changes,
+    events: Events,
+    known: set[str] | None,
+    wanted: frozenset[str],
+    *,
+    as_lines_of_json: bool,
+) -> None:
+    """Print changes, and what becomes of the component, until cancelled.
+
+    A parameter that has just been heard for the first time is no change; None: whichever it is.
+    """
+    async with aclosing(_merged(changes, events)) as news:
+        async for each in news:
+            if isinstance(each, Change):
+                if each.old is None and (known is None or each.name in known):
+                    known = known and known - {each.name}
+                    continue
+                if wanted and each.name not in wanted:
+                    continue
+                text = _change_text(each)
+            elif isinstance(each, Heard) or each.component is not session.component:
+                continue
+            else:
+                text = _event_text(each)
+            at = session.now
+            if as_lines_of_json:
+                print_document(_line(each, at))
+            else:
+                print_line(f"{time_text(at)}  {text}")
+
+
+async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | Event]:
+    """What comes from either of them, as it comes."""
+    waiting: dict[asyncio.Future[Change | Event], Changes | Events] = {}
+
+    def wait(feed: Changes | Events) -> None:
+        waiting[asyncio.ensure_future(anext(feed))] = feed
+
+    try:
+        wait(changes)
+        wait(events)
+        while waiting:
+            done, _ = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
+            for each in [each for each in waiting if each in done]:
+                feed = waiting.pop(each)
+                if not isinstance(each.exception(), StopAsyncIteration):  # else a log is over
+                    wait(feed)
+                    yield each.result()
+    finally:
+        for each in waiting:
+            if not each.cancel():
+                each.exception()  # both end with the link; one of them is told
+
+
+def _line(news: Change | _News, at: float) -> Document:
+    """What has happened, for programs."""
+    from paramclient.documents.command import ChangeLineDoc, EventLineDoc  # only here: loads pydantic
+
+    return ChangeLineDoc.of(news, at) if isinstance(news, Change) else EventLineDoc.of(news, at)
+
+
+def _change_text(change: Change) -> str:
+    old, new = (
+        "none" if param is None else format_value(param.value, param.type)
+        for param in (change.old, change.new)
+    )
+    return f"{change.name}  {old} -> {new}  ({change.by})"
+
+
+def _event_text(event: _News) -> str:
+    match event:
+        case Lost():
+            what = f"lost: not heard for {event.silence:.1f} s"
+        case Found():
+            what = f"found after {event.silence:.1f} s"
+        case Rebooted():
+            what = "has started again"
+        case Contested():
+            what = f"contested: {'; '.join(event.contest.claimants)}"
+        case Uncontested():
+            what = "contested no more"
+        case Resynced():
+            number = len(event.changed)
+            what = f"resynced: {number or 'nothing'} had moved"
+    return f"{event.component.system}/{event.component.component} {what}"

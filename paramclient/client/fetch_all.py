@@ -1,0 +1,238 @@
+"""Fetch several components side by side: who takes part, how long to wait, what came of it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Final
+
+import anyio
+
+from paramclient.client.component import PROGRESS_INTERVAL, TIME_IS_OVER, Component
+from paramclient.errors import CacheError, ContestedAddress, NoReply
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.params.fetch import Fetch
+from paramclient.protocol.params.fetch_result import FetchResult, Progress
+from paramclient.protocol.station import Address, Peer, Station
+
+__all__ = ["FetchTogether", "FetchedAll"]
+
+SILENT_PATIENCE: Final = 1.0
+"""Seconds for which a component that does not answer at all is asked, once another one is done."""
+PATIENCE_PER_ANSWER: Final = 4.0
+"""The same by the longest time in which another one has answered: where one process is all vehicles, or this
+one serves many links, an answer may come seconds later than it would from one alone."""
+
+
+@dataclass(frozen=True, slots=True)
+class FetchedAll:
+    """What a fetch of several components brought.
+
+    Attributes:
+        results: by (system, component), for those that answered.
+        silent: those that have not, each with its error: a CacheError where the policy allows no download and
+            nothing is cached.
+    """
+
+    results: Mapping[Address, FetchResult]
+    silent: Mapping[Address, NoReply | CacheError | ContestedAddress]
+
+    @property
+    def complete(self) -> bool:
+        """Whether everyone who answered gave every parameter."""
+        return all(result.complete for result in self.results.values())
+
+
+class FetchTogether:
+    """The fetches of all components of one system, or of every system.
+
+    Args:
+        station: the protocol.
+        components: everyone heard; it may grow meanwhile.
+        system: of this system only.
+        refresh: as in `Component.fetch_all`.
+    """
+
+    def __init__(
+        self, station: Station, components: Mapping[Address, Component], system: int | None, *, refresh: bool
+    ) -> None:
+        self._station = station
+        self._components = components
+        self._system = system
+        self._refresh = refresh
+        self._fetches: dict[Address, Fetch] = {}
+        self._is_cache_awaited = False
+        self._unanswered: dict[Address, Fetch] = {}
+        self._longest_answer = 0.0
+        self._unheard_at: dict[Address, float] = {}  # when those who have not answered were not heard either
+
+    async def run(
+        self,
+        check: Callable[[], None],
+        wake: Callable[[], None],
+        closed: Callable[[ComponentMachine], Awaitable[None]],
+        *,
+        until: float,
+        hear_until: float,
+        listen_until: float,
+        progress: Callable[[Mapping[Address, Progress]], None] | None,
+    ) -> FetchedAll:
+        """Fetch until nothing more may come.
+
+        Args:
+            check: raises what ends it; called at each turn.
+            wake: is told that there may be something to send.
+            closed: waits until no file of a component is open on board that nobody wants any more.
+            until: ends it, with what has come.
+            hear_until, listen_until: as in `is_worth_waiting`.
+            progress: called about ten times a second.
+
+        Raises:
+            ParamClientError: as from `outcome`.
+        """
+        began = anyio.current_time()
+        try:
+            while True:
+                check()
+                now = anyio.current_time()
+                if self.join(now):
+                    wake()
+                is_worth_it = self.is_worth_waiting(now, listen_until=listen_until, hear_until=hear_until)
+                if now >= until or not is_worth_it:
+                    return self.outcome(now, waited=now - began)
+                await self.news(min(PROGRESS_INTERVAL, until - now))
+                if progress is not None:
+                    progress(self.progress(anyio.current_time()))
+        finally:
+            self._end(anyio.current_time())
+            wake()  # they may have been in the way of others
+            for address in self._fetches:
+                await closed(self._station.components[address])
+
+    def join(self, now: float) -> bool:
+        """Begin the fetches of components that have none yet, as soon as their cached table is there.
+
+        Gives whether any has begun.
+        """
+        self._is_cache_awaited = False
+        ready: dict[tuple[int, Peer], list[ComponentMachine]] = {}
+        for address, component in self._components.items():
+            machine = component._machine
+            if address in self._fetches or not machine.who.has_parameters:
+                continue
+            if self._system not in (None, machine.system) or (machine.presence.is_lost and not machine.fetch):
+                continue
+            if machine.peers.contest is not None:
+                continue
+            if self._refresh or component._cache_is_due(now):
+                ready.setdefault(machine.vehicle, []).append(machine)
+            else:
+                self._is_cache_awaited = True
+        for machines in ready.values():
+            begun = self._station.begin_fetches(machines, now, refresh=self._refresh)
+            for machine, fetch in zip(machines, begun, strict=True):
+                address = machine.address
+                self._fetches[address] = self._unanswered[address] = fetch
+        return bool(ready)
+
+    def is_worth_waiting(self, now: float, *, listen_until: float, hear_until: float) -> bool:
+        """Whether more may come.
+
+        Args:
+            now: the time.
+            listen_until: until then somebody else may be heard.
+            hear_until: until then it is waited for anybody at all.
+        """
+        if now < listen_until or self._is_cache_awaited:
+            return True
+        if not self._fetches:
+            return now < hear_until
+        for address, fetch in list(self._unanswered.items()):
+            self._look(address, fetch, now)
+        patience = math.inf
+        if any(fetch.result is not None for fetch in self._fetches.values()):
+            patience = max(SILENT_PATIENCE, PATIENCE_PER_ANSWER * self._longest_answer)
+        return any(
+            not fetch.done and (not fetch.is_silent or not self._is_mute(address, fetch, now, patience))
+            for address, fetch in self._fetches.items()
+        )
+
+    async def news(self, seconds: float) -> None:
+        """Wait until a fetch ends, but not longer than this."""
+        ended = anyio.Event()
+        under_way = [fetch for fetch in self._fetches.values() if not fetch.done]
+        for fetch in under_way:
+            fetch.on_done.append(ended.set)
+        try:
+            with anyio.move_on_after(seconds):
+                await ended.wait()
+        finally:
+            for fetch in under_way:
+                with suppress(ValueError):
+                    fetch.on_done.remove(ended.set)
+
+    def progress(self, now: float) -> dict[Address, Progress]:
+        """How far each is."""
+        return {address: fetch.progress(now) for address, fetch in self._fetches.items()}
+
+    def outcome(self, now: float, *, waited: float) -> FetchedAll:
+        """What came in so many seconds, also of those that are not over.
+
+        Raises:
+            NoReply, CacheError, ContestedAddress: nothing came.
+            LinkError: the link failed, or the client was closed.
+        """
+        results: dict[Address, FetchResult] = {}
+        silent: dict[Address, NoReply | CacheError | ContestedAddress] = {}
+        for address, fetch in self._fetches.items():
+            try:
+                if fetch.error is not None:
+                    raise fetch.error
+                results[address] = fetch.result or fetch.partial(now, TIME_IS_OVER)
+            except (NoReply, CacheError, ContestedAddress) as error:
+                silent[address] = error
+        for address, component in self._components.items():
+            is_wanted = self._system in (None, address[0])
+            contest = component._machine.peers.contest
+            if is_wanted and address not in self._fetches and contest is not None:
+                silent[address] = contest.error
+            elif is_wanted and address not in self._fetches and component._machine.presence.is_lost:
+                what = f"the parameters of {address[0]}/{address[1]} (lost)"
+                silent[address] = NoReply(what, attempts=0, waited=component.silence)
+        if not results:
+            attempts = 0
+            for failure in silent.values():
+                if not isinstance(failure, NoReply):
+                    raise failure
+                attempts = max(attempts, failure.attempts)
+            whose = "any component" if self._system is None else f"any component of system {self._system}"
+            raise NoReply(f"the parameters of {whose}", attempts=attempts, waited=waited)
+        return FetchedAll(results, silent)
+
+    def _end(self, now: float) -> None:
+        """Nobody waits for them any longer."""
+        for address, fetch in self._fetches.items():
+            self._station.components[address].end_fetch(fetch, now)
+
+    def _look(self, address: Address, fetch: Fetch, now: float) -> None:
+        """See whether one has answered by now, and how long that took; or whether it was heard at all."""
+        presence = self._station.components[address].presence
+        answered_at = fetch.first_value_at
+        if fetch.result is not None and fetch.result.source == "cache":
+            answered_at = fetch.ended_at
+        if fetch.done or answered_at < math.inf:
+            del self._unanswered[address]
+            if answered_at < math.inf:
+                took = answered_at - fetch.begun_at - fetch.held_up(now)
+                self._longest_answer = max(self._longest_answer, took)
+        elif presence.is_overdue(now):
+            self._unheard_at[address] = now
+
+    def _is_mute(self, address: Address, fetch: Fetch, now: float, patience: float) -> bool:
+        """Whether one could have answered for so long, was heard meanwhile, and has not answered."""
+        presence = self._station.components[address].presence
+        since = max(fetch.begun_at + fetch.held_up(now), self._unheard_at.get(address, -math.inf))
+        is_heard = presence.heard_at >= since or presence.is_lost or not presence.has_beaten
+        return is_heard and now - since >= patience

@@ -1,0 +1,184 @@
+"""What was: changes of values, and tables that were set down."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import TYPE_CHECKING
+
+from paramclient.documents.document import Document, Maybe, Scalar
+from paramclient.documents.param import WrittenParamDoc
+from paramclient.model.identity import autopilot_name
+from paramclient.model.notation import bits_text, hash_text, time_text, value_json
+from paramclient.model.values import type_name
+
+if TYPE_CHECKING:
+    from paramclient.cache import CutOff, HistoryEntry, SnapshotSummary
+    from paramclient.model.paramset import ParamSet
+
+__all__ = [
+    "CutOffDoc",
+    "ExactDoc",
+    "HistoryDoc",
+    "HistoryEntryDoc",
+    "SnapshotDoc",
+    "SnapshotsDoc",
+    "WholeSnapshotDoc",
+]
+
+
+class ExactDoc(Document):
+    """A value to the last bit."""
+
+    type: str
+    bits: str
+
+
+class HistoryEntryDoc(Document):
+    """One change of a value; see `HistoryEntry`.
+
+    `at` (unix seconds) and the exact values are said to programs that go on with them.
+    """
+
+    time: str
+    component: int
+    name: str
+    old: Scalar
+    new: Scalar | None
+    by: str
+    at: Maybe[float] = None
+    old_exact: Maybe[ExactDoc] = None
+    new_exact: Maybe[ExactDoc] = None
+
+    @classmethod
+    def of(cls, entry: HistoryEntry, *, exact: bool = False) -> HistoryEntryDoc:
+        """A line of history."""
+        old, new = entry.old, entry.new
+        return cls(
+            time=time_text(entry.at),
+            component=entry.component,
+            name=entry.name,
+            old=value_json(old.value, old.type),
+            new=None if new is None else value_json(new.value, new.type),
+            by=entry.by,
+            at=entry.at if exact else None,
+            old_exact=ExactDoc(type=type_name(old.type), bits=bits_text(old)) if exact else None,
+            new_exact=ExactDoc(type=type_name(new.type), bits=bits_text(new))
+            if exact and new is not None
+            else None,
+        )
+
+
+class CutOffDoc(Document):
+    """A set-up that was cut off, as the service ended while it ran; see `CutOff`.
+
+    `at` (unix seconds) is when it was last known to run.
+    """
+
+    time: str
+    component: int
+    kind: str
+    by: str
+    done: int
+    total: int
+    at: float
+
+    @classmethod
+    def of(cls, note: CutOff) -> CutOffDoc:
+        """All of it that is of the past of a vehicle."""
+        return cls(
+            time=time_text(note.at),
+            component=note.component,
+            kind=note.kind,
+            by=note.asked_by,
+            done=note.done,
+            total=note.total,
+            at=round(note.at, 3),
+        )
+
+
+class HistoryDoc(Document):
+    """Changes of values, the newest last. `before` is what to ask with for those that came before them.
+
+    `cut_off` has the set-ups of this time that were cut off, where there are any.
+    """
+
+    history: list[HistoryEntryDoc]
+    before: Maybe[float] = None
+    cut_off: Maybe[list[CutOffDoc]] = None
+
+    @classmethod
+    def of(
+        cls,
+        entries: Iterable[HistoryEntry],
+        *,
+        exact: bool = False,
+        before: float | None = None,
+        cut_off: Iterable[CutOff] = (),
+    ) -> HistoryDoc:
+        """Lines of history."""
+        return cls(
+            history=[HistoryEntryDoc.of(entry, exact=exact) for entry in entries],
+            before=before,
+            cut_off=[CutOffDoc.of(note) for note in cut_off] or None,
+        )
+
+
+class SnapshotDoc(Document):
+    """A table as it was set down at a moment, without its parameters; see `SnapshotSummary`."""
+
+    id: int
+    time: str
+    component: int
+    size: int
+    complete: bool
+    hash: str | None
+    reason: str
+    at: Maybe[float] = None
+
+    @classmethod
+    def of(cls, summary: SnapshotSummary, *, exact: bool = False) -> SnapshotDoc:
+        """All of it but the vehicle's key; with the time as a number where a program goes on with it."""
+        return cls(
+            id=summary.id,
+            time=time_text(summary.at),
+            component=summary.component,
+            size=summary.size,
+            complete=summary.complete,
+            hash=hash_text(summary.hash),
+            reason=summary.reason,
+            at=summary.at if exact else None,
+        )
+
+
+class SnapshotsDoc(Document):
+    """Snapshots, the newest last."""
+
+    snapshots: list[SnapshotDoc]
+
+    @classmethod
+    def of(cls, kept: Iterable[SnapshotSummary], *, exact: bool = False) -> SnapshotsDoc:
+        """Those of a vehicle."""
+        return cls(snapshots=[SnapshotDoc.of(each, exact=exact) for each in kept])
+
+
+class WholeSnapshotDoc(SnapshotDoc):
+    """A snapshot with its parameters by name, and who the vehicle was then."""
+
+    source: str
+    system: int | None
+    autopilot: str | None
+    uid: str | None
+    params: dict[str, WrittenParamDoc]
+
+    @classmethod
+    def whole(cls, summary: SnapshotSummary, params: ParamSet) -> WholeSnapshotDoc:
+        """All of it."""
+        identity = params.identity
+        return cls(
+            **SnapshotDoc.of(summary, exact=True).model_dump(),
+            source=params.source,
+            system=params.system,
+            autopilot=None if identity is None else autopilot_name(identity.autopilot),
+            uid=None if identity is None else identity.uid,
+            params={name: WrittenParamDoc.of(param) for name, param in params.items()},
+        )

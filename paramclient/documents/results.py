@@ -1,0 +1,135 @@
+"""What became of a call: of a fetch, of a value that was set."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from paramclient.documents.document import Document, Maybe, Scalar
+from paramclient.documents.param import ParamDoc
+from paramclient.documents.problem import Problem
+from paramclient.model.notation import hash_text, rounded, value_json
+from paramclient.model.values import ParamType
+
+if TYPE_CHECKING:
+    from paramclient.protocol.params.fetch_result import FetchResult
+    from paramclient.protocol.params.sampling import Sample
+    from paramclient.protocol.params.writes import SetResult
+
+__all__ = [
+    "FetchResultDoc",
+    "FetchedAllDoc",
+    "NotSetDoc",
+    "SampleDoc",
+    "SetManyDoc",
+    "SetResultDoc",
+    "SilentDoc",
+]
+
+
+class SampleDoc(Document):
+    """What a sample of a cached table has shown."""
+
+    size: int
+    count: int
+    differing: list[str]
+
+    @classmethod
+    def of(cls, sample: Sample) -> SampleDoc:
+        """All of it."""
+        return cls(size=sample.size, count=sample.count, differing=list(sample.differing))
+
+
+class FetchResultDoc(Document):
+    """What a fetch brought; see `FetchResult`. The parameters are in the component's table."""
+
+    link: str
+    system: int
+    component: int
+    source: str
+    count: int
+    received: int
+    missing: list[int]
+    hash: str | None
+    elapsed_s: float
+    notes: list[str]
+    resumed: int
+    lost: int
+    repeated: int
+    round_trip_s: float | None
+    sample: SampleDoc | None
+
+    @classmethod
+    def of(cls, result: FetchResult, *, link: str) -> FetchResultDoc:
+        """All of it but the parameters."""
+        return cls(
+            link=link,
+            system=result.system,
+            component=result.component,
+            source=result.source,
+            count=result.count,
+            received=result.received,
+            missing=list(result.missing),
+            hash=hash_text(result.hash),
+            elapsed_s=round(result.elapsed, 4),
+            notes=list(result.notes),
+            resumed=result.resumed,
+            lost=result.lost,
+            repeated=result.repeated,
+            round_trip_s=rounded(result.round_trip),
+            sample=None if result.sample is None else SampleDoc.of(result.sample),
+        )
+
+
+class SilentDoc(Document):
+    """A component that did not answer a fetch of all."""
+
+    link: str
+    system: int
+    component: int
+    problem: Problem
+
+
+class FetchedAllDoc(Document):
+    """What a fetch of several components brought."""
+
+    results: list[FetchResultDoc]
+    silent: list[SilentDoc]
+
+
+class SetResultDoc(Document):
+    """What became of a value that was set: accepted, or adjusted by the vehicle; see `SetResult`."""
+
+    name: str
+    status: str
+    requested: Scalar
+    actual: Scalar
+    attempts: int
+    param: ParamDoc
+    note: Maybe[str] = None
+
+    @classmethod
+    def of(cls, result: SetResult) -> SetResultDoc:
+        """All of it."""
+        requested = result.requested
+        kind = ParamType.REAL64 if isinstance(requested, float) else result.param.type
+        return cls(
+            name=result.name,
+            status=result.status,
+            requested=value_json(requested, kind),
+            actual=value_json(result.actual, result.param.type),
+            attempts=result.attempts,
+            param=ParamDoc.kept(result.param),
+            note=result.note or None,
+        )
+
+
+class NotSetDoc(Document):
+    """Why a value was not set."""
+
+    problem: Problem
+
+
+class SetManyDoc(Document):
+    """What became of each of several values, by name."""
+
+    results: dict[str, SetResultDoc | NotSetDoc]

@@ -1,0 +1,76 @@
+"""param.pck as a parameter file: types, exact values and defaults, and nothing about whose they are."""
+
+from __future__ import annotations
+
+from paramclient.errors import FileError, PackError, UsageError
+from paramclient.files.param_file import FileForm, ParamFile
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import ParamType, bits_of, from_bits, same_bits, type_name
+from paramclient.protocol.ftp import param_pck
+
+__all__ = ["is_packed", "read_packed", "write_packed"]
+
+_MAGICS = (b"\x1b\x67", b"\x1c\x67")
+
+
+def is_packed(data: bytes) -> bool:
+    """Whether these bytes begin as such a file does."""
+    return data.startswith(_MAGICS)
+
+
+def read_packed(data: bytes, source: str) -> ParamFile:
+    """Read a file as a vehicle gives it, or as it is written to one.
+
+    Raises:
+        FileError: it is none.
+    """
+    notes = []
+    with_defaults = False
+    try:
+        try:
+            entries = param_pck.decode_upload(data)
+        except PackError:
+            held = param_pck.decode(data)
+            entries, with_defaults = held.entries, held.with_defaults
+            if held.total > len(entries):
+                notes.append(f"The file holds {len(entries)} of the vehicle's {held.total} parameters.")
+    except PackError as error:
+        raise FileError(f"no packed parameter file: {error}", source=source) from error
+    if not entries:
+        raise FileError("the file holds no parameter", source=source)
+    params = {}
+    for name, kind, bits, default in entries:
+        value = from_bits(bits, kind)
+        given = value if default is None and with_defaults else None
+        if default is not None:
+            given = from_bits(default, kind)
+        params[name] = WrittenParam(name, value, kind, given)
+    return ParamFile((ParamSet(params, source=source),), FileForm.PCK, source, notes=tuple(notes))
+
+
+def write_packed(params: ParamSet) -> bytes:
+    """The bytes of such a file. Defaults are in it where all of them are known.
+
+    Raises:
+        UsageError: the file cannot say it: it knows four types, and numbers only.
+    """
+    with_defaults = all(param.default is not None for param in params.values())
+    entries = [_entry(param, with_defaults=with_defaults) for param in params.values()]
+    return param_pck.encode(entries, with_defaults=with_defaults)
+
+
+def _entry(param: WrittenParam, *, with_defaults: bool) -> param_pck.PackedParam:
+    kind = param.type
+    if not isinstance(kind, ParamType) or kind not in param_pck.PACKABLE:
+        known = ", ".join(each.name for each in sorted(param_pck.PACKABLE))
+        has = "no type" if kind is None else f"the type {type_name(kind)}"
+        raise UsageError(f"{param.name} has {has}, and a packed file holds {known}")
+    if isinstance(param.value, bytes):
+        raise UsageError(f"{param.name} is no number; json and yaml can keep it")
+    bits = param.bits_as(kind)
+    default = None
+    if with_defaults and param.default is not None:
+        default = bits_of(param.default, kind)
+        if same_bits(kind, bits, default):
+            default = None  # as vehicles write it: an entry without one has its default
+    return param_pck.PackedParam(param.name, kind, bits, default)

@@ -1,0 +1,234 @@
+"""What telemetry logs hold of vehicles, brought into a cache with the times that it has there."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import closing
+from dataclasses import dataclass
+from functools import partial
+from typing import Final
+
+import anyio
+import anyio.lowlevel
+
+from paramclient.cache import CachedComponent, ParamCache, TableUpdate
+from paramclient.client.cache_writer import FLUSH_INTERVAL, WriteThrough
+from paramclient.links.tlog import Record, open_log, read_records
+from paramclient.model.identity import Identity
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import (
+    ComponentForgotten,
+    ComponentHeard,
+    ComponentIdentified,
+    ComponentReplaced,
+    Fetched,
+)
+from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.station import Address, Station
+from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, HEARTBEAT_ID, Framer
+
+__all__ = ["ImportedTable", "import_log"]
+
+RECORDS_PER_TURN: Final = 1_000
+"""Frames that are read before other tasks have their turn: a few milliseconds."""
+LOG_PEER: Final = "log"
+
+
+@dataclass(frozen=True, slots=True)
+class ImportedTable:
+    """What a log held of one component.
+
+    Attributes:
+        key: the name under which the vehicle's tables are kept.
+        system, component: its address.
+        autopilot: MAV_AUTOPILOT of its heartbeat, or None.
+        params: how many parameters were heard.
+        complete: whether those are all.
+        hash: the PX4 hash that confirms the table at the end of the log, or None.
+        notes: what was not taken from files that a ground station read over MAVFTP, in sentences.
+    """
+
+    key: str
+    system: int
+    component: int
+    autopilot: int | None
+    params: int
+    complete: bool
+    hash: int | None
+    notes: tuple[str, ...] = ()
+
+
+async def import_log(path: str | os.PathLike[str], cache: ParamCache) -> tuple[ImportedTable, ...]:
+    """Bring what a telemetry log holds into a cache; all of it is kept, or nothing.
+
+    Each value and each change has the time of the log. What the cache has of a later time stays as it is, so
+    it does not matter in which order logs are brought in, nor how often. A vehicle is known by its hardware
+    id if its AUTOPILOT_VERSION is anywhere in the log; else it is one of this log alone.
+
+    Args:
+        path: the log.
+        cache: where to.
+
+    Raises:
+        LinkError: the file cannot be read, or is no telemetry log.
+        CacheError: the cache cannot be written.
+    """
+    name = f"replay:{await anyio.Path(path).resolve()}"
+    with closing(open_log(os.fspath(path), name)) as file:
+        said = await _introductions(read_records(file))
+        file.seek(0)
+        return await _Import(name, said, cache).read(read_records(file))
+
+
+async def _introductions(records: Iterator[Record]) -> dict[int, dict[Address, bytes]]:
+    """The first HEARTBEAT and AUTOPILOT_VERSION of each component, by message, as they stand in the log."""
+    found: dict[int, dict[Address, bytes]] = {HEARTBEAT_ID: {}, AUTOPILOT_VERSION_ID: {}}
+    framer = Framer(set(found), stream=False)
+    for number, record in enumerate(records):
+        for frame in framer.receive(record.data):
+            found[frame.message_id].setdefault((frame.system, frame.component), record.data)
+        if not number % RECORDS_PER_TURN:
+            await anyio.lowlevel.checkpoint()
+    return found
+
+
+class _Import:
+    """One log on its way into a cache.
+
+    Args:
+        name: of the log as a link, which an identity without a hardware id has.
+        said: who the components are, and how they write values, ahead of the time when they say it.
+        cache: where to.
+    """
+
+    def __init__(self, name: str, said: Mapping[int, Mapping[Address, bytes]], cache: ParamCache) -> None:
+        self._heartbeats = said[HEARTBEAT_ID]
+        self._versions = said[AUTOPILOT_VERSION_ID]
+        self._at = 0.0
+        self._station = Station(link=name, is_stream=False, upkeep=Upkeep.chosen(None, "auto", is_log=True))
+        self._writer = _PastWriter(
+            cache,
+            identity_of=self._identity_of,
+            is_doubted=lambda machine: False,  # nobody can be asked: the last one who said it counts
+            clock=lambda: self._at,
+        )
+
+    async def read(self, records: Iterator[Record]) -> tuple[ImportedTable, ...]:
+        station, writer = self._station, self._writer
+        machines = station.components
+        try:
+            flush_at = 0.0
+            for number, record in enumerate(records):
+                if record.at >= flush_at and number:
+                    station.tick(record.at)  # what ended in a pause, ended at its beginning
+                    await self._follow()
+                    await writer.flush()
+                    flush_at = record.at + FLUSH_INTERVAL
+                self._at = max(self._at, record.at)  # a clock that was set back does not make time go back
+                station.receive(record.data, LOG_PEER, self._at)
+                await self._follow()
+                if not number % RECORDS_PER_TURN:
+                    await anyio.lowlevel.checkpoint()
+            station.over(self._at)
+            await self._follow()
+            await writer.flush()
+            await writer.merge()
+        finally:
+            await writer.close()
+        heard = (machines[address] for address in sorted(machines))
+        return tuple(self._told(each) for each in heard if each.table.params or each.fetches.notes)
+
+    async def _follow(self) -> None:
+        """See to what has happened, as the client does."""
+        station, writer = self._station, self._writer
+        while events := station.events():
+            for event in events:
+                machine = event.machine
+                if isinstance(event, ComponentHeard):
+                    address = (machine.system, machine.component)
+                    for said in (self._heartbeats, self._versions):
+                        if address in said:  # what comes before it is of the same vehicle
+                            station.receive(said[address], LOG_PEER, self._at)
+                    await self._bring(machine)
+                elif isinstance(event, ComponentIdentified):
+                    for each in station.components.values():
+                        if each.system == machine.system:
+                            await self._bring(each)
+                elif isinstance(event, ComponentReplaced):
+                    writer.let_go(machine)
+                elif isinstance(event, ComponentForgotten):
+                    writer.part_with(machine)
+                elif isinstance(event, Fetched) and event.result.complete:
+                    writer.synced(machine, is_whole=event.result.source != "cache")
+
+    async def _bring(self, machine: ComponentMachine) -> None:
+        identity = self._identity_of(machine)
+        if identity is not None and not self._writer.follow(machine, identity):
+            await self._writer.bring(machine, identity)
+
+    def _identity_of(self, machine: ComponentMachine) -> Identity | None:
+        """Who the vehicle is; where nothing in the log says it, one of this log alone."""
+        identity = self._station.identity_of(machine)
+        is_silent = all(system != machine.system for system, _ in self._versions)
+        return machine.identity if identity is None and is_silent else identity
+
+    def _told(self, machine: ComponentMachine) -> ImportedTable:
+        identity = self._identity_of(machine) or machine.identity
+        complete = machine.table.complete
+        return ImportedTable(
+            identity.key,
+            machine.system,
+            machine.component,
+            machine.who.autopilot,
+            params=len(machine.table.params),
+            complete=complete,
+            hash=machine.table.hash if complete else None,
+            notes=machine.fetches.notes,
+        )
+
+
+class _PastWriter(WriteThrough):
+    """Gathers what the tables learn, with the times of the log, until `merge`."""
+
+    def __init__(
+        self,
+        cache: ParamCache,
+        *,
+        identity_of: Callable[[ComponentMachine], Identity | None],
+        is_doubted: Callable[[ComponentMachine], bool],
+        clock: Callable[[], float],
+    ) -> None:
+        super().__init__(
+            cache, owned=False, identity_of=identity_of, is_doubted=is_doubted, clock=clock, now=clock
+        )
+        self._kept_tables = cache
+        self._updates: list[TableUpdate] = []
+        self._based_on: dict[tuple[str, int], float] = {}
+        self._has_asked: set[tuple[str, int]] = set()
+        self._has_values: set[tuple[str, int]] = set()
+
+    async def merge(self) -> None:
+        """Write everything that was gathered."""
+        work = partial(self._kept_tables.merge, self._updates, based_on=self._based_on)
+        await self._worker.run(work)
+
+    async def _load(self, machine: ComponentMachine, identity: Identity) -> CachedComponent | None:
+        """The kept table, where it is of an earlier time: once, as what follows it is not written yet."""
+        key = (identity.key, machine.component)
+        if key in self._has_asked:
+            return None
+        self._has_asked.add(key)
+        cached = await self._worker.run(partial(self._kept_tables.load, *key))
+        if cached is None or cached.updated_at >= self._clock():
+            return None
+        self._based_on[key] = cached.updated_at
+        return cached
+
+    async def _save(self, cache: ParamCache, updates: list[TableUpdate]) -> bool:
+        for update in updates:
+            key = (update.identity.key, update.component)
+            if update.params or key in self._based_on or key in self._has_values:
+                self._updates.append(update)
+                self._has_values.add(key)
+        return True

@@ -1,0 +1,1 @@
+"""Plain data: values, parameters, parameter sets, identities, comparison, JSON notation."""

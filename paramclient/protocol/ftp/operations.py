@@ -1,0 +1,439 @@
+"""One piece of work with the files of a component: requests one at a time, each until it is answered."""
+
+from __future__ import annotations
+
+import math
+from abc import abstractmethod
+from collections.abc import Callable
+from typing import Final, TypeVar
+
+from paramclient.errors import FileErrorCode, FileTransferError, NoReply, UsageError
+from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.round_trip import LONGEST_SILENCE, RoundTrip
+from paramclient.protocol.wire import FileTransfer, Message
+
+__all__ = ["BUSY", "SESSION_LOST", "Job", "Line", "path_bytes"]
+
+Result = TypeVar("Result")
+
+COPY_RISK: Final = 0.01
+"""The share of requests without an answer from which on each is sent twice: servers give the same answer to
+the same request, so that costs its few bytes."""
+QUIET_TIME: Final = 3.2
+"""Seconds for which nothing is sent to a server whose session is in use: ArduPilot ends a session 3 s after
+its last reply to anybody, and the refusal of an open is such a reply (measured)."""
+BUSY_PATIENCE: Final = 30.0
+"""Seconds for which the session of another station is waited for. Its transfer keeps the session alive."""
+MOST_FAILURES: Final = 8
+"""How often an open may fail without a reason. ArduPilot says no more when the session is open already, as
+after an open whose answer was lost; it is then closed and opened again at once."""
+FAILURES_IN_LOSS: Final = 16
+"""The same where requests are lost: a closing that is lost, or that an open has overtaken, leaves the session
+open."""
+CLOSE_ATTEMPTS: Final = 4
+"""Times that the closing of a session is asked for, or the answer to its open. A server that keeps silent for
+so long ends the session by its own timeout: ArduPilot after 3 s, PX4 after 10 s."""
+MOST_CLOSE_COPIES: Final = 4
+"""Requests to close that go out at once on a lossy link: each has 12 bytes of payload."""
+UNHEARD_ATTEMPTS: Final = 16
+"""Requests after which a server that has never answered counts as none: where two exchanges of three are
+lost, all of them are lost once in 700 times."""
+EVEN_ATTEMPTS: Final = 2
+MOST_DOUBLINGS: Final = 4
+"""Requests to a server that has not answered yet which follow each other without a longer wait, and how often
+the wait doubles after that."""
+BUSY = frozenset((FileErrorCode.INVALID_SESSION, FileErrorCode.NO_SESSIONS_AVAILABLE))
+"""What servers say of an open while another station has a file open, or has left one open."""
+SESSION_LOST = frozenset((FileErrorCode.INVALID_SESSION, FileErrorCode.FILE_NOT_FOUND))
+"""What servers say to a request in a session that is not open."""
+MOST_OPENINGS: Final = 3
+"""How often a file is opened when its session is lost on board."""
+
+
+def path_bytes(path: str) -> bytes:
+    """A path as it stands in a request.
+
+    Raises:
+        UsageError: it is empty, longer than a request can hold, or has a NUL in it.
+    """
+    data = path.encode("utf-8", "surrogateescape")
+    if not data or b"\0" in data:
+        raise UsageError(f"the path of a file has at least one character, and no NUL: {path!r}")
+    if len(data) > MOST_DATA:
+        raise UsageError(f"the path of a file has at most {MOST_DATA} bytes, not {len(data)}")
+    return data
+
+
+class Line:
+    """The way to the files of one component, which all work there shares.
+
+    Attributes:
+        target: system and component.
+        round_trip: the component's; requests feed it, and it says when to repeat them.
+        heard_at: when the server sent us anything last.
+        keeps_session: whether the server is known to give a session the number that its open asked for.
+    """
+
+    def __init__(
+        self,
+        target: tuple[int, int],
+        round_trip: RoundTrip,
+        send: Callable[[Message], None],
+        now: float,
+        *,
+        keeps_session: Callable[[], bool],
+    ) -> None:
+        self.keeps_session = keeps_session
+        self.target = target
+        self.round_trip = round_trip
+        self.heard_at = -math.inf
+        self._send = send
+        # Where the numbers begin differs from one program to the next: a server gives its last answer once
+        # more to a request that has the number of the one before.
+        self._sequence = int(now * 1000) & 0xFFFF
+        self._session = self._sequence % 255
+
+    def send(self, packet: Packet) -> None:
+        self._send(FileTransfer(0, *self.target, packet.pack()))
+
+    def close_session(self, session: int) -> None:
+        """Request the closing of one session, and do not wait for it; twice, as one may get lost.
+
+        A reset of all sessions would close those of other stations too (measured with PX4).
+        """
+        packet = Packet(self.next_sequence(), session, Opcode.TERMINATE_SESSION)
+        self.send(packet)
+        self.send(packet)
+
+    def next_sequence(self, *, answers: int = 1) -> int:
+        """A number for a request that may get so many answers, each with a number of its own."""
+        number = self._sequence
+        self._sequence = (number + 1 + answers) & 0xFFFF
+        return number
+
+    def next_session(self) -> int:
+        """The number of a session that we ask for; never 0, in whose place a server may put another."""
+        self._session = self._session % 255 + 1
+        return self._session
+
+
+class Job(Operation[Result]):
+    """Something that is done with one file. Its owner gives it the answers and the time.
+
+    A job ends with its result or its error when its session is closed: the server has acknowledged that, or
+    has kept silent for `CLOSE_ATTEMPTS` timeouts. So whoever gets the result may open the next file at once.
+
+    Attributes:
+        path: of the file or directory.
+        asked_at: when the opening of the file was asked for last, but for repeats; infinity before.
+        is_over: whether the job needs the server no longer: nothing was begun, or its session is closed.
+        is_of_caller: whether somebody waits for it who is to be told when the component is lost.
+        yields: whether it ends with the server's refusal while another station has a file open, and does not
+            wait for that; to be set before any answer comes.
+        session: the number of the session that is open for it, or None.
+        asked_session: the one that was asked for when it is not known whether that is open, or None.
+    """
+
+    def __init__(self, line: Line, path: str, now: float) -> None:
+        super().__init__(now)
+        self._line = line
+        self.path = path
+        self.is_of_caller = False
+        self.yields = False
+        self.session: int | None = None
+        self.asked_session: int | None = None
+        self.is_over = False
+        self.asked_at = math.inf
+        self._path_data = path_bytes(path)
+        self._tell: Callable[[float], None] | None = None  # what ends it, once its session is closed
+        self._request: Packet | None = None
+        self._then: Callable[[Packet, float], None] | None = None
+        self._attempts = 0
+        self._sent_at = math.inf
+        self._failures = 0
+        self._openings = 1
+        self._busy_since = math.inf
+        self._open_at = math.inf  # when the file is opened again, as the server's session is in use
+
+    @property
+    def attempts(self) -> int:
+        """How often the present request was sent."""
+        return self._attempts
+
+    @property
+    def _has_request(self) -> bool:
+        """Whether the answer to a request is awaited."""
+        return self._request is not None
+
+    @property
+    def blocked_until(self) -> float | None:
+        """When the file is opened again, while the server's session is in use; None where it is not."""
+        return None if self._open_at == math.inf else self._open_at
+
+    @property
+    def is_ended(self) -> bool:
+        """Whether the outcome is known; the session may still be open."""
+        return self._tell is not None
+
+    @abstractmethod
+    def begin(self, now: float) -> None:
+        """The server is free: start."""
+
+    def finish(self, result: Result, now: float) -> None:
+        """End with a result as soon as the session is closed; later ends are ignored."""
+        self._close(lambda at: Operation.finish(self, result, at), now)
+
+    def fail(self, error: Exception, now: float) -> None:
+        """End with an error as soon as the session is closed; later ends are ignored.
+
+        After silence (`NoReply`) the closing is sent and nothing is awaited.
+        """
+        if isinstance(error, NoReply) and self._tell is None:
+            self._send_blind_close()
+            self.session = self.asked_session = None
+        self._close(lambda at: Operation.fail(self, error, at), now)
+
+    def abandon(self, now: float) -> None:
+        """End, and await nothing more of a component that has no server; nobody is told."""
+        self.on_done.clear()
+        self._send_blind_close()
+        self.session = self.asked_session = None
+        self._close(_nothing, now)
+
+    def stop(self, now: float, error: Exception | None = None) -> None:
+        """End without waiting for the session's closing, which goes on until `is_over`.
+
+        Args:
+            now: the time.
+            error: what to end with; None where nobody waits any more, and nobody is told.
+        """
+        if error is None:
+            self.on_done.clear()
+        else:
+            Operation.fail(self, error, now)
+        self._close(_nothing, now)
+
+    def _close(self, tell: Callable[[float], None], now: float) -> None:
+        """Close the session, then tell of the end."""
+        if self._tell is not None:
+            return
+        self._tell = tell
+        self._open_at = math.inf
+        if self.session is not None:
+            self._terminate(self.session, now)
+        elif self.asked_session is not None and self._request is not None:
+            # An open is on its way. Its answer says which session to close, as PX4 gives numbers of its own;
+            # ArduPilot keeps to ours, so this closes it even where nobody waits for that answer any more.
+            self._send_blind_close()
+            self._attempts = min(self._attempts, 1)
+        else:
+            self._closed(now)
+
+    def _terminate(self, session: int, now: float) -> None:
+        copies = self._line.round_trip.copies(COPY_RISK, MOST_CLOSE_COPIES)
+        self._ask(
+            Opcode.TERMINATE_SESSION, lambda _, now: self._closed(now), now, session=session, copies=copies
+        )
+
+    def _closed(self, now: float) -> None:
+        self._request = self._then = self.session = self.asked_session = None
+        self.is_over = True
+        assert self._tell is not None
+        self._tell(now)
+
+    def _send_blind_close(self) -> None:
+        """Ask for the session to be closed, and do not wait for it; twice, as one may get lost."""
+        session = self.asked_session if self.session is None else self.session
+        if session is not None:
+            self._line.close_session(session)
+
+    def server_heard(self, now: float) -> None:
+        """The server has sent something to anybody: a session that is in use lives on."""
+        if self._open_at < math.inf:
+            self._open_at = now + QUIET_TIME
+
+    def take(self, packet: Packet, now: float) -> None:
+        """Something came from the server for us."""
+        request = self._request
+        if request is None or self._then is None:
+            return
+        is_answer = packet.sequence == (request.sequence + 1) & 0xFFFF and packet.requested == request.opcode
+        if is_answer and packet.opcode in (Opcode.ACK, Opcode.NAK):
+            then = self._then
+            # what takes long on board says nothing of the link
+            attempts = 2 if request.opcode == Opcode.CALC_FILE_CRC32 else self._attempts
+            self._line.round_trip.answered(self._sent_at, now, attempts)
+            self._request = self._then = None
+            then(packet, now)
+
+    def tick(self, now: float) -> None:
+        """Do what is due."""
+        if self._open_at <= now:
+            self._open_at = math.inf
+            self.begin(now)
+        if self._request is not None and self._deadline() <= now:
+            self._line.round_trip.timed_out(self._attempts)
+            if self.is_ended and self._attempts >= CLOSE_ATTEMPTS:
+                self._send_blind_close()
+                self._closed(now)
+            elif self._is_hopeless(now):
+                self._request = None
+                self.fail(self._no_reply(self._attempts, now), now)
+            else:
+                self._transmit(self._request, now)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do, or infinity."""
+        return min(self._open_at, self._deadline() if self._request is not None else math.inf)
+
+    def resume(self, now: float) -> None:
+        """The link is back: ask again."""
+        if self._request is not None:
+            self._attempts = 0
+            self._transmit(self._request, now)
+
+    def _ask(
+        self,
+        opcode: Opcode,
+        then: Callable[[Packet, float], None],
+        now: float,
+        *,
+        data: bytes = b"",
+        session: int = 0,
+        offset: int = 0,
+        copies: int = 1,
+    ) -> None:
+        """Send a request, again and again until its answer comes, which goes to `then`."""
+        sequence = self._line.next_sequence()
+        self._request = Packet(sequence, session, opcode, data, offset=offset)
+        self._then = then
+        self._attempts = 0
+        self._transmit(self._request, now, copies=copies)
+
+    def _open_file(
+        self, opcode: Opcode, then: Callable[[Packet, float], None], now: float, *, copies: int = 1
+    ) -> None:
+        """Open the file in a session of its own, which `session` names when `then` is called.
+
+        Where an open is on its way already, its number is used again.
+        """
+
+        def opened(packet: Packet, now: float) -> None:
+            code = self._code(packet)
+            if packet.opcode == Opcode.ACK:
+                self.session, self.asked_session = packet.session, None
+                if self.is_ended:
+                    self._terminate(packet.session, now)
+                else:
+                    then(packet, now)
+            elif self.is_ended and code == FileErrorCode.FAIL:
+                self._terminate(number, now)  # it is open already, by an open of ours whose answer was lost
+            elif self.is_ended:
+                self._closed(now)
+            elif is_first and code == FileErrorCode.FAIL and self._attempts == 1 and not self._failures:
+                # no answer was lost, so it is another station's session that has this number
+                self._failures = 1
+                self.asked_session = None
+                self.begin(now)
+            elif code == FileErrorCode.FAIL and self._failures < self._failures_allowed:
+                # what is open may be what an open of ours has opened whose answer was lost
+                self._failures += 1
+                self._line.close_session(number)
+                self.begin(now)
+            else:
+                self._wait_or_refuse(packet, "does not open", now)
+
+        is_first = self.asked_at == math.inf
+        self.asked_at = now
+        number = self._line.next_session() if self.asked_session is None else self.asked_session
+        self.asked_session = number
+        self._ask(opcode, opened, now, data=self._path_data, session=number, copies=copies)
+
+    def _wait_or_refuse(self, packet: Packet, what: str, now: float) -> None:
+        """Begin again later where the server's session is in use; else end with the error of a NAK."""
+        self._busy_since = min(self._busy_since, now)
+        is_in_use = self._code(packet) in BUSY and now - self._busy_since < BUSY_PATIENCE
+        if is_in_use and not self.yields:
+            self._open_at = now + QUIET_TIME
+        else:
+            self.asked_session = None
+            self._refused(packet, what, now)
+
+    def _may_reopen(self, packet: Packet) -> bool:
+        """Drop a session that the server has given up; gives whether its file may be opened again."""
+        self._openings += 1
+        if self._code(packet) not in SESSION_LOST or self._openings > MOST_OPENINGS:
+            return False
+        self.session = None
+        return True
+
+    @property
+    def _failures_allowed(self) -> int:
+        return FAILURES_IN_LOSS if self._is_lossy else MOST_FAILURES
+
+    @property
+    def _is_lossy(self) -> bool:
+        """Whether requests are seen to be lost on this link."""
+        return self._line.round_trip.seen_loss >= COPY_RISK
+
+    def _is_hopeless(self, now: float) -> bool:
+        """Whether the request was sent often enough."""
+        is_unheard = self._line.heard_at == -math.inf  # of what is lost on the way there, nothing is known
+        if (
+            is_unheard
+            and self._attempts < UNHEARD_ATTEMPTS
+            and now - self._line.round_trip.heard_at < LONGEST_SILENCE
+        ):
+            return False
+        return self._line.round_trip.is_hopeless(self._attempts, now)
+
+    def _refused(self, packet: Packet, what: str, now: float) -> None:
+        """End with the error that a NAK names."""
+        system, component = self._line.target
+        code = self._code(packet)
+        errno = packet.data[1] if code == FileErrorCode.FAIL_ERRNO and len(packet.data) > 1 else 0
+        words = FileErrorCode.name_of(code) + (f" {errno}" if errno else "")
+        self.fail(
+            FileTransferError(
+                f"{system}/{component} {what} {self.path}: {words}",
+                system=system,
+                component=component,
+                path=self.path,
+                code=code,
+                errno=errno,
+            ),
+            now,
+        )
+
+    def _no_reply(self, attempts: int, now: float) -> NoReply:
+        system, component = self._line.target
+        return NoReply(f"{self.path} of {system}/{component}", attempts=attempts, waited=now - self.begun_at)
+
+    @staticmethod
+    def _code(packet: Packet) -> int:
+        return packet.data[0] if packet.data else FileErrorCode.FAIL
+
+    def _transmit(self, request: Packet, now: float, *, copies: int = 1) -> None:
+        self._attempts += 1
+        self._sent_at = now
+        for _ in range(max(copies, 2) if self._is_lossy else copies):
+            self._line.send(request)
+
+    def _deadline(self) -> float:
+        # while a burst comes the server does nothing else
+        since = min(max(self._sent_at, self._line.heard_at), self._sent_at + LONGEST_SILENCE)
+        round_trip = self._line.round_trip
+        # what takes long on board is not asked for again at once
+        is_slow = self._request is not None and self._request.opcode == Opcode.CALC_FILE_CRC32
+        if is_slow:
+            return since + round_trip.timeout
+        timeout = round_trip.repeat_timeout(self._attempts)
+        if self._line.heard_at == -math.inf and round_trip.smoothed is not None:
+            # the server may be at work for another station, whose burst nothing interrupts
+            timeout *= 2.0 ** min(max(self._attempts - EVEN_ATTEMPTS, 0), MOST_DOUBLINGS)
+        return since + timeout
+
+
+def _nothing(now: float) -> None:
+    """Whoever waited is told already."""

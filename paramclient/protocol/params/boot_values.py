@@ -1,0 +1,118 @@
+"""Values that a vehicle measures at each start: read again when it has measured them."""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import deque
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+from paramclient.protocol.params.reads import Read, Reads
+from paramclient.protocol.params.table import Table
+
+__all__ = ["StartValues"]
+
+MEASURING_TIME: Final = 3.0
+"""Seconds after a start is noticed, and after the vehicle's main loop runs, until its measurements are done.
+ArduPilot 4.6-dev (SITL) is done with gyroscopes and barometers 2.7 s after it went off, at about the time at
+which it first sends its clock; Rover shows the group GPS1_* and loads the defaults of RC*_DZ only then
+(measured)."""
+YOUNG: Final = 5.0
+"""Seconds of its own clock up to which a vehicle that is met may still be measuring."""
+MOST_AT_ONCE: Final = 5
+"""Reads in flight: what one batch of ArduPilot serves."""
+RETRY_PAUSE: Final = 0.1
+"""Seconds until it is looked again whether a fetch has ended."""
+
+_MEASURED = re.compile(
+    r"INS\d?_(ACC\d?_ID|GYR\d?_ID|ACC\d?_CALTEMP|GYR\d?_CALTEMP|GYR\d?OFFS_[XYZ]|GYROFFS_[XYZ])"
+    r"|BARO\d?_(GND_PRESS|DEVID)|GND_ABS_PRESS\d?|ARSPD\d?_(OFFSET|DEVID)"
+    r"|COMPASS_DEV_ID\d?|COMPASS_DEC|STAT_BOOTCNT|GPS\d?_TYPE|RC\d+_DZ"
+)
+"""ArduPilot's parameters that differed between 1.3 s and 9 s after a start (measured on three vehicles, first
+start and later ones), and their kin of other sensors."""
+
+
+class StartValues:
+    """Reads again what a vehicle without a hash measures at each start; see `MEASURING_TIME`.
+
+    Where the whole table comes as a file in no time, that is fetched instead. A vehicle with a hash needs
+    neither: its hash shows what has moved.
+
+    Args:
+        reads, table: the component's.
+        is_wanted: whether the table is to be kept up to date, and nothing else does that.
+        is_fetching: whether a fetch of the component is under way.
+        fetch_file: fetches the table where that is cheap; gives whether it is.
+    """
+
+    def __init__(
+        self,
+        reads: Reads,
+        table: Table,
+        *,
+        is_wanted: Callable[[], bool],
+        is_fetching: Callable[[], bool],
+        fetch_file: Callable[[float], bool],
+    ) -> None:
+        self._reads = reads
+        self._table = table
+        self._is_wanted = is_wanted
+        self._is_fetching = is_fetching
+        self._fetch_file = fetch_file
+        self._read_at = math.inf
+        self._has_clock = False  # whether its clock has been told since its start, or since it is heard
+        self._waiting: deque[str] = deque()
+        self._in_flight = 0
+
+    def restarted(self, now: float, *, by_clock: bool) -> None:
+        """The vehicle has started again; `by_clock` says that its clock has shown that."""
+        self._read_at = now + MEASURING_TIME
+        self._has_clock = by_clock
+
+    def clock_told(self, uptime: float, now: float) -> None:
+        """It has told its clock, which it does when its main loop runs.
+
+        Args:
+            uptime: seconds since boot.
+            now: the time.
+        """
+        is_first = not self._has_clock
+        self._has_clock = True
+        if is_first and (self._read_at < math.inf or uptime <= YOUNG):
+            self._read_at = now + MEASURING_TIME
+
+    def tick(self, now: float) -> None:
+        """Read what is due."""
+        if self._read_at > now:
+            return
+        if self._is_fetching():
+            self._read_at = now + RETRY_PAUSE
+            return
+        self._read_at = math.inf
+        if self._is_wanted() and not self._fetch_file(now):
+            self._waiting = deque(name for name in self._table.params if _MEASURED.fullmatch(name))
+            self._ask(now)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do, or infinity."""
+        return self._read_at
+
+    def stop(self) -> None:
+        """Read nothing any more."""
+        self._read_at = math.inf
+        self._waiting.clear()
+
+    def _ask(self, now: float) -> None:
+        while self._waiting and self._in_flight < MOST_AT_ONCE:
+            self._in_flight += 1
+            read = self._reads.ask(self._waiting.popleft(), now, urgent=False)
+            read.on_done.append(partial(self._read_ended, read))
+
+    def _read_ended(self, read: Read) -> None:
+        self._in_flight -= 1
+        if read.result is None:
+            self._waiting.clear()  # lost, or the link is: the next start or check brings them
+        self._ask(read.ended_at)

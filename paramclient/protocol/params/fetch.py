@@ -1,0 +1,766 @@
+"""Bring a component's table up to date the cheapest sure way: by the vehicle's hash, or by its list."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from functools import partial
+from typing import Final, NamedTuple
+
+from paramclient.errors import CacheError, LinkError, NoReply, UnknownParameter
+from paramclient.protocol.params.duplicate_names import Repeated, repeated_names
+from paramclient.protocol.params.fetch_notes import (
+    FILE_IN_USE,
+    FROM_MEMORY,
+    LEFT_OUT,
+    NO_FILE,
+    NOT_ASKED,
+    NOT_CONFIRMED,
+    NOT_REFRESHED,
+    NOT_RESUMED,
+    NOT_SAMPLED,
+    SAMPLED,
+    UNPROVEN,
+    UNSETTLED,
+)
+from paramclient.protocol.params.fetch_result import (
+    Announcement,
+    FetchResult,
+    Means,
+    Policy,
+    Progress,
+    Sampled,
+)
+from paramclient.protocol.params.file_download import PackFetch
+from paramclient.protocol.params.hash_check import Proof
+from paramclient.protocol.params.list_download import Download, present_of
+from paramclient.protocol.params.list_estimate import ListPace
+from paramclient.protocol.params.reads import Read
+from paramclient.protocol.params.sampling import Sampling
+from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.wire import HASH_CHECK, ParamRequestRead, ParamValue
+
+__all__ = ["Check", "Fetch"]
+
+FILE_PATIENCE: Final = 1.0
+FILE_TIMEOUTS: Final = 4.0
+"""Seconds, and timeouts, for which the opening of the file may stay unanswered before the list is asked for
+beside it."""
+BLIND_PATIENCE: Final = 2.0
+"""The same where nothing at all was answered: until then four requests of each kind have gone out."""
+ENOUGH_SILENCE: Final = 5
+"""Unanswered requests to open the file after which the component counts as one that serves none."""
+FILE_SHARE: Final = 0.1
+"""The time in which the file comes, as a share of the list's: 3.07 s of 34.6 s at 57600 baud (measured)."""
+QUICK_FILE: Final = 0.4
+"""Seconds in which the file comes on a link that is no limit (measured)."""
+MOST_TO_REPEAT: Final = 1.5
+"""Seconds of a download that are repeated where the component seems to have started again: ArduPilot's clock
+shows that 1.4 s later (measured)."""
+MOST_RESTARTS: Final = 8
+"""Times that a vehicle may start again, or turn out to be another one, before a fetch is given up."""
+
+
+class Check(NamedTuple):
+    """How the table of a vehicle without a hash is fetched only to see whether it has moved.
+
+    While another station has a file open, such a fetch ends with the server's refusal.
+
+    Attributes:
+        may_list: whether the list is downloaded where the file does not come for another reason.
+    """
+
+    may_list: bool
+
+
+class Fetch(Operation[FetchResult]):
+    """One fetch: hash first where a cached table has one, else or on a difference the file, or the list.
+
+    The file is asked for where the component serves it: it is exact, has the firmware's defaults, and comes
+    quicker. When that fails, the list follows, and `notes` says why. Where there is no hash, a sample of a
+    cached table may settle it, if that was asked for.
+
+    The list is asked for beside the file when the opening of the file stays unanswered, and when another
+    station has a file open and the list is quicker than waiting for the end of its session. As soon as the
+    file is opened after all, the list's gaps are left to it. What is complete first ends the fetch.
+
+    Of a vehicle with a hash, `Proof` says whether what came is confirmed.
+
+    What an earlier download has left unfinished is gone on with, when the count is still the same. With a
+    hash it must be proven in the end, or all is downloaded after all; without one what the cache knows stays
+    *cached*.
+
+    Attributes:
+        holders: how many wait for it; with none left it is cancelled.
+        download: the download by list, once it is needed.
+        file: the download as a file, while that is tried and when it has come.
+        file_failed: whether the component has no such file, once that is known: None before, and where it may
+            be bad luck.
+        check: how it is done where only the watch wants it; None where somebody waits for the table.
+        first_value_at: when the first value came of a download by list; infinity before.
+        begun_anew_at: when it was begun anew because the component seemed to have started again; minus
+            infinity where it was not.
+    """
+
+    def __init__(
+        self,
+        means: Means,
+        now: float,
+        *,
+        announced: Announcement | None,
+        refresh: bool,
+        listed: bool,
+        by_list: bool = False,
+        policy: Policy,
+        may_use_file: Callable[[], bool],
+        check: Check | None = None,
+        sampled: Sampled | None,
+    ) -> None:
+        super().__init__(now)
+        self._means = means
+        self._target = means.target
+        self._round_trip = means.round_trip
+        self._reads = means.reads
+        table = self._table = means.table
+        self._expects_hash = means.expects_hash
+        self._may_use_file = may_use_file
+        self._present: Mapping[int, str] | None = None  # with what a list would go on
+        self._list_pace: ListPace | None = None  # while another station has a file open
+        self._list_error: Exception | None = None  # why the list beside the file came to nothing
+        self._was_in_use = False  # the server's session, when the list was asked for
+        self._is_cancelled = False
+        self._has_begun = self._had_no_file = self._file_was_silent = False
+        self._sampling: Sampling | None = None
+        self._hash_read: Read | None = None
+        self._proof = Proof(table)
+        self._repeated: Repeated | None = None
+        self._was_asked_meanwhile = False
+        self._is_hash_unknown = False  # the vehicle answers, but not to that
+        self.first_value_at = math.inf
+        self._held_before = 0.0  # by a download that was begun anew
+        self._listed = listed
+        self._by_list = by_list
+        self.check = check
+        self._policy = policy
+        self._restarts = 0
+        self._download_begun_at = now
+        self.begun_anew_at = -math.inf
+        self.holders = 0
+        self.download: Download | None = None
+        self.file: PackFetch | None = None
+        self.file_failed: bool | None = None
+        self._notes: tuple[str, ...] = ()
+        self._left_out_before = table.left_out
+        if policy is Policy.CACHE_ONLY or refresh or listed:
+            self._begin_download(now)
+        elif sampled is not None and table.complete and table.count and not self._expects_hash():
+            self._sample(sampled, table.count, now)
+        elif table.hash is None or not table.complete:
+            self._begin_or_resume(announced, now)
+        elif announced is not None and announced.is_fresh(now):
+            self._compare(announced, now)
+        else:
+            self._ask_hash(self._hash_came_first, now)
+
+    def announced(self, announcement: Announcement) -> None:
+        """A `_HASH_CHECK` passed by: PX4 sends one at the head of its list."""
+        if self.file is not None and self.file.is_awaited:
+            self._proof.before = announcement
+        if self.download is not None and not self.download.names:
+            self.download.heed(announcement.at)
+            if self._proof.before is None:
+                self._proof.before = announcement
+
+    def heard(self, message: ParamValue, now: float) -> None:
+        """Every PARAM_VALUE of the component passes here, before the reads take their answers."""
+        if self.file is not None:
+            self.file.heard(message)
+        download = self.download
+        if download is None:
+            if not self._reads.awaits(message):  # else it comes because we have asked
+                self._means.following.heard(message, now)
+        elif not download.done:
+            if self.first_value_at > now:
+                self.first_value_at = now
+            download.heard(message, now)
+            is_unheard = self._proof.before is None and not self._was_asked_meanwhile
+            if is_unheard and self._expects_hash() and not self.done:
+                # the one at the head of the list was lost; asked for now, it need not be waited for later
+                self._was_asked_meanwhile = True
+                self._ask_hash(self._hash_came_meanwhile, now)
+
+    def tick(self, now: float) -> None:
+        self.look(now)
+        if self._repeated is not None:
+            self._repeated.tick(now)
+        if self._list_pace is not None:
+            self._list_pace.tick(now)
+        if self.download is not None:
+            self.download.tick(now)
+
+    def next_deadline(self) -> float:
+        if self._repeated is not None:
+            return self._repeated.next_deadline()
+        deadline = self._list_due_at if self.download is None else self.download.next_deadline()
+        return deadline if self._list_pace is None else min(deadline, self._list_pace.next_deadline())
+
+    def look(self, now: float) -> None:
+        """See how the file stands: it may be known by now that there is none, or that the list is quicker."""
+        if self.file is not None:
+            self.file.look(now)
+        file = self.file
+        if file is None or file.done:
+            return
+        if file.is_served:
+            if self.download is not None and not self.download.done:
+                self.download.gives_way = True
+            self._drop_list_pace()
+        elif self._is_file_check:
+            return
+        elif file.is_awaited and not self._may_use_file():
+            self._drop_file(now, is_served=False)
+            self._had_no_file = True
+            if self.download is None:
+                self._begin_list(now)
+        elif self.download is None and self._list_error is None:
+            if file.blocked_until is not None and self._list_pace is None:
+                self._measure_list(now)
+            elif self._list_due_at <= now:
+                self._begin_list_beside(now)
+
+    def doubt(self) -> None:
+        """What has come may be of the past."""
+        self._proof.doubt()
+
+    def resume(self, now: float) -> None:
+        """The link is back."""
+        if self.download is not None:
+            self.download.resume(now)
+
+    @property
+    def is_about_the_cache(self) -> bool:
+        """Whether it is still to be seen if what is known already will do."""
+        return not self._has_begun or (self.download is not None and self.download.resumed > 0)
+
+    @property
+    def is_sampling(self) -> bool:
+        """Whether a sample is being read that may settle it."""
+        return self._sampling is not None
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether parameters have come, which are of the past if the vehicle starts again."""
+        return self._has_begun or self.is_sampling
+
+    def restart(self, now: float) -> None:
+        """The vehicle is another one, or has started again: what came is not about it. Fetch it anew."""
+        held_up = self.held_up(now)
+        self._drop(now)
+        self.download = None
+        self._notes = ()
+        self.file_failed = None
+        self._had_no_file = self._file_was_silent = self._was_in_use = False
+        self._list_error = None
+        self._restarts += 1
+        if self._restarts > MOST_RESTARTS:
+            whose = "/".join(map(str, self._target))
+            what = f"the parameters of {whose}, which has started again {self._restarts} times"
+            self.fail(NoReply(what, attempts=self._restarts, waited=now - self.begun_at), now)
+            return
+        self._held_before = held_up
+        self._proof.forget()
+        self._was_asked_meanwhile = False
+        self._listed = False
+        self._begin_download(now)
+
+    def seems_restarted(self, silent_since: float, now: float) -> bool:
+        """Begin anew where the component may have started again; gives whether that was done.
+
+        It is not where that would repeat more than the component's clock takes to show a restart.
+
+        Args:
+            silent_since: when the component was heard last.
+            now: the time.
+        """
+        if self.done or not self._has_begun or silent_since - self._download_begun_at > MOST_TO_REPEAT:
+            return False
+        self.begun_anew_at = now
+        self.restart(now)
+        return True
+
+    def finish(self, result: FetchResult, now: float) -> None:
+        """End with a result as soon as no session of a file is open on board that nobody wants."""
+        files = self._means.files
+        if not files.has_idle_session:
+            super().finish(result, now)
+        else:
+            restarts = self._restarts  # a result of the run before a restart is none
+
+            def closed(at: float) -> None:
+                if not self._is_cancelled and self._restarts == restarts:
+                    self.finish(result, at)
+
+            files.on_closed.append(closed)
+
+    def cancel(self, now: float) -> None:
+        """Nobody waits any more. What is on its way still goes into the table."""
+        self._is_cancelled = True
+        self._drop(now)
+
+    def partial(self, now: float, note: str) -> FetchResult:
+        """What has come so far, for someone whose time is up while it goes on.
+
+        Raises:
+            NoReply: nothing has come.
+        """
+        download = self.download
+        file = self.file
+        if file is not None and file.count and (download is None or not download.received):
+            missing = () if file.done else tuple(range(file.count))
+            return self._result("ftp", file.count, missing, None, now, (note,))
+        if download is None or download.count is None:
+            what = "the parameters of " + "/".join(map(str, self._target))
+            attempts = 1 if download is None else download.lists
+            raise NoReply(what, attempts=attempts, waited=now - self.begun_at)
+        return self._result("stream", download.count, download.missing, None, now, (note,))
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether nothing has come although it was asked for more than once."""
+        if self.file is not None and not self.file.is_silent:
+            return False
+        if self.download is not None:
+            return self.download.count is None and self.download.lists > 1
+        if self.file is not None:
+            return True
+        read = self._hash_read
+        return read is not None and read.attempts > 1 and not read.controls
+
+    def held_up(self, now: float) -> float:
+        """Seconds for which its list has waited for its turn: other lists of the same link ran."""
+        stream = self.download if self.file is None else self.file
+        return self._held_before + (0.0 if stream is None else stream.held_for(now))
+
+    def progress(self, now: float) -> Progress:
+        """How far it is."""
+        if self.file is not None and (self.download is None or not self.file.is_awaited):
+            return self.file.progress(now)
+        received, total = (0, self._table.count) if self.download is None else self.download.progress
+        came = received - (0 if self.download is None else self.download.resumed)
+        return Progress.after(received, total, came, now - self.first_value_at)
+
+    def _sample(self, sampled: Sampled, count: int, now: float) -> None:
+        """Judge the cached table by some of its parameters."""
+        table = self._table
+        sampling = self._sampling = Sampling(
+            self._reads, table.params, table.encoding, count, now, size=sampled.size, seed=sampled.seed
+        )
+
+        def ended() -> None:
+            self._sampling = None
+            sample = sampling.result
+            if sample is not None and sample.agrees:
+                result = self._result("cache", count, (), None, sampling.ended_at, (SAMPLED,))
+                self.finish(replace(result, sample=sample), sampling.ended_at)
+            else:
+                why = str(sampling.error) if sample is None else sample.differing[0]
+                self._notes += (NOT_SAMPLED.format(why),)
+                self._begin_download(sampling.ended_at)
+
+        sampling.on_done.append(ended)
+
+    def _ask_hash(self, then: Callable[[Read], None], now: float) -> None:
+        read = self._hash_read = self._reads.ask(HASH_CHECK, now)
+
+        def ended() -> None:
+            if self._hash_read is read:
+                self._hash_read = None
+                then(read)
+
+        read.on_done.append(ended)
+
+    def _hash_came_meanwhile(self, read: Read) -> None:
+        self._proof.meanwhile = Announcement.answering(read)
+        self._is_hash_unknown = isinstance(read.error, UnknownParameter)
+        if self.download is not None and self.download.done:
+            self._download_ended(self.download)
+
+    def _hash_came_first(self, read: Read) -> None:
+        if read.result is None:
+            self._begin_download(read.ended_at)
+        else:
+            self._compare(Announcement.of(read.result, read.ended_at), read.ended_at)
+
+    def _compare(self, announcement: Announcement, now: float) -> None:
+        table = self._table
+        known = "none" if table.hash is None else f"{table.hash:08x}"
+        self._means.trace("%s/%s: hash %08x announced, %s here", *self._target, announcement.hash, known)
+        if announcement.hash != table.hash or announcement.count != table.size:
+            self._proof.before = announcement
+            self._begin_download(now)
+            return
+        table.count = announcement.count
+        table.verify()
+        notes = () if table.volatile_known else (UNPROVEN,)
+        if self._policy is Policy.HASH_ONLY:
+            notes = (NOT_REFRESHED,) if table.unhashed() else ()
+        self.finish(self._result("cache", announcement.count, (), announcement.hash, now, notes), now)
+
+    def _begin_or_resume(self, announced: Announcement | None, now: float) -> None:
+        """Go on with what is there, if that is enough and the vehicle's count is still the same."""
+        if not present_of(self._table, self._reads):
+            self._begin_download(now)
+        elif not self._expects_hash():
+            self._resume(now)
+        elif announced is not None and announced.is_fresh(now):
+            self._resume_under(announced, now)
+        else:
+            self._ask_hash(self._hash_came_to_resume, now)
+
+    def _hash_came_to_resume(self, read: Read) -> None:
+        if read.result is not None:
+            self._resume_under(Announcement.of(read.result, read.ended_at), read.ended_at)
+        elif isinstance(read.error, UnknownParameter):
+            self._is_hash_unknown = True
+            self._resume(read.ended_at)
+        else:
+            self._begin_download(read.ended_at)
+
+    def _resume_under(self, announcement: Announcement, now: float) -> None:
+        self._proof.before = announcement
+        if announcement.count == self._table.count:
+            self._resume(now)
+        else:
+            self._begin_download(now)
+
+    def _resume(self, now: float) -> None:
+        self._begin_download(now, present=present_of(self._table, self._reads))
+
+    def _begin_download(self, now: float, present: Mapping[int, str] | None = None) -> None:
+        if self._policy is not Policy.AUTO:
+            self._stay_with_cache(now)
+            return
+        means = self._means
+        self._has_begun = True
+        self._download_begun_at = now
+        self._present = present
+        means.doubt(now)
+        may_use_file = self._is_file_check or self._may_use_file()
+        if self._listed or self._by_list or self._had_no_file or not may_use_file:
+            self._begin_list(now)
+            return
+        means.trace("%s/%s: the file is wanted, %s there", *self._target, len(present or ()))
+        if self._expects_hash():
+            # once, and before the file: so the answer is of the time before it
+            means.send(ParamRequestRead(*self._target, HASH_CHECK, -1))
+        file = self.file = PackFetch(
+            means.files,
+            means.turns,
+            means.table,
+            means.changed,
+            now,
+            adds_defaults=means.adds_defaults,
+            yields=self.check is not None,
+        )
+        file.on_done.append(partial(self._file_ended, file))
+
+    @property
+    def _is_file_check(self) -> bool:
+        """Whether it ends without a list when the file does not come."""
+        return self.check is not None and not self.check.may_list
+
+    @property
+    def _list_due_at(self) -> float:
+        """When the list is asked for beside a file whose opening nothing answers; infinity where it comes."""
+        file, trip = self.file, self._round_trip
+        if file is None or file.done or file.is_served or not file.is_awaited or self._list_error is not None:
+            return math.inf
+        if file.blocked_until is not None or self.download is not None or self._is_file_check:
+            return math.inf
+        if trip.smoothed is None:
+            return file.asked_at + BLIND_PATIENCE
+        return file.asked_at + max(FILE_PATIENCE, FILE_TIMEOUTS * trip.prompt_timeout)
+
+    def _measure_list(self, now: float) -> None:
+        """Another station has a file open: see whether the list is quicker than the end of its session."""
+        gap, count = self._reads.pace.gap, self._table.count
+        if gap and count:
+            self._choose(count * gap, now)
+            return
+        pace = self._list_pace = ListPace(self._reads, now)
+
+        def ended() -> None:
+            if self._list_pace is pace and pace.result is not None:
+                self._choose(pace.result, pace.ended_at)
+
+        pace.on_done.append(ended)
+
+    def _choose(self, list_takes: float, now: float) -> None:
+        """Ask for the list if it comes quicker than the file will."""
+        file = self.file
+        if file is None or file.blocked_until is None or self.download is not None:
+            return
+        file_takes = file.blocked_until - now + max(QUICK_FILE, FILE_SHARE * list_takes)
+        self._means.trace(
+            "%s/%s: another station has a file open; the list takes %.1f s and the file %.1f s",
+            *self._target,
+            list_takes,
+            file_takes,
+        )
+        if list_takes <= file_takes:
+            self._was_in_use = True
+            self._begin_list_beside(now)
+
+    def _begin_list_beside(self, now: float) -> None:
+        """Ask for the list while the file is not served."""
+        assert self.file is not None
+        self.file.give_way()
+        self._begin_list(now)
+
+    def _begin_list(self, now: float) -> None:
+        means, present = self._means, self._present
+        means.trace("%s/%s: the list is wanted, %s there", *self._target, len(present or ()))
+        count, following = self._table.count, means.following
+        if not self._listed and following.is_running(now):
+            # another station has asked for it: to ask again would begin it anew for both
+            followed, of = following.hand_over(means.reads)
+            present, count = {**(present or {}), **followed} if of == count else followed, of
+        download = self.download = Download(
+            means.target,
+            means.round_trip,
+            means.send,
+            means.reads,
+            means.turns,
+            now,
+            listed=self._listed,
+            count=count,
+            present=present,
+            beside_file=self.file is not None,
+        )
+        if download.done:
+            self._download_ended(download)
+            return
+        download.on_done.append(partial(self._download_ended, download))
+        if self._proof.before is None and self._expects_hash() and not self._was_asked_meanwhile:
+            # beside the list, so that a lost request of either kind shows at once
+            self._was_asked_meanwhile = True
+            self._ask_hash(self._hash_came_meanwhile, now)
+
+    def _file_ended(self, file: PackFetch) -> None:
+        if self.file is not file:
+            return
+        now = file.ended_at
+        self._drop_list_pace()
+        if file.error is None:
+            self._drop_download()
+            self.file_failed = False
+            if file.left_out:
+                self._table.unconfirm()
+                self._table.complete = False
+                self.finish(self._result("ftp", file.count or 0, file.left_out, None, now, ()), now)
+                return
+            self._table.complete = True
+            is_proven = self._proof.is_given(file.count or 0)
+            if not is_proven and self._expects_hash() and not self._is_hash_unknown:
+                self._ask_hash(partial(self._hash_came_after_file, file), now)
+                return
+            if not is_proven:
+                self._table.unconfirm()
+            self.finish(self._result("ftp", file.count or 0, (), self._table.hash, now, ()), now)
+            return
+        self.file = None
+        self._held_before += file.held_up
+        is_over = self._is_file_check or (self.check is not None and file.is_in_use and not self.download)
+        if file.error is not None and (is_over or isinstance(file.error, LinkError)):
+            self.fail(file.error, now)
+            return
+        self._had_no_file = True
+        self.file_failed = True if file.is_useless else None
+        self._file_was_silent = file.is_unheard
+        if not self._was_in_use:
+            self._notes += (NO_FILE.format(file.error),)
+        if self.download is not None:
+            self.download.go_on(now)
+        elif self._list_error is not None:
+            self.fail(self._list_error, now)
+        elif self._present is not None:
+            self._resume(now)
+        else:
+            self._begin_download(now)
+
+    def _hash_came_after_file(self, file: PackFetch, read: Read) -> None:
+        """The file is the vehicle's table at one moment; its hash may be of a later one."""
+        after = Announcement.answering(read)
+        self._table.unconfirm()
+        count = file.count or 0
+        notes = () if after is None else self._proof.settle(after, count)
+        result = self._result("ftp", count, (), self._table.hash, read.ended_at, notes or ())
+        self.finish(result, read.ended_at)
+
+    def _stay_with_cache(self, now: float) -> None:
+        """The policy allows no download: give what is known, and say so."""
+        table = self._table
+        if not table.params:
+            whose = "/".join(map(str, self._target))
+            self.fail(CacheError(f"nothing is cached of {whose}, and the policy is {self._policy}"), now)
+            return
+        count, missing = table.gaps()
+        note = NOT_ASKED if self._policy is Policy.CACHE_ONLY else NOT_CONFIRMED
+        self.finish(self._result("cache", count, missing, None, now, (note,)), now)
+
+    def _download_ended(self, download: Download) -> None:
+        if self.download is not download:
+            return
+        file = self.file
+        if download.error is not None:
+            if file is not None and not file.done:
+                self.download, self._list_error = None, download.error  # the file may still come
+            else:
+                self.fail(download.error, download.ended_at)
+            return
+        if file is not None and not file.done:
+            self._file_was_silent = file.is_silent and file.attempts >= ENOUGH_SILENCE
+            if self._file_was_silent and not self._was_in_use:
+                self._notes += (NO_FILE.format(file.silence(download.ended_at)),)
+            self._drop_file(download.ended_at)
+        if download.missing:
+            self._drop_hash_read()  # it can prove nothing
+        if self._hash_read is not None or self._asks_for_repeated(download):
+            return  # it is on its way
+        now = download.ended_at if self._repeated is None else self._repeated.ended_at
+        if self._is_proven(download):
+            self._finish_download(download, now, ())
+        elif self._expects_hash() and not (self._is_hash_unknown or download.missing):
+            self._ask_hash(lambda read: self._settle(download, read, read.ended_at), now)
+        else:
+            self._settle(download, None, now)
+
+    def _asks_for_repeated(self, download: Download) -> bool:
+        """Whether it is still being asked what the vehicle means by names that came more than once."""
+        if self._repeated is None:
+            names = repeated_names(download.names)
+            if not (names or self._table.passed_over):
+                return False
+            self._repeated = Repeated(names, self._round_trip, self._reads, self._table, download.ended_at)
+            self._repeated.on_done.append(partial(self._download_ended, download))
+        return not self._repeated.done
+
+    def _is_proven(self, download: Download) -> bool:
+        """Whether what was announced in its course proves the table that it brought."""
+        if download.missing or not download.is_settled:
+            return False
+        self._remove_what_is_gone(download)
+        return self._proof.is_given(download.count or 0)
+
+    def _remove_what_is_gone(self, download: Download) -> None:
+        self._means.changed(self._table.settle(download.names))
+
+    def _settle(self, download: Download, read: Read | None, now: float) -> None:
+        """The download is over and the hash is known, if there is one."""
+        after = None if read is None else Announcement.answering(read)
+        notes: tuple[str, ...] = ()
+        if not download.missing:
+            self._remove_what_is_gone(download)
+            if not download.is_settled:
+                notes = (UNSETTLED,)
+            self._table.unconfirm()
+        if after is not None and not download.missing:
+            judged = self._proof.settle(after, download.count or 0, needs_proof=download.resumed > 0)
+            if judged is None:
+                # what was heard earlier is not what the vehicle has now, or cannot be told from it
+                self._notes = (NOT_RESUMED,)
+                self._proof.forget()
+                self._was_asked_meanwhile = False
+                self._begin_download(now)
+                return
+            notes += judged
+        self._finish_download(download, now, notes)
+
+    def _finish_download(self, download: Download, now: float, notes: tuple[str, ...]) -> None:
+        count = download.count or 0
+        missing = download.missing
+        table = self._table
+        if self._repeated is not None and self._repeated.names:
+            notes += (self._repeated.note,)
+            table.complete = False
+        elif not missing:
+            table.complete = download.is_settled
+        else:
+            table.place(download.names)
+        table.count = count
+        if self._file_was_silent and not missing:  # while the list has come
+            self.file_failed = True
+        if self._was_in_use:
+            notes += (FILE_IN_USE,)
+        if download.resumed and table.hash is None:
+            earlier = table.only_cached
+            notes += (FROM_MEMORY.format(earlier),) if earlier else ()
+        self.finish(
+            self._result("stream", count, missing, table.hash if not missing else None, now, notes), now
+        )
+
+    def _result(
+        self,
+        source: str,
+        count: int,
+        missing: tuple[int, ...],
+        confirmed: int | None,
+        now: float,
+        notes: tuple[str, ...],
+    ) -> FetchResult:
+        received = count - len(missing)
+        download = self.download
+        left_out = self._table.left_out - self._left_out_before
+        if left_out:
+            more = f", and {left_out - 1} more times" if left_out > 1 else ""
+            notes += (LEFT_OUT.format(self._table.left_out_name, more),)
+        return FetchResult(
+            *self._target,
+            self._table.params.copy(),
+            source,
+            count,
+            received,
+            missing,
+            confirmed,
+            now - self.begun_at,
+            self._notes + notes,
+            resumed=0 if download is None else download.resumed,
+            lost=0 if download is None else download.lost,
+            repeated=0 if download is None else download.repeated,
+            round_trip=self._round_trip.smoothed,
+        )
+
+    def _drop_hash_read(self) -> None:
+        read, self._hash_read = self._hash_read, None
+        if read is not None:
+            self._reads.release(read)
+
+    def _drop(self, now: float) -> None:
+        self._drop_hash_read()
+        sampling, self._sampling = self._sampling, None
+        if sampling is not None:
+            sampling.cancel()
+        self._drop_list_pace()
+        repeated, self._repeated = self._repeated, None
+        if repeated is not None:
+            repeated.cancel()
+        self._drop_file(now)
+        self._drop_download()
+
+    def _drop_list_pace(self) -> None:
+        pace, self._list_pace = self._list_pace, None
+        if pace is not None:
+            pace.cancel()
+
+    def _drop_file(self, now: float, *, is_served: bool = True) -> None:
+        self._drop_list_pace()
+        file, self.file = self.file, None
+        if file is not None:
+            self._held_before += file.held_for(now)
+            file.cancel(now, is_served=is_served)
+
+    def _drop_download(self) -> None:
+        download, self.download = self.download, None
+        if download is not None:
+            download.cancel()

@@ -1,0 +1,270 @@
+"""Fetch every parameter of a component as one packed file over MAVFTP."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Final
+
+from paramclient.errors import FileErrorCode, FileTransferError, NoReply, PackError
+from paramclient.model.values import is_portable_name
+from paramclient.protocol.ftp import BUSY, FileRead, FileTransfers
+from paramclient.protocol.ftp.packets import MOST_DATA
+from paramclient.protocol.ftp.param_pck import LARGEST_FILE, Pack, decode, total_of
+from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.fetch_result import Progress
+from paramclient.protocol.params.table import Table
+from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.scheduler import Seen, Turns
+from paramclient.protocol.wire import MOST_PARAMETERS, ParamValue
+
+__all__ = ["PARAMETER_FILE", "PackFetch"]
+
+PARAMETER_FILE: Final = "@PARAM/param.pck"
+"""The table of ArduPilot 4.1 and later, and of PX4 after 1.17."""
+WITH_DEFAULTS: Final = "?withdefaults=1"
+"""Understood since ArduPilot 4.3; what does not know it may say that there is no such file."""
+SILENCE: Final = 2.0
+"""Seconds without anything after which the file no longer keeps the lists of others waiting."""
+MOST_TRIES: Final = 2
+"""Times that a file is read which turns out to be none, or of the past: it is made anew for each reader, and
+a gap that is filled later may hold newer values of another length."""
+
+
+class PackFetch(Operation[None]):
+    """One fetch of the packed file into the table. It ends with the table filled, or with the reason why not.
+
+    While the file comes, PARAM_VALUEs go on: what was heard since it was asked for is newer than what stands
+    in it. A param_count that differs from the file's makes the file one of the past. It waits for its turn on
+    the link, as a list does.
+
+    Args:
+        files: the component's.
+        turns: those of the link.
+        table: where the parameters go.
+        changed: is told of the changes.
+        now: the time.
+        adds_defaults: whether the component is known to serve the file with the defaults, if it serves it.
+            Else it is asked for without them where there is none with them.
+        yields: whether to give up at once when another station has a file open.
+
+    Attributes:
+        held_up: seconds for which it waited for its turn.
+        is_in_use: whether it ended as another station has a file open.
+        is_useless: whether the component does not have the file, or one that cannot be read: with this
+            firmware that will not change.
+        left_out: the indices of entries whose names no parameter file can hold: they did not come.
+        is_unheard: whether it ended as nothing at all came of it, though the component was there.
+    """
+
+    def __init__(
+        self,
+        files: FileTransfers,
+        turns: Turns,
+        table: Table,
+        changed: Callable[[list[Change]], None],
+        now: float,
+        *,
+        adds_defaults: Callable[[], bool],
+        yields: bool = False,
+    ) -> None:
+        super().__init__(now)
+        self._adds_defaults = adds_defaults
+        self._yields = yields
+        self._files = files
+        self._turns = turns
+        self._table = table
+        self._changed = changed
+        self._heard: set[str] = set()
+        self._heard_count: int | None = None
+        self._attempts = 0
+        self._query = WITH_DEFAULTS
+        self._not_found: FileTransferError | None = None  # with the defaults
+        self._job: FileRead | None = None
+        self._silent_at = math.inf
+        self._doubts = table.doubts
+        self._asked_at = now
+        self.held_up = 0.0
+        self.is_useless = False
+        self.is_in_use = False
+        self.is_unheard = False
+        self.left_out: tuple[int, ...] = ()
+        self._count: int | None = None
+        self._waits_since: float | None = now
+        turns.ask(self, now)
+
+    @property
+    def is_silent(self) -> bool:
+        """Whether nothing of the file has come although it was asked for more than once."""
+        return self.is_awaited and self._job is not None and self._job.attempts > 1
+
+    @property
+    def is_awaited(self) -> bool:
+        """Whether nothing of the file has come."""
+        return self._job is None or not self._job.received
+
+    @property
+    def asked_at(self) -> float:
+        """When the opening of the file was asked for; infinity while that waits for its turn."""
+        return math.inf if self._job is None else self._job.asked_at
+
+    @property
+    def attempts(self) -> int:
+        """How often the present request was sent."""
+        return 0 if self._job is None else self._job.attempts
+
+    def silence(self, now: float) -> NoReply:
+        """The error of a file of which nothing comes."""
+        return NoReply(PARAMETER_FILE, attempts=self.attempts, waited=now - self.asked_at)
+
+    @property
+    def is_served(self) -> bool:
+        """Whether the component has opened the file, so that it will come."""
+        return self._job is not None and self._job.session is not None
+
+    @property
+    def blocked_until(self) -> float | None:
+        """When the file is opened again, while another station has a file open; None where none has."""
+        return None if self._job is None else self._job.blocked_until
+
+    @property
+    def silent_at(self) -> float:
+        """While nothing has come: when that has lasted too long for others to wait."""
+        return self._silent_at if self.is_awaited else math.inf
+
+    def give_way(self) -> None:
+        """Let a list of the same component run beside, as long as nothing comes of the file."""
+        self._turns.give_back(self)
+
+    def seen(self) -> Seen:
+        """What has come, in messages: a burst that is repaired on its own goes over nothing."""
+        came = 0 if self._job is None else self._job.received // MOST_DATA
+        return Seen(came, came, 0.0, False)
+
+    def begin(self, now: float) -> None:
+        """It is this file's turn."""
+        if self._waits_since is not None:
+            self.held_up += now - self._waits_since
+            self._waits_since = None
+        self._read(now)
+
+    def held_for(self, now: float) -> float:
+        """Seconds for which it has waited for its turn so far."""
+        return self.held_up + (0.0 if self._waits_since is None else now - self._waits_since)
+
+    def progress(self, now: float) -> Progress:
+        """How far it is: by the share of the file, whose size the vehicle gives."""
+        job, total = self._job, self.count or self._table.count
+        share = min(job.received / job.size, 1.0) if job is not None and job.size else float(self.done)
+        received, running = int(share * (total or 0)), now - self.begun_at - self.held_for(now)
+        left = running * (1 - share) / share if share else None
+        return Progress(received, total, received / running if running > 0 else 0.0, left)
+
+    @property
+    def count(self) -> int | None:
+        """Parameters that the component has, as soon as the file's beginning has said so."""
+        return self._count if self._job is None else total_of(self._job.beginning)
+
+    def heard(self, message: ParamValue) -> None:
+        """Every PARAM_VALUE of the component passes here, after it went into the table."""
+        self._heard.add(message.param_id)
+        if message.param_count <= MOST_PARAMETERS:
+            self._heard_count = message.param_count
+
+    def look(self, now: float) -> None:
+        """See whether the component has said meanwhile that it has no file without the defaults either."""
+        error, job = self._not_found, self._job
+        if error is not None and job is not None and not self.is_served and self._adds_defaults():
+            self._job = None
+            self._files.release(job, now, is_served=False)
+            self._fails(error, now)
+
+    def cancel(self, now: float, *, is_served: bool = True) -> None:
+        """Nobody wants it any more; the file is closed on board, where the component serves files."""
+        job, self._job = self._job, None
+        self._turns.give_back(self)
+        if job is not None:
+            self._files.release(job, now, is_served=is_served)
+
+    def _read(self, now: float) -> None:
+        self._attempts += 1
+        self._asked_at = now
+        self._silent_at = now + SILENCE
+        self._doubts = self._table.doubts
+        self._heard.clear()
+        self._heard_count = None
+        job = self._job = self._files.read(PARAMETER_FILE + self._query, now, limit=LARGEST_FILE)
+        job.yields = self._yields
+        job.on_done.append(partial(self._came, job))
+
+    def _came(self, job: FileRead) -> None:
+        if self._job is not job:
+            return
+        self._job = None
+        now = job.ended_at
+        if job.result is None:
+            may_be_the_query = isinstance(job.error, FileTransferError) and job.error.is_not_found
+            if may_be_the_query and self._query and not self._adds_defaults():
+                assert isinstance(job.error, FileTransferError)
+                self._not_found = job.error
+                self._query = ""
+                self._attempts -= 1
+                self._read(now)
+            else:
+                assert job.error is not None
+                is_there = self._doubts == self._table.doubts
+                self.is_unheard = is_there and isinstance(job.error, NoReply) and not job.received
+                self._fails(job.error, now)
+            return
+        total = total_of(job.result)
+        if self._doubts != self._table.doubts:
+            self._is_none(PackError("the vehicle was away meanwhile", offset=0), now)
+            return
+        if total is not None and self._heard_count not in (None, total):
+            self._is_none(PackError(f"the vehicle has {self._heard_count} parameters by now", offset=4), now)
+            return
+        try:
+            pack = decode(job.result)
+            if len(pack.entries) < pack.total:
+                raise PackError(f"it has {len(pack.entries)} of {pack.total} parameters", offset=2)
+            if pack.total > MOST_PARAMETERS:
+                raise PackError(f"no component has {pack.total} parameters", offset=4)
+        except PackError as error:
+            self._is_none(error, now, is_useless=True)
+            return
+        self._turns.give_back(self)
+        self._fill(pack)
+        self.finish(None, now)
+
+    def _fails(self, error: Exception, now: float) -> None:
+        if isinstance(error, FileTransferError):
+            self.is_useless = error.is_not_found or error.code == FileErrorCode.UNKNOWN_COMMAND
+            self.is_in_use = error.code in BUSY
+        self._turns.give_back(self)
+        self.fail(error, now)
+
+    def _is_none(self, error: PackError, now: float, *, is_useless: bool = False) -> None:
+        """What came is not the vehicle's table: read it again, or give up."""
+        if self._attempts < MOST_TRIES:
+            self._read(now)
+            return
+        self.is_useless = is_useless
+        self._turns.give_back(self)
+        self.fail(error, now)
+
+    def _fill(self, pack: Pack) -> None:
+        table = self._table
+        changes = table.take_pack(pack, self._asked_at, self._heard)
+        present = {entry.name for entry in pack.entries}
+        self.left_out = tuple(
+            index for index, entry in enumerate(pack.entries) if not is_portable_name(entry.name)
+        )
+        changes += table.remove(
+            lambda param: (
+                param.name not in present and (param.index is not None or param.name in table.displaced)
+            )
+        )
+        table.displaced.clear()
+        table.count = self._count = pack.total
+        self._changed(changes)

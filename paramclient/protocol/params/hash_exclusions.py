@@ -1,0 +1,108 @@
+"""Which parameters a PX4 vehicle leaves out of its hash: found by recomputing the hash, not believed.
+
+PX4 does not count volatile parameters into `_HASH_CHECK`, and which ones are volatile depends on its version.
+The names below are only where the search begins; the set is *known* when the hash that is computed without
+it equals the one the vehicle announced.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from itertools import combinations
+from typing import Final
+
+from paramclient.model.values import crc32_px4
+
+__all__ = ["find_volatile", "hash_of"]
+
+MOST_HASHED: Final = 1_000_000
+"""Parameters that go into hashes while single names are tried, about a tenth of a second: trying one costs a
+hash of the whole table."""
+MOST_NAMES_REMEMBERED: Final = 4_096
+"""Names of which it is remembered whether they are of a group: those of a few firmwares. To look takes ten
+times as long, and all vehicles of a fleet have the same."""
+
+# Groups of PX4 parameters marked @volatile in one firmware or another: calibration that is learnt in flight,
+# flight counters, and what follows the place on earth.
+_GROUPS = tuple(
+    re.compile(pattern)
+    for pattern in (
+        r"CAL_ACC\d_[XYZ](OFF|SCALE)",
+        r"CAL_GYRO\d_[XYZ]OFF",
+        r"CAL_MAG\d_[XYZ](OFF|SCALE|ODIAG)",
+        r"CAL_MAG\d_[XYZ]COMP",
+        r"CAL_BARO\d_OFF",
+        r"ASPD_SCALE_\d",
+        r"LND_FLIGHT_T_(HI|LO)",
+        r"COM_FLIGHT_UUID",
+        r"EKF2_MAG_DECL",
+        r"SENS_DPRES_OFF",
+    )
+)
+
+
+def find_volatile(
+    bits: Mapping[str, int], announced: int, *, believed: Iterable[str] = ()
+) -> tuple[frozenset[str], bool]:
+    """The names that a vehicle left out when it computed its hash.
+
+    Tries what is believed (from an earlier session), the usual groups, none, the usual groups but for one or
+    two of them, and then the first guess with each single name taken out or in.
+
+    Args:
+        bits: the bits of the parameters that have an index (see `Param.bits`), by name.
+        announced: the vehicle's hash for exactly these.
+        believed: names that an earlier download proved, or that changed under an unchanged hash.
+
+    Returns:
+        The names, and True when the hash agrees. Without agreement: the best guess, and False.
+    """
+    chunks = _chunks(bits)
+    guess: frozenset[str] | None = None
+    for candidate in _candidates([name for name, _ in chunks], frozenset(believed)):
+        if guess is None:
+            guess = candidate
+        if crc32_px4(b"".join(chunk for name, chunk in chunks if name not in candidate)) == announced:
+            return candidate, True
+    return guess or frozenset(), False
+
+
+def hash_of(bits: Mapping[str, int], *, leave_out: frozenset[str]) -> int:
+    """The value of PX4's `_HASH_CHECK` for parameters given by their bits, see `px4_hash`."""
+    return crc32_px4(b"".join(chunk for name, chunk in _chunks(bits) if name not in leave_out))
+
+
+def _chunks(bits: Mapping[str, int]) -> list[tuple[str, bytes]]:
+    """What the hash takes in of each parameter, in its order; see `hash_chunk`."""
+    return [
+        (name, name.encode("latin-1") + (each & 0xFFFFFFFF).to_bytes(4, "little"))
+        for name, each in sorted(bits.items())
+    ]
+
+
+@lru_cache(maxsize=MOST_NAMES_REMEMBERED)
+def _group_of(name: str) -> re.Pattern[str] | None:
+    return next((group for group in _GROUPS if group.fullmatch(name)), None)
+
+
+def _candidates(names: Sequence[str], believed: frozenset[str]) -> Iterator[frozenset[str]]:
+    found: dict[re.Pattern[str], set[str]] = {}
+    for name in names:
+        group = _group_of(name)
+        if group is not None:
+            found.setdefault(group, set()).add(name)
+    groups = [frozenset(found[group]) for group in _GROUPS if group in found]
+    usual = frozenset().union(*groups)
+    first = (believed & frozenset(names)) | usual
+    yield first
+    if believed:
+        yield believed & frozenset(names)
+    yield usual
+    yield frozenset()
+    for left_out in (1, 2):
+        for some in combinations(groups, left_out):
+            yield usual.difference(*some)
+    for name in names[: MOST_HASHED // max(len(names), 1)]:
+        yield first ^ {name}

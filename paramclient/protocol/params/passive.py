@@ -1,0 +1,256 @@
+"""Tables that fill by what others ask for: on a link on which nothing is sent, and in logs."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Final
+
+from paramclient.errors import NoReply
+from paramclient.model.values import is_portable_name
+from paramclient.protocol.params.fetch import Fetch
+from paramclient.protocol.params.fetch_result import Announcement, FetchResult, Means, Policy, Progress
+from paramclient.protocol.params.hash_check import Proof
+from paramclient.protocol.params.passive_file import FileObserver, ObservedPack
+from paramclient.protocol.params.sync import Sync
+from paramclient.protocol.wire import MOST_PARAMETERS, ParamValue
+
+__all__ = ["OVERHEARING_PATIENCE", "Overheard", "Overhearing"]
+
+OVERHEARING_PATIENCE: Final = 20.0
+"""Seconds in which somebody may begin to ask for the list, where the caller sets no limit."""
+LONGEST_PAUSE: Final = 5.0
+"""Seconds without a new value after which a list counts as over: in PX4's low-bandwidth mode one comes every
+0.13 s, and who misses some asks for them again within a second or two."""
+
+
+class Overheard:
+    """Follows the lists of a component that others ask for, and the hashes that it announces to them.
+
+    A table is whole when every index below the count has come since it was last in doubt, from lists, or in
+    the packed file that another station reads over MAVFTP. What was announced proves it where the hash
+    computed from it is the same.
+
+    Args:
+        means: the component's.
+        sync: the component's.
+        whole: is told each time that the table is whole or confirmed.
+        is_log: whether the link is a log, which ends.
+
+    Attributes:
+        names: what has come, by index under `count`.
+        count: as it was heard with them, or None.
+        news_at: when the last index came that was not there yet.
+        is_log: as above.
+        is_over: whether nothing more will come.
+        file: the packed file, as others read it.
+    """
+
+    def __init__(
+        self, means: Means, sync: Sync, *, whole: Callable[[FetchResult, float], None], is_log: bool
+    ) -> None:
+        self.names: dict[int, str] = {}
+        self.count: int | None = None
+        self.news_at = -math.inf
+        self.is_log = is_log
+        self.is_over = False
+        self.file = FileObserver(self._file_came)
+        self._means = means
+        self._table = means.table
+        self._sync = sync
+        self._whole = whole
+        self._began_at = 0.0
+        self._is_whole = False
+        self._source = "stream"
+
+    def heard(self, message: ParamValue, now: float) -> None:
+        """Every PARAM_VALUE of the component passes here after it went into the table."""
+        name, _, _, count, index = message
+        if self.file.is_reading:
+            self.file.value_heard(message)
+        if index >= count or count > MOST_PARAMETERS:
+            return
+        names = self.names
+        if count != self.count or names.get(index, name) != name:
+            self.forget()
+            self.count = count
+            self._began_at = now
+        if index not in names:
+            names[index] = name
+            self.news_at = now
+            if len(names) == count:
+                self._complete("stream", now)
+
+    def announced(self, announcement: Announcement, now: float) -> None:
+        """The component has announced a hash to somebody."""
+        table = self._table
+        if not table.complete:
+            return
+        if self._sync.compare(now):
+            if not self._sync.synced:
+                self._whole(self._result("cache", (), announcement.hash, now), now)
+        elif self._is_whole and self._is_proven(announcement):
+            self._whole(self._result(self._source, (), table.hash, now), now)
+        elif table.hash is not None:
+            self.forget()
+            self._sync.contradicted()
+
+    def forget(self) -> None:
+        """What has come may not hold any more: it counts when it has come again."""
+        self.names.clear()
+        self.count = None
+        self._is_whole = False
+
+    def settled(self, now: float, notes: tuple[str, ...] = ()) -> FetchResult | None:
+        """The table, where it is known to be the vehicle's."""
+        if not self._sync.synced:
+            return None
+        source = self._source if self._is_whole else "cache"
+        return self._result(source, (), self._table.hash, now, notes)
+
+    def result(self, now: float, notes: tuple[str, ...] = ()) -> FetchResult | None:
+        """What has come so far; None where that is nothing."""
+        result = self.settled(now, notes)
+        if result is not None:
+            return result
+        if not self.names or self.count is None:
+            return None
+        self._table.place(self.names)
+        missing = tuple(index for index in range(self.count) if index not in self.names)
+        return self._result("stream", missing, None, now, notes)
+
+    def _file_came(self, came: ObservedPack, now: float) -> None:
+        """Another station has read the packed file, or the beginning of it."""
+        table, total = self._table, came.pack.total
+        if table.count != total:
+            if table.count is not None:
+                self._sync.count_moved(now)
+            table.move(total)
+        entries = {index: entry.name for index, entry in came.entries()}
+        is_all = len(entries) == total
+        names = {index: name for index, name in entries.items() if is_portable_name(name)}
+        if (
+            is_all
+            or total != self.count
+            or any(self.names.get(at, name) != name for at, name in names.items())
+        ):
+            self.forget()
+            self.count = total
+            self._began_at = came.began_at
+        was_whole = len(self.names) == total
+        self.names |= names
+        self.news_at = now
+        self._means.changed(table.take_pack(came.pack, came.began_at, came.newer, start=came.start))
+        if len(self.names) == total and not was_whole:
+            self._complete("ftp" if is_all else "stream", now)
+
+    def _complete(self, source: str, now: float) -> None:
+        """Every index has come."""
+        table = self._table
+        self._is_whole = True
+        self._source = source
+        self.file.notes.clear()
+        self._means.changed(table.settle(self.names))
+        table.complete = True
+        table.count = self.count
+        announced = self._sync.announced
+        if announced is None or not self._is_proven(announced):
+            table.unconfirm()
+        self._whole(self._result(source, (), table.hash, now), now)
+
+    def _is_proven(self, announcement: Announcement) -> bool:
+        proof = Proof(self._table)
+        proof.before = announcement
+        return proof.is_given(self._table.size)
+
+    def _result(
+        self,
+        source: str,
+        missing: tuple[int, ...],
+        confirmed: int | None,
+        now: float,
+        notes: tuple[str, ...] = (),
+    ) -> FetchResult:
+        count = (self.count if self.names else self._table.count) or 0
+        return FetchResult(
+            *self._means.target,
+            self._table.params.copy(),
+            source,
+            count,
+            count - len(missing),
+            missing,
+            confirmed,
+            max(0.0, now - self._began_at),
+            (*self.file.notes, *notes),
+        )
+
+
+class Overhearing(Fetch):
+    """A fetch where nothing may be asked: it waits until the table that others ask for has come.
+
+    It ends when the table is whole or confirmed, and with what has come when the list has paused for
+    `LONGEST_PAUSE`. Where nobody asks it does not end by itself. In a log it ends with that, as only then it
+    is known what the last word was.
+    """
+
+    def __init__(self, means: Means, overheard: Overheard, now: float) -> None:
+        self._overheard = overheard
+        super().__init__(
+            means,
+            now,
+            announced=None,
+            refresh=False,
+            listed=False,
+            policy=Policy.CACHE_ONLY,
+            may_use_file=lambda: False,
+            sampled=None,
+        )
+
+    def came(self, result: FetchResult, now: float) -> None:
+        """The table is whole or confirmed."""
+        if not self._overheard.is_log:
+            self.finish(result, now)
+
+    def over(self, now: float) -> None:
+        """Nothing more will come."""
+        result = self._overheard.result(now)
+        if result is None:
+            self.fail(self._nothing(now), now)
+        else:
+            self.finish(result, now)
+
+    def tick(self, now: float) -> None:
+        if self.next_deadline() <= now:
+            self.over(now)
+
+    def next_deadline(self) -> float:
+        overheard = self._overheard
+        if overheard.is_log or overheard.file.is_reading or not overheard.names:
+            return math.inf
+        return max(overheard.news_at, self.begun_at) + LONGEST_PAUSE
+
+    def partial(self, now: float, note: str) -> FetchResult:
+        result = self._overheard.result(now, (note,))
+        if result is None:
+            raise self._nothing(now)
+        return result
+
+    @property
+    def is_silent(self) -> bool:
+        overheard = self._overheard
+        return not (overheard.names or overheard.file.is_reading or overheard.is_log)
+
+    def progress(self, now: float) -> Progress:
+        return Progress(len(self._overheard.names), self._overheard.count, 0.0, None)
+
+    def _begin_download(self, now: float, present: Mapping[int, str] | None = None) -> None:
+        overheard = self._overheard
+        if overheard.is_over:
+            self.over(now)
+        elif not overheard.is_log and (result := overheard.settled(now)) is not None:
+            self.finish(result, now)
+
+    def _nothing(self, now: float) -> NoReply:
+        system, component = self._target
+        what = f"the parameters of {system}/{component}, for which nobody was heard asking"
+        return NoReply(what, attempts=0, waited=now - self.begun_at)

@@ -1,0 +1,156 @@
+"""The packed parameter file of a component as other stations read it over MAVFTP."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from typing import Final, NamedTuple
+
+from paramclient.errors import PackError
+from paramclient.protocol.ftp import ObservedRead, ObservedReads
+from paramclient.protocol.ftp.packets import Opcode, Packet
+from paramclient.protocol.ftp.param_pck import LARGEST_FILE, Pack, PackedParam, decode_prefix
+from paramclient.protocol.ftp.passive import path_of
+from paramclient.protocol.params.file_download import PARAMETER_FILE
+from paramclient.protocol.wire import MOST_PARAMETERS, FileTransfer, ParamValue
+
+__all__ = ["FileObserver", "ObservedPack", "acknowledges_open", "opens_parameter_file"]
+
+HEADER_SIZE: Final = 6
+"""Bytes at the beginning of the file that say how many entries it has."""
+NOTES_MAX: Final = 20
+"""Notes that are kept: a log of a bad link may hold hundreds of reads that failed."""
+
+
+class ObservedPack(NamedTuple):
+    """What is proven of one read of the file.
+
+    Attributes:
+        pack: the entries, at most those before the first gap.
+        start: the index of the first entry.
+        newer: names of which a PARAM_VALUE was heard after the file was opened.
+        began_at: when it was opened, in seconds.
+    """
+
+    pack: Pack
+    start: int
+    newer: frozenset[str]
+    began_at: float
+
+    def entries(self) -> Iterator[tuple[int, PackedParam]]:
+        """Each entry with its index."""
+        return enumerate(self.pack.entries, start=self.start)
+
+
+class FileObserver:
+    """Puts the parameter file together that other stations read, and says what it could not use.
+
+    Only a read whose open request was heard counts, as nothing else names the file. Of a file with gaps the
+    entries before the first one are given: no entry depends on those behind it.
+
+    Args:
+        came: is called with what is proven of each read, and the time.
+
+    Attributes:
+        notes: what was not taken, and why, since `clear_notes`.
+    """
+
+    def __init__(self, came: Callable[[ObservedPack, float], None]) -> None:
+        self.notes: list[str] = []
+        self._came = came
+        self._reads = ObservedReads(_is_parameter_file, size_max=LARGEST_FILE, ended=self._ended)
+        self._names: dict[ObservedRead, set[str]] = {}
+        self._counts: dict[ObservedRead, int] = {}
+
+    @property
+    def is_reading(self) -> bool:
+        """Whether any station is reading the file."""
+        return bool(self._reads.running)
+
+    def request_heard(self, message: FileTransfer, station: tuple[int, int], now: float) -> None:
+        """Take a FILE_TRANSFER_PROTOCOL that a station has sent to the component."""
+        packet = Packet.unpack(message.payload)
+        if packet.opcode < Opcode.ACK:
+            self._reads.request_heard(packet, station, now)
+
+    def reply_heard(self, message: FileTransfer, now: float) -> None:
+        """Take a FILE_TRANSFER_PROTOCOL that the component has sent to a station."""
+        addressee = (message.target_system, message.target_component)
+        self._reads.reply_heard(Packet.unpack(message.payload), addressee, now)
+
+    def value_heard(self, message: ParamValue) -> None:
+        """Take a PARAM_VALUE of the component: it is newer than what a file holds that was opened before."""
+        for read in self._reads.running:
+            self._names.setdefault(read, set()).add(message.param_id)
+            if message.param_count <= MOST_PARAMETERS:
+                self._counts[read] = message.param_count
+
+    def tick(self, now: float) -> None:
+        """End the reads that have stopped."""
+        self._reads.tick(now)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do, or infinity."""
+        return self._reads.next_deadline()
+
+    def close(self, now: float) -> None:
+        """Take what there is: the component starts again or is lost, or the log is over."""
+        self._reads.close_all(now)
+
+    def forget(self) -> None:
+        """Another vehicle has taken the address."""
+        self._reads.forget()
+        self._names.clear()
+        self._counts.clear()
+        self.notes.clear()
+
+    def _ended(self, read: ObservedRead, now: float) -> None:
+        newer = frozenset(self._names.pop(read, ()))
+        count = self._counts.pop(read, None)
+        if not read.blocks.received:
+            return
+        system, component = read.station
+        file = f"the parameter file that station {system}/{component} read"
+        data = read.blocks.prefix
+        try:
+            if len(data) < HEADER_SIZE:
+                raise PackError("its first bytes were not heard", offset=0)
+            pack, number = decode_prefix(data)
+            if count not in (None, pack.total) or pack.total > MOST_PARAMETERS:
+                raise PackError(f"it is of {pack.total} parameters, and the vehicle has {count}", offset=4)
+        except PackError as error:
+            self._note(f"Nothing was taken from {file}: {error}.")
+            return
+        self._came(ObservedPack(pack, _start_of(read.path), newer, read.began_at), now)
+        if len(pack.entries) < number:
+            taken = f"{len(pack.entries)} of {number} parameters were taken from {file}"
+            self._note(f"{taken}: its bytes from {len(data)} on were not heard without a gap.")
+
+    def _note(self, text: str) -> None:
+        if len(self.notes) < NOTES_MAX:
+            self.notes.append(text)
+
+
+def opens_parameter_file(message: FileTransfer) -> bool:
+    """Whether a station asks for the parameter file to be opened."""
+    packet = Packet.unpack(message.payload)
+    return packet.opcode == Opcode.OPEN_FILE_RO and _is_parameter_file(path_of(packet))
+
+
+def acknowledges_open(message: FileTransfer) -> bool:
+    """Whether a server says that it has opened a file to be read."""
+    packet = Packet.unpack(message.payload)
+    return packet.opcode == Opcode.ACK and packet.requested == Opcode.OPEN_FILE_RO
+
+
+def _is_parameter_file(path: str) -> bool:
+    return path.partition("?")[0] == PARAMETER_FILE
+
+
+def _start_of(path: str) -> int:
+    """The index of the file's first parameter, by the query with which it was opened."""
+    match = _start(path)
+    return 0 if match is None else int(match[1])
+
+
+_start: Final = re.compile(r"[?&]start=([0-9]{1,5})(?![0-9])").search

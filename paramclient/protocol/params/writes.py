@@ -1,0 +1,505 @@
+"""One write: PARAM_SET until its value is proven. Writes to one name queue up in order."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+from paramclient.errors import NoReply, ParamErrorCode, TypeMismatch, UsageError, ValueNotApplied
+from paramclient.model.values import (
+    Encoding,
+    Param,
+    ParamType,
+    Trust,
+    Value,
+    decode,
+    encode,
+    format_value,
+    type_name,
+)
+from paramclient.protocol.params.change_origin import by_us
+from paramclient.protocol.params.reads import Read, Reads
+from paramclient.protocol.params.write_resolution import note_on_small_change
+from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.stats.trace import Trace, silent
+from paramclient.protocol.wire import Message, ParamError, ParamSet, ParamValue
+
+__all__ = ["SetResult", "Write", "Writes"]
+
+
+@dataclass(frozen=True, slots=True)
+class SetResult:
+    """What became of a `set`.
+
+    Attributes:
+        name: param_id.
+        status: "accepted" (the vehicle holds what was asked for, as far as its type can), or "adjusted" (it
+            took the value and made another of it, as ArduPilot makes 1234 of 1234.7 for an integer; or it
+            changed it while it was watched, as modules of PX4 clamp values within a second).
+        requested: the value that was asked for.
+        actual: the value that the vehicle reports.
+        param: the parameter as it is now.
+        attempts: how many PARAM_SETs were sent.
+        note: what else is to be known, in a sentence: that PX4 does not keep a change as small as this one.
+    """
+
+    name: str
+    status: str
+    requested: Value
+    actual: Value
+    param: Param
+    attempts: int
+    note: str = ""
+
+    @property
+    def adjusted(self) -> bool:
+        return self.status == "adjusted"
+
+    def __str__(self) -> str:
+        actual = format_value(self.actual, self.param.type)
+        if self.adjusted:
+            return f"{self.name} = {actual} (adjusted from {format_value(self.requested, self.param.type)})"
+        return f"{self.name} = {actual}"
+
+
+class Write(Operation[SetResult]):
+    """One PARAM_SET until its value is proven; see `Writes`.
+
+    Attributes:
+        settle: seconds from the acknowledgement until the value is read once more.
+        is_forced: whether a value that the vehicle cannot store is sent all the same.
+        acknowledged: the result so far, while the value is watched for that time.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        value: Value,
+        begun_at: float,
+        asker: str | None = None,
+        *,
+        settle: float = 0.0,
+        is_forced: bool = False,
+    ) -> None:
+        super().__init__(begun_at)
+        self.name = name
+        self.value = value
+        self.by = by_us(asker)
+        self.settle = settle
+        self.is_forced = is_forced
+        self.acknowledged: SetResult | None = None
+        self.attempts = 0
+        self.sent_at = math.inf
+        self.number = 0  # the type that was sent
+        self.wanted: Param | None = None
+        self.before: Param | None = None
+        self.is_answered = False  # a value that is not the wanted one came after the last PARAM_SET
+        self.made: Param | None = None  # what the vehicle held after an earlier one: not the old value either
+        self.verify_at = math.inf
+        self.read: Read | None = None
+        self.was_retyped = False
+
+
+class Writes:
+    """Every write to one component: those to one name in order, those to different names side by side.
+
+    How a write goes: learn the type (unless it was heard or verified on this link), send exactly that type,
+    wait for a PARAM_VALUE of the name. Only the wanted value proves success. Another value may be an old
+    read's answer or the stream passing by: wait a little, read by name, then decide. A value that is neither
+    the old nor the wanted one may be the vehicle's adjustment, or another station's that came between: the
+    PARAM_SET is sent again, and if the same comes of it, it is the adjustment. The old one means that nothing
+    was applied, and the PARAM_SET is sent again, as it may have been lost, until that is no longer likely.
+
+    Where the caller asks for it, the value is watched for a while after that, and then read once more: what
+    the vehicle has made of it meanwhile is its adjustment. All that time the write is acknowledged, so that
+    changes of the value are not ours, but the next write to the name waits.
+
+    Nothing is sent before it is certain how the component writes values: an integer in the wrong encoding
+    would be taken as another number.
+
+    Attributes:
+        queues: by name, those that are open, the one under way first; no name has an empty one.
+        is_held: whether one waits for that.
+        asked, retries: writes so far, and PARAM_SETs that were sent for another time.
+        against_non_finite: why the vehicle must not be sent NaN and infinity; "" where it may be.
+        is_px4: whether it is a PX4, which does not keep small changes.
+        left_open: is told the name and the author of a write of which nobody learns any more whether the
+            vehicle takes it.
+    """
+
+    def __init__(
+        self,
+        target: tuple[int, int],
+        round_trip: RoundTrip,
+        send: Callable[[Message], None],
+        reads: Reads,
+        params: Mapping[str, Param],
+        encoding: Callable[[], Encoding],
+        is_certain: Callable[[], bool],
+        trace: Trace = silent,
+    ) -> None:
+        self._target = target
+        self._round_trip = round_trip
+        self._send = send
+        self._reads = reads
+        self._params = params
+        self._encoding = encoding
+        self._is_certain = is_certain
+        self._trace = trace
+        self.asked = self.retries = 0
+        self.is_held = False
+        self.against_non_finite = ""
+        self.is_px4 = False
+        self.queues: dict[str, deque[Write]] = {}
+        self.left_open: Callable[[str, str, float], None] = _nobody
+
+    def __len__(self) -> int:
+        return len(self.queues)
+
+    def author(self, name: str) -> str | None:
+        """Who a change of this name is by, as far as a PARAM_SET to it is under way."""
+        write = self._active(name)
+        return None if write is None else write.by
+
+    def set(
+        self,
+        name: str,
+        value: Value,
+        now: float,
+        asker: str | None = None,
+        *,
+        settle: float = 0.0,
+        force: bool = False,
+    ) -> Write:
+        """Begin a write, behind those to the same name that are open."""
+        write = Write(name, value, now, asker, settle=settle, is_forced=force)
+        self.asked += 1
+        queue = self.queues.setdefault(name, deque())
+        queue.append(write)
+        if len(queue) == 1:
+            self._start(write, now)
+        return write
+
+    def check_finite(self, name: str, value: Value, *, force: bool) -> None:
+        """See that a value may be sent as far as it is a finite number.
+
+        Raises:
+            UsageError: it is NaN or infinite, and the vehicle must not be sent that.
+        """
+        if isinstance(value, float) and not math.isfinite(value) and self.against_non_finite and not force:
+            raise UsageError(
+                f"{name} = {value} was not sent to {self._target[0]}/{self._target[1]}: "
+                f"{self.against_non_finite}. Force it to send it all the same."
+            )
+
+    def cancel(self, write: Write, now: float) -> None:
+        """Forget a write. What was sent cannot be taken back: the vehicle may have applied it."""
+        queue = self.queues.get(write.name)
+        if queue is None or write not in queue:
+            return
+        if queue[0] is write:
+            self._leave_open(write, now)
+            self._leave(write, now)
+        else:
+            queue.remove(write)
+
+    def proceed(self, now: float) -> None:
+        """It is certain now how the component writes values: begin what had to wait for that."""
+        self.is_held = False
+        for queue in list(self.queues.values()):
+            if queue and not queue[0].attempts and queue[0].read is None:
+                self._start(queue[0], now)
+
+    def wants(self, message: ParamValue) -> bool:
+        """Whether a PARAM_VALUE says what the PARAM_SET under way to its name has said."""
+        write = self._active(message.param_id)
+        wanted = None if write is None else write.wanted
+        if wanted is None or wanted.type != message.param_type:
+            return False
+        return wanted.bits == decode(message.raw, message.param_type, self._encoding())[1]
+
+    def heard(self, message: ParamValue, now: float) -> None:
+        """Every PARAM_VALUE of the component passes here after it went into the table."""
+        write = self._active(message.param_id)
+        if write is None:
+            return
+        value, bits = decode(message.raw, message.param_type, self._encoding())
+        heard = Param(write.name, value, message.param_type, None, bits)
+        if message.param_type != write.number:
+            if write.was_retyped:
+                words = f"it is written as {type_name(write.number)} and reported as {type_name(heard.type)}"
+                self._fail(write, self._type_mismatch(write, words), now)
+            else:
+                write.was_retyped = True
+                self._begin(write, heard, now)
+        elif write.wanted is not None and write.wanted.same_value(heard):
+            is_sure = write.read is None and not write.is_answered
+            self._round_trip.answered(write.sent_at, now, write.attempts if is_sure else write.attempts + 1)
+            self._succeed(write, now)
+        else:
+            if write.read is None:
+                write.is_answered = True
+                write.verify_at = min(write.verify_at, now + self._grace)
+
+    def defer(self, message: ParamValue, until: float) -> None:
+        """Take a PARAM_VALUE that may be older than the last change: it proves nothing.
+
+        Where it has the wanted value, the parameter is read at `until` to decide.
+        """
+        write = self._active(message.param_id)
+        if write is not None and write.read is None and self.wants(message):
+            write.is_answered = True
+            write.verify_at = min(write.verify_at, until)
+
+    def refused(self, message: ParamError, now: float) -> bool:
+        """A PARAM_ERROR: true when it ended a write."""
+        write = self._active(message.param_id) if message.param_index < 0 or message.param_id else None
+        if write is None:
+            return False
+        self._fail(write, self._reads.error_of(message, write.name), now)
+        return True
+
+    def denied(self, name: str, now: float) -> None:
+        """ArduPilot's text says that a write to this name was denied."""
+        write = self._active(name)
+        if write is not None:
+            message = ParamError(0, 0, name, -1, ParamErrorCode.READ_ONLY)
+            self._fail(write, self._reads.error_of(message, name), now)
+
+    def tick(self, now: float) -> None:
+        """Verify, send again, give up; but nothing while it is open who would get it."""
+        if not self._is_certain():
+            return
+        timeout = self._round_trip.timeout
+        for queue in list(self.queues.values()):
+            if not queue:
+                continue
+            write = queue[0]
+            if write.verify_at <= now:  # also where it is watched, and that time is over
+                write.verify_at = math.inf
+                self._read(write, now)
+            elif self._awaits_answer(write) and not write.is_answered and write.sent_at + timeout <= now:
+                self._round_trip.timed_out(write.attempts)
+                if self._round_trip.is_hopeless(write.attempts, now):
+                    # reads in between have shown that nothing came of it
+                    self._fail(write, self._not_applied(write, self._params[write.name]), now)
+                    continue
+                self._transmit(write, now)
+                if write.attempts > 2 and not write.done:
+                    # the vehicle may be silent on just this write: what does it hold?
+                    self._read(write, now)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do, or infinity."""
+        earliest = math.inf
+        if not self.queues or not self._is_certain():
+            return earliest
+        timeout = self._round_trip.timeout
+        for queue in self.queues.values():
+            write = queue[0]
+            earliest = min(earliest, write.verify_at)
+            if self._awaits_answer(write) and not write.is_answered:
+                earliest = min(earliest, write.sent_at + timeout)
+        return earliest
+
+    def resume(self, now: float) -> None:
+        """The link is back: what was under way goes on at once."""
+        for queue in list(self.queues.values()):
+            if queue and self._awaits_answer(queue[0]):
+                if self._is_certain():
+                    queue[0].attempts -= 1
+                self._transmit(queue[0], now)
+
+    def lose(self, now: float) -> None:
+        """The component is lost: nobody waits any longer. What it has taken is not known."""
+        self._end_all(lambda write: self._no_reply(write, now, " (lost)"), now)
+
+    def fail_all(self, error: Exception, now: float) -> None:
+        """Nothing can be acknowledged any more."""
+        self._end_all(lambda write: error, now)
+
+    def _end_all(self, error_of: Callable[[Write], Exception], now: float) -> None:
+        queues, self.queues = self.queues, {}
+        for queue in queues.values():
+            for write in queue:
+                if write.read is not None:
+                    self._reads.release(write.read)
+                    write.read = None
+                write.fail(error_of(write), now)
+
+    @property
+    def _grace(self) -> float:
+        # an old answer can be at most about one round trip ahead of the one that counts
+        return max(self._round_trip.timeout / 2, 0.05)
+
+    def _active(self, name: str) -> Write | None:
+        """The write whose PARAM_SET to this name is under way and not acknowledged."""
+        queue = self.queues.get(name)
+        return queue[0] if queue and queue[0].attempts and queue[0].acknowledged is None else None
+
+    @staticmethod
+    def _awaits_answer(write: Write) -> bool:
+        return write.attempts > 0 and write.acknowledged is None and write.read is None
+
+    def _start(self, write: Write, now: float) -> None:
+        known = self._params.get(write.name)
+        if not self._is_certain():
+            self.is_held = True
+            return
+        if known is not None and known.trust is not Trust.CACHED:
+            self._begin(write, known, now)
+        else:
+            self._read(write, now)
+
+    def _begin(self, write: Write, known: Param, now: float) -> None:
+        write.before = known
+        write.number = known.type
+        self._transmit(write, now)
+
+    def _transmit(self, write: Write, now: float) -> None:
+        if not self._is_certain():
+            # whoever may be there now is not meant: as soon as it is known, it is begun, or overdue
+            self.is_held = True
+            write.sent_at = -math.inf
+            write.is_answered = False
+            write.verify_at = math.inf
+            return
+        encoding = self._encoding()
+        try:
+            raw = encode(write.value, write.number, encoding)
+        except UsageError as error:
+            # once something was sent, it is the vehicle that has turned out to be different
+            self._fail(write, self._type_mismatch(write, str(error)) if write.was_retyped else error, now)
+            return
+        value, bits = decode(raw, write.number, encoding)
+        try:
+            self.check_finite(write.name, value, force=write.is_forced)
+        except UsageError as error:
+            self._fail(write, error, now)
+            return
+        write.wanted = Param(write.name, value, write.number, None, bits)
+        write.attempts += 1
+        self.retries += write.attempts > 1
+        write.sent_at = now
+        write.is_answered = False
+        write.verify_at = math.inf
+        self._send(ParamSet(*self._target, write.name, raw, write.number))
+
+    def _read(self, write: Write, now: float) -> None:
+        """Ask what the vehicle holds: before the first PARAM_SET to learn the type, later to decide."""
+        read = write.read = self._reads.ask(write.name, now)
+
+        def answered() -> None:
+            if write.read is not read:
+                return  # it has ended meanwhile, or nobody wants it any more
+            write.read = None
+            if isinstance(read.error, NoReply) and write.attempts:
+                self._fail(write, self._no_reply(write, read.ended_at), read.ended_at)
+            elif read.error is not None:
+                self._fail(write, read.error, read.ended_at)
+            elif write.acknowledged is not None:
+                self._end_watch(write, write.acknowledged, read.ended_at)
+            elif write.attempts:
+                self._decide(write, self._params[write.name], read.ended_at)
+            else:
+                self._begin(write, self._params[write.name], read.ended_at)
+
+        read.on_done.append(answered)
+
+    def _decide(self, write: Write, actual: Param, now: float) -> None:
+        """A read after the PARAM_SET showed a value that is not the wanted one."""
+        is_made_again = write.made is not None and write.made.same_value(actual)
+        if write.is_answered and is_made_again:
+            self._succeed(write, now)
+        elif self._round_trip.is_hopeless(write.attempts, now):
+            self._fail(write, self._not_applied(write, actual), now)
+        else:
+            is_old = write.before is not None and write.before.same_value(actual)
+            write.made = None if is_old else actual
+            self._transmit(write, now)
+
+    def _succeed(self, write: Write, now: float) -> None:
+        actual = self._params[write.name]
+        wanted = write.wanted
+        exact = wanted is not None and wanted.same_value(actual)
+        if exact and actual.type != ParamType.REAL32 and not isinstance(write.value, bytes):
+            exact = actual.value == write.value
+        status = "accepted" if exact else "adjusted"
+        before = write.before if self.is_px4 else None
+        note = "" if before is None else note_on_small_change(before, actual)
+        result = SetResult(write.name, status, write.value, actual.value, actual, write.attempts, note)
+        self._trace("%s/%s %s: %s after try %s", *self._target, write.name, status, write.attempts)
+        if write.settle > 0.0:
+            if write.read is not None:
+                self._reads.release(write.read)
+                write.read = None
+            write.acknowledged = result
+            write.verify_at = now + write.settle
+            return
+        self._leave(write, now)
+        write.finish(result, now)
+
+    def _end_watch(self, write: Write, result: SetResult, now: float) -> None:
+        """The value was read once more: what has become of it since the acknowledgement?"""
+        actual = self._params[write.name]
+        if not result.param.same_value(actual):
+            result = replace(result, status="adjusted", actual=actual.value)
+        self._leave(write, now)
+        write.finish(replace(result, param=actual), now)
+
+    def _fail(self, write: Write, error: Exception, now: float) -> None:
+        if isinstance(error, NoReply):
+            self._leave_open(write, now)
+        self._leave(write, now)
+        self._trace("%s/%s %s: not written: %s", *self._target, write.name, error)
+        write.fail(error, now)
+
+    def _leave_open(self, write: Write, now: float) -> None:
+        if write.attempts and write.acknowledged is None:
+            self.left_open(write.name, write.by, now)
+
+    def _leave(self, write: Write, now: float) -> None:
+        if write.read is not None:
+            self._reads.release(write.read)
+            write.read = None
+        queue = self.queues[write.name]
+        queue.remove(write)
+        if queue:
+            self._start(queue[0], now)
+        else:
+            del self.queues[write.name]
+
+    def _no_reply(self, write: Write, now: float, why: str = "") -> Exception:
+        what = f"PARAM_SET {write.name} to {self._target[0]}/{self._target[1]}{why}"
+        if write.acknowledged is not None:
+            what += ": it was acknowledged, and could not be read once more"
+        return NoReply(what, attempts=write.attempts, waited=now - write.begun_at)
+
+    def _not_applied(self, write: Write, actual: Param) -> Exception:
+        system, component = self._target
+        number = actual.type
+        return ValueNotApplied(
+            f"{system}/{component} keeps {write.name} at {format_value(actual.value, number)}; "
+            f"{format_value(write.value, number)} was sent {write.attempts} times",
+            system=system,
+            component=component,
+            name=write.name,
+            requested=write.value,
+            actual=actual.value,
+        )
+
+    def _type_mismatch(self, write: Write, words: str) -> Exception:
+        system, component = self._target
+        return TypeMismatch(
+            f"{write.name} of {system}/{component} is not what it was: {words}",
+            system=system,
+            component=component,
+            name=write.name,
+        )
+
+
+def _nobody(_name: str, _by: str, _now: float) -> None:
+    return

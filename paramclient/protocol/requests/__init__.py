@@ -1,0 +1,1 @@
+"""Round-trip time, timeouts and pacing of requests."""

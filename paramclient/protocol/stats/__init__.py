@@ -1,0 +1,1 @@
+"""Traffic, packet loss by sequence numbers, and traces of a link."""

@@ -1,0 +1,357 @@
+"""What goes over a link, counted: by component and by message, with rates and losses."""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from collections.abc import Hashable
+from dataclasses import dataclass
+from typing import Final
+
+from paramclient.protocol.stats.packet_loss import SequenceCheck
+from paramclient.protocol.stats.sniffer import Seen, Sniffer
+from paramclient.protocol.wire import HEARTBEAT_ID, Frame, Heartbeat, decode, message_name
+
+__all__ = ["ComponentTraffic", "MessageTraffic", "RadioStatus", "Traffic", "TrafficReport"]
+
+WINDOW: Final = 5.0
+"""Seconds over which rates and losses are measured: some heartbeats, and short enough to turn an antenna."""
+SLICE: Final = 0.5
+"""Seconds that are counted as one."""
+SHORTEST_TIME: Final = 1.0
+"""Seconds below which a rate would be made of too little."""
+MOST_COMPONENTS: Final = 1_000
+"""Components that are counted one by one; frames of further ones count for the link alone."""
+MOST_MESSAGES: Final = 500
+"""Message ids counted one by one for a component; the dialect has fewer than that."""
+MOST_PEERS: Final = 256
+"""Peers whose unfinished frames, and peers of one component whose numbers, are followed."""
+RADIO_STATUS_IDS: Final = frozenset({109, 166})
+"""RADIO_STATUS, and RADIO as older firmware of SiK radios sends it; they have the same layout."""
+
+
+@dataclass(frozen=True, slots=True)
+class MessageTraffic:
+    """One kind of message from one component.
+
+    Attributes:
+        name: `HEARTBEAT`, …; `UNKNOWN_4711` for an id that the dialect does not have.
+        message_id: its number.
+        count: frames since the link was opened.
+        rate: frames a second, of late.
+    """
+
+    name: str
+    message_id: int
+    count: int
+    rate: float
+
+
+@dataclass(frozen=True, slots=True)
+class RadioStatus:
+    """What a telemetry radio last said of itself, in its own units (SiK: 0 to 254, about half a dB each).
+
+    Attributes:
+        rssi, noise: signal and noise here.
+        remote_rssi, remote_noise: the same at the other end.
+        free: percent of its buffer for sending that is free.
+        errors, fixed: packets received with errors, and of these those that were corrected, since its start.
+    """
+
+    rssi: int
+    noise: int
+    remote_rssi: int
+    remote_noise: int
+    free: int
+    errors: int
+    fixed: int
+
+
+@dataclass(frozen=True, slots=True)
+class ComponentTraffic:
+    """What was heard of one component since the link was opened; rates and `loss` are those of late.
+
+    Attributes:
+        system, component: who it is.
+        version: the MAVLink version of its last frame, 1 or 2.
+        heartbeat: its last HEARTBEAT, or None.
+        heartbeat_age: seconds since that came, or None.
+        age: seconds since anything came.
+        frames, bytes: how much came.
+        frame_rate, byte_rate: a second.
+        lost: frames that did not come, by the gaps in their numbers; see `SequenceCheck` for the rule.
+        loss: the share of its frames that was lost, 0 to 1; None where nothing new has come of late.
+        repeated, late: frames that came twice, or after a later one.
+        signed: frames with a signature; it is not verified.
+        messages: by kind, the most frequent one first.
+        radio: what it says of itself, if it is a radio.
+    """
+
+    system: int
+    component: int
+    version: int
+    heartbeat: Heartbeat | None
+    heartbeat_age: float | None
+    age: float
+    frames: int
+    bytes: int
+    frame_rate: float
+    byte_rate: float
+    lost: int
+    loss: float | None
+    repeated: int
+    late: int
+    signed: int
+    messages: tuple[MessageTraffic, ...]
+    radio: RadioStatus | None
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficReport:
+    """What has gone over a link.
+
+    Attributes:
+        seconds: for how long it was listened to.
+        components: by address.
+        bytes_received, bytes_sent: how much came and went.
+        received_rate, sent_rate: bytes a second, of late.
+        frames: whole frames that came.
+        damaged: frames with a wrong checksum.
+        unknown: frames with an id that the dialect does not have; they are among `frames`.
+        other_bytes: bytes that came and belong to no frame.
+    """
+
+    seconds: float
+    components: tuple[ComponentTraffic, ...]
+    bytes_received: int
+    bytes_sent: int
+    received_rate: float
+    sent_rate: float
+    frames: int
+    damaged: int
+    unknown: int
+    other_bytes: int
+
+
+class Traffic:
+    """Counts everything that a link delivers, for those who ask for it: an ordinary client does without.
+
+    Args:
+        is_stream: whether frames may be spread over several chunks.
+    """
+
+    def __init__(self, *, is_stream: bool) -> None:
+        self._is_stream = is_stream
+        self._sniffers: dict[Hashable, Sniffer] = {}
+        self._sources: dict[tuple[int, int], _Source] = {}
+        self._began: float | None = None
+        self._received = _Recently()
+        self._sent = _Recently()
+        self._frames = 0
+        self._unknown = 0
+        self._damaged = 0  # and the next: of sniffers that are gone
+        self._other_bytes = 0
+
+    def receive(self, data: bytes, peer: Hashable, now: float) -> None:
+        """Take what came; an empty chunk says that the peer's stream has ended."""
+        self._begin(now)
+        self._received.add(now, len(data))
+        key = peer if self._is_stream else None
+        sniffer = self._sniffers.get(key)
+        if sniffer is None:
+            sniffer = self._sniffers[key] = Sniffer(stream=self._is_stream)
+            if len(self._sniffers) > MOST_PEERS:
+                self._forget(next(iter(self._sniffers)))
+        for seen in sniffer.receive(data) if data else self._forget(key):
+            self._count(seen, peer, now)
+
+    def sent(self, total: int, now: float) -> None:
+        """Take note of how many bytes were sent up to now."""
+        self._begin(now)
+        self._sent.add(now, total - self._sent.total)
+
+    def pause(self) -> None:
+        """The link is away: what was cut off by that is not continued."""
+        for peer in list(self._sniffers):
+            self._forget(peer)
+
+    @property
+    def lost(self) -> int:
+        """Frames of all components that have not come."""
+        return sum(source.lost for source in self._sources.values())
+
+    @property
+    def repeated(self) -> int:
+        """Frames of all components that came twice."""
+        return sum(source.repeated for source in self._sources.values())
+
+    def report(self, now: float) -> TrafficReport:
+        """How it stands."""
+        began = now if self._began is None else self._began
+        sniffers = self._sniffers.values()
+        return TrafficReport(
+            seconds=now - began,
+            components=tuple(self._sources[address].report(began, now) for address in sorted(self._sources)),
+            bytes_received=self._received.total,
+            bytes_sent=self._sent.total,
+            received_rate=self._received.rate(began, now),
+            sent_rate=self._sent.rate(began, now),
+            frames=self._frames,
+            damaged=self._damaged + sum(each.damaged for each in sniffers),
+            unknown=self._unknown,
+            other_bytes=self._other_bytes + sum(each.other_bytes for each in sniffers),
+        )
+
+    def _begin(self, now: float) -> None:
+        if self._began is None:
+            self._began = now
+
+    def _forget(self, peer: Hashable) -> list[Seen]:
+        """Part with a peer's stream; what stood in its unfinished end."""
+        sniffer = self._sniffers.pop(peer)
+        seen = sniffer.flush()
+        self._damaged += sniffer.damaged
+        self._other_bytes += sniffer.other_bytes
+        return seen
+
+    def _count(self, seen: Seen, peer: Hashable, now: float) -> None:
+        self._frames += 1
+        if not seen.is_known:
+            self._unknown += 1
+        address = (seen.system, seen.component)
+        source = self._sources.get(address)
+        if source is None:
+            if not seen.is_known or len(self._sources) >= MOST_COMPONENTS:
+                return  # an address that no checksum proves is none
+            source = self._sources[address] = _Source(address)
+        source.heard(seen, peer, now)
+
+
+class _Source:
+    """One component's frames."""
+
+    def __init__(self, address: tuple[int, int]) -> None:
+        self._address = address
+        self._bytes = _Recently()
+        self._frames = _Recently()
+        self._lost = _Recently()
+        self._repeated = _Recently()
+        self._messages: dict[int, _Recently] = {}
+        self._checks: dict[Hashable, SequenceCheck] = {}
+        self._signed = 0
+        self._version = 1
+        self._heard_at = 0.0
+        self._heartbeat: Heartbeat | None = None
+        self._heartbeat_at = 0.0
+        self._radio: RadioStatus | None = None
+        self._late = 0  # of peers that are gone
+
+    def heard(self, seen: Seen, peer: Hashable, now: float) -> None:
+        self._heard_at = now
+        self._version = seen.version
+        self._signed += seen.is_signed
+        self._bytes.add(now, seen.size)
+        self._frames.add(now, 1)
+        messages = self._messages.get(seen.message_id)
+        if messages is None and len(self._messages) < MOST_MESSAGES:
+            messages = self._messages[seen.message_id] = _Recently()
+        if messages is not None:
+            messages.add(now, 1)
+        check = self._check(peer)
+        lost, repeated = check.lost, check.repeated
+        check.heard(seen.sequence, now)
+        if (check.lost, check.repeated) != (lost, repeated):
+            self._lost.add(now, check.lost - lost)
+            self._repeated.add(now, check.repeated - repeated)
+        if seen.message_id in RADIO_STATUS_IDS:
+            self._radio = _radio_status(seen.payload)
+        elif seen.message_id == HEARTBEAT_ID and seen.is_known:
+            message = decode(Frame(*seen[:6]))
+            assert isinstance(message, Heartbeat)
+            self._heartbeat = message
+            self._heartbeat_at = now
+
+    @property
+    def lost(self) -> int:
+        return self._lost.total
+
+    @property
+    def repeated(self) -> int:
+        return self._repeated.total
+
+    def report(self, began: float, now: float) -> ComponentTraffic:
+        system, component = self._address
+        came = self._frames.of_late(now) - self._repeated.of_late(now)
+        lost = max(self._lost.of_late(now), 0)
+        messages = [
+            MessageTraffic(message_name(number), number, each.total, each.rate(began, now))
+            for number, each in self._messages.items()
+        ]
+        return ComponentTraffic(
+            system,
+            component,
+            version=self._version,
+            heartbeat=self._heartbeat,
+            heartbeat_age=None if self._heartbeat is None else now - self._heartbeat_at,
+            age=now - self._heard_at,
+            frames=self._frames.total,
+            bytes=self._bytes.total,
+            frame_rate=self._frames.rate(began, now),
+            byte_rate=self._bytes.rate(began, now),
+            lost=self._lost.total,
+            loss=lost / (came + lost) if came > 0 else None,
+            repeated=self._repeated.total,
+            late=self._late + sum(check.late for check in self._checks.values()),
+            signed=self._signed,
+            messages=tuple(sorted(messages, key=lambda each: (-each.rate, -each.count, each.name))),
+            radio=self._radio,
+        )
+
+    def _check(self, peer: Hashable) -> SequenceCheck:
+        check = self._checks.get(peer)
+        if check is None:
+            check = self._checks[peer] = SequenceCheck()
+            if len(self._checks) > MOST_PEERS:
+                self._late += self._checks.pop(next(iter(self._checks))).late
+        return check
+
+
+class _Recently:
+    """A sum, and how much of it was added within the last `WINDOW` seconds."""
+
+    __slots__ = ("_slices", "total")
+
+    def __init__(self) -> None:
+        self.total = 0
+        self._slices: deque[list[int]] = deque(maxlen=round(WINDOW / SLICE))  # number of the slice, sum
+
+    def add(self, now: float, amount: int) -> None:
+        self.total += amount
+        number = int(now / SLICE)
+        if self._slices and self._slices[-1][0] == number:
+            self._slices[-1][1] += amount
+        else:
+            self._slices.append([number, amount])
+
+    def of_late(self, now: float) -> int:
+        first = _first_slice(now)
+        return sum(amount for number, amount in self._slices if number >= first)
+
+    def rate(self, began: float, now: float) -> float:
+        """So much a second."""
+        return self.of_late(now) / max(now - max(_first_slice(now) * SLICE, began), SHORTEST_TIME)
+
+
+def _first_slice(now: float) -> int:
+    """The oldest slice that is still of late."""
+    return int(now / SLICE) - round(WINDOW / SLICE) + 1
+
+
+_RADIO_STATUS = struct.Struct("<HHBBBBB")
+
+
+def _radio_status(payload: bytes) -> RadioStatus:
+    errors, fixed, rssi, remote_rssi, free, noise, remote_noise = _RADIO_STATUS.unpack_from(
+        payload.ljust(_RADIO_STATUS.size, b"\0")
+    )
+    return RadioStatus(rssi, noise, remote_rssi, remote_noise, free, errors, fixed)

@@ -1,0 +1,1 @@
+"""Identification, presence, commands, reboot and system id of a vehicle."""

@@ -1,0 +1,177 @@
+"""Commands: COMMAND_LONG until COMMAND_ACK has said what becomes of it."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from paramclient.errors import CommandRefused, CommandResult, NoReply
+from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.wire import CommandAck, CommandLong, Message
+
+__all__ = ["Command", "Commands"]
+
+PROGRESS_PATIENCE: Final = 10.0
+"""Seconds for which "in progress" is good: a component that works on a command says so again, and then says
+what came of it (MAVLink guide, "Command Protocol": the time-out begins anew with each)."""
+MOST_CONFIRMATIONS: Final = 255
+"""What fits into the field that counts the repetitions."""
+
+
+class Command(Operation[None]):
+    """One command until it is accepted; see `Commands`.
+
+    Attributes:
+        number: MAV_CMD.
+        params: its seven parameters.
+        repeats: whether it is sent again by itself while no answer comes.
+        attempts: how often it was sent.
+        sent_at: when it was sent last.
+    """
+
+    def __init__(self, number: int, params: tuple[float, ...], repeats: bool, begun_at: float) -> None:
+        super().__init__(begun_at)
+        self.number = number
+        self.params = params
+        self.repeats = repeats
+        self.attempts = 0
+        self.sent_at = math.inf
+        self.progress_at: float | None = None
+
+
+class Commands:
+    """Every command to one component.
+
+    An answer names the command and nothing else, so those of one number are done one after the other, and
+    those of different numbers side by side. What is not answered is sent again after the measured time-out,
+    with `confirmation` counted up, as often as a read would be.
+
+    Args:
+        target: the component.
+        own: system and component that we send as: answers to others are not for us.
+        round_trip: the component's.
+        send: takes each message.
+    """
+
+    def __init__(
+        self,
+        target: tuple[int, int],
+        own: tuple[int, int],
+        round_trip: RoundTrip,
+        send: Callable[[Message], None],
+    ) -> None:
+        self._target = target
+        self._addressees = (own, (0, 0))  # MAVLink 1 and older firmware name nobody
+        self._round_trip = round_trip
+        self._send = send
+        self._queues: dict[int, deque[Command]] = {}
+
+    def __len__(self) -> int:
+        return len(self._queues)
+
+    def begin(self, number: int, params: tuple[float, ...], now: float, *, repeats: bool = True) -> Command:
+        """Send a command, or put it behind those of the same number.
+
+        Args:
+            number: MAV_CMD.
+            params: up to seven; the others are 0.
+            now: the time.
+            repeats: whether to send it again while no answer comes; else only `repeat` does.
+        """
+        command = Command(number, (*params, *[0.0] * (7 - len(params))), repeats, now)
+        queue = self._queues.setdefault(number, deque())
+        queue.append(command)
+        if len(queue) == 1:
+            self.repeat(command, now)
+        return command
+
+    def repeat(self, command: Command, now: float) -> None:
+        """Send one that is under way once more."""
+        confirmation = min(command.attempts, MOST_CONFIRMATIONS)
+        command.attempts += 1
+        command.sent_at = now
+        self._send(CommandLong(*self._target, command.number, command.params, confirmation))
+
+    def cancel(self, command: Command, now: float) -> None:
+        """Forget a command. What was sent cannot be taken back."""
+        queue = self._queues.get(command.number)
+        if queue is not None and command in queue:
+            self._leave(command, now)
+
+    def acknowledged(self, message: CommandAck, now: float) -> None:
+        """Take a COMMAND_ACK."""
+        queue = self._queues.get(message.command)
+        if queue is None or (message.target_system, message.target_component) not in self._addressees:
+            return
+        command = queue[0]
+        if command.progress_at is None:
+            self._round_trip.answered(command.sent_at, now, command.attempts)
+        if message.result == CommandResult.IN_PROGRESS:
+            command.progress_at = now
+            return
+        self._leave(command, now)
+        if message.result == CommandResult.ACCEPTED:
+            command.finish(None, now)
+        else:
+            command.fail(CommandRefused(*self._target, command.number, message.result), now)
+
+    def tick(self, now: float) -> None:
+        """Send again, give up."""
+        for queue in list(self._queues.values()):
+            command = queue[0]
+            if self._due(command) > now:
+                continue
+            if command.progress_at is None:
+                self._round_trip.timed_out(command.attempts)
+                if not self._round_trip.is_hopeless(command.attempts, now):
+                    self.repeat(command, now)
+                    continue
+            self._leave(command, now)
+            command.fail(self._no_reply(command, now), now)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do, or infinity."""
+        return min((self._due(queue[0]) for queue in self._queues.values()), default=math.inf)
+
+    def resume(self, now: float) -> None:
+        """The link is back: what was under way is asked for again."""
+        for queue in self._queues.values():
+            if queue[0].repeats:
+                queue[0].attempts -= 1
+                self.repeat(queue[0], now)
+
+    def lose(self, now: float, why: str = " (lost)") -> None:
+        """Nobody is there to answer. Whether anything was obeyed is not known."""
+        self._end_all(lambda command: self._no_reply(command, now, why), now)
+
+    def fail_all(self, error: Exception, now: float) -> None:
+        """Nothing can be answered any more."""
+        self._end_all(lambda command: error, now)
+
+    def _due(self, command: Command) -> float:
+        if command.progress_at is not None:
+            return command.progress_at + PROGRESS_PATIENCE
+        return command.sent_at + self._round_trip.timeout if command.repeats else math.inf
+
+    def _leave(self, command: Command, now: float) -> None:
+        queue = self._queues[command.number]
+        was_first = queue[0] is command
+        queue.remove(command)
+        if not queue:
+            del self._queues[command.number]
+        elif was_first:
+            self.repeat(queue[0], now)
+
+    def _end_all(self, error_of: Callable[[Command], Exception], now: float) -> None:
+        queues, self._queues = self._queues, {}
+        for queue in queues.values():
+            for command in queue:
+                command.fail(error_of(command), now)
+
+    def _no_reply(self, command: Command, now: float, why: str = "") -> NoReply:
+        system, component = self._target
+        awaited = f"COMMAND_ACK for command {command.number} from {system}/{component}{why}"
+        return NoReply(awaited, attempts=command.attempts, waited=now - command.begun_at)

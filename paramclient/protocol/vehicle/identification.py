@@ -1,0 +1,368 @@
+"""Who a component is and how it writes values: by its heartbeat and its AUTOPILOT_VERSION."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Final
+
+from paramclient.model.identity import Identity
+from paramclient.model.values import Encoding
+from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.wire import (
+    AUTOPILOT_VERSION_ID,
+    CAPABILITY_FTP,
+    CAPABILITY_PARAM_ENCODE_BYTEWISE,
+    CAPABILITY_PARAM_ENCODE_C_CAST,
+    MAV_AUTOPILOT_ARDUPILOTMEGA,
+    MAV_AUTOPILOT_INVALID,
+    MAV_AUTOPILOT_PX4,
+    MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
+    MAV_CMD_REQUEST_MESSAGE,
+    MAV_RESULT_ACCEPTED,
+    MAV_TYPE_GCS,
+    AutopilotVersion,
+    CommandAck,
+    CommandLong,
+    Heartbeat,
+    HighLatency2,
+    Message,
+)
+
+__all__ = ["Identification", "judge_encoding"]
+
+PX4_WITH_FILE: Final = 0x01120000
+"""flight_sw_version of the first PX4 that serves the packed parameter file: 1.18."""
+ARDUPILOT_WITH_DEFAULTS: Final = 0x04040000
+"""flight_sw_version of the first ArduPilot of which every build adds the defaults to that file: 4.4. They
+came during the development of 4.3."""
+TRIES: Final = 4
+"""AUTOPILOT_VERSION is asked for so often where nothing is known of the link, or where it was refused; many
+components (cameras, radios) never give one."""
+HEARTBEAT_PATIENCE: Final = 3.0
+"""Seconds for which the encoding is open after a version that does not tell it, where no heartbeat came yet:
+autopilots send one every second."""
+ENCODING_CAPABILITIES: Final = CAPABILITY_PARAM_ENCODE_BYTEWISE | CAPABILITY_PARAM_ENCODE_C_CAST
+VERSION_DELAY: Final = 0.1
+"""Seconds by which AUTOPILOT_VERSION may follow the acknowledgement of its request; then it was lost."""
+DOUBT_PATIENCE: Final = 5.0
+"""Seconds for which one that has said it before is asked at the least: it may only be starting."""
+DOUBT_PACE: Final = 1.0
+"""Seconds between two questions when the usual number of them has not helped."""
+LATER_PACE: Final = 5.0
+"""Seconds between two questions to one that has given its hardware id before and did not in that time, while
+it is heard: its radio may have been deaf."""
+
+
+_WAYS: Final = (
+    (MAV_CMD_REQUEST_MESSAGE, float(AUTOPILOT_VERSION_ID)),
+    (MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1.0),
+)
+"""The commands that bring AUTOPILOT_VERSION, and their first parameters."""
+
+
+def judge_encoding(
+    chosen: Encoding | None, capabilities: int | None, autopilot: int | None
+) -> tuple[Encoding, str]:
+    """The encoding of a component and the reason, by the first evidence there is.
+
+    What the user said; the capability bits of AUTOPILOT_VERSION; the autopilot in its own heartbeat; the
+    standard. ArduPilot sets neither capability bit, PX4 before 1.12 neither, and MAV_PROTOCOL_CAPABILITY_
+    PARAM_FLOAT is set by both, so it proves nothing (measured).
+
+    Args:
+        chosen: what the user said, or None.
+        capabilities: the bits of AUTOPILOT_VERSION, or None while unknown.
+        autopilot: MAV_AUTOPILOT, or None before a heartbeat.
+    """
+    if chosen is not None:
+        return chosen, "chosen by the user"
+    bits = capabilities or 0
+    if bits & CAPABILITY_PARAM_ENCODE_BYTEWISE:
+        return Encoding.BYTEWISE, "the vehicle's capability PARAM_ENCODE_BYTEWISE"
+    if bits & CAPABILITY_PARAM_ENCODE_C_CAST:
+        return Encoding.C_CAST, "the vehicle's capability PARAM_ENCODE_C_CAST"
+    if autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
+        return Encoding.C_CAST, "its heartbeat says ArduPilot, which casts values to float"
+    if autopilot == MAV_AUTOPILOT_PX4:
+        return Encoding.BYTEWISE, "its heartbeat says PX4, which sends values byte by byte"
+    return Encoding.BYTEWISE, "the standard's encoding, as nothing says otherwise"
+
+
+class Identification:
+    """Follows a component's heartbeat, asks for its AUTOPILOT_VERSION, and draws the conclusions.
+
+    Attributes:
+        identity: who the vehicle is; without a hardware id until AUTOPILOT_VERSION came.
+        known_at: when the version came; minus infinity before that.
+        attempts: how often it was asked for since it was open.
+        doubted_at: since when that is; minus infinity where it was not open but at the beginning.
+        settled: whether `identity` is as good as it gets: the version came, or it never will.
+        autopilot, vehicle_type: of the heartbeat; None before one came.
+        was_away: whether another vehicle may have taken its place since it said who it is; true as well while
+            one that has is being asked.
+        encoding, encoding_reason: how it writes values, and why that is believed.
+    """
+
+    def __init__(
+        self,
+        target: tuple[int, int],
+        link: str,
+        round_trip: RoundTrip,
+        send: Callable[[Message], None],
+        chosen: Encoding | None,
+        *,
+        may_ask: bool = True,
+    ) -> None:
+        self._target = target
+        self._round_trip = round_trip
+        self._send = send
+        self._chosen = chosen
+        self._may_ask = may_ask
+        self.identity = Identity(target[0], link)
+        self.settled = False
+        self.was_away = False
+        self.known_at = -math.inf
+        self.autopilot: int | None = None
+        self.vehicle_type: int | None = None
+        self.capabilities: int | None = None
+        self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
+        self.attempts = 0
+        self.doubted_at = -math.inf
+        self._asked_at = -math.inf
+        self._is_asking = False
+        self._asks_until = -math.inf  # however often that is
+        self._denied_at = math.inf  # when the last way of asking was refused
+        self._lost_at = math.inf  # when the answer counts as lost, as the request was acknowledged
+        self._beat_awaited_until = math.inf  # while a heartbeat may still tell the encoding
+        self._heard_at = -math.inf
+        self._was_doubted = False  # since the last version
+
+    @property
+    def has_parameters(self) -> bool:
+        """Whether parameters can be expected of it: it is no ground station."""
+        return self.vehicle_type != MAV_TYPE_GCS
+
+    @property
+    def says_file(self) -> bool:
+        """Whether it says that it serves files, and has the packed parameter file among them.
+
+        PX4 says so since long before it had that: 1.17 answers "file not found" (measured). An ArduPilot,
+        which mostly has it, is believed to have it until its version says otherwise.
+        """
+        if self.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA and self.capabilities is None:
+            return True
+        has_none = self.autopilot == MAV_AUTOPILOT_PX4 and self.identity.firmware < PX4_WITH_FILE
+        return bool((self.capabilities or 0) & CAPABILITY_FTP) and not has_none
+
+    @property
+    def adds_defaults(self) -> bool:
+        """Whether it is known to serve that file with the defaults, if it serves it."""
+        is_ardupilot = self.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
+        return is_ardupilot and self.identity.firmware >= ARDUPILOT_WITH_DEFAULTS
+
+    @property
+    def firmware(self) -> tuple[int, str] | None:
+        """Its version and git hash, once it has said them."""
+        return None if self.known_at == -math.inf else (self.identity.firmware, self.identity.git_hash)
+
+    @property
+    def encoding_is_certain(self) -> bool:
+        """Whether nothing that is still to come can tell otherwise."""
+        has_said = self.autopilot in (MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4)
+        is_known = self.settled and self._beat_awaited_until == math.inf
+        return self._chosen is not None or has_said or is_known or not self.has_parameters
+
+    @property
+    def is_doubted(self) -> bool:
+        """Whether another vehicle may have taken its place, and the answer is awaited."""
+        return self.was_away and self._is_asking
+
+    @property
+    def is_unconfirmed(self) -> bool:
+        """Whether another vehicle may have taken its place, and it was asked in vain."""
+        return self.was_away and not self._is_asking and self._may_ask
+
+    @property
+    def may_be_written(self) -> bool:
+        """Whether it is certain whom a write reaches, and what it makes of it."""
+        return self.encoding_is_certain and not self.was_away
+
+    @property
+    def has_spoken(self) -> bool:
+        """Whether it has said what it is, by a heartbeat or its version, or has been asked in vain."""
+        return self.vehicle_type is not None or self.settled
+
+    @property
+    def is_autopilot(self) -> bool:
+        """Whether its heartbeat names an autopilot."""
+        return self.autopilot not in (None, MAV_AUTOPILOT_INVALID) and self.has_parameters
+
+    @property
+    def is_asking(self) -> bool:
+        """Whether its AUTOPILOT_VERSION is awaited."""
+        return self._is_asking
+
+    def heartbeat(self, message: Heartbeat | HighLatency2) -> bool:
+        """Take a heartbeat, or what stands for it; true when it shows another kind than was known."""
+        self._beat_awaited_until = math.inf
+        is_another_kind = False
+        if (message.autopilot, message.type) != (self.autopilot, self.vehicle_type):
+            is_another_kind = self.vehicle_type is not None
+            self.autopilot = message.autopilot
+            self.vehicle_type = message.type
+            self.identity = replace(self.identity, autopilot=message.autopilot, vehicle_type=message.type)
+            self._judge()
+        return is_another_kind
+
+    def heard(self, now: float) -> None:
+        """Something came: ask who it is, if that has not been asked."""
+        self._heard_at = now
+        if not self.attempts and self.has_parameters:
+            self._ask(now)
+
+    def doubt(self, now: float) -> None:
+        """It was away, or has started again: ask who it is now."""
+        if self.has_parameters:
+            is_open = self._may_ask and (self.settled or self.was_away)
+            self.was_away = self.identity.uid is not None or is_open
+            self._was_doubted = self._was_doubted or self.settled
+            self.attempts = 0
+            self.doubted_at = now
+            if self.identity.uid is not None:
+                self._asks_until = now + DOUBT_PATIENCE
+            self._ask(now)
+
+    def forget(self, now: float) -> None:
+        """Another vehicle has its address: ask that one who it is."""
+        system, link = self.identity.system, self.identity.link
+        self.identity = Identity(system, link)
+        self.settled = False
+        self.known_at = -math.inf
+        self.autopilot = self.vehicle_type = self.capabilities = None
+        self._beat_awaited_until = math.inf
+        self._judge()
+        self.was_away = True
+        self._was_doubted = False
+        self.attempts = 0
+        self.doubted_at = now
+        self._asks_until = now + DOUBT_PATIENCE
+        self._ask(now)
+
+    def version(self, message: AutopilotVersion, now: float) -> bool:
+        """Take an AUTOPILOT_VERSION; true when what is known may not be of the vehicle that has sent it.
+
+        So it is with another hardware id, with the first one where there may have been another vehicle, and
+        with any where it was open for a while who speaks.
+        """
+        was_unconfirmed = self.is_unconfirmed
+        if self._is_asking:
+            self._round_trip.answered(self._asked_at, now, self.attempts)
+        self._is_asking = self.was_away = False
+        system, _ = self._target
+        before = self.identity
+        self.identity = Identity.from_version(
+            system=system,
+            link=before.link,
+            autopilot=self.autopilot or 0,
+            vehicle_type=self.vehicle_type or 0,
+            uid=message.uid,
+            uid2=message.uid2,
+            firmware=message.flight_sw_version,
+            git_hash=message.git_hash,
+            board=message.board_version,
+            vendor_id=message.vendor_id,
+            product_id=message.product_id,
+            capabilities=message.capabilities,
+        )
+        self.capabilities = message.capabilities
+        self._judge()
+        if self.autopilot is None and not message.capabilities & ENCODING_CAPABILITIES:
+            self._beat_awaited_until = now + HEARTBEAT_PATIENCE
+        is_known = before.uid is not None or self._was_doubted
+        is_another = self.settled and is_known and before.key != self.identity.key
+        self._was_doubted = False
+        self.settled = True
+        self.known_at = now
+        return is_another or was_unconfirmed
+
+    def ask_again(self, now: float) -> None:
+        """Another vehicle may have taken the address: ask, if it has ever been said who it is."""
+        if self.identity.uid is not None and not self._is_asking:
+            self.attempts = 0
+            self._ask(now)
+
+    def lose(self) -> None:
+        """It is not heard any more. Who has said it before is asked again when it is; others are asked on."""
+        if self.settled:
+            self._is_asking = False
+
+    def acknowledged(self, message: CommandAck, now: float) -> None:
+        """Take a COMMAND_ACK: a refusal of one way to ask leads to the other at once.
+
+        What is accepted comes with the acknowledgement, or was lost.
+        """
+        asked = (MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
+        if self._is_asking and message.command in asked:
+            if message.result != MAV_RESULT_ACCEPTED:
+                self._denied_at = now
+            else:
+                self._lost_at = min(self._lost_at, now + VERSION_DELAY)
+
+    def tick(self, now: float) -> None:
+        """Ask again, or let it be."""
+        if self._beat_awaited_until <= now:
+            self._beat_awaited_until = math.inf
+        if self._next_request_at() <= now:
+            self._ask(now)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do, or infinity."""
+        return min(self._next_request_at(), self._beat_awaited_until)
+
+    def _next_request_at(self) -> float:
+        """When to ask again, or infinity; that follows what other answers tell of the link."""
+        if self.is_unconfirmed:
+            return self._asked_at + LATER_PACE if self._heard_at > self._asked_at else math.inf
+        if not self._is_asking:
+            return math.inf
+        pause = self._round_trip.repeat_timeout(self.attempts)
+        if self.attempts >= self._tries and self._asked_at < self._asks_until:
+            pause = max(pause, DOUBT_PACE)
+        return min(self._denied_at, self._lost_at, self._asked_at + pause)
+
+    @property
+    def _tries(self) -> int:
+        is_blind = self._round_trip.smoothed is None or self._denied_at < math.inf
+        return TRIES if is_blind else self._round_trip.tries
+
+    def _ask(self, now: float) -> None:
+        if not self._may_ask:
+            return
+        if self.is_unconfirmed and self.attempts:
+            self._request(now, _WAYS)
+            return
+        if self.attempts >= self._tries and now >= self._asks_until:
+            self._is_asking = False
+            self.settled = True
+            self.was_away = self.was_away and self.identity.uid is not None
+            return
+        was_refused = self._denied_at < math.inf
+        self.attempts += 1
+        self._is_asking = True
+        ways: tuple[tuple[int, float], ...] = _WAYS
+        if was_refused:
+            ways = (_WAYS[(self.attempts + 1) % 2],)
+        elif self.attempts == 1:
+            ways = _WAYS[:1]
+        self._request(now, ways)  # after silence both: a request or its answer may have been lost
+
+    def _request(self, now: float, ways: tuple[tuple[int, float], ...]) -> None:
+        self._asked_at = now
+        self._denied_at = self._lost_at = math.inf
+        for command, first in ways:
+            self._send(CommandLong(*self._target, command, (first, *[0.0] * 6)))
+
+    def _judge(self) -> None:
+        self.encoding, self.encoding_reason = judge_encoding(self._chosen, self.capabilities, self.autopilot)

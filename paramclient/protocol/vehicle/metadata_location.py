@@ -1,0 +1,152 @@
+"""Where a component says that the descriptions of what it has lie: MAVLink's component metadata protocol.
+
+MAV_CMD_REQUEST_MESSAGE asks for COMPONENT_METADATA, which names a general file; that names the others
+(MAVLink guide, "Component Metadata Protocol").
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+from paramclient.errors import CommandResult, NoReply, ParamClientError
+from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.wire import (
+    COMPONENT_METADATA_ID,
+    MAV_CMD_REQUEST_MESSAGE,
+    CommandAck,
+    CommandLong,
+    ComponentMetadata,
+    Message,
+)
+
+__all__ = ["DescriptionAsk", "Descriptions"]
+
+NONE_THERE: Final = (CommandResult.UNSUPPORTED, CommandResult.DENIED, CommandResult.FAILED)
+"""Results that say that the protocol is not spoken; others are no answer."""
+
+
+class DescriptionAsk(Operation[ComponentMetadata | None]):
+    """One question for the general file; its result is None where the component has none.
+
+    Attributes:
+        attempts: how often it was asked.
+    """
+
+    def __init__(self, begun_at: float) -> None:
+        super().__init__(begun_at)
+        self.attempts = 0
+
+
+class Descriptions:
+    """Asks a component for its COMPONENT_METADATA, again in time, until there is an answer or no hope of one.
+
+    Args:
+        target: its system and component.
+        own: ours.
+        round_trip: of the component.
+        send: takes each message for it.
+        is_identifying: whether it is being asked for AUTOPILOT_VERSION with the same command: a refusal is
+            then none of this.
+    """
+
+    def __init__(
+        self,
+        target: tuple[int, int],
+        own: tuple[int, int],
+        round_trip: RoundTrip,
+        send: Callable[[Message], None],
+        *,
+        is_identifying: Callable[[], bool],
+    ) -> None:
+        self._target = target
+        self._own = own
+        self._round_trip = round_trip
+        self._send = send
+        self._is_identifying = is_identifying
+        self._asks: list[DescriptionAsk] = []
+        self._asked_at = -math.inf
+
+    @property
+    def is_asking(self) -> bool:
+        """Whether an answer is awaited."""
+        return bool(self._asks)
+
+    def ask(self, now: float) -> DescriptionAsk:
+        """Ask; give it back with `release`. Those who ask at the same time share the answer."""
+        ask = DescriptionAsk(now)
+        self._asks.append(ask)
+        if len(self._asks) == 1:
+            self._request(now)
+        else:
+            ask.attempts = self._asks[0].attempts
+        return ask
+
+    def release(self, ask: DescriptionAsk) -> None:
+        """Wait for it no longer."""
+        if ask in self._asks:
+            self._asks.remove(ask)
+
+    def heard(self, message: ComponentMetadata, now: float) -> None:
+        """The answer has come; an empty address means none."""
+        if self._asks:
+            self._round_trip.answered(self._asked_at, now, self._asks[0].attempts)
+            self._finish(message if message.uri else None, now)
+
+    def acknowledged(self, message: CommandAck, now: float) -> None:
+        """Take a COMMAND_ACK: a refusal is an answer too."""
+        is_ours = (message.target_system, message.target_component) in (self._own, (0, 0))
+        is_meant = message.command == MAV_CMD_REQUEST_MESSAGE and is_ours and not self._is_identifying()
+        if self._asks and is_meant and message.result in NONE_THERE:
+            self._round_trip.answered(self._asked_at, now, self._asks[0].attempts)
+            self._finish(None, now)
+
+    def tick(self, now: float) -> None:
+        """Ask again, or give up."""
+        if self.next_deadline() > now:
+            return
+        first = self._asks[0]
+        self._round_trip.timed_out(first.attempts)
+        if self._round_trip.is_hopeless(first.attempts, now):
+            self._give_up("", now)
+        else:
+            self._request(now)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do, or infinity."""
+        return self._asked_at + self._round_trip.timeout if self._asks else math.inf
+
+    def lose(self, now: float) -> None:
+        """The component is lost: whoever waits gets NoReply."""
+        self._give_up(" (lost)", now)
+
+    def resume(self, now: float) -> None:
+        """The link was away and is back."""
+        if self._asks:
+            self._request(now)
+
+    def fail_all(self, error: ParamClientError, now: float) -> None:
+        """No answer can come any more."""
+        asks, self._asks = self._asks, []
+        for ask in asks:
+            ask.fail(error, now)
+
+    def _give_up(self, why: str, now: float) -> None:
+        what = f"COMPONENT_METADATA of {self._target[0]}/{self._target[1]}{why}"
+        asks, self._asks = self._asks, []
+        for ask in asks:
+            ask.fail(NoReply(what, attempts=ask.attempts, waited=now - ask.begun_at), now)
+
+    def _request(self, now: float) -> None:
+        self._asked_at = now
+        for ask in self._asks:
+            ask.attempts += 1
+        first = (float(COMPONENT_METADATA_ID), *[0.0] * 6)
+        self._send(CommandLong(*self._target, MAV_CMD_REQUEST_MESSAGE, first))
+
+    def _finish(self, result: ComponentMetadata | None, now: float) -> None:
+        asks, self._asks = self._asks, []
+        for ask in asks:
+            ask.finish(result, now)

@@ -1,0 +1,264 @@
+"""One restart of a component on our command: asked for, gone, back, and proven to be the same vehicle."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Final
+
+from paramclient.errors import AnotherVehicle, NoReply
+from paramclient.model.identity import Identity
+from paramclient.protocol.requests.operation import Operation
+from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
+from paramclient.protocol.vehicle.commands import Command, Commands
+from paramclient.protocol.vehicle.identification import Identification
+from paramclient.protocol.vehicle.presence import Presence
+from paramclient.protocol.wire import MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
+
+__all__ = ["SAVING_TIME", "Restart"]
+
+SAVING_TIME: Final = 2.5
+"""Seconds from a write until it outlives a restart: PX4 saves changed parameters up to two seconds later
+(its `param_autosave` waits 0.3 s, and saves no more often than every 2 s)."""
+STILL_THERE: Final = 1.0
+"""Seconds after the command: a component that still sends heartbeats then has not obeyed it. PX4 goes down
+0.4 s after it has accepted, ArduPilot 0.2 s (their sources), and neither starts in so little time."""
+GRACE: Final = 0.5
+"""Seconds after such a heartbeat in which a clock may show that it was the first of a new start."""
+MOST_TRIES: Final = 5
+"""Commands that a component may leave unanswered which is heard all the time."""
+CLOCK_PATIENCE: Final = 2.5
+"""Seconds after a silence in which SYSTEM_TIME, where the component sends it, tells what the silence was."""
+STEP: Final = 0.15
+"""Seconds by which a start must be later than the one before for the clock to show that it is another one:
+messages are not equally long on their way."""
+DOWN_DELAY: Final = 0.3
+"""Seconds from accepting until a vehicle is certainly off: ArduPilot goes off after 0.2 s, and the first
+frame of its new run comes at the earliest 0.31 s after the acknowledgement (measured)."""
+CLOCK_SILENCE: Final = 0.25
+"""Seconds without a clock from a vehicle before the numbers of its frames mean anything: of one that streams
+telemetry they pass 0 all the time."""
+UNNOTICED: Final = 10.0
+"""Seconds after which an accepted restart counts as done where nothing can show it: the component is heard
+without a gap, tells no clock, and does not say that it boots."""
+ASKING_PACE: Final = 1.0
+"""Seconds between two rounds of questions to a component that is back and does not say who it is."""
+
+
+class Restart(Operation[None]):
+    """MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN until the same vehicle is back, or until another one is.
+
+    Before it, who the component is must be known, or asked in vain, and what was written must be saved. The
+    command is repeated only to a component that is heard to be still there: one that has obeyed and whose
+    answer was lost would start twice. That it has started again is shown by its clock, by its heartbeat, or
+    by a silence behind which a clock does not go on; without an answer to the command too. It ends when the
+    component says who it is (by its heartbeat, where it has no hardware id) and no longer that it boots. It
+    has no time limit of its own.
+
+    Args:
+        target: the component.
+        commands, who, presence, round_trip: the component's.
+        saved_at: when all that was written is saved.
+        restarted: is told when the component has started again and nobody else has noticed; calls `rebooted`.
+        clock_requests: the component's.
+        returns: whether it comes back under its address. Else it ends as soon as it obeys, or is gone.
+        now: the time.
+
+    Attributes:
+        waiters: how many wait for it.
+        stage: what is awaited, in words.
+    """
+
+    def __init__(
+        self,
+        target: tuple[int, int],
+        commands: Commands,
+        who: Identification,
+        presence: Presence,
+        round_trip: RoundTrip,
+        saved_at: float,
+        restarted: Callable[[float], None],
+        clock_requests: ClockRequests,
+        *,
+        returns: bool,
+        now: float,
+    ) -> None:
+        super().__init__(now)
+        self._target = target
+        self._commands = commands
+        self._who = who
+        self._presence = presence
+        self._round_trip = round_trip
+        self._saved_at = saved_at
+        self._restarted = restarted
+        self._clock_requests = clock_requests
+        self._returns = returns
+        self.waiters = 0
+        self._command: Command | None = None
+        self._before: Identity | None = None
+        self._started_before: float | None = None
+        self._accepted_at: float | None = None
+        self._heard_again_at: float | None = None  # after a silence of which it is open what it was
+        self._numbering_began_at = -math.inf  # where that proves nothing
+        self._back_at: float | None = None
+        self._ask_at = -math.inf
+
+    @property
+    def attempts(self) -> int:
+        """How often the command was sent."""
+        return 0 if self._command is None else self._command.attempts
+
+    @property
+    def stage(self) -> str:
+        system, component = self._target
+        if self._back_at is not None:
+            return f"who {system}/{component} is after its restart"
+        if self._accepted_at is not None:
+            return f"{system}/{component} to be back after its restart"
+        return f"the restart of {system}/{component}"
+
+    def rebooted(self, now: float) -> None:
+        """Its clock or its heartbeat shows that it has started again."""
+        if self._command is None:
+            return
+        self._clock_requests.stop_following()
+        if not self._returns:
+            self.finish(None, now)
+        self._back_at = now
+        self._ask_at = now
+
+    def numbering_began(self, now: float) -> bool:
+        """Its frames may be numbered from 0 again; gives whether that shows that it has started again.
+
+        It does where the component has accepted the command, has had the time to go off, and is not telling
+        its clock meanwhile. ArduPilot sends its clock only 1.4 s after its first heartbeat.
+        """
+        accepted_at = self._accepted_at
+        if self.done or self._back_at is not None:
+            return False
+        self._numbering_began_at = now
+        if accepted_at is None or now < accepted_at + DOWN_DELAY:
+            return False
+        if now < self._presence.clock_at + CLOCK_SILENCE:
+            return False
+        self._restarted(now)
+        return True
+
+    def silent(self, silence: float, now: float) -> None:
+        """It is heard again after so many seconds that something must have happened."""
+        command = self._command
+        if command is None or self._back_at is not None:
+            return
+        if min(silence, now - command.sent_at) >= self._presence.gap:
+            self._heard_again_at = now
+
+    def another(self, now: float) -> None:
+        """Another vehicle has said that the address is its own."""
+        if self._before is not None:
+            self._fail_for_another(now)
+
+    def stop(self, now: float) -> None:
+        """Nobody waits any more. What was sent cannot be taken back."""
+        self._clock_requests.stop_following()
+        if self._command is not None:
+            self._commands.cancel(self._command, now)
+
+    def tick(self, now: float) -> None:
+        """Do what is due."""
+        if not self.done:
+            due, step = self._next_step()
+            if due <= now:
+                step(now)
+
+    def next_deadline(self) -> float:
+        """When `tick` has something to do, or infinity."""
+        return math.inf if self.done else self._next_step()[0]
+
+    def _next_step(self) -> tuple[float, Callable[[float], None]]:
+        command, presence, who = self._command, self._presence, self._who
+        if command is None:
+            return (self._saved_at if who.settled else math.inf), self._begin
+        if self._back_at is not None:
+            if presence.is_booting:
+                return math.inf, self._ask
+            if self._has_said_who(self._back_at):
+                return -math.inf, self._compare
+            return (math.inf if who.is_asking else self._ask_at), self._ask
+        if self._clock_shows_it(command.sent_at):
+            return -math.inf, self._restarted
+        if self._heard_again_at is not None:
+            return self._heard_again_at + CLOCK_PATIENCE, self._judge_silence
+        if self._accepted_at is not None:
+            due = max(self._accepted_at, presence.clock_at) + UNNOTICED
+            return (math.inf if presence.is_lost else due), self._restarted
+        if presence.beat_at >= command.sent_at + STILL_THERE:
+            due = max(presence.beat_at + GRACE, command.sent_at + self._round_trip.timeout)
+            if self._numbering_began_at >= max(command.sent_at, presence.clock_at):
+                due = max(due, self._numbering_began_at + CLOCK_PATIENCE)  # it may have obeyed
+            return due, self._repeat
+        return math.inf, self._repeat
+
+    def _begin(self, now: float) -> None:
+        self._before = self._who.identity
+        self._started_before = self._presence.started_at
+        self._command = command = self._commands.begin(
+            MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, (1.0,), now, repeats=False
+        )
+        command.on_done.append(self._answered)
+        self._clock_requests.follow(now)
+
+    def _answered(self) -> None:
+        command = self._command
+        assert command is not None
+        if command.error is None:
+            self._accepted_at = command.ended_at
+            if not self._returns:
+                self.finish(None, command.ended_at)
+        elif not isinstance(command.error, NoReply):
+            self.fail(command.error, command.ended_at)
+        elif not self._returns:
+            self.finish(None, command.ended_at)  # it is lost, as it should be
+
+    def _repeat(self, now: float) -> None:
+        command = self._command
+        assert command is not None
+        if command.done or command.attempts >= MOST_TRIES:
+            self.fail(NoReply(self.stage, attempts=command.attempts, waited=now - self.begun_at), now)
+        else:
+            self._commands.repeat(command, now)
+
+    def _judge_silence(self, now: float) -> None:
+        """The clock has had the time to tell."""
+        heard_again_at, self._heard_again_at = self._heard_again_at, None
+        assert heard_again_at is not None
+        if self._presence.clock_at < heard_again_at:  # one that had gone back would have ended the waiting
+            self._restarted(now)
+
+    def _clock_shows_it(self, sent_at: float) -> bool:
+        """Whether it has started since the command was sent, also where its clock was hardly older before."""
+        started_at = self._presence.started_at
+        if started_at is None or started_at < sent_at:
+            return False
+        return self._started_before is None or started_at >= self._started_before + STEP
+
+    def _ask(self, now: float) -> None:
+        self._ask_at = now + ASKING_PACE
+        self._who.doubt(now)
+
+    def _has_said_who(self, since: float) -> bool:
+        assert self._before is not None
+        if self._before.uid is None:
+            return self._presence.beat_at >= since
+        return self._who.known_at >= since
+
+    def _compare(self, now: float) -> None:
+        assert self._before is not None
+        if self._before.is_same_vehicle(self._who.identity):
+            self.finish(None, now)
+        else:
+            self._fail_for_another(now)
+
+    def _fail_for_another(self, now: float) -> None:
+        assert self._before is not None
+        self.fail(AnotherVehicle(*self._target, str(self._before), str(self._who.identity)), now)

@@ -1,0 +1,195 @@
+"""The documents of a service back to what the library gives. Nothing of a value is lost on the way."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import fields
+from types import NoneType
+from typing import Any, Final
+
+from paramclient.client.stats import ClientStats
+from paramclient.errors import LinkError, ParamClientError
+from paramclient.model.identity import Identity
+from paramclient.model.values import Param, ParamType, Trust, Value, from_bits
+from paramclient.protocol.params.fetch_result import FetchResult, Progress
+from paramclient.protocol.params.sampling import Sample
+from paramclient.protocol.params.writes import SetResult
+
+__all__ = [
+    "Document",
+    "check_kind",
+    "fetch_result_of",
+    "hash_of",
+    "identity_of",
+    "number_of",
+    "param_of",
+    "params_of",
+    "progress_of",
+    "set_result_of",
+    "stats_of",
+    "understood",
+    "value_as_sent",
+    "value_of",
+]
+
+Document = Mapping[str, Any]
+
+_WORDS: Final = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
+_IDENTITY: Final = {"link": (str,), "git_hash": (str,), "uid": (str, NoneType)}
+"""What those members of an identity are that are no numbers."""
+_FLOAT32: Final = struct.Struct("<f")
+
+
+@contextmanager
+def understood(name: str) -> Iterator[None]:
+    """Read documents in here: LinkError, where one is not what it should be."""
+    try:
+        yield
+    except ParamClientError:
+        raise
+    except (ArithmeticError, AttributeError, LookupError, TypeError, ValueError, struct.error) as error:
+        raise LinkError(f"{name} tells what cannot be understood: {error!r}", link=name) from error
+
+
+def number_of(told: object) -> Value:
+    """A value as JSON has it: a number, NaN and infinities as words, four raw bytes as `0x…`."""
+    if isinstance(told, str):
+        return _WORDS[told] if told in _WORDS else int(told.removeprefix("0x"), 16).to_bytes(4, "little")
+    if isinstance(told, bool) or not isinstance(told, int | float):
+        raise TypeError(f"a value is no {type(told).__name__}")
+    return told
+
+
+def value_of(told: object, kind: ParamType | int) -> Value:
+    """The same of a type: JSON has the shortest decimal of a float32, and may have 2.0 as 2."""
+    value = number_of(told)
+    if kind == ParamType.REAL32 and not isinstance(value, bytes):
+        rounded: float = _FLOAT32.unpack(_FLOAT32.pack(value))[0]
+        return rounded
+    return float(value) if kind == ParamType.REAL64 and isinstance(value, int) else value
+
+
+def value_as_sent(value: Value) -> object:
+    """A value that is to be written, so that the service takes it for the same."""
+    if isinstance(value, bytes):
+        return {"raw": value.hex()}
+    if isinstance(value, float) and value - value != 0.0:  # JSON knows no such numbers
+        return "NaN" if value != value else "Infinity" if value > 0 else "-Infinity"
+    return value
+
+
+def param_of(document: Document, name: str | None = None) -> Param:
+    """A parameter; its name stands in the document, or it is the key under which that stands."""
+    named = document["type"]
+    kind = ParamType[named] if named in ParamType.__members__ else int(named.removeprefix("TYPE_"))
+    bits = int(document["bits"], 16)
+    index, default = document["index"], document.get("default")
+    name = document["name"] if name is None else name
+    check_kind(name, str)
+    return Param(
+        name,
+        from_bits(bits, kind, is_raw=str(document["value"]).startswith("0x")),
+        kind,
+        None if index is None else int(index),
+        bits,
+        Trust(document.get("trust", Trust.CACHED)),
+        None if default is None else value_of(default, kind),
+    )
+
+
+def params_of(documents: Mapping[str, Document]) -> dict[str, Param]:
+    """A whole table, in the order in which the service has it."""
+    return {name: param_of(document, name) for name, document in documents.items()}
+
+
+def hash_of(told: str | None) -> int | None:
+    """A PX4 hash."""
+    return None if told is None else int(told, 16)
+
+
+def identity_of(document: Document) -> Identity:
+    """Who a vehicle is; what this version does not know is left out."""
+    told = {each.name: document[each.name] for each in fields(Identity)}
+    for name, value in told.items():
+        check_kind(value, *_IDENTITY.get(name, (int,)))
+    return Identity(**told)
+
+
+def check_kind(value: object, *kinds: type) -> None:
+    """See that a value is of one of these kinds; a boolean is no number.
+
+    Raises:
+        TypeError: it is not.
+    """
+    if not isinstance(value, kinds) or (isinstance(value, bool) and bool not in kinds):
+        raise TypeError(f"{value!r:.40} is not what it should be")
+
+
+def progress_of(document: Document) -> Progress:
+    """How far a fetch is."""
+    told = Progress(*(document[each.name] for each in fields(Progress)))
+    check_kind(told.received, int)
+    check_kind(told.total, int, NoneType)
+    check_kind(told.rate, int, float)
+    check_kind(told.seconds_left, int, float, NoneType)
+    return told
+
+
+def fetch_result_of(document: Document, params: Mapping[str, Param], elapsed: float) -> FetchResult:
+    """What a fetch brought.
+
+    Args:
+        document: all of it but the parameters.
+        params: these, as they are now.
+        elapsed: seconds from the call to the end.
+    """
+    sample = document["sample"]
+    return FetchResult(
+        system=document["system"],
+        component=document["component"],
+        params=dict(params),
+        source=document["source"],
+        count=document["count"],
+        received=document["received"],
+        missing=tuple(document["missing"]),
+        hash=hash_of(document["hash"]),
+        elapsed=elapsed,
+        notes=tuple(document["notes"]),
+        resumed=document["resumed"],
+        lost=document["lost"],
+        repeated=document["repeated"],
+        round_trip=document["round_trip_s"],
+        sample=None if sample is None else Sample(**{**sample, "differing": tuple(sample["differing"])}),
+    )
+
+
+def set_result_of(document: Document, requested: Value) -> SetResult:
+    """What became of a value that was asked for."""
+    param = param_of(document["param"])
+    return SetResult(
+        document["name"],
+        document["status"],
+        requested,
+        value_of(document["actual"], param.type),
+        param,
+        document["attempts"],
+        document.get("note", ""),
+    )
+
+
+def stats_of(documents: list[Document]) -> ClientStats:
+    """The numbers of several links, added up; of those that are open."""
+    counted = [each.name for each in fields(ClientStats) if each.name != "round_trips"]
+    sums: dict[str, Any] = {}
+    for name in counted:
+        told = [each[name] for each in documents if each.get(name) is not None]  # an older one counts less
+        sums[name] = sum(told) if told or name not in ("lost", "repeated") else None
+    trips = {
+        (int(system), int(component)): float(seconds)
+        for each in documents
+        for address, seconds in each["round_trips"].items()
+        for system, component in [address.split("/")]
+    }
+    return ClientStats(**sums, round_trips=trips)

@@ -1,0 +1,1561 @@
+"""The command: what it prints for programs and for people, how it ends, and what it never prints."""
+
+from __future__ import annotations
+
+import os
+import pty
+import re
+import select
+import signal
+import socket
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any, Self
+
+import pytest
+
+import paramclient
+from paramclient import LinkError, ParamCache, ParamErrorCode, ParamType, Policy
+from paramclient.cli import parameters as vehicle_commands
+from paramclient.cli import run
+from paramclient.cli.exit_codes import ExitCode, code_of, status_of
+from paramclient.cli.options import LinkOptions
+from paramclient.cli.output import printable
+from paramclient.errors import CacheError, ClientClosed, PackError, ParamClientError
+from paramclient.links import Peer, SimLink
+from paramclient.model.notation import hash_text
+from paramclient.protocol import wire
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam, px4_table
+from paramclient.sim.param_table import Entry
+from tests.commands import Command, Outcome, Put, behind, in_process, leaping, strict
+from tests.flying import flying
+from tests.shell import swiftly
+
+ROOT = Path(__file__).parents[2]
+PATIENCE = 60.0  # seconds after which a test gives up; nothing waits that long when all is well
+ESCAPE = "\x1b"
+
+FETCH_KEYS = [
+    *("system", "component", "autopilot", "uid", "count", "received", "source", "hash", "missing"),
+    *("cached", "sample", "lost", "repeated", "round_trip_s"),
+    *("elapsed_s", "bytes_received", "bytes_sent", "params"),
+]
+PARAM_KEYS = ["value", "type", "index", "bits"]
+HASH = "cf579589"
+"""Of the simulated PX4 vehicle's table, as the recordings of the real one have it."""
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Runs the command in this process, on a clock that leaps."""
+    leaping(monkeypatch)
+    return in_process(capsys)
+
+
+@pytest.fixture
+def live_command(capsys: pytest.CaptureFixture[str]) -> Command:
+    """Runs the command in this process in real time, for sockets with another process at the far end."""
+    return in_process(capsys)
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    """Puts a simulated vehicle, or any link, behind every URL; gives a URL."""
+    return behind(monkeypatch, "sim:custom")
+
+
+@pytest.fixture(scope="session")
+def warm_cache(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A cache file with the table of `sim:px4`."""
+    path = tmp_path_factory.mktemp("warm") / "cache.sqlite3"
+    assert run(["fetch", "sim:px4", "--cache", str(path)]) == 0
+    return path.read_bytes()
+
+
+@pytest.fixture
+def warm(warm_cache: bytes, tmp_path: Path) -> Path:
+    """The same for one test alone."""
+    path = tmp_path / "warm.sqlite3"
+    path.touch(mode=0o600)
+    path.write_bytes(warm_cache)
+    return path
+
+
+def key_of(cache: Path) -> str:
+    """The key of the vehicle that was seen last."""
+    return ParamCache(cache).vehicles()[0].key
+
+
+# processes
+
+PLAIN = {
+    name: value
+    for name, value in os.environ.items()
+    if name not in {"FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "COLUMNS", "PYTHONUNBUFFERED"}
+}
+"""The environment without what changes how programs print."""
+
+
+@contextmanager
+def process(*arguments: object, **options: Any) -> Iterator[subprocess.Popen[str]]:
+    """The command as a process of its own, which is gone afterwards."""
+    words = [sys.executable, "-m", "paramclient", *map(str, arguments)]
+    options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": PLAIN, **options}
+    with subprocess.Popen(words, cwd=ROOT, text=True, **options) as started:
+        watchdog = threading.Timer(PATIENCE, started.kill)
+        watchdog.start()
+        try:
+            yield started
+        finally:
+            watchdog.cancel()
+            if started.poll() is None:
+                started.kill()
+
+
+def ended(started: subprocess.Popen[str]) -> Outcome:
+    """Wait for its end."""
+    out, err = started.communicate(timeout=PATIENCE)
+    return Outcome(started.returncode, out or "", err or "")
+
+
+def run_process(*arguments: object, **options: Any) -> Outcome:
+    with process(*arguments, **options) as started:
+        return ended(started)
+
+
+def line_of(stream: Any) -> str:
+    """The next line that a process prints."""
+    line = str(stream.readline())
+    assert line.endswith("\n"), "the process has ended"
+    return line
+
+
+@contextmanager
+def simulated(*arguments: str) -> Iterator[str]:
+    """`sim` in a process of its own on a port that the system chooses; gives the URL to reach it."""
+    with process("sim", *arguments, "--link", "udpin:127.0.0.1:0") as started:
+        found = re.search(r" listens on udpin:127\.0\.0\.1:([0-9]+);", line_of(started.stdout))
+        assert found is not None
+        assert int(found[1]) > 0
+        yield f"udpout:127.0.0.1:{found[1]}"
+
+
+# fetch
+
+
+def test_fetch_prints_one_object_with_exactly_these_keys(command: Command, tmp_path: Path) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    cold = command("fetch", "sim:px4", "--json", "--cache", cache)
+    assert (cold.code, cold.err) == (0, "")
+    first = cold.json
+    assert list(first) == FETCH_KEYS
+    assert {key: first[key] for key in FETCH_KEYS[:9]} == {
+        "system": 1,
+        "component": 1,
+        "autopilot": "px4",
+        "uid": "4954414c44494e4f",
+        "count": 903,
+        "received": 903,
+        "source": "stream",
+        "hash": HASH,
+        "missing": [],
+    }
+    assert first["bytes_received"] > 903 * 25
+    assert 0 < first["bytes_sent"] < 1000
+    assert first["elapsed_s"] > 0
+    assert (first["lost"], first["repeated"]) == (0, 0)
+    assert 0 <= first["round_trip_s"] < first["elapsed_s"]
+    assert list(first["params"].values()) == sorted(
+        first["params"].values(), key=lambda param: param["index"]
+    )
+    for row in px4_table():
+        param = first["params"][row.name]
+        assert list(param) == PARAM_KEYS
+        assert (param["type"], param["bits"]) == (ParamType(row.type).name, f"{row.bits:08x}")
+
+    again = command("fetch", "sim:px4", "--json", "--cache", cache).json
+    assert (again["source"], again["hash"], again["missing"]) == ("cache", HASH, [])
+    assert again["bytes_received"] < first["bytes_received"] / 5
+    assert again["params"] == first["params"]
+
+    refreshed = command("fetch", "sim:px4", "--json", "--refresh", "--cache", cache).json
+    assert refreshed["source"] == "stream"
+
+
+def test_a_vehicle_without_a_hash_has_none_in_its_object(command: Command) -> None:
+    fetched = command("fetch", "sim:ardupilot", "--json", "--no-cache").json
+    assert (fetched["autopilot"], fetched["hash"], fetched["received"]) == ("ardupilot", None, 1382)
+    assert fetched["uid"] == "336431323139633763346335343034616100"
+
+
+ODD = [
+    SimParam("NAN", ParamType.REAL32, float("nan")),
+    SimParam("UP", ParamType.REAL32, float("inf")),
+    SimParam("DOWN", ParamType.REAL32, float("-inf")),
+    SimParam("TENTH", ParamType.REAL32, 0.1),
+    SimParam("SNAN", ParamType.INT32, -5000000),
+    SimParam("LONG", ParamType.UINT64, 0x1_0000_0002),
+    SimParam("DOUBLE", ParamType.REAL64, 0.5),
+    SimParam("ODD", 77, b"\x01\x02\x03\x04"),
+    SimParam("SMALL", ParamType.INT8, -1),
+]
+
+
+def test_every_value_is_strict_json(command: Command, put: Callable[[Endpoint], str]) -> None:
+    params = command("fetch", put(GenericVehicle(ODD)), "--json", "--no-cache").json["params"]
+    assert {name: (param["value"], param["type"], param["bits"]) for name, param in params.items()} == {
+        "NAN": ("NaN", "REAL32", "7fc00000"),
+        "UP": ("Infinity", "REAL32", "7f800000"),
+        "DOWN": ("-Infinity", "REAL32", "ff800000"),
+        "TENTH": (0.1, "REAL32", "3dcccccd"),
+        "SNAN": (-5000000, "INT32", "ffb3b4c0"),
+        "LONG": ("0x00000002", "UINT64", "0000000000000002"),
+        "DOUBLE": ("0x00000000", "REAL64", "0000000000000000"),
+        "ODD": ("0x04030201", "TYPE_77", "04030201"),
+        "SMALL": (-1, "INT8", "000000ff"),
+    }
+
+
+def test_people_see_a_table_and_a_summary(command: Command, warm: Path) -> None:
+    fetched = command("fetch", "sim:px4", "--cache", warm)
+    assert fetched.code == 0
+    header, *rows = fetched.words
+    assert header == ["name", "value", "type", "index", "trust"]
+    assert len(rows) == 903
+    by_name = {row[0]: row[1:] for row in rows}
+    assert by_name["MC_ROLL_P"] == ["4.0", "REAL32", "547", "verified"]
+    volatile = {row.name for row in px4_table() if row.volatile}
+    assert {name for name, row in by_name.items() if row[-1] == "live"} == volatile
+    assert re.fullmatch(
+        r"903 parameters of 1/1 px4 from cache in [0-9.]+ s, round trip [0-9.]+ ms, "
+        r"[0-9,]+ bytes received, [0-9,]+ sent; "
+        rf"hash {HASH}\n",
+        fetched.err,
+    )
+
+
+def test_people_see_what_a_bad_link_has_cost(command: Command) -> None:
+    fetched = command("fetch", "sim:px4?loss=0.1&delay=0.01&seed=1", "--no-cache")
+    assert fetched.code == 0
+    found = re.fullmatch(
+        r"903 parameters of 1/1 px4 from stream in [0-9.]+ s, ([0-9]+) lost, [0-9]+ repeated, "
+        r"round trip ([0-9.]+) ms, [0-9,]+ bytes received, [0-9,]+ sent; hash [0-9a-f]{8}\n",
+        fetched.err,
+    )
+    assert found is not None
+    assert 50 <= int(found[1]) <= 903
+    assert float(found[2]) >= 20
+
+
+class Gappy(GenericVehicle):
+    """Never sends one of its parameters."""
+
+    def _send_value(self, entry: Entry, **where: Any) -> None:
+        if entry.name != "B":
+            super()._send_value(entry, **where)
+
+
+def test_what_did_not_come_is_named(command: Command, put: Callable[[Endpoint], str]) -> None:
+    url = put(Gappy({"A": 1, "B": 2, "C": 3}))
+    fetched = command("fetch", url, "--json", "--no-cache", "--timeout", 5)
+    assert fetched.code == 1
+    assert fetched.json["missing"] == [1]
+    assert (fetched.json["count"], fetched.json["received"]) == (3, 2)
+    assert list(fetched.json["params"]) == ["A", "C"]
+    assert "paramclient: incomplete: index 1 did not come\n" in fetched.err
+
+
+class Secretive(PX4Vehicle):
+    """Tells a value that its hash does not cover in the list only."""
+
+    secret = next(row.name for row in px4_table() if row.volatile)
+
+    def _send_value(self, entry: Entry, **where: Any) -> None:
+        if entry.name != self.secret or self._position is not None:
+            super()._send_value(entry, **where)
+
+
+def test_a_value_that_only_the_cache_knows_is_missing(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    url = put(Secretive())
+    known = command("fetch", url, "--json", "--cache", cache).json
+    fetched = command("fetch", url, "--json", "--cache", cache, "--timeout", 2)
+    assert fetched.code == 1
+    assert fetched.json["source"] == "cache"
+    assert fetched.json["missing"] == [known["params"][Secretive.secret]["index"]]
+    assert fetched.json["received"] == len(fetched.json["params"]) == 902
+    assert Secretive.secret not in fetched.json["params"]
+
+
+def test_the_system_and_the_component_can_be_chosen(command: Command) -> None:
+    assert command("fetch", "sim:px4?system=7", "--system", 7, "--json", "--no-cache").json["system"] == 7
+    nobody = command("get", "sim:px4?system=7", "MC_ROLL_P", "--system", 6, "--timeout", 0.2, "--no-cache")
+    assert nobody.code == 3
+    nobody = command("get", "sim:px4", "MC_ROLL_P", "--component", 6, "--timeout", 0.2, "--no-cache")
+    assert nobody.code == 3
+
+
+def test_the_encoding_can_be_chosen(command: Command) -> None:
+    told = command("get", "sim:ardupilot", "RTL_ALT", "--encoding", "bytewise", "--json", "--no-cache").json
+    cast = command("get", "sim:ardupilot", "RTL_ALT", "--json", "--no-cache").json
+    assert cast["params"]["RTL_ALT"]["value"] != told["params"]["RTL_ALT"]["value"]
+
+
+# get
+
+
+def test_get_gives_the_same_shape_as_fetch(command: Command) -> None:
+    got = command("get", "sim:px4", "MC_ROLL_P", "SYS_AUTOSTART", "--json", "--no-cache")
+    assert (got.code, got.err) == (0, "")
+    assert got.json == {
+        "params": {
+            "MC_ROLL_P": {"value": 4.0, "type": "REAL32", "index": 547, "bits": "40800000"},
+            "SYS_AUTOSTART": {"value": 10040, "type": "INT32", "index": 877, "bits": "00002738"},
+        }
+    }
+
+
+def test_get_tells_what_failed_beside_what_came(command: Command) -> None:
+    got = command("get", "sim:px4?param_error=1", "NOPE", "MC_ROLL_P", "--json", "--no-cache")
+    assert got.code == 1
+    assert list(got.json) == ["params", "errors"]
+    assert list(got.json["params"]) == ["MC_ROLL_P"]
+    assert list(got.json["errors"]) == ["NOPE"]
+    assert "NOPE" in got.json["errors"]["NOPE"]
+    assert got.err == f"paramclient: {got.json['errors']['NOPE']}\n"
+
+    table = command("get", "sim:px4?param_error=1", "NOPE", "MC_ROLL_P", "--no-cache")
+    assert table.words == [["name", "value", "type", "index"], ["MC_ROLL_P", "4.0", "REAL32", "547"]]
+
+
+# set
+
+
+def test_set_tells_what_the_vehicle_made_of_it(command: Command) -> None:
+    done = command("set", "sim:ardupilot", "RTL_ALT", 1234.7, "RTL_ALT", 99, "--json", "--no-cache")
+    assert done.code == 0
+    assert done.json == {
+        "results": [
+            {"name": "RTL_ALT", "requested": 1234.7, "actual": 1234, "status": "adjusted"},
+            {"name": "RTL_ALT", "requested": 99, "actual": 99, "status": "accepted"},
+        ]
+    }
+    table = command("set", "sim:ardupilot", "RTL_ALT", 1234.7, "--no-cache")
+    assert table.words == [
+        ["name", "requested", "actual", "status"],
+        ["RTL_ALT", "1234.7", "1234", "adjusted"],
+    ]
+    assert table.err.startswith("1 of 1 set on 1/1 ardupilot in ")
+
+
+def test_nan_can_be_forced(command: Command) -> None:
+    wanted = ("MC_ROLL_P", "nan", "MC_PITCH_P", "-inf")
+    refused = command("set", "sim:px4", *wanted, "MC_YAW_P", 3, "--json", "--no-cache")
+    assert refused.code == 2
+    assert [each["status"] for each in refused.json["results"]] == ["invalid", "invalid", "accepted"]
+    assert "PX4 cannot save NaN and infinity" in refused.err
+    done = command("set", "sim:px4", *wanted, "--force", "--json", "--no-cache")
+    assert done.json["results"] == [
+        {"name": "MC_ROLL_P", "requested": "NaN", "actual": "NaN", "status": "accepted"},
+        {"name": "MC_PITCH_P", "requested": "-Infinity", "actual": "-Infinity", "status": "accepted"},
+    ]
+
+
+def test_settle_tells_what_modules_of_px4_make_of_a_value_within_a_second(command: Command) -> None:
+    wanted = ("MPC_TILTMAX_LND", 80, "MC_ROLL_P", 6.25)
+    at_once = command("set", "sim:px4", *wanted, "--json", "--no-cache")
+    assert [each["status"] for each in at_once.json["results"]] == ["accepted", "accepted"]
+    done = command("set", "sim:px4", *wanted, "--settle", 1.2, "--json", "--no-cache")
+    assert done.code == 0
+    assert done.json["results"] == [
+        {"name": "MPC_TILTMAX_LND", "requested": 80, "actual": 45.0, "status": "adjusted"},
+        {"name": "MC_ROLL_P", "requested": 6.25, "actual": 6.25, "status": "accepted"},
+    ]
+    assert command("set", "sim:px4", *wanted, "--settle", -1, "--no-cache").code == 2
+
+
+class Stubborn(GenericVehicle):
+    """Keeps what it has, without a reason."""
+
+    def _write(self, entry: Entry, bits: int) -> None:
+        pass
+
+
+class Mistyped(GenericVehicle):
+    """Says of every set that its type is wrong."""
+
+    def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
+        self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
+
+
+class Mute(GenericVehicle):
+    """Is there, and answers nothing about parameters."""
+
+    def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
+        pass
+
+    _on_set = _on_read  # type: ignore[assignment]  # it looks at neither
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "name", "value", "actual", "status", "code"),
+    [
+        (
+            ArduPilotVehicle(read_only=["RTL_ALT"], param_error=True),
+            *("RTL_ALT", 5, None, "refused", 1),
+        ),
+        (PX4Vehicle(param_error=True), "NOPE", 5, None, "unknown", 1),
+        (Mistyped({"A": 1}, param_error=True), "A", 5, None, "mismatch", 1),
+        (Stubborn({"A": 0.1}), "A", 5, 0.1, "not-applied", 1),
+        (Mute({"A": 1}), "A", 5, None, "no-reply", 3),
+        (GenericVehicle([SimParam("A", ParamType.UINT8, 1)]), "A", 300, None, "invalid", 2),
+    ],
+    ids=["refused", "unknown", "mismatch", "not-applied", "no-reply", "invalid"],
+)
+def test_a_set_that_fails_tells_why(
+    command: Command,
+    put: Callable[[Endpoint], str],
+    vehicle: Endpoint,
+    name: str,
+    value: int,
+    actual: float | None,
+    status: str,
+    code: int,
+) -> None:
+    # no time is set where the vehicle answers: then only the answer can end the command
+    limit = ["--timeout", 2] if status == "no-reply" else []
+    done = command("set", put(vehicle), name, value, "--json", "--no-cache", *limit)
+    assert done.code == code
+    [result] = done.json["results"]
+    reason = result.pop("reason")
+    assert result == {"name": name, "requested": value, "actual": actual, "status": status}
+    assert done.err == f"paramclient: {name}: {reason}\n"
+
+
+def test_a_change_too_small_for_px4_is_told(command: Command, put: Callable[[Endpoint], str]) -> None:
+    link = put(PX4Vehicle(table={"A": 0.5}))
+    done = command("set", link, "A", 0.50000006, "--no-cache")
+    assert done.code == 0
+    note = "PX4 takes a change of at most 1.19e-07 for none: its next start may bring 0.5 back"
+    assert f"A: {note}\n" in done.err
+    [result] = command("set", link, "A", 0.5, "--json", "--no-cache").json["results"]
+    assert result["note"] == note.replace("0.5 back", "0.50000006 back")
+    assert "note" not in command("set", link, "A", 0.75, "--json", "--no-cache").json["results"][0]
+
+
+def test_all_sets_are_tried_and_the_worst_counts(command: Command, put: Callable[[Endpoint], str]) -> None:
+    vehicle = GenericVehicle([SimParam("A", ParamType.UINT8, 1), SimParam("B", 6, 1)], param_error=True)
+    done = command("set", put(vehicle), "NOPE", 1, "A", 300, "B", 2, "--json", "--no-cache")
+    assert [result["status"] for result in done.json["results"]] == ["unknown", "invalid", "accepted"]
+    assert done.code == 2
+    assert vehicle.values == {"A": 1, "B": 2}
+    assert done.err.count("\n") == 2
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "held"),
+    [
+        ("I", "16777217", 16777217),
+        ("I", "-16777217", -16777217),
+        ("I", "-0x10", -16),
+        ("I", "0X1f", 31),
+        ("I", "+5", 5),
+        ("I", "010", 10),
+        ("I", "3.0", 3),
+        ("I", "1e3", 1000),
+        ("U", "4294967295", 4294967295),
+        ("F", "-.5", -0.5),
+        ("F", "7", 7.0),
+        ("F", "INF", float("inf")),
+    ],
+)
+def test_numbers_are_read_exactly(
+    command: Command, put: Callable[[Endpoint], str], name: str, text: str, held: float
+) -> None:
+    table = [SimParam("I", ParamType.INT32, 1), SimParam("U", ParamType.UINT32, 1), SimParam("F", 9, 1.0)]
+    vehicle = GenericVehicle(table)
+    done = command("set", put(vehicle), name, text, "--json", "--no-cache")
+    assert (done.code, done.json["results"][0]["status"]) == (0, "accepted")
+    assert vehicle.values[name] == held
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["true", "", " 1", "1_000", "0x", "--5", "nano", "1e999", "0b1", "\u0661", "1,5", "--jsno", "9" * 400],
+)
+def test_what_is_no_number_is_not_sent(command: Command, put: Callable[[Endpoint], str], text: str) -> None:
+    vehicle = GenericVehicle({"A": 1})
+    done = command("set", put(vehicle), "A", text, "--no-cache")
+    assert (done.code, done.out) == (2, "")
+    assert done.err.startswith("paramclient: A: ")
+    assert done.err.count("\n") == 1
+    assert not vehicle.requests
+
+
+# fetch under a policy
+
+
+@pytest.mark.parametrize("policy", ["cache-only", "hash-only"])
+def test_fetch_may_ask_for_little(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path, policy: str
+) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    rows = [SimParam("A", ParamType.INT32, 1), SimParam("CAL_ACC0_XOFF", ParamType.INT32, 2, volatile=True)]
+    vehicle = PX4Vehicle(table=rows)
+    url = put(vehicle)
+    nothing = command("fetch", url, "--cache", cache, "--policy", policy)
+    assert nothing.code == 5
+    assert "nothing is cached of 1/1" in nothing.err
+    assert command("fetch", url, "--cache", cache, "--json").json["cached"] == []
+    vehicle.requests.clear()
+    fetched = command("fetch", url, "--cache", cache, "--policy", policy, "--json")
+    assert fetched.code == 0
+    assert policy in fetched.err
+    found = fetched.json
+    assert list(found) == FETCH_KEYS
+    assert {name: param["value"] for name, param in found["params"].items()} == {"A": 1, "CAL_ACC0_XOFF": 2}
+    assert (found["source"], found["missing"], found["received"]) == ("cache", [], 2)
+    if policy == "hash-only":
+        assert found["cached"] == ["CAL_ACC0_XOFF"]
+        assert found["hash"] is not None
+        assert vehicle.requests["PARAM_REQUEST_READ"] == 1
+    else:
+        assert found["cached"] == ["A", "CAL_ACC0_XOFF"]
+        assert found["hash"] is None
+        assert vehicle.requests["PARAM_REQUEST_READ"] == 0
+    assert vehicle.requests["PARAM_REQUEST_LIST"] == 0
+    shown = command("fetch", url, "--cache", cache, "--policy", policy)
+    assert [row[-1] for row in shown.words[1:]] == [
+        "verified" if policy == "hash-only" else "cached",
+        "cached",
+    ]
+
+
+def test_a_policy_and_refresh_exclude_each_other(command: Command) -> None:
+    refused = command("fetch", "sim:px4", "--refresh", "--policy", "cache-only", "--no-cache")
+    assert (refused.code, refused.out) == (2, "")
+    assert "cache-only" in refused.err
+    unknown = command("fetch", "sim:px4", "--policy", "never", "--no-cache")
+    assert unknown.code == 2
+
+
+# what differs from the defaults
+
+
+def test_fetch_prints_what_differs_from_the_defaults(command: Command) -> None:
+    shown = command("fetch", "sim:ardupilot", "--changed", "--no-cache")
+    assert shown.code == 0
+    assert shown.words[0] == ["name", "value", "type", "index", "trust", "default"]
+    assert len(shown.words) == 42
+    assert ["RELAY1_FUNCTION", "1", "INT8", "61", "live", "0"] in shown.words
+    found = command("fetch", "sim:ardupilot", "--changed", "--json", "--no-cache").json
+    assert list(found) == FETCH_KEYS
+    assert (found["count"], found["received"], len(found["params"])) == (1382, 1382, 41)
+    assert list(found["params"]["RELAY1_FUNCTION"]) == [*PARAM_KEYS, "default"]
+    assert found["params"]["RELAY1_FUNCTION"]["default"] == 0
+    everything = command("fetch", "sim:ardupilot", "--json", "--no-cache").json["params"]
+    assert {name: param for name, param in everything.items() if param["value"] != param["default"]} == (
+        found["params"]
+    )
+
+
+def test_without_defaults_there_is_nothing_to_differ_from(command: Command, warm: Path) -> None:
+    for arguments in (("fetch", "sim:px4", "--changed"), ("show", "--changed")):
+        shown = command(*arguments, "--cache", warm)
+        assert (shown.code, shown.out) == (1, "")
+        assert "defaults are not known" in shown.err
+        found = command(*arguments, "--cache", warm, "--json")
+        assert found.code == 1
+        assert "defaults are not known" in found.err
+        assert (found.json["components"][0] if "show" in arguments else found.json)["params"] == {}
+
+
+def test_show_prints_what_differs_from_the_defaults(command: Command, tmp_path: Path) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    assert command("fetch", "sim:ardupilot", "--cache", cache).code == 0
+    shown = command("show", "--changed", "--cache", cache)
+    assert shown.code == 0
+    assert shown.words[0] == ["name", "value", "default", "type", "index", "heard"]
+    assert [row[:5] for row in shown.words if row[0] == "RELAY1_FUNCTION"] == [
+        ["RELAY1_FUNCTION", "1", "0", "INT8", "61"]
+    ]
+    assert len(shown.words) == 42
+    assert "41 of 1382 parameters differ" in shown.err
+    (table,) = command("show", "--changed", "--json", "--cache", cache).json["components"]
+    assert len(table["params"]) == 41
+    assert table["params"]["RELAY1_FUNCTION"]["default"] == 0
+    assert len(command("show", "--cache", cache).words) == 1383
+
+
+# fetch with a sample
+
+
+def test_a_sample_may_be_enough_and_says_how_sure_that_is(command: Command, tmp_path: Path) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    arguments = ("fetch", "sim:ardupilot", "--cache", cache, "--accept", "sampled")
+    first = command(*arguments, "--json")
+    assert (first.json["source"], first.json["sample"]) == ("ftp", None)
+    found = command(*arguments, "--json")
+    assert found.code == 0
+    assert (found.json["source"], found.json["received"], found.json["missing"]) == ("cache", 1382, [])
+    assert len(found.json["params"]) == 1382
+    assert len(found.json["cached"]) == 1382 - 30
+    assert found.json["sample"] == {
+        "size": 30,
+        "count": 1382,
+        "confidence": {"1": 0.0217, "10": 0.1976, "100": 0.8975},
+    }
+    shown = command(*arguments, "--sample", 60)
+    assert shown.code == 0
+    assert "60 of 1382 parameters were read and agreed" in shown.err
+    assert "4% for 1 and 36% for 10 and 99% for 100" in shown.err
+
+
+def test_a_sample_needs_to_be_accepted(command: Command) -> None:
+    refused = command("fetch", "sim:ardupilot", "--sample", 5, "--no-cache")
+    assert (refused.code, refused.out) == (2, "")
+    assert "--accept sampled" in refused.err
+    for words in (["--accept", "sampled", "--sample", "0"], ["--accept", "guessed"]):
+        assert command("fetch", "sim:ardupilot", "--no-cache", *words).code == 2
+
+
+# watch
+
+
+def test_watch_prints_lines_of_json_as_values_change(live_command: Command, tmp_path: Path) -> None:
+    with (
+        simulated("px4") as url,
+        process("watch", url, "MC_ROLL_P", "--json", "--no-cache") as watching,
+    ):
+        assert line_of(watching.stderr) == "watching MC_ROLL_P of 1/1 px4\n"
+        before = datetime.now(UTC)
+        done = live_command("set", url, "MC_PITCH_P", 7, "MC_ROLL_P", "nan", "--force", "--no-cache")
+        assert done.code == 0
+        change = strict(line_of(watching.stdout))
+        assert list(change) == ["time", "name", "old", "new", "by"]
+        at = datetime.fromisoformat(change.pop("time"))
+        assert before.timestamp() - 0.001 <= at.timestamp() <= time.time()
+        assert at.utcoffset() is not None
+        assert change == {"name": "MC_ROLL_P", "old": 4.0, "new": "NaN", "by": "vehicle"}
+        watching.send_signal(signal.SIGINT)
+        outcome = ended(watching)
+    assert (outcome.code, outcome.out, outcome.err) == (130, "", "")
+
+
+def test_watch_without_names_brings_the_table_first(live_command: Command, tmp_path: Path) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    with simulated("px4", "--system", "3") as url, process("watch", url, "--cache", cache) as watching:
+        assert line_of(watching.stderr) == "watching 903 parameters of 3/1 px4\n"
+        assert live_command("set", url, "MC_ROLL_P", 6.1, "--no-cache").code == 0
+        line = line_of(watching.stdout)
+        assert re.fullmatch(r"[0-9T:.-]+Z  MC_ROLL_P  4\.0 -> 6\.1  \(vehicle\)\n", line)
+        watching.send_signal(signal.SIGTERM)
+        assert ended(watching) == Outcome(143, "", "")
+    # what it had learnt by then was kept
+    [kept] = live_command("show", "3", "--json", "--cache", cache).json["components"]
+    assert kept["params"]["MC_ROLL_P"]["value"] == 6.1
+    assert len(kept["params"]) == 903
+
+
+def test_watch_ends_by_itself_after_its_time(command: Command) -> None:
+    watched = command("watch", "sim:px4", "MC_ROLL_P", "--timeout", 3, "--no-cache")
+    assert (watched.code, watched.out) == (0, "")
+    unknown = command("watch", "sim:px4?param_error=1", "NOPE", "--no-cache")
+    assert (unknown.code, unknown.out) == (1, "")
+
+
+def test_watch_tells_what_has_changed_since_the_cache_was_written(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    url = put(GenericVehicle({"A": 1, "B": 2}))
+    assert command("fetch", url, "--cache", cache).code == 0
+    put(GenericVehicle({"A": 1, "B": 3}))
+    watched = command("watch", url, "--json", "--cache", cache, "--timeout", 3)
+    assert watched.code == 0
+    change = watched.json
+    assert (change["name"], change["old"], change["new"]) == ("B", 2, 3)
+
+
+def goings_and_comings() -> PX4Vehicle:
+    """A vehicle that is away from 2 s on for 8 s, and comes back with another value of B."""
+
+    class Restless(PX4Vehicle):
+        begun_at: float | None = None
+
+        def tick(self, now: float) -> None:
+            if self.begun_at is None:
+                self.begun_at = now
+            elif now > self.begun_at + 1.5 and self._heartbeat.base_mode:
+                self._heartbeat = replace(self._heartbeat, base_mode=0)
+                self.set_param("B", 3)
+                self.reboot(now, down=8.0)
+            super().tick(now)
+
+    return Restless(table={"A": 1, "B": 2})
+
+
+@pytest.mark.parametrize("as_json", [True, False])
+@swiftly
+async def test_watch_tells_what_becomes_of_the_vehicle(
+    put: Callable[[Endpoint], str], capsys: pytest.CaptureFixture[str], as_json: bool
+) -> None:
+    url = put(goings_and_comings())
+    options = LinkOptions(json=as_json, no_cache=True, timeout=20.0)
+    assert await vehicle_commands.watch(url, options=options) == 0
+    printed = capsys.readouterr()
+    assert printed.err == "watching 2 parameters of 1/1 px4\n"
+    lines = printed.out.splitlines()
+    if not as_json:
+        told = [line.partition("Z  ")[2] for line in lines]
+        assert told[0] == "1/1 lost: not heard for 5.0 s"
+        assert re.fullmatch(r"1/1 found after \d\d?\.\d s", told[1])
+        assert told[2:] == [
+            "1/1 has started again",
+            "B  2 -> 3  (vehicle)",
+            "1/1 resynced: 1 had moved",
+        ]
+        return
+    lost, found, rebooted, change, resynced = (strict(line) for line in lines)
+    where = {"system": 1, "component": 1}
+    assert list(lost) == ["time", "event", "system", "component", "silence_s"]
+    for each in (lost, found, rebooted, change, resynced):
+        datetime.fromisoformat(each.pop("time"))
+    assert lost == {"event": "lost", **where, "silence_s": pytest.approx(5.0, abs=0.1)}
+    assert found == {"event": "found", **where, "silence_s": pytest.approx(9.0, abs=1.5)}
+    assert rebooted == {"event": "rebooted", **where}
+    assert change == {"name": "B", "old": 2, "new": 3, "by": "vehicle"}
+    assert resynced == {"event": "resynced", **where, "changed": ["B"], "hash": resynced["hash"]}
+    assert re.fullmatch("[0-9a-f]{8}", resynced["hash"])
+
+
+@swiftly
+async def test_watch_tells_of_its_own_vehicle_alone(
+    put: Callable[[Endpoint], str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    other = goings_and_comings()
+    other.system = 2
+    url = put(Air([PX4Vehicle(table={"A": 1}), other]))
+    assert await vehicle_commands.watch(url, options=LinkOptions(no_cache=True, timeout=20.0)) == 0
+    assert capsys.readouterr().out == ""
+
+
+@swiftly
+async def test_watch_may_only_listen(
+    put: Callable[[Endpoint], str], capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    vehicle = goings_and_comings()
+    url = put(vehicle)
+    options = LinkOptions(cache=str(tmp_path / "cache.sqlite3"), timeout=20.0)
+    assert await vehicle_commands.watch(url, policy=Policy.CACHE_ONLY, options=options) == 0
+    printed = capsys.readouterr()
+    assert printed.err == "watching 0 parameters of 1/1 px4\n"
+    assert len(printed.out.splitlines()) == 3, "lost, found, has started again"
+    assert vehicle.requests.keys() == {"HEARTBEAT", "COMMAND_LONG"}
+
+
+@pytest.mark.parametrize("is_json", [True, False])
+def test_a_link_that_fails_under_watch_is_told_once(
+    command: Command, put: Callable[[Endpoint | SimLink], str], is_json: bool
+) -> None:
+    class Failing(SimLink):
+        received = 0
+
+        async def receive(self) -> list[tuple[Peer, bytes]]:
+            self.received += 1
+            if self.received > 6:
+                raise LinkError("it is gone", link=self.name)
+            return await super().receive()
+
+    url = put(Failing(PX4Vehicle(table={"A": 1}), "sim:custom"))
+    watched = command("watch", url, "A", "--no-cache", *(["--json"] if is_json else []))
+    assert (watched.code, watched.out) == (4, "")
+    assert watched.err == "watching A of 1/1 px4\nparamclient: it is gone\n"
+
+
+# link
+
+LINK_KEYS = [
+    *("link", "seconds", "bytes_received", "bytes_sent", "received_per_s", "sent_per_s"),
+    *("frames", "unknown", "damaged", "other_bytes", "signing", "components"),
+]
+HEARD_KEYS = [
+    *("system", "component", "mavlink", "autopilot", "type", "state", "heartbeat_age_s", "age_s"),
+    *("frames", "bytes", "frames_per_s", "bytes_per_s", "lost", "loss", "repeated", "late", "signed"),
+    *("round_trip_s", "messages", "radio"),
+]
+
+
+def test_link_prints_one_object_with_exactly_these_keys(live_command: Command) -> None:
+    with simulated("px4", "--system", "7", "--delay", "0.02", "--bit-errors", "0.0001") as url:
+        heard = live_command("link", url, "--json", "--seconds", 3)
+    assert (heard.code, heard.err) == (0, "")
+    assert list(heard.json) == LINK_KEYS
+    assert heard.json["link"] == url
+    assert 2.5 <= heard.json["seconds"] < 10
+    assert 21 * 3 <= heard.json["bytes_sent"] < 1000
+    [component] = heard.json["components"]
+    assert list(component) == HEARD_KEYS
+    assert (component["system"], component["component"], component["mavlink"]) == (7, 1, 2)
+    assert (component["autopilot"], component["type"], component["state"]) == ("px4", "quadrotor", "standby")
+    assert 0 <= component["age_s"] <= component["heartbeat_age_s"] < heard.json["seconds"]
+    assert 0.03 < component["round_trip_s"] < 2
+    beats = component["messages"]["HEARTBEAT"]
+    assert beats["id"] == 0
+    assert 1 <= beats["count"] <= component["frames"] <= heard.json["frames"]
+    assert component["radio"] is None
+
+
+class Modem(PX4Vehicle):
+    """A vehicle with a telemetry radio, and with a message that no dialect has."""
+
+    def data_to_send(self) -> list[bytes]:
+        frames = super().data_to_send()
+        if frames:
+            status = b"\x03\x00\x02\x00\xc8\xbe\x60\x28\x2a"
+            frames.append(wire.build_frame(109, status, system=51, component=68, sequence=0))
+            frames.append(b"\xfd\x01\x00\x00\x00\x33\x44\xff\xff\x7f" + b"abc")
+        return frames
+
+
+def test_people_see_what_is_heard(command: Command, put: Callable[[Endpoint], str]) -> None:
+    heard = command("link", put(Modem(telemetry=20)), "--seconds", 2)
+    assert (heard.code, heard.err) == (0, "")
+    lines = heard.out.splitlines()
+    assert re.split("  +", lines[0]) == [
+        *("from", "what", "v", "frames/s", "bytes/s", "loss", "round trip", "heartbeat")
+    ]
+    assert re.fullmatch(r"1/1 +px4 quadrotor +2 +[0-9.]+ +[0-9,]+ +0\.0% +[0-9.]+ ms +[0-9.]+ s", lines[1])
+    assert re.match(r"51/68 +radio +2 +[0-9.]+ ", lines[2])
+    assert lines[3] == ""
+    assert re.match(r"1/1 standby: ATTITUDE [0-9.]+/s, HEARTBEAT [0-9.]+/s, ", lines[4])
+    assert re.match(r"51/68: RADIO_STATUS [0-9.]+/s, UNKNOWN_8388607 [0-9.]+/s$", lines[5])
+    assert lines[6] == (
+        "  signal 200 here, 190 there; noise 40 and 42; buffer 96 % free; 3 packets with errors, 2 corrected"
+    )
+    assert lines[7] == ""
+    assert re.fullmatch(r"sim:custom, [0-9.]+ s: [0-9,]+ bytes/s received, [0-9,]+ sent", lines[8])
+    assert re.fullmatch(
+        r"[0-9,]+ frames, 0 lost, 0 with a wrong checksum, [1-9][0-9]* of unknown ids, 0 signed; "
+        r"0 other bytes",
+        lines[9],
+    )
+    assert len(lines) == 10
+
+
+def test_a_link_on_which_nothing_is_heard_is_code_3(live_command: Command, put: Callable[..., str]) -> None:
+    silent = live_command("link", "udpin:127.0.0.1:0", "--seconds", 0.3, "--json")
+    assert (silent.code, silent.out) == (3, "")
+    assert re.fullmatch(r"paramclient: no reply: anything on udpin:127\.0\.0\.1:0 in [0-9.]+ s\n", silent.err)
+
+    class Noise(SimLink):
+        async def receive(self) -> list[tuple[Peer, bytes]]:
+            return [(peer, b"x" * len(data)) for peer, data in await super().receive()]
+
+    noisy = live_command("link", put(Noise(PX4Vehicle())), "--seconds", 0.3)
+    assert (noisy.code, noisy.out) == (3, "")
+    assert re.search(r"anything on sim:custom \(but [0-9,]+ other bytes\) in", noisy.err)
+
+
+def test_a_link_that_fails_while_it_is_looked_at_is_code_4(command: Command, put: Callable[..., str]) -> None:
+    class Failing(SimLink):
+        async def receive(self) -> list[tuple[Peer, bytes]]:
+            raise LinkError(f"{self.name}: gone", link=self.name)
+
+    failed = command("link", put(Failing(PX4Vehicle())), "--seconds", PATIENCE)
+    assert (failed.code, failed.out, failed.err) == (4, "", "paramclient: sim:custom: gone\n")
+
+
+def test_the_round_trip_is_measured_where_nobody_says_who_he_is(
+    command: Command, put: Callable[[Endpoint], str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Shy(PX4Vehicle):
+        def _on_command(self, *_: object) -> None:
+            pass
+
+    monkeypatch.setattr("paramclient.cli.link.FIRST_MEASURE", 0.2)
+    vehicle = Shy()
+    heard = command("link", put(vehicle), "--seconds", 2, "--json")
+    [component] = heard.json["components"]
+    assert vehicle.requests["PARAM_REQUEST_READ"] == 1
+    assert 0 <= component["round_trip_s"] < 1
+
+
+def test_link_is_live_on_a_terminal() -> None:
+    shown = on_terminal("link", "sim:px4", "--seconds", 1.5, COLUMNS="80")
+    assert shown.code == 0
+    assert shown.out.count("round trip") >= 3
+    assert shown.out.count("\x1b[?25l") == shown.out.count("\x1b[?25h") > 0  # the cursor is back
+    *_, last = shown.out.split("heartbeat")
+    assert "px4 quadrotor" in last  # and the last table stands
+    assert "1/1 standby: " in last
+    waiting = on_terminal("link", "udpin:127.0.0.1:0", "--seconds", 0.5)
+    assert waiting.code == 3
+    assert "nothing heard yet: udpin:127.0.0.1:0" in waiting.out
+    one = on_terminal("link", "sim:px4", "--seconds", 1, "--json")
+    assert strict(one.out)["components"][0]["system"] == 1
+
+
+def test_a_live_link_ends_with_ctrl_c() -> None:
+    ours, theirs = pty.openpty()
+    try:
+        with process("link", "sim:px4", stdout=theirs, env={**PLAIN, "TERM": "xterm"}) as looking:
+            os.close(theirs)
+            printed = b""
+            while b"1/1 standby" not in printed:
+                assert select.select([ours], [], [], PATIENCE)[0]
+                printed += os.read(ours, 65536)
+            looking.send_signal(signal.SIGINT)
+            while select.select([ours], [], [], PATIENCE)[0]:
+                try:
+                    printed += os.read(ours, 65536)
+                except OSError:
+                    break
+            assert (looking.wait(PATIENCE), looking.stderr and looking.stderr.read()) == (130, "")
+        *_, last = printed.decode().split("heartbeat")
+        assert "1/1 standby: " in last
+    finally:
+        os.close(ours)
+
+
+# with no link
+
+
+def test_show_gives_the_table_as_it_was(command: Command, warm: Path) -> None:
+    shown = command("show", "--json", "--cache", warm)
+    assert (shown.code, shown.err) == (0, "")
+    assert list(shown.json) == ["components"]
+    [component] = shown.json["components"]
+    assert list(component) == ["system", "component", "autopilot", "uid", "hash", "synced_at", "params"]
+    assert (component["system"], component["component"], component["autopilot"]) == (1, 1, "px4")
+    assert (component["uid"], component["hash"]) == ("4954414c44494e4f", HASH)
+    synced_at = datetime.fromisoformat(component["synced_at"])
+    assert synced_at.utcoffset() is not None
+    assert synced_at.timestamp() <= time.time()
+    fetched = command("fetch", "sim:px4", "--json", "--no-cache").json
+    assert component["params"] == fetched["params"]
+
+    table = command("show", "--cache", warm)
+    assert table.words[0] == ["name", "value", "type", "index", "heard"]
+    assert len(table.words) == 904
+    assert table.err.startswith(f"903 parameters of 1/1 px4 ({key_of(warm)}), synced 20")
+
+
+def test_show_lists_several_vehicles_and_finds_one(command: Command, warm: Path) -> None:
+    assert command("get", "sim:ardupilot?system=2", "RTL_ALT", "--cache", warm).code == 0
+    listed = command("show", "--cache", warm)
+    assert [row[:2] for row in listed.words] == [
+        ["component", "autopilot"],
+        ["2/1", "ardupilot"],
+        ["1/1", "px4"],
+    ]
+    assert "paramclient show VEHICLE" in listed.err
+    assert len(command("show", "--json", "--cache", warm).json["components"]) == 2
+    key = key_of(warm)
+    for name in ("2", key, key[: len("uid:") + 6], key.removeprefix("uid:").upper()):
+        [component] = command("show", name, "--json", "--cache", warm).json["components"]
+        assert (component["system"], component["synced_at"]) == (2, None)
+        assert list(component["params"]) == ["RTL_ALT"]
+    assert [row[0] for row in command("show", "2", "--cache", warm).words] == ["name", "RTL_ALT"]
+
+
+def test_show_says_when_there_is_nothing(command: Command, warm: Path, tmp_path: Path) -> None:
+    nowhere = tmp_path / "nothing.sqlite3"
+    assert command("show", "--json", "--cache", nowhere).json == {"components": []}
+    empty = command("show", "--cache", nowhere)
+    assert (empty.code, empty.out, empty.err) == (0, "", f"the cache {nowhere} is empty\n")
+    for arguments in (["show", "9"], ["show", "--component", "9"], ["show", "1", "--component", "9"]):
+        missing = command(*arguments, "--cache", warm)
+        assert (missing.code, missing.out) == (2, "")
+        assert missing.err.startswith("paramclient: ")
+    assert not nowhere.exists()
+
+
+def test_a_name_that_fits_two_vehicles_chooses_none(command: Command, warm: Path) -> None:
+    assert command("get", "sim:ardupilot", "RTL_ALT", "--cache", warm).code == 0
+    for arguments in (["show", "1"], ["cache", "history", "1"], ["cache", "remove", "1"]):
+        outcome = command(*arguments, "--cache", warm)
+        assert (outcome.code, outcome.out) == (2, "")
+        assert "vehicle 1 fits 2 vehicles" in outcome.err
+        assert all(f"\n  {each}\n" in outcome.err for each in ParamCache(warm).vehicles())
+    assert len(ParamCache(warm).vehicles()) == 2
+
+
+def test_the_cache_can_be_looked_into(command: Command, warm: Path) -> None:
+    assert command("set", "sim:px4", "MC_ROLL_P", 6.5, "MC_YAW_P", 3, "--cache", warm).code == 0
+
+    assert command("cache", "path", "--cache", warm).out == f"{warm}\n"
+    assert command("cache", "path", "--json", "--cache", warm).json == {"path": str(warm)}
+
+    listed = command("cache", "list", "--json", "--cache", warm).json
+    assert listed["path"] == str(warm)
+    [summary] = listed["components"]
+    assert (summary["key"], summary["size"], summary["complete"]) == (key_of(warm), 903, True)
+    assert command("cache", "list", "--cache", warm).words[1][-1] == key_of(warm)
+
+    entries = command("cache", "history", "1", "--json", "--cache", warm).json["history"]
+    assert [list(entry) for entry in entries] == [["time", "component", "name", "old", "new", "by"]] * 2
+    assert [entry["name"] for entry in entries] == ["MC_ROLL_P", "MC_YAW_P"]
+    assert (entries[0]["old"], entries[0]["new"], entries[0]["by"]) == (4.0, 6.5, "us")
+    for narrowed in (["1", "MC_YAW_P"], ["1", "--limit", 1]):
+        [entry] = command("cache", "history", *narrowed, "--json", "--cache", warm).json["history"]
+        assert entry == entries[1]
+    other = command("cache", "history", "1", "--component", 9, "--json", "--cache", warm)
+    assert other.json == {"history": []}
+    assert command("cache", "history", "1", "MC_ROLL_P", "--cache", warm).words[1][2:] == [
+        *("MC_ROLL_P", "4.0", "6.5", "us")
+    ]
+
+
+def test_a_vehicle_can_be_forgotten(command: Command, warm: Path) -> None:
+    key = key_of(warm)
+    assert command("cache", "remove", "1", "--component", 9, "--cache", warm).code == 2
+    removed = command("cache", "remove", "1", "--json", "--cache", warm)
+    assert (removed.code, removed.json) == (0, {"key": key, "removed": 1})
+    assert command("cache", "list", "--json", "--cache", warm).json["components"] == []
+    assert command("cache", "remove", "1", "--cache", warm).code == 2
+
+
+# how it ends
+
+
+@pytest.mark.parametrize(
+    ("arguments", "text"),
+    [
+        (["fech", "sim:px4"], "fetch"),
+        (["fetch"], "URL"),
+        (["fetch", "sim:px4", "--bogus"], "--bogus"),
+        (["fetch", "sim:px4", "--no-json"], "--no-json"),
+        (["fetch", "sim:px4", "--system", "0"], "--system"),
+        (["fetch", "sim:px4", "--system", "x"], "--system"),
+        (["fetch", "sim:px4", "--timeout", "nan"], "seconds above 0"),
+        (["fetch", "sim:px4", "--timeout", "0"], "seconds above 0"),
+        (["fetch", "sim:px4", "--cache", "x", "--no-cache"], "exclude each other"),
+        (["fetch", "sim:px4", "--encoding", "json"], "bytewise"),
+        (["get", "sim:px4"], "NAME"),
+        (["get", "sim:px4", "SEVENTEEN_LETTERS", "--no-cache"], "SEVENTEEN_LETTERS"),
+        (["set", "sim:px4", "A"], "pairs"),
+        (["set", "sim:px4"], "pairs"),
+        (["watch", "sim:px4", "ÄÖÜ"], "ASCII"),
+        (["sim", "px5"], "px4"),
+        (["sim", "px4", "--link", "sim:px4"], "vehicle itself"),
+        (["sim", "px4", "--loss", "2", "--link", "tcp:127.0.0.1:1"], "loss"),
+        (["sim", "px4", "--dead", "NOPE", "--link", "tcp:127.0.0.1:1"], "NOPE"),
+        (["sim", "px4", "--list-stops-at", "-1", "--link", "tcp:127.0.0.1:1"], "list_stops_at"),
+        (["sim", "px4", "--reboot-at", "0", "--link", "tcp:127.0.0.1:1"], "values from 1 up"),
+        (["sim", "px4", "--other-list-every", "0", "--link", "tcp:127.0.0.1:1"], "list_every"),
+        (["cache", "history"], "VEHICLE"),
+    ],
+)
+def test_bad_arguments_are_code_2_and_one_line(command: Command, arguments: list[str], text: str) -> None:
+    outcome = command(*arguments)
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err.startswith("paramclient: ")
+    assert outcome.err.count("\n") == 1
+    assert text in outcome.err
+
+
+def test_a_bad_link_name_tells_the_forms(command: Command) -> None:
+    outcome = command("fetch", "carrier-pigeon", "--no-cache")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err.startswith("paramclient: link name 'carrier-pigeon': ")
+    assert "\n  udpin:HOST:PORT " in outcome.err
+
+
+def test_a_vehicle_that_is_not_there_is_code_3(live_command: Command) -> None:
+    outcome = live_command("fetch", "udpin:127.0.0.1:0", "--timeout", 0.1, "--no-cache", "--json")
+    assert (outcome.code, outcome.out) == (3, "")
+    assert outcome.err == "paramclient: no reply: an autopilot in 0.1 s\n"
+
+
+def test_a_vehicle_that_does_not_answer_is_code_3(command: Command, put: Callable[[Endpoint], str]) -> None:
+    class Deaf(Mute):
+        def _on_list(self) -> None:
+            pass
+
+    outcome = command("fetch", put(Deaf({"A": 1})), "--timeout", 0.5, "--no-cache")
+    assert (outcome.code, outcome.out) == (3, "")
+
+
+def test_a_link_that_fails_is_code_4(live_command: Command, put: Callable[..., str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        outcome = live_command("fetch", f"tcp:127.0.0.1:{port}", "--no-cache")
+    assert (outcome.code, outcome.out) == (4, "")
+    assert "connection refused" in outcome.err
+    assert outcome.err.count("\n") == 1
+
+    class Dropping(SimLink):
+        async def receive(self) -> list[tuple[Peer, bytes]]:
+            data = await super().receive()
+            if self.endpoint.requests["PARAM_SET"]:  # type: ignore[attr-defined]  # a vehicle's
+                raise LinkError(f"{self.name}: gone", link=self.name)
+            return data
+
+    done = live_command(
+        "set", put(Dropping(GenericVehicle({"A": 1}))), "A", 2, "A", 3, "--json", "--no-cache"
+    )
+    assert done.code == 4
+    assert [result["status"] for result in done.json["results"]] == ["link", "link"]
+
+
+def test_a_cache_that_fails_is_code_5_and_only_a_warning_for_fetch(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+) -> None:
+    for arguments in (["show"], ["show", "--json"], ["cache", "list"], ["cache", "history", "1"]):
+        outcome = command(*arguments, "--cache", tmp_path)
+        assert (outcome.code, outcome.out) == (5, "")
+        assert outcome.err.startswith(f"paramclient: {tmp_path} ")
+        assert outcome.err.count("\n") == 1
+    fetched = command("fetch", put(GenericVehicle({"A": 1})), "--json", "--cache", tmp_path)
+    assert (fetched.code, fetched.json["received"]) == (0, 1)
+    warned, told = fetched.err.splitlines()
+    assert warned.startswith("paramclient: warning: going on without the cache: ")
+    assert "not written to the cache, and lost: 1 value" in told
+
+
+def test_every_error_has_a_code_and_every_failed_set_a_word() -> None:
+    def kinds(error: type[ParamClientError]) -> Iterator[type[ParamClientError]]:
+        yield error
+        for each in error.__subclasses__():
+            yield from kinds(each)
+
+    ours = [kind for kind in kinds(ParamClientError) if kind.__module__ == "paramclient.errors"]
+    assert len(ours) > 9
+    for kind in ours:
+        if kind is not ParamClientError:
+            error = kind.__new__(kind)
+            assert code_of(error) > ExitCode.DONE
+            if kind not in (CacheError, PackError, paramclient.VehicleError):
+                assert status_of(error)
+    assert code_of(ClientClosed("", link="")) == ExitCode.LINK
+
+
+def test_signals_are_handled_as_before_afterwards(command: Command, put: Callable[[Endpoint], str]) -> None:
+    class Interrupting(Mute):
+        def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
+            signal.raise_signal(signal.SIGTERM)
+
+    before = [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)]
+    assert command("get", put(GenericVehicle({"A": 1})), "A", "--no-cache").code == 0
+    assert command("get", put(Interrupting({"A": 1})), "A", "--no-cache").code == 143
+    assert [signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)] == before
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+def test_a_fetch_that_is_interrupted_ends_cleanly(number: int, code: int, tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.settimeout(PATIENCE)
+        url = f"udpout:127.0.0.1:{listener.getsockname()[1]}"
+        with process("fetch", url, "--cache", tmp_path / "cache.sqlite3") as fetching:
+            listener.recv(100)  # the client is at work
+            fetching.send_signal(number)
+            assert ended(fetching) == Outcome(code, "", "")
+
+
+def test_a_fetch_that_is_interrupted_in_a_file_has_it_closed_on_board() -> None:
+    vehicle = ArduPilotVehicle(live_period=0)
+    with flying(Air.symmetric([vehicle], delay=0.05)) as url:
+        with process("fetch", url, "--no-cache") as fetching:
+            while not vehicle.open_files:
+                assert fetching.poll() is None
+                time.sleep(0.001)
+            fetching.send_signal(signal.SIGINT)
+            assert ended(fetching) == Outcome(130, "", "")
+        assert not vehicle.open_files
+        assert vehicle.requests["FILE_TRANSFER_PROTOCOL"] >= 2
+        again = run_process("fetch", url, "--no-cache", "--json")
+        assert again.json["source"] == "ftp"
+        assert again.json["elapsed_s"] < 2.0, "a session that stays open is closed on board after 3 s"
+
+
+def test_a_second_signal_does_not_wait(live_command: Command, warm: Path) -> None:
+    with simulated("px4") as url, process("watch", url, "MC_ROLL_P", "--cache", warm) as watching:
+        line_of(watching.stderr)
+        with sqlite3.connect(warm) as other:
+            other.execute("BEGIN IMMEDIATE")  # closing has to wait: the change cannot be written
+            assert live_command("set", url, "MC_ROLL_P", 6, "--no-cache").code == 0
+            line_of(watching.stdout)
+            deadline = time.monotonic() + PATIENCE
+            while watching.poll() is None and time.monotonic() < deadline:
+                watching.send_signal(signal.SIGINT)
+                time.sleep(0.05)
+        other.close()
+        assert ended(watching) == Outcome(-signal.SIGINT, "", "")
+
+
+def test_sim_ends_cleanly() -> None:
+    with process("sim", "ardupilot", "--link", "tcpin:127.0.0.1:0", "--component", "9") as started:
+        assert re.fullmatch(
+            r"ardupilot 1/9 listens on tcpin:127\.0\.0\.1:[1-9][0-9]*; Ctrl-C ends it\n",
+            line_of(started.stdout),
+        )
+        started.send_signal(signal.SIGINT)
+        assert ended(started) == Outcome(130, "", "")
+
+
+class FarEnd:
+    """Speaks to a simulated vehicle in another process: takes its messages until one is what was wanted."""
+
+    def __init__(self, url: str) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.settimeout(PATIENCE)
+        self._socket.connect(("127.0.0.1", int(url.rpartition(":")[2])))
+
+    def ask(self, *requests: wire.Message) -> None:
+        for request in requests:
+            self._socket.send(wire.encode(request, system=255, component=190, sequence=0))
+
+    def until(self, is_last: Callable[[wire.Frame, wire.Message | None], bool]) -> list[wire.Message | None]:
+        messages: list[wire.Message | None] = []
+        while True:
+            [frame] = wire.Framer(stream=False).receive(self._socket.recv(300))
+            messages.append(wire.decode(frame))
+            if is_last(frame, messages[-1]):
+                return messages
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+
+def test_sim_with_dead_indices_and_lists_that_stop() -> None:
+    misfortunes = ["--dead", "3", "--dead", "ATT_EN", "--list-stops-at", 10, "--list-stops", "inf"]
+    with simulated("px4", *map(str, misfortunes)) as url, FarEnd(url) as far:
+        dead = PX4Vehicle().param("ATT_EN").index
+        far.ask(wire.ParamRequestList(1, 1))
+        for _ in range(2):
+            found = far.until(lambda _, message: isinstance(message, wire.Heartbeat))
+            listed = [each.param_index for each in found if isinstance(each, wire.ParamValue)][1:]
+            if listed:
+                break
+        assert listed == [index for index in range(12) if index not in (3, dead)]
+        far.ask(wire.ParamRequestRead(1, 1, "", 3), wire.ParamRequestRead(1, 1, "", 100))
+        *_, answer = far.until(lambda _, message: isinstance(message, wire.ParamValue))
+        assert isinstance(answer, wire.ParamValue)
+        assert answer.param_index == 100
+
+
+def test_sim_that_boots_and_reboots_in_mid_stream() -> None:
+    def says(status: int) -> Callable[[wire.Frame, wire.Message | None], bool]:
+        return lambda _, message: isinstance(message, wire.Heartbeat) and message.system_status == status
+
+    misfortunes = ["--boot-time", "1", "--reboot-at", "50", "--reboot-down", "0.2"]
+    with simulated("ardupilot", *misfortunes) as url, FarEnd(url) as far:
+        far.ask(wire.Heartbeat(6, 8))
+        far.until(says(3))
+        far.ask(wire.ParamRequestList(1, 1))
+        found = far.until(says(wire.MAV_STATE_BOOT))
+        assert sum(isinstance(each, wire.ParamValue) for each in found) <= 50
+
+
+def test_sim_on_a_satellite_link_beside_another_station() -> None:
+    misfortunes = ["--system", "7", "--high-latency", "--other-list-every", "0.2"]
+    with simulated("px4", *misfortunes) as url, FarEnd(url) as far:
+        far.ask(wire.Heartbeat(6, 8))
+        heard = set()
+
+        def is_both(frame: wire.Frame, message: wire.Message | None) -> bool:
+            if isinstance(message, wire.ParamRequestList):
+                assert message == wire.ParamRequestList(7, 1)
+            heard.add((frame.system, type(message)))
+            return {(7, wire.HighLatency2), (254, wire.ParamRequestList)} <= heard
+
+        far.until(is_both)
+        assert {kind for system, kind in heard if system == 7} == {wire.HighLatency2}
+
+
+def test_a_closed_pipe_ends_it_without_a_word(warm: Path) -> None:
+    for arguments in (["fetch", "sim:px4"], ["fetch", "sim:px4", "--json"], ["show"], ["cache", "path"]):
+        reading, writing = os.pipe()
+        os.close(reading)
+        try:
+            outcome = run_process(*arguments, "--cache", warm, stdout=writing)
+        finally:
+            os.close(writing)
+        assert (outcome.code, outcome.err) == (141, "")
+
+
+def test_a_full_disk_is_told(warm: Path) -> None:
+    with Path("/dev/full").open("w") as full:
+        outcome = run_process("show", "--json", "--cache", warm, stdout=full)
+    assert outcome.code == 1
+    assert outcome.err == "paramclient: cannot write the output: No space left on device\n"
+
+
+# what it needs, and what it loads
+
+
+def test_without_the_extra_it_says_what_to_install() -> None:
+    program = """if True:
+        import sys
+        sys.modules["cyclopts"] = sys.modules["rich"] = None
+        sys.argv = ["paramclient", "fetch", "sim:px4"]
+        from paramclient.__main__ import main
+        main()
+    """
+    outcome = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE
+    )
+    assert (outcome.returncode, outcome.stdout) == (2, "")
+    assert outcome.stderr == (
+        "paramclient: the command needs cyclopts and rich: pip install 'paramclient[cli]'\n"
+    )
+
+
+def printed_by(program: str) -> str:
+    """What a Python program of its own prints."""
+    return subprocess.run(
+        [sys.executable, "-c", program],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=PATIENCE,
+    ).stdout
+
+
+def test_rich_and_the_simulators_load_only_where_they_are_needed() -> None:
+    program = (
+        "import sys, paramclient.cli; print([n for n in ('rich', 'paramclient.sim') if n in sys.modules])"
+    )
+    assert printed_by(program) == "[]\n"
+
+
+def test_the_module_is_the_command() -> None:
+    assert run_process("--version") == Outcome(0, f"paramclient {paramclient.__version__}\n", "")
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        *([name] for name in ("fetch", "get", "set", "watch", "link", "show", "sim", "cache")),
+        ["cache", "list"],
+    ],
+    ids=" ".join,
+)
+def test_help_has_examples(command: Command, arguments: Sequence[str]) -> None:
+    helped = command(*arguments, "--help")
+    assert (helped.code, helped.err) == (0, "")
+    assert helped.out.startswith(f"Usage: {' '.join(['paramclient', *arguments])} ")
+    assert f"Examples:\n  {' '.join(['paramclient', *arguments])}" in helped.out
+    assert ESCAPE not in helped.out
+    if not arguments:
+        assert "Exit codes: 0 done;" in helped.out
+        assert command().out == helped.out
+
+
+# what people see
+
+
+class Hostile:
+    """A vehicle whose names are what a terminal would obey.
+
+    Everything goes to and from a plain vehicle; only the names are exchanged on the way.
+    """
+
+    NAMES = ("\x1b[2J\x1b]0;own\x07", "[red]B[/red]", "\x9b31mC\r\n", "D\u00e9\x7f:boom:")
+
+    def __init__(self) -> None:
+        self.vehicle = GenericVehicle(dict.fromkeys("ABCD", 1))
+
+    def receive(self, data: bytes, now: float) -> None:
+        self.vehicle.receive(data, now)
+
+    def tick(self, now: float) -> None:
+        self.vehicle.tick(now)
+
+    def next_deadline(self) -> float | None:
+        return self.vehicle.next_deadline()
+
+    def data_to_send(self) -> list[bytes]:
+        return [self._renamed(data) for data in self.vehicle.data_to_send()]
+
+    def _renamed(self, data: bytes) -> bytes:
+        [frame] = wire.Framer(stream=False).receive(data)
+        message = wire.decode(frame)
+        if isinstance(message, wire.ParamValue):
+            name = self.NAMES["ABCD".index(message.param_id)]
+            message = message._replace(param_id=name)
+            return wire.encode(message, system=1, component=1, sequence=frame.sequence)
+        return data
+
+
+def test_nothing_from_the_wire_reaches_the_terminal_as_it_came(
+    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
+) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    url = put(Hostile())
+    for outcome in (fetched := command("fetch", url, "--cache", cache), command("show", "--cache", cache)):
+        assert [row[0] for row in outcome.words[1:]] == ["[red]B[/red]"]  # the others are no usable names
+        assert (outcome.out + outcome.err).replace("\n", "").isprintable()
+        assert (outcome.out + outcome.err).isascii()
+    assert fetched.code == 1
+    assert "no parameter file can hold the name" in fetched.err
+    fetched = command("fetch", url, "--json", "--cache", cache)
+    assert list(fetched.json["params"]) == ["[red]B[/red]"]
+    assert fetched.out.replace("\n", "").isprintable()
+    assert fetched.out.isascii()
+
+
+def test_a_hash_has_8_digits() -> None:
+    assert hash_text(0x1F) == "0000001f"
+    assert hash_text(None) is None
+
+
+def test_a_narrow_terminal_does_not_narrow_a_pipe(warm: Path) -> None:
+    listed = run_process("cache", "list", "--cache", warm, env={**PLAIN, "COLUMNS": "20"})
+    assert listed.words[1][-1] == key_of(warm)
+
+
+def test_unprintable_text_is_escaped() -> None:
+    assert printable("A_1 [x]") == "A_1 [x]"
+    assert printable("\x00\u202e\U0001f4a9\n\t") == "\\x00\\u202e\\U0001f4a9\\x0a\\x09"
+
+
+def on_terminal(*arguments: object, **environment: str) -> Outcome:
+    """The command with its stdout and stderr on one terminal."""
+    ours, theirs = pty.openpty()
+    printed = b""
+    try:
+        with process(
+            *arguments, stdout=theirs, stderr=theirs, env={**PLAIN, "TERM": "xterm", **environment}
+        ) as started:
+            os.close(theirs)
+            # the terminal is at its end when the last one who has it open goes
+            while select.select([ours], [], [], PATIENCE)[0]:
+                try:
+                    printed += os.read(ours, 65536)
+                except OSError:
+                    break
+            return Outcome(started.wait(PATIENCE), printed.decode(), "")
+    finally:
+        os.close(ours)
+
+
+def test_progress_is_drawn_on_a_terminal(tmp_path: Path) -> None:
+    shown = on_terminal("fetch", "sim:px4", "--no-cache")
+    assert shown.code == 0
+    assert re.search(r"fetching 1/1 px4 .*[0-9]+/903 [0-9]+/s, [0-9]+ s left", shown.out)
+    assert "\x1b[1m" in shown.out  # the heading of the table
+    assert shown.out.count("\x1b[?25l") == shown.out.count("\x1b[?25h") > 0  # the cursor is back
+
+    plain = on_terminal("fetch", "sim:px4", "--no-cache", NO_COLOR="1")
+    assert re.search(r"[0-9]+/903", plain.out)
+    assert not re.search(r"\x1b\[(3|9)[0-9]m", plain.out)
+
+
+def test_nothing_is_drawn_for_what_takes_no_time(warm: Path) -> None:
+    shown = on_terminal("fetch", "sim:px4", "--cache", warm)
+    assert shown.code == 0
+    assert "from cache in" in shown.out
+    assert "fetching" not in shown.out
+
+
+def test_a_pipe_gets_no_escape_codes(tmp_path: Path) -> None:
+    fetched = run_process("fetch", "sim:px4", "--cache", tmp_path / "cache.sqlite3")
+    assert fetched.code == 0
+    assert len(fetched.out.splitlines()) == 904
+    assert ESCAPE not in fetched.out + fetched.err
+    assert "\r" not in fetched.out + fetched.err
+
+
+# sim
+
+
+def test_sim_serves_other_processes_through_a_faulty_link(live_command: Command) -> None:
+    arguments = ["px4", "--loss", "0.05", "--delay", "0.01", "--jitter", "0.005", "--seed", "1"]
+    with simulated(*arguments, "--system", "42", "--bit-errors", "0.00001", "--duplicate", "0.01") as url:
+        fetched = live_command("fetch", url, "--json", "--no-cache")
+    assert fetched.code == 0
+    assert (fetched.json["system"], fetched.json["received"], fetched.json["missing"]) == (42, 903, [])
+    with simulated("px4", "--loss", "1") as url:
+        assert live_command("get", url, "MC_ROLL_P", "--timeout", 1, "--no-cache").code == 3
+
+
+def test_sim_answers_with_param_error_where_asked(live_command: Command) -> None:
+    with simulated("ardupilot", "--param-error") as url:
+        got = live_command("get", url, "NOPE", "--json", "--no-cache")
+    assert got.code == 1
+    assert "silent" not in got.json["errors"]["NOPE"]
+
+
+def test_sim_speaks_first_on_udpout() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+        free.bind(("127.0.0.1", 0))
+        free.settimeout(PATIENCE)
+        link = f"udpout:127.0.0.1:{free.getsockname()[1]}"
+        with process("sim", "px4", "--link", link) as started:
+            assert line_of(started.stdout) == f"px4 1/1 speaks to {link}; Ctrl-C ends it\n"
+            [heartbeat] = wire.Framer(stream=False).receive(free.recv(300))
+    assert (heartbeat.message_id, heartbeat.system) == (0, 1)
+
+
+def test_sim_on_a_byte_stream_joins_what_was_cut() -> None:
+    request = wire.encode(wire.ParamRequestRead(1, 1, "MC_ROLL_P"), system=255, component=190, sequence=0)
+    framer = wire.Framer()
+    messages: list[wire.Message | None] = []
+    with process("sim", "px4", "--link", "tcpin:127.0.0.1:0") as started:
+        found = re.search(r":([0-9]+);", line_of(started.stdout))
+        assert found is not None
+        with socket.create_connection(("127.0.0.1", int(found[1])), PATIENCE) as connection:
+
+            def receive(heartbeats: int) -> None:
+                while sum(isinstance(each, wire.Heartbeat) for each in messages) < heartbeats:
+                    messages.extend(map(wire.decode, framer.receive(connection.recv(4096))))
+
+            connection.sendall(request[:9])
+            receive(2)  # by then the first half has been read
+            connection.sendall(request[9:])
+            receive(4)
+    values = [each.param_id for each in messages if isinstance(each, wire.ParamValue)]
+    assert values == ["MC_ROLL_P"]
+
+
+def test_the_garbage_collector_leaves_out_what_is_loaded_when_a_command_begins() -> None:
+    program = (
+        "import gc, paramclient.cli as cli\n"
+        "cli.run = lambda arguments: print(gc.get_freeze_count(), len(gc.get_objects())) or 0\n"
+        "from paramclient.__main__ import main\n"
+        "main()"
+    )
+    frozen, rest = map(int, printed_by(program).split())
+    assert frozen > 10 * rest
+
+
+def test_a_command_loads_its_own_modules_only() -> None:
+    """To start is a part of the time that each call takes."""
+    program = (
+        "import sys; from paramclient.cli import run; run(['ports', '--json']); "
+        "print([name for name in sys.modules if name.startswith('paramclient.cli.')])"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, env=PLAIN, capture_output=True, text=True, timeout=PATIENCE
+    )
+    loaded = set(strict(done.stdout.splitlines()[-1].replace("'", '"')))
+    assert "paramclient.cli.ports" in loaded
+    assert not loaded & {f"paramclient.cli.{name}" for name in ("diff", "setup", "serve", "vehicle", "fleet")}
+
+
+@pytest.mark.parametrize("words", [(), ("--help",), ("cache",), ("fleet", "--help")])
+def test_a_page_of_help_says_what_each_command_does(words: tuple[str, ...], command: Command) -> None:
+    out = command(*words).out
+    rows = re.findall(r"^│ ([a-z]+) +(\S.*)│$", out, re.MULTILINE)
+    assert rows
+    assert all(text.strip() for _, text in rows)
+    assert len(re.findall(r"^│ [a-z]+ ", out, re.MULTILINE)) == len(rows)

@@ -1,0 +1,596 @@
+"""The command diff: what it compares, what it prints, how it ends; and where its parameters come from."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import select
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from paramclient import ParamCache, ParamClient, ParamType
+from paramclient.cache import StoredParam, TableState
+from paramclient.cli import connection, run
+from paramclient.links import SimLink
+from paramclient.model.identity import Identity
+from paramclient.model.values import Param, Value, bits_of, from_bits
+from paramclient.sim import GenericVehicle, PX4Vehicle, SimParam, Vehicle
+from paramclient.sim.param_table import Entry
+from tests.caches import NOW, PX4, update
+from tests.commands import Command, in_process
+
+ROOT = Path(__file__).parents[2]
+PATIENCE = 60.0  # seconds after which a test gives up; nothing waits that long when all is well
+
+INT32, REAL32 = ParamType.INT32, ParamType.REAL32
+AT = "2026-11-18T11:06:40.000Z"
+"""NOW, as it is printed."""
+FIRST = replace(PX4, system=1, uid="aa00000000000001")
+SECOND = replace(PX4, system=2, uid="bb00000000000002")
+THIRD = replace(PX4, system=3, uid="cc00000000000003")
+
+Content = dict[str, tuple[Value, int] | tuple[Value, int, Value]]
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    return tmp_path / "cache.sqlite3"
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], cache: Path) -> Command:
+    """Runs the command in this process, with a cache of its own."""
+    return in_process(capsys, "--cache", str(cache))
+
+
+def keep(
+    cache: Path, content: Content, identity: Identity = FIRST, *, component: int = 1, complete: bool = True
+) -> None:
+    """Put a table into the cache."""
+    params = [
+        StoredParam(
+            Param(
+                name, value, number, index, bits_of(value, number), default=default[0] if default else None
+            ),
+            NOW,
+        )
+        for index, (name, (value, number, *default)) in enumerate(content.items())
+    ]
+    state = TableState(None, len(params) + (not complete), complete=complete, synced_at=NOW)
+    with ParamCache(cache) as kept:
+        kept.save(update(*params, identity=identity, component=component, replace=True, table=state))
+
+
+BEFORE: Content = {
+    "A_SAME": (1, INT32, 1),
+    "B_FLOAT": (0.1, REAL32, 0.1),
+    "C_LEFT": (5, INT32, 5),
+    "E_BOTH": (7, INT32, 0),
+    "F_CONFLICT": (1.5, REAL32, 0.0),
+    "G_TYPE": (1, INT32, 1),
+}
+AFTER: Content = {
+    "A_SAME": (1, INT32, 1),
+    "B_FLOAT": (0.2, REAL32, 0.1),
+    "D_RIGHT": (6, INT32, 0),
+    "E_BOTH": (7, INT32, 0),
+    "F_CONFLICT": (2.5, REAL32, 0.0),
+    "G_TYPE": (1.0, REAL32, 1),
+}
+
+
+@pytest.fixture
+def two(cache: Path) -> None:
+    """Two vehicles in the cache."""
+    keep(cache, BEFORE)
+    keep(cache, AFTER, SECOND)
+
+
+@pytest.mark.usefixtures("two")
+def test_people_see_what_differs(command: Command) -> None:
+    outcome = command("diff", 1, 2)
+    assert outcome.code == 1
+    assert outcome.rows == [
+        ["name", "left", "right", "is"],
+        ["B_FLOAT", "0.1", "0.2", "different"],
+        ["C_LEFT", "5", "only left"],
+        ["D_RIGHT", "6", "only right"],
+        ["F_CONFLICT", "1.5", "2.5", "different"],
+        ["G_TYPE", "1", "1.0", "same, INT32 and REAL32"],
+    ]
+    assert outcome.err.splitlines() == [
+        f"left: 6 parameters of 1/1 px4 from cache uid:aa00000000000001, {AT}",
+        f"right: 6 parameters of 2/1 px4 from cache uid:bb00000000000002, {AT}",
+        "3 same; 2 different; 1 only left; 1 only right; 1 of another type",
+    ]
+
+
+@pytest.mark.usefixtures("two")
+def test_all_names_what_is_the_same_too(command: Command) -> None:
+    assert ["A_SAME", "1", "1", "same"] in command("diff", 1, 2, "--all").rows
+
+
+@pytest.mark.usefixtures("two")
+def test_a_base_tells_who_has_moved(command: Command, cache: Path) -> None:
+    keep(cache, {"B_FLOAT": (0.1, REAL32), "F_CONFLICT": (0.5, REAL32)}, THIRD)
+    outcome = command("diff", 1, 2, "--base", 3)
+    assert outcome.rows[0] == ["name", "left", "right", "base", "is", "moved"]
+    assert {row[0]: row[1:] for row in outcome.rows[1:]} == {
+        "B_FLOAT": ["0.1", "0.2", "0.1", "different", "right"],
+        "C_LEFT": ["5", "only left", "unknown"],
+        "D_RIGHT": ["6", "only right", "unknown"],
+        "F_CONFLICT": ["1.5", "2.5", "0.5", "different", "conflict"],
+        "G_TYPE": ["1", "1.0", "same, INT32 and REAL32", "unknown"],
+    }
+    assert "; moved from the base: 1 right, 1 conflict; 5 not in the base\n" in outcome.err
+
+
+@pytest.mark.usefixtures("two")
+def test_the_defaults_are_a_base(command: Command) -> None:
+    outcome = command("diff", 1, 2, "--base", "defaults", "--json")
+    assert outcome.code == 1
+    assert outcome.json["base"]["source"] == "the firmware's defaults"
+    assert outcome.json["moves"] == {"neither": 3, "left": 0, "right": 2, "both": 1, "conflict": 1}
+    moved = {name: (entry["is"], entry["moved"]) for name, entry in outcome.json["params"].items()}
+    assert moved == {
+        "B_FLOAT": ("different", "right"),
+        "C_LEFT": ("only left", "neither"),
+        "D_RIGHT": ("only right", "right"),
+        "E_BOTH": ("same", "both"),
+        "F_CONFLICT": ("different", "conflict"),
+        "G_TYPE": ("same", "neither"),
+    }
+
+
+def test_defaults_that_nobody_knows_are_no_base(command: Command, cache: Path) -> None:
+    keep(cache, {"A": (1, INT32)})
+    outcome = command("diff", 1, 1, "--base", "defaults")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert "defaults are not known" in outcome.err
+
+
+def test_the_same_is_code_0_and_prints_no_table(command: Command, cache: Path) -> None:
+    keep(cache, {"A": (0.0, REAL32), "B": (1, INT32)})
+    keep(cache, {"B": (1, INT32), "A": (-0.0, REAL32)}, SECOND)
+    outcome = command("diff", 1, 2)
+    assert (outcome.code, outcome.out) == (0, "")
+    assert outcome.err.splitlines()[-1] == "2 same"
+    told = command("diff", 1, 2, "--json")
+    assert (told.code, told.err, told.json["same"], told.json["params"]) == (0, "", True, {})
+
+
+def test_another_type_alone_is_told_and_no_difference(command: Command, cache: Path) -> None:
+    keep(cache, {"A": (1, INT32)})
+    keep(cache, {"A": (1.0, REAL32)}, SECOND)
+    outcome = command("diff", 1, 2)
+    assert (outcome.code, outcome.rows[1:]) == (0, [["A", "1", "1.0", "same, INT32 and REAL32"]])
+    assert outcome.err.splitlines()[-1] == "1 same; 1 of another type"
+
+
+def test_programs_get_exact_values(command: Command, cache: Path) -> None:
+    keep(cache, {"A": (float("nan"), REAL32), "B": (16777217, INT32), "C": (b"\1\0\0\0", ParamType.UINT64)})
+    keep(cache, {"A": (from_bits(0x7FC00001, REAL32), REAL32), "B": (16777216, INT32)}, SECOND)
+    outcome = command("diff", 1, 2, "--json")
+    assert outcome.err == ""
+    told = outcome.json
+    assert list(told) == ["same", "left", "right", "base", "counts", "moves", "params"]
+    assert (told["same"], told["base"], told["moves"]) == (False, None, None)
+    assert told["left"] == {
+        "source": "cache uid:aa00000000000001",
+        "system": 1,
+        "component": 1,
+        "autopilot": "px4",
+        "uid": "aa00000000000001",
+        "at": AT,
+        "count": 3,
+    }
+    assert told["counts"] == {"same": 0, "different": 2, "only left": 1, "only right": 0}
+    assert told["params"]["A"] == {
+        "is": "different",
+        "types_differ": False,
+        "rounding": False,
+        "left": {"value": "NaN", "type": "REAL32", "bits": "7fc00000"},
+        "right": {"value": "NaN", "type": "REAL32", "bits": "7fc00001"},
+        "base": None,
+        "moved": None,
+    }
+    integers = told["params"]["B"]
+    assert integers["left"] == {"value": 16777217, "type": "INT32", "bits": "01000001"}
+    assert (integers["is"], integers["rounding"]) == ("different", True)
+    raw = told["params"]["C"]
+    assert raw["left"] == {"value": "0x00000001", "type": "UINT64", "bits": "0000000000000001"}
+    assert (raw["is"], raw["right"]) == ("only left", None)
+    people = command("diff", 1, 2).rows
+    assert people[1] == ["A", "nan = 0x7fc00000", "nan = 0x7fc00001", "different"]
+    assert people[2] == ["B", "16777217", "16777216", "different, the same as float32"]
+
+
+@pytest.mark.usefixtures("two")
+def test_what_only_the_other_has_may_be_left_out_and_what_only_this_one_has_may_not(command: Command) -> None:
+    names = set(command("diff", 1, 2, "--partial", "--json").json["params"])
+    assert names == set(command("diff", 1, 2, "--json").json["params"]) - {"D_RIGHT"}
+    assert "C_LEFT" in names
+
+
+def test_a_file_of_a_few_values_may_be_the_same_as_a_whole_vehicle(
+    command: Command, cache: Path, tmp_path: Path
+) -> None:
+    keep(cache, BEFORE)
+    file = tmp_path / "few.param"
+    file.write_text("B_FLOAT,0.1\nC_LEFT,5\n")
+    assert command("diff", file, 1).code == 1
+    assert command("diff", file, 1, "--partial").code == 0
+    file.write_text("B_FLAOT,0.1\n")
+    assert command("diff", file, 1, "--partial").code == 1
+
+
+@pytest.mark.usefixtures("two")
+def test_only_what_is_asked_for_counts(command: Command) -> None:
+    assert command("diff", 1, 2, "--only", "A_*", "--only", "E_BOTH").code == 0
+    narrowed = command("diff", 1, 2, "--only", "?_FLOAT", "--json")
+    assert (narrowed.code, list(narrowed.json["params"])) == (1, ["B_FLOAT"])
+    misspelt = command("diff", 1, 2, "--only", "A_*", "--only", "B_FLAOT")
+    assert (misspelt.code, misspelt.out) == (2, "")
+    assert misspelt.err == "paramclient: no parameter of either side is called B_FLAOT\n"
+
+
+# where the parameters come from
+
+
+@pytest.mark.usefixtures("two")
+@pytest.mark.parametrize(
+    "word",
+    [
+        *("1", "cache:1", "01", "aa00000000000001", "AA00000000000001", "cache:aa00000000000001"),
+        *("uid:aa00000000000001", "cache:uid:aa00000000000001", "uid:AA0000", "cache:uid:aa0000"),
+    ],
+)
+def test_a_vehicle_in_the_cache_has_several_names(command: Command, word: str) -> None:
+    outcome = command("diff", word, "cache:2", "--json")
+    assert outcome.json["left"]["uid"] == "aa00000000000001"
+
+
+def test_a_vehicle_without_a_hardware_id_is_named_by_its_key(command: Command, cache: Path) -> None:
+    for link in ("udpin:0.0.0.0:14550", "sim:px4", "serial:/dev/ttyACM0:57600"):
+        identity = Identity(3, link)
+        keep(cache, {"A": (1, INT32)}, identity)
+        key = f"system:3@{link}"
+        assert command("diff", key, f"cache:{key}", "--json").json["left"]["source"] == f"cache {key}"
+
+
+@pytest.mark.usefixtures("two")
+@pytest.mark.parametrize(
+    ("words", "code", "text"),
+    [
+        (["9", "1"], 2, "9 is not in the cache"),
+        (["cache:quad.params", "1"], 2, "quad.params is not in the cache"),
+        (
+            ["1", "1", "--component", "9"],
+            2,
+            "which holds 1/1 (uid:aa00000000000001)",
+        ),
+        (
+            ["quad.params", "1"],
+            2,
+            "no such file, and no cached vehicle; link name 'quad.params': it names no kind",
+        ),
+        (["1", "2", "--base", "quad.params"], 2, "  cache:VEHICLE "),
+        (["udpin:x", "1"], 2, "link name 'udpin:x': the port is missing"),
+        (["", "1"], 2, "no such file"),
+        (["cache:", "1"], 2, "needs a name"),
+        (["a\0b", "1"], 2, "a\\x00b"),
+        (["1", "x" * 5000], 2, "no such file"),
+        (["1"], 2, "RIGHT"),
+    ],
+)
+def test_a_word_that_means_nothing_is_told(command: Command, words: list[str], code: int, text: str) -> None:
+    outcome = command("diff", *words)
+    assert (outcome.code, outcome.out) == (code, "")
+    assert text in outcome.err
+
+
+@pytest.mark.usefixtures("two")
+def test_without_a_cache_there_is_no_vehicle_in_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["diff", "1", "2", "--no-cache"]) == 2
+    assert "--no-cache excludes" in capsys.readouterr().err
+
+
+def test_a_table_that_is_not_whole_is_not_compared(command: Command, cache: Path) -> None:
+    keep(cache, {"A": (1, INT32)}, complete=False)
+    outcome = command("diff", 1, 1)
+    assert (outcome.code, outcome.out) == (5, "")
+    assert "the cache has 1 of 2 parameters of 1/1 (uid:aa00000000000001), not all" in outcome.err
+
+
+def test_of_several_components_the_autopilot_is_meant(command: Command, cache: Path) -> None:
+    keep(cache, {"CAM": (1, INT32)}, component=100)
+    only = command("diff", 1, 1, "--all", "--json").json
+    assert (only["left"]["component"], list(only["params"])) == (100, ["CAM"])
+    keep(cache, {"A": (1, INT32)})
+    assert command("diff", 1, 1, "--json").json["left"]["component"] == 1
+    assert command("diff", 1, 1, "--component", 100, "--json").json["left"]["component"] == 100
+
+
+def test_an_empty_name_is_no_vehicle(command: Command, cache: Path) -> None:
+    """Not even the only one that there is: a script may have an empty variable there."""
+    keep(cache, BEFORE)
+    for words in (["show", ""], ["cache", "history", ""], ["cache", "remove", ""]):
+        assert command(*words).code == 2
+    assert len(ParamCache(cache).vehicles()) == 1
+
+
+# files
+
+ROWS = ("A_SAME\t1\t6", "B_FLOAT\t0.100000001490116119\t9", "C_LEFT\t5\t6")
+
+
+@pytest.fixture
+def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
+    """Writes a file of these lines into the folder in which the command runs."""
+    monkeypatch.chdir(tmp_path)
+
+    def place(name: str, *lines: str) -> str:
+        (tmp_path / name).write_text("".join(f"{line}\n" for line in lines), encoding="utf-8")
+        return name
+
+    return place
+
+
+def test_files_of_two_stations_can_be_the_same(command: Command, write: Callable[..., str]) -> None:
+    typed = write("quad.params", *(f"1\t1\t{row}" for row in ROWS))
+    untyped = write("quad.param", "A_SAME,1", "B_FLOAT,0.1", "C_LEFT,5")
+    outcome = command("diff", typed, untyped)
+    assert (outcome.code, outcome.out) == (0, "")
+    assert outcome.err.splitlines() == [
+        "left: 3 parameters of 1/1 from quad.params",
+        "right: 3 parameters from quad.param",
+        "3 same",
+    ]
+    other = write("other.param", "A_SAME,1", "B_FLOAT,0.10000002", "C_LEFT,5")
+    changed = command("diff", untyped, other, "--base", typed, "--json")
+    assert (changed.code, list(changed.json["params"])) == (1, ["B_FLOAT"])
+    assert changed.json["params"]["B_FLOAT"]["right"] == {"value": 0.10000002, "type": None, "bits": None}
+    assert changed.json["params"]["B_FLOAT"]["moved"] == "right"
+    assert changed.json["right"]["count"] == 3
+
+
+def test_a_file_is_held_against_a_vehicle(
+    command: Command, write: Callable[..., str], vehicles: dict[str, Vehicle]
+) -> None:
+    vehicles["tcp:one:1"] = GenericVehicle({"A": 1, "B": 0.1})
+    outcome = command("diff", write("quad.parm", "A 1", "B 0.1"), "tcp:one:1", "--json")
+    assert (outcome.code, outcome.json["counts"]["same"]) == (0, 2)
+
+
+@pytest.mark.usefixtures("two")
+def test_a_file_that_exists_wins(command: Command, write: Callable[..., str], tmp_path: Path) -> None:
+    for name in ("1", "aa0000", "tcp:one:1"):
+        write(name, "A 1")
+        outcome = command("diff", name, "cache:1", "--json")
+        assert (outcome.json["left"]["source"], outcome.json["right"]["system"]) == (name, 1)
+    (tmp_path / "2").mkdir()
+    assert command("diff", "2", "2").code == 0
+
+
+def test_a_component_of_a_file_can_be_chosen(command: Command, write: Callable[..., str]) -> None:
+    both = write("both.params", "1\t1\tA\t1\t6", "1\t100\tB\t2\t6")
+    camera = write("camera.params", "1\t100\tB\t2\t6")
+    assert command("diff", both, camera, "--component", 100).code == 0
+    assert command("diff", both, camera).code == 1
+    assert command("diff", both, camera, "--component", 7).code == 2
+    fleet = write("fleet.params", "1\t1\tA\t1\t6", "2\t1\tA\t2\t6")
+    second = write("second.params", "2\t1\tA\t2\t6")
+    assert command("diff", fleet, second).code == 2
+    assert command("diff", fleet, second, "--system", 2).code == 0
+
+
+def test_a_damaged_file_is_code_2(command: Command, write: Callable[..., str]) -> None:
+    write("\x1bquad.param", "A,1", "B,one")
+    outcome = command("diff", "\x1bquad.param", "\x1bquad.param")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert outcome.err.startswith("paramclient: \\x1bquad.param:2: ")
+
+
+def test_a_pipe_is_no_file(command: Command, tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    outcome = command("diff", tmp_path / "pipe", "1")
+    assert (outcome.code, outcome.out) == (2, "")
+    assert "no regular file" in outcome.err
+
+
+def test_show_prints_a_file(command: Command, write: Callable[..., str]) -> None:
+    path = write("both.params", "1\t1\tA\t1\t6", "1\t100\tB\t0.1\t9")
+    shown = command("show", path)
+    assert (shown.code, shown.rows[:2]) == (0, [["name", "value", "type"], ["A", "1", "INT32"]])
+    assert shown.err == "1 parameter of 1/1 from both.params\n1 parameter of 1/100 from both.params\n"
+    told = command("show", path, "--component", 100, "--json")
+    assert (told.code, told.err) == (0, "")
+    assert told.json == {
+        "file": "both.params",
+        "form": "qgc",
+        "components": [
+            {
+                "source": "both.params",
+                "system": 1,
+                "component": 100,
+                "autopilot": None,
+                "uid": None,
+                "at": None,
+                "count": 1,
+                "params": {"B": {"value": 0.1, "type": "REAL32", "bits": "3dcccccd"}},
+            }
+        ],
+    }
+    assert command("show", path, "--component", 7).code == 2
+
+
+def test_show_prints_comments_and_what_differs_from_the_defaults(
+    command: Command, write: Callable[..., str]
+) -> None:
+    plain = write("quad.param", "A,1", "# why", "B,2")
+    assert command("show", plain).rows == [["name", "value", "comment"], ["A", "1"], ["B", "2", "why"]]
+    unknown = command("show", plain, "--changed")
+    assert (unknown.code, unknown.out) == (1, "")
+    assert "defaults are not known" in unknown.err
+    params = {"A": {"value": 1, "default": 0}, "B": {"value": -0.0, "default": 0}, "C": {"value": 1}}
+    full = write("quad.json", json.dumps({"paramclient": 1, "sets": [{"params": params}]}))
+    changed = command("show", full, "--changed")
+    assert (changed.code, changed.rows) == (0, [["name", "value", "default"], ["A", "1", "0"]])
+    assert changed.err == "1 parameter from quad.json, those that differ from their default\n"
+    [component] = command("show", full, "--changed", "--json").json["components"]
+    assert component["params"] == {"A": {"value": 1, "type": None, "bits": None, "default": 0}}
+
+
+@pytest.mark.usefixtures("two")
+def test_show_finds_a_cached_vehicle_beside_a_file(command: Command, write: Callable[..., str]) -> None:
+    write("1", "A 1")
+    assert "file" in command("show", "1", "--json").json
+    [component] = command("show", "cache:1", "--json").json["components"]
+    assert component["uid"] == "aa00000000000001"
+
+
+# links
+
+
+class Gappy(GenericVehicle):
+    """Never sends one of its parameters."""
+
+    def _send_value(self, entry: Entry, **where: Any) -> None:
+        if entry.name != "B":
+            super()._send_value(entry, **where)
+
+
+@pytest.fixture
+def vehicles(monkeypatch: pytest.MonkeyPatch) -> dict[str, Vehicle]:
+    """What is behind which URL; nothing is behind all others."""
+    known: dict[str, Vehicle] = {}
+
+    def client(url: str, **options: Any) -> ParamClient:
+        return ParamClient(SimLink(known.pop(url), url), **options)  # each of them is asked once
+
+    monkeypatch.setattr(connection, "ParamClient", client)
+    return known
+
+
+def test_two_links_are_fetched_side_by_side(command: Command, vehicles: dict[str, Vehicle]) -> None:
+    vehicles["tcp:one:1"] = GenericVehicle({"A": 1, "B": 2})
+    vehicles["tcp:two:1"] = GenericVehicle({"A": 1, "B": 3}, system=7)
+    outcome = command("diff", "tcp:one:1", "tcp:two:1", "--base", "tcp:one:1", "--json")
+    assert (outcome.code, outcome.err) == (1, "")
+    assert [
+        (entry["left"]["value"], entry["right"]["value"]) for entry in outcome.json["params"].values()
+    ] == [(2, 3)]
+    assert outcome.json["params"]["B"]["moved"] == "right"
+    assert (outcome.json["left"]["system"], outcome.json["right"]["system"]) == (1, 7)
+    assert outcome.json["right"]["source"] == "link tcp:two:1"
+
+
+def test_what_a_link_did_not_bring_is_named(command: Command, vehicles: dict[str, Vehicle]) -> None:
+    vehicles["tcp:one:1"] = Gappy({"A": 1, "B": 2})
+    outcome = command("diff", "tcp:one:1", "tcp:one:1", "--timeout", 1)
+    assert (outcome.code, outcome.out) == (1, "")
+    assert "1/1 generic on tcp:one:1 is incomplete: index 1 did not come" in outcome.err
+
+
+def test_one_link_that_fails_ends_all(command: Command) -> None:
+    began = time.monotonic()
+    outcome = command("diff", "udpin:127.0.0.1:0", "tcp:127.0.0.1:1", "--timeout", PATIENCE)
+    assert (outcome.code, outcome.out) == (4, "")
+    assert time.monotonic() - began < PATIENCE  # what is never heard on the other one is not waited for
+
+
+def test_a_link_gives_what_the_vehicle_has_confirmed(
+    command: Command, vehicles: dict[str, Vehicle], cache: Path
+) -> None:
+    """After a hash hit: what the hash does not cover is read afresh, what is not listed was known once."""
+
+    def quad(volatile: float) -> PX4Vehicle:
+        table = [
+            SimParam("A", INT32, 1),
+            SimParam("V", REAL32, volatile, volatile=True),
+            SimParam("Z", INT32, 1),
+        ]
+        return PX4Vehicle(table=table, not_in_use=["Z"])
+
+    vehicles["tcp:one:1"] = quad(0.5)
+    assert command("diff", "tcp:one:1", "tcp:one:1").code == 0
+    vehicles["tcp:one:1"] = quad(0.5)
+    assert command("get", "tcp:one:1", "Z").code == 0
+    vehicles["tcp:one:1"] = quad(0.75)
+    outcome = command("diff", "tcp:one:1", "1", "--json")
+    assert (outcome.code, outcome.err) == (1, "")
+    told = {name: (entry["is"], entry["left"]) for name, entry in outcome.json["params"].items()}
+    assert told == {
+        "V": ("different", {"value": 0.75, "type": "REAL32", "bits": "3f400000"}),
+        "Z": ("only right", None),
+    }
+
+
+def test_no_link_is_opened_before_all_else_is_right(command: Command, vehicles: dict[str, Vehicle]) -> None:
+    """`vehicles` has none, so opening any would fail."""
+    assert command("diff", "tcp:one:1", "9").code == 2
+    assert command("diff", "tcp:one:1", "quad.params").code == 2
+
+
+# terminals and pipes
+
+PLAIN = {
+    name: value
+    for name, value in os.environ.items()
+    if name not in {"FORCE_COLOR", "NO_COLOR", "TTY_COMPATIBLE", "COLUMNS", "PYTHONUNBUFFERED"}
+}
+
+
+def start(cache: Path, stdout: int, *more: str) -> subprocess.Popen[str]:
+    words = [sys.executable, "-m", "paramclient", "diff", "1", "2", *more, "--cache", str(cache)]
+    environment = {**PLAIN, "TERM": "xterm", "COLUMNS": "60"}
+    return subprocess.Popen(
+        words, cwd=ROOT, stdout=stdout, stderr=subprocess.PIPE, text=True, env=environment
+    )
+
+
+@pytest.mark.usefixtures("two")
+def test_a_terminal_gets_colours(cache: Path) -> None:
+    keep(cache, {"A": (123456789, INT32), "B": (1, INT32), "C": (5, INT32)}, FIRST)
+    keep(cache, {"A": (987654321, INT32), "B": (2, INT32), "D": (6, INT32)}, SECOND)
+    keep(cache, {"A": (1, INT32), "B": (1, INT32), "C": (0, INT32), "D": (0, INT32)}, THIRD)
+    ours, theirs = pty.openpty()
+    printed = b""
+    try:
+        with start(cache, theirs, "--base", "3") as started:
+            os.close(theirs)
+            while select.select([ours], [], [], PATIENCE)[0]:
+                try:
+                    printed += os.read(ours, 65536)
+                except OSError:  # the terminal is at its end when the last one who has it open goes
+                    break
+            started.communicate(timeout=PATIENCE)
+    finally:
+        os.close(ours)
+    assert started.returncode == 1
+    coloured = set(re.findall(r"\x1b\[([0-9;]+)m *([^\x1b]+)\x1b", printed.decode()))
+    yellow, red, green, bold_red = "33", "31", "32", "1;31"
+    assert coloured >= {
+        *((bold_red, "123456789"), (bold_red, "987654321")),  # the values that are in conflict
+        *((yellow, "2"), (red, "5"), (green, "6")),
+    }
+    assert not any(text in ("1", "0") for _, text in coloured)  # neither what has not moved nor the base
+
+
+@pytest.mark.usefixtures("two")
+def test_an_output_that_nobody_reads_ends_it(cache: Path) -> None:
+    ours, theirs = os.pipe()
+    os.close(ours)
+    with start(cache, theirs) as started:
+        os.close(theirs)
+        _, told = started.communicate(timeout=PATIENCE)
+    assert (started.returncode, "Traceback" in told) == (141, False)

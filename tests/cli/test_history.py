@@ -1,0 +1,315 @@
+"""The commands history and fleet diff, and the moments that people write."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta, timezone
+from pathlib import Path
+
+import pytest
+
+from paramclient.cache import BY_US, ParamCache, TableState
+from paramclient.cli.moments import parse_time, parse_when
+from paramclient.errors import UsageError
+from paramclient.model.notation import time_text
+from paramclient.model.values import ParamType, bits_of
+from tests.caches import NOW, PX4, stored, update, whole_table
+from tests.commands import Command, in_process
+
+DONE = TableState(complete=True)
+EAST = timezone(timedelta(hours=2))
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def command(path: Path, capsys: pytest.CaptureFixture[str]) -> Command:
+    """Runs the command in this process, with a cache of its own."""
+    return in_process(capsys, "--cache", str(path))
+
+
+# Moments
+
+
+def at(text: str) -> float:
+    return datetime.fromisoformat(text).timestamp()
+
+
+@pytest.mark.parametrize(
+    ("text", "moment"),
+    [
+        ("2026-11-20T14:00Z", "2026-11-20T14:00Z"),
+        ("2026-11-20T14:00:05.123Z", "2026-11-20T14:00:05.123Z"),
+        ("2026-11-20 14:00", "2026-11-20T14:00+02:00"),
+        ("2026-11-20 14:00 +05:30", "2026-11-20T14:00+05:30"),
+        ("2026-11-20T14:00-0800", "2026-11-20T14:00-08:00"),
+        ("2026-11-20 14:00 utc", "2026-11-20T14:00Z"),
+        ("2026-11-19", "2026-11-19T00:00+02:00"),
+        ("today", "2026-11-21T00:00+02:00"),
+        ("Yesterday", "2026-11-20T00:00+02:00"),
+        (" yesterday  9:05 ", "2026-11-20T09:05+02:00"),
+        ("yesterday 14:00Z", "2026-11-19T14:00Z"),
+        ("today 0:30", "2026-11-21T00:30+02:00"),
+        ("00:59:59.5", "2026-11-21T00:59:59.5+02:00"),
+        ("21:00Z", "2026-11-20T21:00Z"),
+        ("90s ago", "2026-11-20T22:58:30Z"),
+        ("2h ago", "2026-11-20T21:00Z"),
+        ("2h", "2026-11-20T21:00Z"),
+        ("1h30m ago", "2026-11-20T21:30Z"),
+        ("1 hour 30 minutes ago", "2026-11-20T21:30Z"),
+        ("1.5 days ago", "2026-11-19T11:00Z"),
+        ("2 WEEKS AGO", "2026-11-06T23:00Z"),
+    ],
+)
+def test_a_moment_is_read_as_people_write_it(text: str, moment: str) -> None:
+    """Eleven in the evening in Greenwich is tomorrow where the user is: his days count."""
+    now = at("2026-11-20T23:00Z")
+    assert parse_time(text, now, EAST) == parse_when(text, now, EAST) == at(moment)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("", " ", "ago", "now", "2", "2 ago", "h", "2h ago ago", "2hago", "2 parsecs", "2 mins. ago", "-2h"),
+        *("2h -1h ago", "1e3s", "9" * 30, "999999999w", "99999w ago", "\u0662h ago", "2h\0ago"),
+        *("2026-02-30", "2026-13-01", "2026-11", "20.11.2026", "11/20/2026", "2026-W47-5", "0000-01-01"),
+        *("1969-12-31", "24:30", "14", "14:0", "14:00:", "today14:00", "yesterday T14:00", "T14:00"),
+        *("14:00 25:00", "1h yesterday", "2026-11-20T14:00+99:00"),
+    ],
+)  # fmt: skip
+def test_what_is_no_moment_is_an_error_that_says_how_one_is_written(text: str) -> None:
+    with pytest.raises(UsageError, match=r"is no time: a time is written as 2026-11-20T14:00Z"):
+        parse_time(text, NOW, EAST)
+
+
+@pytest.mark.parametrize("text", ["2027-01-01", "23:59", "today 12:00"])
+def test_the_future_is_not_known(text: str) -> None:
+    with pytest.raises(UsageError, match="is in the future"):
+        parse_when(text, at("2026-11-20T08:00Z"), UTC)
+
+
+def test_a_number_alone_is_a_snapshot() -> None:
+    assert (parse_when("12", NOW), type(parse_when(" 12 ", NOW))) == (12, int)
+    assert parse_when("20261120", NOW) == 20261120
+    with pytest.raises(UsageError, match="is no time"):
+        parse_when("9" * 19, NOW)
+
+
+def test_without_a_zone_it_is_that_of_this_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+    try:
+        monkeypatch.setenv("TZ", "XYZ-3")
+        time.tzset()
+        assert parse_time("2026-11-20 14:00", at("2026-12-01T00:00Z")) == at("2026-11-20T11:00Z")
+        assert parse_time("yesterday", at("2026-11-20T22:30Z")) == at("2026-11-19T21:00Z")
+    finally:
+        monkeypatch.undo()
+        time.tzset()
+
+
+# history
+
+
+HOUR_AGO = float(int(time.time()) - 3600)  # when the tests were collected: what follows may take its time
+
+
+@pytest.fixture
+def known(path: Path) -> None:
+    """A vehicle that has changed a little in the last hour."""
+    with ParamCache(path) as cache:
+        for number, items in enumerate(([("A", 1), ("B", 1)], [("A", 2)], [("B", 2)])):
+            at = HOUR_AGO + 600 * number
+            cache.save(update(*(stored(*item, at=at, by=BY_US) for item in items), table=DONE, at=at))
+        at = HOUR_AGO + 1300
+        cache.save(update(stored("C", 1, at=at), stored("C", 2, at=at), component=154, at=at))
+        cache.snapshot(PX4.key, 1, reason="before apply \x1b[31m.parm", at=HOUR_AGO + 1500)
+        cache.snapshot(PX4.key, 154, reason="by hand", at=HOUR_AGO + 1900)
+
+
+@pytest.mark.usefixtures("known")
+def test_changes_are_told_as_in_the_cache_and_since_a_moment(command: Command) -> None:
+    for words in (["history"], ["cache", "history"]):
+        found = command(*words, "1", "--json").json["history"]
+        assert [(each["component"], each["name"], each["old"], each["new"]) for each in found] == [
+            (1, "A", 1, 2), (1, "B", 1, 2), (154, "C", 1, 2),
+        ]  # fmt: skip
+    first = time_text(HOUR_AGO + 600)
+    assert found[0] == {"time": first, "component": 1, "name": "A", "old": 1, "new": 2, "by": "us"}
+    assert command("history", "1", "A").words == [
+        ["time", "component", "name", "old", "new", "by"],
+        [first, "1", "A", "1", "2", "us"],
+    ]
+    second = time_text(HOUR_AGO + 900)
+    since = command("history", "1", "--since", second, "--component", 1, "--json").json["history"]
+    assert [each["name"] for each in since] == ["B"]
+    since = command("history", "1", "--since", first, "--limit", 3, "--json").json["history"]
+    assert [each["name"] for each in since] == ["A", "B", "C"]
+
+
+@pytest.mark.usefixtures("known")
+def test_snapshots_are_listed_with_their_numbers(command: Command) -> None:
+    first, second = (time_text(HOUR_AGO + after) for after in (1500, 1900))
+    found = command("history", "uid:000200", "--snapshots", "--json").json["snapshots"]
+    assert found == [
+        {
+            "id": 1, "time": first, "component": 1, "size": 2, "complete": True,
+            "hash": None, "reason": "before apply \x1b[31m.parm",
+        },
+        {
+            "id": 2, "time": second, "component": 154, "size": 1, "complete": False,
+            "hash": None, "reason": "by hand",
+        },
+    ]  # fmt: skip
+    assert command("history", "1", "--snapshots").words == [
+        ["id", "time", "component", "params", "hash", "reason"],
+        ["1", first, "1", "2", "before", "apply", "\\x1b[31m.parm"],
+        ["2", second, "154", "1", "by", "hand", "(not", "complete)"],
+    ]
+    for narrowed in (["--component", 154], ["--limit", 1], ["--since", time_text(HOUR_AGO + 1700)]):
+        found = command("history", "1", "--snapshots", *narrowed, "--json").json["snapshots"]
+        assert [each["id"] for each in found] == [2]
+
+
+@pytest.mark.usefixtures("known")
+@pytest.mark.parametrize(
+    ("arguments", "code", "text"),
+    [
+        (["1", "--since", "soon"], 2, "'soon' is no time: a time is written as"),
+        (["1", "--since", "2099-01-01"], 2, "is in the future"),
+        (["1", "A", "--snapshots"], 2, "it takes no parameter's name"),
+        (["1", "A_NAME_THAT_IS_TOO_LONG"], 2, "a param_id holds 16"),
+        (["1", "--limit", "0"], 2, "limit"),
+        (["9"], 2, "vehicle 9 is not in the cache"),
+    ],
+)
+def test_what_cannot_be_told_is_an_error(
+    command: Command, arguments: list[str], code: int, text: str
+) -> None:
+    failed = command("history", *arguments)
+    assert (failed.code, failed.out) == (code, "")
+    assert text in failed.err
+
+
+# fleet diff
+
+
+def three(path: Path) -> None:
+    """Three vehicles: the second has changed A, the third lacks it."""
+    with ParamCache(path) as cache:
+        for number in (1, 2, 3):
+            identity = replace(PX4, system=number, uid=f"{number:04x}")
+            cache.save(
+                update(
+                    *([stored("A", 1)] if number < 3 else []),
+                    stored("F", bits_of(0.1, 9), ParamType.REAL32),
+                    identity=identity,
+                    table=DONE,
+                )
+            )
+        second = replace(PX4, system=2, uid="0002")
+        cache.save(update(stored("A", 5, at=NOW + 60, by=BY_US), identity=second, at=NOW + 60))
+        cache.save(whole_table(1, second, component=154))
+
+
+def test_who_differs_is_told_and_since_when(path: Path, command: Command) -> None:
+    three(path)
+    same = command("fleet", "diff", "F")
+    assert (same.code, same.out, same.err) == (0, "", "no parameter differs among 3 vehicles\n")
+    table = command("fleet", "diff", "*")
+    assert table.code == 1
+    assert table.words == [
+        ["name", "value", "vehicles", "since", "vehicle"],
+        ["A", "1", "1", "of", "3", "before", "2026-11-18T11:06:40.000Z", "1", "(uid:0001)"],
+        ["5", "1", "of", "3", "2026-11-18T11:07:40.000Z", "2", "(uid:0002)"],
+        ["lacks", "it", "1", "of", "3", "3", "(uid:0003)"],
+    ]
+    assert table.err == "1 of 2 parameters differs among 3 vehicles\n"
+    alone = command("fleet", "diff", "PARAM_0", "--component", 154)
+    assert (alone.code, alone.err) == (0, "no parameter differs among 1 vehicle\n")
+
+
+def test_most_of_them_are_one_line(path: Path, command: Command) -> None:
+    three(path)
+    with ParamCache(path) as cache:
+        cache.save(update(stored("A", 1), identity=replace(PX4, system=4, uid="0004")))
+        cache.save(update(identity=replace(PX4, system=5, uid="0005")))
+    assert command("fleet", "diff", "A").words[1:] == [
+        ["A", "1", "2", "of", "5", "most"],
+        ["5", "1", "of", "5", "2026-11-18T11:07:40.000Z", "2", "(uid:0002)"],
+        ["lacks", "it", "1", "of", "5", "3", "(uid:0003)"],
+        ["not", "known", "1", "of", "5", "5", "(uid:0005)"],
+    ]
+
+
+def test_vehicles_are_held_against_a_file(path: Path, tmp_path: Path, command: Command) -> None:
+    three(path)
+    file = tmp_path / "wanted.param"
+    file.write_text("A,5\nF,0.1\nNONE,1\n")
+    table = command("fleet", "diff", file)
+    assert table.code == 1
+    assert table.words[1:5] == [
+        ["A", "5", "1", "of", "3", "wanted"],
+        ["1", "1", "of", "3", "before", "2026-11-18T11:06:40.000Z", "1", "(uid:0001)"],
+        ["lacks", "it", "1", "of", "3", "3", "(uid:0003)"],
+        ["NONE", "1", "0", "of", "3", "wanted"],
+    ]
+    file.write_text("F,0.1\n")
+    assert command("fleet", "diff", file).code == 0
+    file.write_text("F,0.1000001\n")
+    assert command("fleet", "diff", file).code == 1
+
+
+def test_the_same_for_programs(path: Path, tmp_path: Path, command: Command) -> None:
+    three(path)
+    told = command("fleet", "diff", "A", "F", "--json")
+    assert told.code == 1
+    found = told.json
+    assert (found["component"], found["vehicles"], found["different"]) == (1, 3, True)
+    assert [(each["name"], each["different"], each["wanted"]) for each in found["names"]] == [
+        ("A", True, None),
+        ("F", False, None),
+    ]
+    ones, fives = found["names"][0]["values"]
+    assert fives == {
+        "value": 5,
+        "type": "INT32",
+        "bits": "00000005",
+        "agrees": False,
+        "vehicles": [{"key": "uid:0002", "system": 2, "since": "2026-11-18T11:07:40.000Z", "changed": True}],
+    }
+    assert (ones["agrees"], ones["vehicles"][0]["changed"]) == (False, False)
+    assert [each["system"] for each in found["names"][0]["lacking"]] == [3]
+    assert found["names"][0]["unknown"] == []
+    [tenth] = found["names"][1]["values"]
+    assert (tenth["value"], tenth["bits"], tenth["agrees"], len(tenth["vehicles"])) == (
+        0.1,
+        "3dcccccd",
+        True,
+        3,
+    )
+    file = tmp_path / "wanted.param"
+    file.write_text("F,0.1\n")
+    assert command("fleet", "diff", file, "--json").json["names"][0]["wanted"] == 0.1
+
+
+@pytest.mark.parametrize(
+    ("words", "code", "text"),
+    [
+        ([], 2, "name the parameters to compare, or a parameter file"),
+        (["A", "NOPE"], 5, "has a parameter NOPE"),
+        (["A", "--component", "9"], 5, "holds no table of component 9"),
+        (["./none.param"], 2, "none.param"),
+        (["A", "none.param"], 2, "none.param is a file: name one file, or parameters, not both"),
+        (["A_NAME_THAT_IS_TOO_LONG"], 2, "a param_id holds 16"),
+    ],
+)
+def test_what_cannot_be_compared_is_an_error(
+    path: Path, command: Command, words: list[str], code: int, text: str
+) -> None:
+    three(path)
+    failed = command("fleet", "diff", *words)
+    assert (failed.code, failed.out) == (code, "")
+    assert text in failed.err

@@ -1,0 +1,388 @@
+"""The command where parameters are described: names for values, units and meanings, help."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from paramclient.metadata import MetadataStore
+from paramclient.model.values import ParamType
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam
+from paramclient.sim.metadata import PARAMETER_FILE
+from tests.commands import Command, Put, behind, in_process, leaping
+
+DATA = Path(__file__).parents[1] / "data"
+XML = DATA / "apm.pdef.xml"
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Runs the command in this process, on a clock that leaps."""
+    leaping(monkeypatch)
+    return in_process(capsys)
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    """Puts a simulated vehicle behind every URL; gives a URL."""
+    return behind(monkeypatch, "sim:custom")
+
+
+def quad(*, metadata: bool = True, ftp: bool = False) -> PX4Vehicle:
+    """A vehicle with few parameters, some of which the simulator knows more of."""
+    table = [
+        SimParam("COM_FLTMODE1", ParamType.INT32, -1),
+        SimParam("EKF2_GPS_CTRL", ParamType.INT32, 7),
+        SimParam("MAV_SYS_ID", ParamType.INT32, 1),
+        SimParam("MC_ROLL_P", ParamType.REAL32, 6.5),
+    ]
+    return PX4Vehicle(table=table, metadata=metadata, ftp=ftp)
+
+
+def copter(system: int = 1) -> ArduPilotVehicle:
+    table = [
+        SimParam("FLTMODE1", ParamType.INT8, 0),
+        SimParam("TST_ALT", ParamType.REAL32, 100.0),
+        SimParam("TST_LOG", ParamType.INT32, 1),
+    ]
+    return ArduPilotVehicle(table=table, system=system, live_period=0)
+
+
+# set
+
+
+def test_a_name_is_set_that_the_vehicle_itself_has_for_a_value(command: Command, put: Any) -> None:
+    vehicle = quad()
+    done = command(
+        "set", put(vehicle), "COM_FLTMODE1=return", "EKF2_GPS_CTRL=Position|Heading", "--json", "--no-cache"
+    )
+    assert (done.code, done.err) == (0, "")
+    assert vehicle.values["COM_FLTMODE1"] == 5
+    assert vehicle.values["EKF2_GPS_CTRL"] == 9
+    first, second = done.json["results"]
+    assert first == {
+        "name": "COM_FLTMODE1",
+        "requested": 5,
+        "actual": 5,
+        "status": "accepted",
+        "text": "Return",
+    }
+    assert second["text"] == "Position|Heading"
+
+
+def test_a_name_is_set_that_a_file_has_for_a_value(command: Command, put: Any) -> None:
+    vehicle = copter()
+    done = command("set", put(vehicle), "FLTMODE1=Loiter", "tst_log=imu+gps", "--metadata", XML, "--no-cache")
+    assert done.code == 0
+    assert vehicle.values["FLTMODE1"] == 5
+    assert vehicle.values["TST_LOG"] == 9
+    assert vehicle.requests["COMMAND_LONG"] <= 1  # it was not asked to describe itself
+
+
+def test_numbers_may_stand_behind_an_equals_sign(command: Command, put: Any) -> None:
+    vehicle = quad(metadata=False)
+    done = command("set", put(vehicle), "COM_FLTMODE1=3", "MC_ROLL_P", 4.25, "MAV_SYS_ID=0x7", "--no-cache")
+    assert done.code == 0
+    assert vehicle.values == {"COM_FLTMODE1": 3, "EKF2_GPS_CTRL": 7, "MAV_SYS_ID": 7, "MC_ROLL_P": 4.25}
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["FLTMODE1=Loitr"],
+            r"FLTMODE1: 'Loitr' is no number, nor one of its values: Stabilize (0), Loiter (5)",
+        ),
+        (["TST_LOG=7", "FLTMODE1=x", "TST_ALT=1"], "FLTMODE1: 'x' is no number"),
+        (["NONE=On"], "NONE: 'On' is no number, and NONE is not described"),
+        (["TST_ALT=high"], "and its values have no names"),
+        (["FLTMODE1="], "FLTMODE1: there is no value behind the equals sign"),
+        (["FLTMODE1", "Loiter"], "FLTMODE1: 'Loiter' is no number; 12, 0x1F"),
+        (["=5"], "a parameter name has at least one character"),
+        (["FLTMODE1=1e999"], "FLTMODE1: 1e999 is beyond the range of a float"),
+        (["FLTMODE1=5", "TST_LOG"], "set takes pairs of NAME and VALUE, or NAME=VALUE"),
+    ],
+)
+def test_nothing_is_sent_where_a_name_is_wrong(
+    command: Command, put: Any, words: list[str], said: str
+) -> None:
+    vehicle = copter()
+    done = command("set", put(vehicle), *words, "--metadata", XML, "--no-cache")
+    assert (done.code, done.out) == (2, "")
+    assert said in done.err
+    assert done.err.count("\n") == 1
+    assert not vehicle.requests
+
+
+def test_names_of_a_vehicle_that_does_not_describe_itself(command: Command, put: Any) -> None:
+    vehicle = copter()
+    done = command("set", put(vehicle), "TST_LOG", 3, "FLTMODE1=Loiter", "--no-cache")
+    assert (done.code, done.out) == (2, "")
+    assert "1/1 ardupilot does not describe its parameters; --metadata takes a file that does" in done.err
+    assert not vehicle.requests["PARAM_SET"]
+
+
+def test_a_wrong_name_is_not_sent_to_a_vehicle_that_describes_itself(command: Command, put: Any) -> None:
+    vehicle = quad()
+    done = command("set", put(vehicle), "MC_ROLL_P", 3, "COM_FLTMODE1=Retrun", "--no-cache")
+    assert (done.code, done.out) == (2, "")
+    assert "COM_FLTMODE1: 'Retrun' is no number, nor one of its values: Unassigned (-1)" in done.err
+    assert not vehicle.requests["PARAM_SET"]
+
+
+def test_a_value_outside_the_range_is_warned_of_and_sent(command: Command, put: Any) -> None:
+    """The range is what the developers mean; what is right the vehicle says."""
+    vehicle = quad()
+    done = command("set", put(vehicle), "MC_ROLL_P=40", "--metadata", "vehicle", "--no-cache")
+    assert done.code == 0
+    assert "paramclient: MC_ROLL_P: 40 is above the maximum of 12 1/s\n" in done.err
+    assert vehicle.values["MC_ROLL_P"] == 40
+
+
+def test_what_needs_a_reboot_is_said(command: Command, put: Any) -> None:
+    words = ("MAV_SYS_ID=2", "MC_ROLL_P=4", "--metadata", "vehicle", "--no-cache")
+    done = command("set", put(quad()), *words)
+    assert "to count when the vehicle has started again: MAV_SYS_ID\n" in done.err
+    done = command("set", put(quad()), *words, "--json")
+    assert [each.get("reboot_required") for each in done.json["results"]] == [True, None]
+
+
+# get
+
+
+def test_get_tells_meaning_and_units(command: Command, put: Any) -> None:
+    done = command(
+        *("get", put(quad()), "EKF2_GPS_CTRL", "MC_ROLL_P", "COM_FLTMODE1"),
+        *("--metadata", "vehicle", "--no-cache"),
+    )
+    assert done.code == 0
+    assert [line.split() for line in done.out.splitlines()] == [
+        ["name", "value", "type", "index", "meaning", "units"],
+        ["EKF2_GPS_CTRL", "7", "INT32", "1", "Position|Altitude|Velocity"],
+        ["MC_ROLL_P", "6.5", "REAL32", "3", "1/s"],
+        ["COM_FLTMODE1", "-1", "INT32", "0", "Unassigned"],
+    ]
+
+
+def test_get_has_more_fields_in_json_where_something_is_known(command: Command, put: Any) -> None:
+    url = put(quad())
+    plain = command("get", url, "MC_ROLL_P", "--json", "--no-cache").json["params"]["MC_ROLL_P"]
+    assert set(plain) == {"value", "type", "index", "bits"}
+    done = command("get", url, "MC_ROLL_P", "COM_FLTMODE1", "--json", "--metadata", "vehicle", "--no-cache")
+    params = done.json["params"]
+    assert params["MC_ROLL_P"] == plain | {
+        "units": "1/s",
+        "metadata": {
+            "short_description": "Gain from the error of the roll angle to the roll rate",
+            "long_description": "The rate per unit of error. Higher reacts quicker and swings sooner.",
+            "units": "1/s",
+            "minimum": 0,
+            "maximum": 12,
+            "increment": 0.1,
+            "decimals": 2,
+            "default": 6.5,
+            "category": "Standard",
+            "group": "MC",
+        },
+    }
+    mode = params["COM_FLTMODE1"]
+    assert mode["text"] == "Unassigned"
+    assert mode["metadata"]["values"]["5"] == "Return"
+
+
+def test_what_a_vehicle_said_once_is_known_from_then_on(command: Command, put: Any, tmp_path: Path) -> None:
+    """For its firmware, with no further question, also with no link."""
+    cache = ("--cache", tmp_path / "cache.sqlite3")
+    plain = command("get", put(quad()), "MC_ROLL_P", *cache)
+    assert "units" not in plain.out
+    assert "1/s" in command("get", put(quad()), "MC_ROLL_P", "--metadata", "vehicle", *cache).out
+    vehicle = quad()
+    assert "1/s" in command("get", put(vehicle), "MC_ROLL_P", *cache).out
+    assert not vehicle.requests["FILE_TRANSFER_PROTOCOL"]
+    assert "units" not in command("get", put(copter(system=2)), "TST_LOG", *cache).out
+    assert "units" not in command("get", put(quad(ftp=True)), "MC_ROLL_P", *cache).out  # newer firmware
+    done = command("set", put(quad()), "MC_ROLL_P", 13, *cache)
+    assert "above the maximum of 12" in done.err
+    done = command("show", "1", "MC_ROLL_P", *cache)
+    assert "Gain from the error of the roll angle" in done.out
+
+
+def test_a_name_is_never_taken_from_what_was_kept_alone(command: Command, put: Any, tmp_path: Path) -> None:
+    """The vehicle confirms it by its checksum: a firmware may have been built from other sources."""
+    cache = ("--cache", tmp_path / "cache.sqlite3")
+    assert command("get", put(quad()), "MC_ROLL_P", "--metadata", "vehicle", *cache).code == 0
+    assert MetadataStore.beside(tmp_path / "cache.sqlite3").has_notes
+    silent = quad(metadata=False)
+    done = command("set", put(silent), "COM_FLTMODE1=Return", *cache)
+    assert done.code == 2
+    assert not silent.requests["PARAM_SET"]
+    vehicle = quad()
+    assert command("set", put(vehicle), "COM_FLTMODE1=Return", *cache).code == 0
+    assert not vehicle.requests["FILE_TRANSFER_PROTOCOL"]
+
+
+# diff
+
+
+def test_diff_says_what_values_mean_and_their_units(command: Command, tmp_path: Path) -> None:
+    left, right = tmp_path / "left.param", tmp_path / "right.param"
+    left.write_text("FLTMODE1,5\nTST_ALT,100\n")
+    right.write_text("FLTMODE1,6\nTST_ALT,120\n")
+    done = command("diff", left, right, "--metadata", XML)
+    assert done.code == 1
+    assert [line.split() for line in done.out.splitlines()][:3] == [
+        ["name", "left", "right", "units", "is"],
+        ["FLTMODE1", "5", "(Loiter)", "6", "(RTL)", "different"],
+        ["TST_ALT", "100", "120", "cm", "different"],
+    ]
+    params = command("diff", left, right, "--metadata", XML, "--json").json["params"]
+    assert (params["FLTMODE1"]["left"]["text"], params["FLTMODE1"]["right"]["text"]) == ("Loiter", "RTL")
+    assert params["TST_ALT"]["units"] == "cm"
+    plain = command("diff", left, right)
+    assert "Loiter" not in plain.out
+    assert "units" not in plain.out
+
+
+def test_diff_knows_what_was_kept_for_the_firmware_of_a_side(
+    command: Command, put: Any, tmp_path: Path
+) -> None:
+    cache = ("--cache", tmp_path / "cache.sqlite3")
+    assert command("get", put(quad()), "MC_ROLL_P", "--metadata", "vehicle", *cache).code == 0
+    file = tmp_path / "wanted.param"
+    file.write_text("COM_FLTMODE1,5\nMC_ROLL_P,7\n")
+    put(quad())
+    done = command("diff", "sim:px4", file, "--only", "COM_FLTMODE1", "--only", "MC_ROLL_P", *cache)
+    assert "-1 (Unassigned)" in done.out
+    assert "5 (Return)" in done.out
+    assert "1/s" in done.out
+
+
+def test_diff_takes_a_file_that_describes_parameters_and_not_a_vehicle(command: Command) -> None:
+    done = command("diff", "a.param", "b.param", "--metadata", "vehicle")
+    assert done.code == 2
+    assert "it takes a file" in done.err
+
+
+def test_where_nothing_is_kept_nothing_is_looked_for(
+    command: Command, put: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def forbidden(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(MetadataStore, "known", forbidden)
+    assert command("get", put(quad()), "MC_ROLL_P", "--cache", tmp_path / "cache.sqlite3").code == 0
+    assert command("get", put(quad()), "MC_ROLL_P", "--no-cache").code == 0
+
+
+def test_a_vehicle_that_cannot_give_its_file(command: Command, put: Any) -> None:
+    vehicle = quad()
+    del vehicle.files[PARAMETER_FILE]
+    done = command("get", put(vehicle), "MC_ROLL_P", "--metadata", "vehicle", "--no-cache")
+    assert done.code == 1
+    assert "file not found" in done.err
+
+
+@pytest.mark.parametrize("words", [["get", "sim:px4", "A"], ["set", "sim:px4", "A=1"], ["show"]])
+def test_a_file_that_is_none_is_code_2(command: Command, tmp_path: Path, words: list[str]) -> None:
+    cache = ("--cache", tmp_path / "cache.sqlite3")
+    (tmp_path / "a.xml").write_text("<html/>")
+    for file, said in (("none.xml", "cannot be read"), ("a.xml", "begins with <html>")):
+        done = command(*words, "--metadata", tmp_path / file, *cache)
+        assert (done.code, done.out) == (2, "")
+        assert said in done.err
+        assert done.err.count("\n") == 1
+
+
+# show
+
+
+@pytest.fixture
+def shown(command: Command, put: Any, tmp_path: Path) -> tuple[object, ...]:
+    """The options with which `show` finds the table of a vehicle."""
+    cache = ("--cache", tmp_path / "cache.sqlite3")
+    assert command("fetch", put(copter()), *cache).code == 0
+    return cache
+
+
+def test_show_prints_what_is_known_of_a_parameter(command: Command, shown: tuple[object, ...]) -> None:
+    done = command("show", "1", "FLTMODE1", "TST_ALT", "--metadata", XML, *shown)
+    assert done.code == 0
+    lines = done.out.splitlines()
+    assert lines[0].split()[-2:] == ["meaning", "units"]
+    assert [line.split()[0] for line in lines[1:3]] == ["FLTMODE1", "TST_ALT"]
+    assert lines[1].endswith("Stabilize")
+    assert lines[3:] == [
+        "",
+        "FLTMODE1: First flight mode",
+        '  The mode at the "lowest" position',
+        "  0: Stabilize",
+        "  5: Loiter",
+        "  6: RTL",
+        "",
+        "TST_ALT: Return height",
+        "  How high to return",
+        "  range: 30 to 3000.5 cm",
+        "  step: 1 cm",
+        "  reboot: a new value counts when the vehicle has started again",
+    ]
+
+
+def test_show_prints_single_parameters_that_nobody_describes(
+    command: Command, shown: tuple[object, ...]
+) -> None:
+    done = command("show", "1", "TST_LOG", *shown)
+    assert done.code == 0
+    assert [line.split()[:2] for line in done.out.splitlines()] == [["name", "value"], ["TST_LOG", "1"]]
+    done = command("show", "1", "TST_LOG", "--json", *shown)
+    assert list(done.json["components"][0]["params"]) == ["TST_LOG"]
+    done = command("show", "1", "NONE", "TST_LOG", *shown)
+    assert (done.code, done.out) == (5, "")
+    assert "not among the cached parameters: NONE" in done.err
+
+
+def test_show_of_a_whole_table_tells_meanings(command: Command, shown: tuple[object, ...]) -> None:
+    done = command("show", "--metadata", XML, *shown)
+    assert "Stabilize" in done.out
+    assert "lowest" not in done.out
+    params = command("show", "--metadata", XML, "--json", *shown).json["components"][0]["params"]
+    assert params["TST_ALT"]["units"] == "cm"
+    assert params["TST_LOG"]["text"] == "IMU"
+    assert "metadata" not in params["TST_LOG"]
+
+
+def test_show_of_a_parameter_file_has_no_names(command: Command, tmp_path: Path) -> None:
+    file = tmp_path / "quad.param"
+    file.write_text("FLTMODE1,5\n")
+    assert command("show", file).code == 0
+    for words in (["FLTMODE1"], ["--metadata", XML]):
+        done = command("show", file, *words)
+        assert (done.code, done.out) == (2, "")
+        assert "go with a vehicle in the cache" in done.err
+
+
+def test_show_speaks_to_no_vehicle(command: Command, shown: tuple[object, ...]) -> None:
+    done = command("show", "--metadata", "vehicle", *shown)
+    assert (done.code, done.out) == (2, "")
+    assert "needs a link" in done.err
+
+
+def test_what_a_file_says_cannot_command_the_terminal(
+    command: Command, shown: tuple[object, ...], tmp_path: Path
+) -> None:
+    nasty = {
+        "name": "TST_LOG",
+        "shortDesc": "\x1b[2Jgone",
+        "longDesc": "a\r\x1b]0;title\x07\nb\u202e",
+        "units": "\x9b31m",
+        "values": [{"value": 1, "description": "\x1b[31mred"}],
+    }
+    path = tmp_path / "nasty.json"
+    path.write_text(json.dumps({"version": 1, "parameters": [nasty]}))
+    for words in (["show", "1", "TST_LOG"], ["show", "1", "TST_LOG", "--json"], ["show", "1"]):
+        done = command(*words, "--metadata", path, *shown)
+        assert done.code == 0
+        assert (done.out + done.err).replace("\n", "").isprintable()
+        assert (done.out + done.err).isascii()

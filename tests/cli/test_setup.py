@@ -1,0 +1,611 @@
+"""The commands apply, verify and restore: what they print, what they send, how they end."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import re
+import signal
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from paramclient import ParamCache, ParamType, read_file
+from paramclient.model.values import Value
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle
+from paramclient.sim.param_table import Entry
+from tests.commands import Command, Put, behind, in_process, leaping
+
+TABLE: dict[str, Value | tuple[ParamType, Value]] = {
+    "RTL_ALT": 1500,
+    "WPNAV_SPEED": 500.0,
+    "WPNAV_ACCEL": 100.0,
+    "COMPASS_OFS_X": 5.0,
+    "EK2_ENABLE": (ParamType.INT8, 0),
+    "BARO1_GND_PRESS": 94500.0,
+}
+GROUP: dict[str, Value | tuple[ParamType, Value]] = {"EK2_GPS_TYPE": (ParamType.INT8, 0)}
+FILE = """\
+RTL_ALT,2500
+WPNAV_SPEED,750.5
+WPNAV_ACCEL,100
+COMPASS_OFS_X,12.5
+"""
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    return tmp_path / "cache.sqlite3"
+
+
+@pytest.fixture
+def in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Runs commands on a loop whose clock leaps: what they wait for takes no time."""
+    leaping(monkeypatch)
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], cache: Path, in_no_time: None) -> Command:
+    """Runs the command in this process, with a cache of its own."""
+    return in_process(capsys, "--cache", str(cache))
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    """Puts simulated vehicles behind every URL; gives a URL."""
+    return behind(monkeypatch, "udpin:0.0.0.0:14550")
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Callable[..., Path]:
+    """Writes a parameter file; gives its path."""
+
+    def write(text: str = FILE, name: str = "quad.param") -> Path:
+        path = tmp_path / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return write
+
+
+def copter(**options: Any) -> ArduPilotVehicle:
+    return ArduPilotVehicle(table=TABLE, groups={"EK2_ENABLE": GROUP}, live=(), **options)
+
+
+# apply
+
+
+def test_apply_sets_what_differs_and_proves_it(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    vehicle = copter()
+    outcome = command("apply", put(vehicle), file())
+    assert outcome.code == 0
+    left_out = "left out: it was measured on one vehicle, and is wrong on every other"
+    assert outcome.rows == [
+        ["name", "before", "wanted", "now", "status", "reason"],
+        ["RTL_ALT", "1500", "2500", "2500", "set"],
+        ["WPNAV_SPEED", "500.0", "750.5", "750.5", "set"],
+        ["COMPASS_OFS_X", "5.0", "12.5", "5.0", "skipped", left_out],
+    ]
+    assert re.fullmatch(r"1/1 ardupilot: 2 set, 1 unchanged, 1 skipped in \d\.\d s\n", outcome.err)
+    assert vehicle.values["RTL_ALT"] == 2500
+    assert vehicle.values["COMPASS_OFS_X"] == 5.0
+    again = command("apply", put(vehicle), file())
+    assert again.code == 0
+    assert again.rows[1:] == [["COMPASS_OFS_X", "5.0", "12.5", "5.0", "skipped", left_out]]
+    assert vehicle.requests["PARAM_SET"] == 2
+
+
+def test_apply_tells_programs_everything(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    outcome = command("apply", put(copter()), file(FILE + "NO_SUCH,1\nRTL_ALTT,3\n"), "--json")
+    assert outcome.code == 1
+    told = outcome.json
+    elapsed = told.pop("elapsed_s")
+    assert elapsed > 0
+    params = told.pop("params")
+    assert told == {
+        "system": 1,
+        "component": 1,
+        "now": {"system": 1, "component": 1},
+        "complete": False,
+        "counts": {
+            **dict.fromkeys(("adjusted", "refused", "unproven", "failed"), 0),
+            "set": 2,
+            "unchanged": 1,
+            "skipped": 3,
+        },
+        "extra": 2,
+        "reboots": 0,
+        "reboot_required": [],
+        "error": None,
+    }
+    assert list(params) == ["RTL_ALT", "WPNAV_SPEED", "COMPASS_OFS_X", "NO_SUCH", "RTL_ALTT"]
+    assert params["WPNAV_SPEED"] == {
+        "status": "set",
+        "type": "REAL32",
+        "before": 500.0,
+        "wanted": 750.5,
+        "actual": 750.5,
+        "category": "",
+        "reason": "",
+        "nearest": [],
+    }
+    assert (params["NO_SUCH"]["status"], params["NO_SUCH"]["category"]) == ("skipped", "missing")
+    full = command("apply", put(copter()), file(), "--json", "--full").json
+    assert full["params"]["WPNAV_ACCEL"]["status"] == "unchanged"
+
+
+def test_names_that_are_not_there_come_with_those_that_are(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    outcome = command("apply", put(copter()), file("RTL_ALTT,3\n"))
+    assert outcome.code == 1
+    assert outcome.rows[1] == ["RTL_ALTT", "3", "skipped", "not on this vehicle (did you mean RTL_ALT?)"]
+
+
+def test_what_the_vehicle_makes_of_a_value_is_told(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    class Limiting(GenericVehicle):
+        def _write(self, entry: Entry, bits: int) -> None:
+            super()._write(entry, min(bits, 1000) if entry.name == "RTL_ALT" else bits)
+
+    class Stubborn(Limiting):
+        def _on_set(self, request: Any, sender: Any) -> None:
+            if request.param_id != "B_B":
+                super()._on_set(request, sender)
+
+    vehicle = Stubborn({"RTL_ALT": 5, "B_B": 1, "C_C": 1})
+    outcome = command("apply", put(vehicle), file("RTL_ALT,2500\nB_B,2\nC_C,2\n"), "--component", 1)
+    assert outcome.code == 1
+    rows = {row[0]: row for row in outcome.rows}
+    assert rows["RTL_ALT"][1:5] == ["5", "2500", "1000", "adjusted"]
+    assert rows["B_B"][1:5] == ["1", "2", "1", "refused"]
+    assert rows["C_C"][1:] == ["1", "2", "2", "set"]
+
+
+def test_what_cannot_be_right_is_found_before_anything_is_sent(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    vehicle = copter()
+    wrong = file("RTL_ALT,2500\nEK2_ENABLE,300\n")
+    outcome = command("apply", put(vehicle), wrong)
+    assert outcome.code == 2
+    assert "EK2_ENABLE: 300" in outcome.err
+    assert vehicle.requests["PARAM_SET"] == 0
+    assert command("apply", put(vehicle), wrong, "--dry-run").code == 2
+    outcome = command("apply", put(vehicle), wrong, "--skip-invalid")
+    assert outcome.code == 1
+    assert vehicle.values["RTL_ALT"] == 2500
+
+
+def test_armed_vehicles_are_left_alone(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    vehicle = copter(armed=True)
+    outcome = command("apply", put(vehicle), file())
+    assert (outcome.code, outcome.out) == (1, "")
+    assert "armed" in outcome.err
+    assert vehicle.requests["PARAM_SET"] == 0
+    would = command("apply", put(vehicle), file(), "--dry-run")
+    assert would.code == 1
+    assert "1/1 ardupilot is armed" in would.err
+    assert command("apply", put(vehicle), file(), "--dry-run", "--allow-armed").code == 0
+    assert command("apply", put(vehicle), file(), "--allow-armed").code == 0
+
+
+def test_include_takes_categories_and_patterns(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    for chosen in ("calibration", "COMPASS_*"):
+        vehicle = copter()
+        assert command("apply", put(vehicle), file(), "--include", "identity", "--include", chosen).code == 0
+        assert vehicle.values["COMPASS_OFS_X"] == 12.5
+    assert command("apply", put(copter()), file(), "--include", "nonsense").code == 2
+
+
+def test_reboot_is_only_done_when_asked_for(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    wanted = file("EK2_ENABLE,1\nEK2_GPS_TYPE,3\n")
+    vehicle = copter()
+    outcome = command("apply", put(vehicle), wanted)
+    assert outcome.code == 0
+    assert "1/1 ardupilot: counts only from the next start of the vehicle on: EK2_ENABLE\n" in outcome.err
+    assert vehicle.values["EK2_GPS_TYPE"] == 3
+    vehicle = copter()
+    outcome = command("apply", put(vehicle), wanted, "--reboot", "--json")
+    assert outcome.code == 0
+    assert (outcome.json["reboots"], outcome.json["reboot_required"]) == (1, [])
+
+
+# what would be sent
+
+
+@pytest.mark.parametrize(("answer", "sets"), [("y", 2), ("yes", 2), ("n", 0), ("", 0)])
+def test_somebody_at_a_terminal_is_asked(
+    command: Command,
+    put: Callable[[Endpoint], str],
+    file: Callable[..., Path],
+    monkeypatch: pytest.MonkeyPatch,
+    answer: str,
+    sets: int,
+) -> None:
+    vehicle = copter()
+    hand, terminal = pty.openpty()
+    os.write(hand, f"{answer}\n".encode())
+    with os.fdopen(hand, "wb"), os.fdopen(terminal, encoding="utf-8") as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: True)
+        outcome = command("apply", put(vehicle), file())
+        assert outcome.code == (0 if sets else 1)
+        assert "go on? [y/N]" in outcome.err
+        assert ["1", "RTL_ALT", "1500", "2500", "set", "the others"] in outcome.rows
+        assert vehicle.requests["PARAM_SET"] == sets
+        assert "go on?" not in command("apply", put(copter()), file(), "--json").err
+        assert "go on?" not in command("apply", put(vehicle), file(), "--yes").err
+        assert "go on?" not in command("apply", put(vehicle), file()).err, "there is nothing to ask about"
+
+
+def test_dry_run_prints_what_would_be_sent_in_its_order(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
+) -> None:
+    vehicle = copter()
+    wanted = file(FILE + "EK2_ENABLE,1\nNO_SUCH,1\n")
+    backup = tmp_path / "before.yaml"
+    outcome = command("apply", put(vehicle), wanted, "--dry-run", "--reboot", "--backup", backup)
+    assert outcome.code == 0
+    assert outcome.rows[1:3] == [
+        ["1", "EK2_ENABLE", "0", "1", "set", "what shows others, counts from the next start on"],
+        ["1", "restart", "the vehicle starts again"],
+    ]
+    assert [row[:5] for row in outcome.rows[3:5]] == [
+        ["2", "RTL_ALT", "1500", "2500", "set"],
+        ["2", "WPNAV_SPEED", "500.0", "750.5", "set"],
+    ]
+    assert [row[0] for row in outcome.rows[5:]] == ["COMPASS_OFS_X", "NO_SUCH"]
+    assert outcome.err.endswith("; nothing was sent\n")
+    assert vehicle.requests["PARAM_SET"] == 0
+    assert vehicle.requests["COMMAND_LONG"] <= 2, "who it is may be asked, and no more"
+    assert not backup.exists()
+
+    told = command("apply", put(vehicle), wanted, "--dry-run", "--json").json
+    planned = [(step["name"], step["value"]) for stage in told["stages"] for step in stage["steps"]]
+    assert planned == [("EK2_ENABLE", 1), ("RTL_ALT", 2500), ("WPNAV_SPEED", 750.5)]
+    assert told["dry_run"] is True
+    assert told["reboot_for"] == ["EK2_ENABLE"]
+
+
+def test_dry_run_is_not_done_with_what_is_missing(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    assert command("apply", put(copter()), file("NO_SUCH,1\n"), "--dry-run").code == 1
+
+
+# backups
+
+
+def test_backup_keeps_what_was_before(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
+) -> None:
+    vehicle = copter()
+    backup = tmp_path / "{system}-{uid}.yaml"
+    assert command("apply", put(vehicle), file(), "--backup", backup).code == 0
+    [kept] = tmp_path.glob("1-*.yaml")
+    assert re.fullmatch(r"1-[0-9a-f]{36}\.yaml", kept.name)
+    assert read_file(kept).sets[0]["RTL_ALT"].value == 1500
+    before = kept.read_bytes()
+    outcome = command("apply", put(vehicle), file("RTL_ALT,99\n"), "--backup", backup)
+    assert outcome.code == 2
+    assert "is there already" in outcome.err
+    assert kept.read_bytes() == before
+    assert vehicle.values["RTL_ALT"] == 2500
+    back = command("restore", put(vehicle), kept)
+    assert back.code == 0
+    assert vehicle.values == copter().values
+
+
+def test_it_is_said_when_nothing_is_kept(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
+) -> None:
+    outcome = command("apply", put(copter()), file(), "--no-cache")
+    assert "is kept nowhere" in outcome.err
+    outcome = command("apply", put(copter()), file(), "--no-cache", "--backup", tmp_path / "b.json")
+    assert "is kept nowhere" not in outcome.err
+
+
+# restore
+
+
+def test_restore_goes_back_behind_the_last_apply(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    vehicle = copter()
+    command("apply", put(vehicle), file(), "--include", "calibration")
+    assert vehicle.values["COMPASS_OFS_X"] == 12.5
+    would = command("restore", put(vehicle), "--dry-run")
+    assert would.code == 0
+    assert [row[1:4] for row in would.rows[1:]] == [
+        ["RTL_ALT", "2500", "1500"],
+        ["WPNAV_SPEED", "750.5", "500.0"],
+        ["COMPASS_OFS_X", "12.5", "5.0"],
+    ]
+    assert vehicle.values["RTL_ALT"] == 2500
+    back = command("restore", put(vehicle))
+    assert back.code == 0
+    assert re.match(r"the state: 6 parameters of 1/1 ardupilot from snapshot 1 of uid:", back.err)
+    assert vehicle.values == copter().values
+    vehicle.set_param("RTL_ALT", 77)  # had the restore been ended in the middle, say
+    assert command("restore", put(vehicle)).code == 0
+    assert vehicle.values == copter().values, "a restore is no apply that restore goes back behind"
+
+
+def test_restore_says_what_it_leaves_out_and_ends_well(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    vehicle = ArduPilotVehicle(
+        table={"RTL_ALT": 1500, "BARO1_GND_PRESS": 94500.0, "INS_GYROFFS_X": 0.25}, live_period=0.0
+    )
+    command("apply", put(vehicle), file("RTL_ALT,2500\n"))
+    vehicle.set_param("BARO1_GND_PRESS", 94600.0)
+    vehicle.set_param("INS_GYROFFS_X", 0.5)
+    back = command("restore", put(vehicle))
+    assert back.code == 0
+    assert {tuple(row) for row in back.rows[1:]} == {
+        ("RTL_ALT", "2500", "1500", "1500", "set"),
+        (
+            *("BARO1_GND_PRESS", "94600.0", "94500.0", "94600.0", "skipped"),
+            "left out: it can only be read: the vehicle writes it",
+        ),
+        (
+            *("INS_GYROFFS_X", "0.5", "0.25", "0.5", "skipped"),
+            "left out: it is measured by the vehicle at each start",
+        ),
+    }
+    assert vehicle.values == {"RTL_ALT": 1500, "BARO1_GND_PRESS": 94600.0, "INS_GYROFFS_X": 0.5}
+
+
+def test_restore_takes_a_moment_or_a_snapshot(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], cache: Path
+) -> None:
+    vehicle = copter()
+    command("apply", put(vehicle), file("RTL_ALT,2\n"))
+    command("apply", put(vehicle), file("RTL_ALT,3\n"))
+    with ParamCache(cache) as kept:
+        first, second = kept.snapshots(kept.vehicles()[0].key)
+    assert command("restore", put(vehicle), second.id).code == 0
+    assert vehicle.values["RTL_ALT"] == 2
+    assert command("restore", put(vehicle), first.id).code == 0
+    assert vehicle.values["RTL_ALT"] == 1500
+    assert command("restore", put(vehicle), "1 week ago").code == 5
+    assert command("restore", put(vehicle), "the day after").code == 2
+    assert command("restore", put(vehicle), 99).code == 5
+
+
+@pytest.mark.parametrize(
+    ("when", "text"),
+    [
+        ([], "the cache knows of no apply to uid:"),
+        (["2h ago"], "is not known: its table was never complete; there is no snapshot"),
+        (["4"], "there is no snapshot 4 of uid:"),
+    ],
+)
+def test_restore_needs_something_to_go_back_to(
+    command: Command, put: Callable[[Endpoint], str], when: list[str], text: str
+) -> None:
+    outcome = command("restore", put(copter()), *when)
+    assert outcome.code == 5
+    assert text in outcome.err
+    assert command("restore", put(copter()), *when, "--no-cache").code == 2
+
+
+# verify
+
+
+def test_verify_compares_and_sets_nothing(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    vehicle = copter()
+    outcome = command("verify", put(vehicle), file(FILE + "BARO1_GND_PRES,1\n"))
+    assert outcome.code == 1
+    assert outcome.rows == [
+        ["name", "wanted", "now", "is", "reason"],
+        ["RTL_ALT", "2500", "1500", "different"],
+        ["WPNAV_SPEED", "750.5", "500.0", "different"],
+        ["BARO1_GND_PRES", "1", "missing", "(did you mean BARO1_GND_PRESS?)"],
+    ]
+    assert outcome.err == "1/1 ardupilot: 1 same, 2 different, 1 missing, 1 left out\n"
+    assert vehicle.requests["PARAM_SET"] == 0
+    vehicle.set_param("RTL_ALT", 2500)
+    vehicle.set_param("WPNAV_SPEED", 750.5)
+    outcome = command("verify", put(vehicle), file())
+    assert (outcome.code, outcome.out) == (0, "")
+    assert outcome.err == "1/1 ardupilot: 3 same, 1 left out\n"
+    told = command("verify", put(vehicle), file(), "--json", "--full").json
+    assert told["met"] is True
+    assert told["counts"] == {"same": 3, "different": 0, "missing": 0, "left out": 1}
+    assert told["params"]["RTL_ALT"]["is"] == "same"
+
+
+@pytest.mark.parametrize("kind", ["px4", "ardupilot"])
+def test_simulated_links_work(command: Command, file: Callable[..., Path], kind: str) -> None:
+    name = {"px4": "MC_ROLL_P", "ardupilot": "ATC_ANG_RLL_P"}[kind]
+    wanted = file(f"{name},4.5\n")
+    url = f"sim:{kind}"
+    assert command("apply", url, wanted, "--no-cache").code == 0
+    assert "kept nowhere" not in command("apply", url, wanted, "--no-cache").err
+    assert command("verify", url, file(f"{name},99\n")).code == 1
+
+
+# several vehicles
+
+
+def fleet(**options: Any) -> tuple[Air, list[ArduPilotVehicle]]:
+    vehicles = [copter(system=system) for system in (1, 2, 3)]
+    camera = GenericVehicle({"CAM_MODE": 1}, system=2, component=100)
+    return Air([*vehicles, camera], **options), vehicles
+
+
+def test_all_vehicles_are_set_side_by_side(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
+) -> None:
+    air, vehicles = fleet()
+    for system in (1, 2, 3):
+        file(f"WPNAV_SPEED,{system}00\nWPNAV_ACCEL,{system}0.5\n", f"own/{system}.param")
+    over = tmp_path / "own/{system}.param"
+    backup = tmp_path / "{system}.yaml"
+    options = ("--all", "--overlay", over, "--backup", backup)
+    outcome = command("apply", put(air), file(), *options)
+    assert outcome.code == 0
+    assert [row[:5] for row in outcome.rows if row[1] == "WPNAV_SPEED"] == [
+        [f"{system}/1", "WPNAV_SPEED", "500.0", f"{system}00.0", f"{system}00.0"] for system in (1, 2, 3)
+    ]
+    assert [vehicle.values["WPNAV_SPEED"] for vehicle in vehicles] == [100.0, 200.0, 300.0]
+    assert [vehicle.values["RTL_ALT"] for vehicle in vehicles] == [2500, 2500, 2500]
+    assert [line.split(":")[0] for line in outcome.err.splitlines()] == [
+        f"{system}/1 ardupilot" for system in (1, 2, 3)
+    ]
+    assert sorted(path.name for path in tmp_path.glob("?.yaml")) == ["1.yaml", "2.yaml", "3.yaml"]
+    assert command("verify", put(air), file(), "--all", "--overlay", over).code == 0
+    outcome = command("verify", put(air), file(), "--all")
+    assert outcome.code == 1
+    assert {row[0] for row in outcome.rows[1:]} == {"1/1", "2/1", "3/1"}
+
+
+def test_one_exit_code_for_all_and_none_stops_the_others(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    air, vehicles = fleet()
+    vehicles[1].armed = True
+    outcome = command("apply", put(air), file(), "--all")
+    assert outcome.code == 1
+    assert "2/1 ardupilot: " in outcome.err
+    assert [vehicle.values["RTL_ALT"] for vehicle in vehicles] == [2500, 1500, 2500]
+    told = command("apply", put(air), file(), "--all", "--json").json
+    assert [each["system"] for each in told["vehicles"]] == [1, 3]
+    assert [each["system"] for each in told["errors"]] == [2]
+    vehicles[1].armed = False
+    vehicles[2].reboot(down=float("inf"))
+    outcome = command("verify", put(air), file(), "--all", "--expect", 3, "--timeout", 30)
+    assert outcome.code == 3
+    assert "3 vehicles (heard: 1/1 ardupilot, 2/1 ardupilot)" in outcome.err
+
+
+def test_a_fleet_needs_a_place_for_each_vehicles_own(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
+) -> None:
+    air, vehicles = fleet()
+    for option in ("--overlay", "--backup"):
+        outcome = command("apply", put(air), file(), "--all", option, "same.param")
+        assert outcome.code == 2
+        assert "{uid} or {system}" in outcome.err
+    file("RTL_ALT,3\n", "1.param")
+    outcome = command("apply", put(air), file(), "--all", "--overlay", tmp_path / "{system}.param")
+    assert outcome.code == 2
+    assert "laid over for 2/1 ardupilot" in outcome.err
+    assert not any(vehicle.requests["PARAM_SET"] for vehicle in vehicles)
+    assert command("verify", put(air), file(), "--all", "--system", 2).code == 2
+    assert command("verify", put(air), file(), "--expect", 2).code == 2
+
+
+def test_a_file_of_several_systems_gives_each_its_own(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    air, vehicles = fleet()
+    text = "".join(f"{system}\t1\tRTL_ALT\t{system}000\t6\n" for system in (1, 2, 3))
+    assert command("apply", put(air), file(text, "fleet.params"), "--all").code == 0
+    assert [vehicle.values["RTL_ALT"] for vehicle in vehicles] == [1000, 2000, 3000]
+
+
+def test_component_chooses_another_one(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    air, _ = fleet()
+    outcome = command("verify", put(air), file("CAM_MODE,1\n"), "--component", 100, "--all")
+    assert outcome.code == 0
+    assert outcome.err.startswith("2/100 generic: 1 same")
+
+
+# ended in the middle
+
+
+@pytest.mark.parametrize("as_json", [False, True])
+def test_whoever_ends_it_learns_what_was_set(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], as_json: bool
+) -> None:
+    class Interrupting(GenericVehicle):
+        def _on_set(self, request: Any, sender: Any) -> None:
+            if self.requests["PARAM_SET"] == 12:
+                signal.raise_signal(signal.SIGINT)
+            else:
+                super()._on_set(request, sender)
+
+    names = [f"P{number:02}" for number in range(40)]
+    vehicle = Interrupting(dict.fromkeys(names, 1))
+    wanted = file("".join(f"{name},2\n" for name in names))
+    outcome = command("apply", put(vehicle), wanted, *(["--json"] if as_json else []))
+    assert outcome.code == 130
+    done = sum(value == 2 for value in vehicle.values.values())
+    assert done < 40
+    if as_json:
+        told = outcome.json
+        assert (told["complete"], told["error"]) == (False, "interrupted")
+        assert 0 < len(told["params"]) <= done
+        assert {row["status"] for row in told["params"].values()} == {"unproven"}
+    else:
+        assert 0 < len(outcome.rows) - 1 <= done
+        assert outcome.rows[1][4:] == ["unproven", "acknowledged, and not read back"]
+        assert re.search(r"interrupted: \d+ values? acknowledged, not proven, .*; run it again", outcome.err)
+    again = command("apply", put(vehicle), wanted)
+    assert again.code == 0
+    assert set(vehicle.values.values()) == {2}
+
+
+def test_a_vehicle_that_falls_silent_is_told_with_what_was_set(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    class Dying(GenericVehicle):
+        def _on_set(self, request: Any, sender: Any) -> None:
+            super()._on_set(request, sender)
+            if self.requests["PARAM_SET"] == 12:
+                self._switch_on(float("inf"))
+
+    names = [f"P{number:02}" for number in range(40)]
+    vehicle = Dying(dict.fromkeys(names, 1))
+    wanted = file("".join(f"{name},2\n" for name in names))
+    outcome = command("apply", put(vehicle), wanted, "--json")
+    assert outcome.code == 3
+    assert outcome.json["error"]
+    assert outcome.json["counts"]["unproven"] + outcome.json["counts"]["failed"] > 0
+    assert "run it again" in command("apply", put(Dying(dict.fromkeys(names, 1))), wanted).err
+
+
+# what firmwares say of their parameters
+
+
+def test_metadata_says_what_is_out_of_range_and_what_needs_a_start(
+    command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
+) -> None:
+    vehicle = copter()
+    described = [
+        {"name": "RTL_ALT", "type": "Int32", "min": 30, "max": 2000},
+        {"name": "WPNAV_SPEED", "type": "Float", "rebootRequired": True},
+    ]
+    metadata = file(json.dumps({"version": 1, "parameters": described}), "parameters.json")
+    outcome = command("apply", put(vehicle), file(), "--metadata", metadata)
+    assert outcome.code == 2
+    assert "RTL_ALT: 2500 is above its maximum, 2000" in outcome.err
+    assert vehicle.requests["PARAM_SET"] == 0
+    options = ("--metadata", metadata, "--include", "out-of-range")
+    outcome = command("apply", put(vehicle), file(), *options)
+    assert outcome.code == 0
+    assert "counts only from the next start of the vehicle on: WPNAV_SPEED" in outcome.err
+    assert command("verify", put(vehicle), file(), "--metadata", metadata).code == 0

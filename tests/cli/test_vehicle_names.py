@@ -1,0 +1,229 @@
+"""Names of vehicles in the cache: what each name means, and that every command keeps to it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from paramclient import AmbiguousVehicle, ParamCache, UnknownVehicle
+from paramclient.cache import CachedVehicle, TableState
+from paramclient.cache.lookup import LISTED_MAX, find_vehicle, is_vehicle_name
+from paramclient.model.identity import Identity
+from paramclient.sim import PX4Vehicle
+from tests.caches import NOW, PX4, stored, update
+from tests.commands import Command, Put, behind, in_process, leaping
+
+FOUR = "4a00000000000011"
+"""The hardware id of system 3: it begins with the number of another system."""
+DIGITS = "0000000000000004"
+"""A hardware id of which every digit is decimal, and whose number could be a system id."""
+LONG = f"{FOUR}00112233445566778899"
+SHARED = "4954414c44494e4f"
+"""The hardware id that every simulated PX4 has."""
+
+
+def known(system: int, uid: str | None, components: tuple[int, ...] = (1,)) -> CachedVehicle:
+    identity = Identity(system, "udpin:0.0.0.0:14550", uid, 12, 2)
+    return CachedVehicle(identity.key, identity, NOW, NOW, components)
+
+
+KEPT = [
+    known(3, FOUR, (1, 154)),
+    known(200, DIGITS),
+    known(7, LONG),
+    known(1, SHARED),
+    known(12, SHARED),
+    known(5, None),
+    known(1, "beef000000000001"),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "found"),
+    [
+        ("3", KEPT[0]),
+        ("003", KEPT[0]),
+        ("200", KEPT[1]),
+        ("5", KEPT[5]),
+        (FOUR, KEPT[0]),
+        (FOUR.upper(), KEPT[0]),
+        (f"uid:{FOUR}", KEPT[0]),
+        (f"UID:{FOUR.upper()}", KEPT[0]),
+        (LONG, KEPT[2]),
+        (f"uid:{LONG[:20]}", KEPT[2]),
+        (DIGITS, KEPT[1]),
+        (f"uid:{DIGITS}", KEPT[1]),
+        ("uid:000000", KEPT[1]),
+        ("uid:beef00", KEPT[6]),
+        (f"uid:{SHARED}/12", KEPT[4]),
+        (f"{SHARED}/1", KEPT[3]),
+        ("uid:495441/12", KEPT[4]),
+        ("system:5@udpin:0.0.0.0:14550", KEPT[5]),
+    ],
+)
+def test_a_name_means_one_vehicle(name: str, found: CachedVehicle) -> None:
+    assert find_vehicle(KEPT, name, place="here") is found
+    assert is_vehicle_name(name)
+
+
+@pytest.mark.parametrize(
+    ("name", "reason"),
+    [
+        ("4", "no vehicle has system id 4"),
+        ("49", "no vehicle has system id 49"),
+        ("000", "system ids are 1 to 255"),
+        ("256", "system ids are 1 to 255"),
+        ("0000", "neither a system id nor a hardware id in full"),
+        ("0000000003", "neither a system id nor a hardware id in full"),
+        ("4a0000", "neither a system id nor a hardware id in full"),
+        (FOUR[:-1], "neither a system id nor a hardware id in full"),
+        ("uid:", "a hardware id has hexadecimal digits"),
+        ("uid:4", "at least 6 digits"),
+        ("uid:4a000", "at least 6 digits"),
+        ("uid:4a0001", "is not in the cache here. The cache holds"),
+        ("uid:quad", "a hardware id has hexadecimal digits"),
+        (f"uid:{FOUR}/3", "is not in the cache here. The cache holds"),
+        (f"uid:{SHARED}/2", "is not in the cache here. The cache holds"),
+        (f"{FOUR} ", "is not in the cache here. The cache holds"),
+        ("\u0663", "is not in the cache here. The cache holds"),
+        ("system:5", "is not in the cache here. The cache holds"),
+        ("SYSTEM:5@udpin:0.0.0.0:14550", "is not in the cache here. The cache holds"),
+        ("", "is not in the cache here. The cache holds"),
+    ],
+)
+def test_a_name_that_no_vehicle_has_lists_those_that_there_are(name: str, reason: str) -> None:
+    with pytest.raises(UnknownVehicle) as caught:
+        find_vehicle(KEPT, name, place="here")
+    assert reason in str(caught.value)
+    assert caught.value.vehicles == tuple(map(str, KEPT))
+    assert all(f"\n  {each}" in str(caught.value) for each in KEPT)
+
+
+@pytest.mark.parametrize(
+    ("name", "fits"),
+    [
+        ("1", [3, 6]),
+        (f"uid:{SHARED}", [3, 4]),
+        (SHARED, [3, 4]),
+        ("uid:4a0000", [0, 2]),
+    ],
+)
+def test_a_name_that_several_have_lists_these(name: str, fits: list[int]) -> None:
+    with pytest.raises(AmbiguousVehicle) as caught:
+        find_vehicle(KEPT, name, place="here")
+    assert caught.value.vehicles == tuple(str(KEPT[each]) for each in fits)
+    assert str(caught.value) == (
+        f"vehicle {name} fits 2 vehicles in the cache here:"
+        + "".join(f"\n  {KEPT[each]}" for each in fits)
+        + "\nChoose one by its key."
+    )
+
+
+def test_a_system_or_a_component_narrows_a_name_and_never_widens_it() -> None:
+    assert find_vehicle(KEPT, "uid:4a0000", place="here", system=7) is KEPT[2]
+    assert find_vehicle(KEPT, "uid:4a0000", place="here", component=154) is KEPT[0]
+    assert find_vehicle(KEPT, None, place="here", component=154) is KEPT[0]
+    with pytest.raises(UnknownVehicle, match=f"vehicle {FOUR}, component 9 is not in the cache"):
+        find_vehicle(KEPT, FOUR, place="here", component=9)
+    with pytest.raises(UnknownVehicle, match="vehicle 3, system 4 is not in the cache"):
+        find_vehicle(KEPT, "3", place="here", system=4)
+
+
+def test_a_long_list_is_cut_and_says_so() -> None:
+    many = [known(1 + number % 255, f"{number:016x}") for number in range(LISTED_MAX + 2)]
+    with pytest.raises(UnknownVehicle, match="and 2 more; `paramclient cache list` shows all") as caught:
+        find_vehicle(many, "uid:ffffff", place="here")
+    assert str(caught.value).count("\n") == LISTED_MAX + 1
+    assert len(caught.value.vehicles) == LISTED_MAX + 2
+
+
+def test_an_empty_cache_says_so() -> None:
+    with pytest.raises(UnknownVehicle, match=r"vehicle 4 is not in the cache here.* holds no vehicle\."):
+        find_vehicle([], "4", place="here")
+
+
+# every command that takes a vehicle in the cache
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    """A cache in which the hardware id of system 3 begins with 4, and two vehicles have system id 9."""
+    path = tmp_path / "cache.sqlite3"
+    whole = TableState(count=1, complete=True)
+    with ParamCache(path) as kept:
+        for system, uid in ((3, FOUR), (9, "c100000000000000"), (9, "c200000000000000")):
+            identity = replace(PX4, system=system, uid=uid)
+            kept.save(update(stored("MC_ROLL_P", 7, index=0), identity=identity, table=whole))
+    return path
+
+
+@pytest.fixture
+def command(cache: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Runs the command in this process, on a clock that leaps, with this cache."""
+    leaping(monkeypatch)
+    return in_process(capsys, "--cache", str(cache))
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    return behind(monkeypatch, "udpin:127.0.0.1:1")
+
+
+LINK = "udpin:127.0.0.1:1"
+COMMANDS = [
+    ["show", "NAME"],
+    ["show", "NAME", "MC_ROLL_P"],
+    ["show", "NAME", "--json"],
+    ["history", "NAME"],
+    ["history", "NAME", "--snapshots"],
+    ["cache", "history", "NAME"],
+    ["cache", "remove", "NAME"],
+    ["cache", "remove", "NAME", "--component", "1"],
+    ["save", "NAME", "FILE"],
+    ["save", "NAME", "FILE", "--all"],
+    ["diff", "NAME", "3"],
+    ["diff", "3", "NAME"],
+    ["diff", "3", "3", "--base", "NAME"],
+    ["diff", LINK, "NAME"],
+    ["apply", LINK, "NAME", "--yes"],
+    ["apply", LINK, "NAME", "--dry-run"],
+    ["apply", LINK, "NAME", "--all", "--yes"],
+    ["verify", LINK, "NAME"],
+]
+"""With NAME for the vehicle, and FILE for a file that is not there."""
+
+
+@pytest.mark.parametrize(
+    "name", ["4", "cache:4", "4a00", "4a000000", "uid:4a00", "9", "cache:9", "uid:c0ffee"]
+)
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_no_command_takes_a_number_for_a_hardware_id_or_one_vehicle_of_several(
+    command: Command, put: Put, cache: Path, tmp_path: Path, words: list[str], name: str
+) -> None:
+    vehicle = PX4Vehicle(table={"MC_ROLL_P": 4.0})
+    put(vehicle)
+    file = tmp_path / "quad.param"
+    done = command(*({"NAME": name, "FILE": str(file)}.get(word, word) for word in words))
+    assert (done.code, done.out) == (2, "")
+    several = name.endswith("9")
+    wanted = f"vehicle {name.removeprefix('cache:')}"
+    assert f"paramclient: {wanted} {'fits 2 vehicles' if several else 'is not'} in the cache" in done.err
+    for each in ParamCache(cache).vehicles():
+        is_listed = f"\n  {each}\n" in done.err
+        assert is_listed == (not several or each.identity.system == 9)
+    assert not file.exists()
+    assert len(ParamCache(cache).components()) == 3, "nothing is removed"
+    assert not vehicle.requests, "nothing is sent"
+
+
+@pytest.mark.parametrize("name", ["3", "cache:3", "uid:4a0000", f"cache:{FOUR}", f"uid:{FOUR}"])
+@pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
+def test_every_command_takes_a_vehicle_by_each_kind_of_name(
+    command: Command, put: Put, cache: Path, tmp_path: Path, words: list[str], name: str
+) -> None:
+    put(PX4Vehicle(table={"MC_ROLL_P": 4.0}))
+    done = command(*({"NAME": name, "FILE": str(tmp_path / "quad.param")}.get(word, word) for word in words))
+    assert done.code in (0, 1), done.err
+    assert (words[:2] == ["cache", "remove"]) == (len(ParamCache(cache).components()) == 2)

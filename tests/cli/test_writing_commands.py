@@ -1,0 +1,411 @@
+"""Commands that write, where several vehicles are on the link: nothing goes to one that was not named."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+
+from paramclient import ParamCache, ParamClient, ParamType
+from paramclient.cache import StoredParam, TableState
+from paramclient.cli import connection
+from paramclient.cli import signing as signing_commands
+from paramclient.links import SimLink
+from paramclient.model.identity import Identity
+from paramclient.model.values import Param, bits_of
+from paramclient.protocol import wire
+from paramclient.protocol.vehicle_selection import LOOK_TIME
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, Vehicle
+from tests.caches import NOW, update
+from tests.commands import Command, Put, behind, in_process, leaping
+from tests.shell import Late, PeersLink, Tap
+from tests.ways import ServedClient
+
+URL = "udpin:0.0.0.0:14550"
+SOURCE = "udpin:0.0.0.0:14551"
+"""Another link, with values to be written."""
+TABLE: dict[str, Any] = {"MC_ROLL_P": 4.0, "MC_PITCH_P": 4.0}
+LISTED = (
+    "paramclient: 2 vehicles on this link: 1/1 PX4 quadrotor, 2/1 ArduPilot quadrotor. "
+    "Choose one with --system.\n"
+)
+QUESTIONS = (wire.Heartbeat, wire.CommandLong)
+"""What identifies vehicles."""
+
+
+@pytest.fixture
+def cache(tmp_path: Path) -> Path:
+    return tmp_path / "cache.sqlite3"
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], cache: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Runs the command in this process, on a clock that leaps, with a cache of its own."""
+    leaping(monkeypatch)
+    cached, plain = in_process(capsys, "--cache", str(cache)), in_process(capsys)
+    return lambda *words: (plain if words[0] == "signing" else cached)(*words)
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    """Puts simulated vehicles behind every link."""
+    place = behind(monkeypatch, URL)
+
+    def both(far_end: Endpoint | SimLink | PeersLink) -> str:
+        link = far_end if isinstance(far_end, SimLink | PeersLink) else SimLink(far_end, URL)
+        monkeypatch.setattr(signing_commands, "create_link", lambda _: link)
+        return place(far_end)
+
+    return both
+
+
+@pytest.fixture
+def words(tmp_path: Path, cache: Path) -> Callable[[str], list[str]]:
+    """Gives the words of a command that writes; nothing that it needs is missing but the vehicle."""
+    file = tmp_path / "wanted.param"
+    file.write_text("MC_ROLL_P,7.5\nMC_PITCH_P,7.5\n")
+    key = tmp_path / "vehicle.key"
+    key.write_bytes(bytes(range(101, 133)))
+    key.chmod(0o600)
+    source = Identity(9, URL, "beef000000000009")
+    values = [
+        StoredParam(Param(name, 7.5, ParamType.REAL32, index, bits_of(7.5, ParamType.REAL32)), NOW)
+        for index, name in enumerate(TABLE)
+    ]
+    with ParamCache(cache) as kept:
+        whole = TableState(count=2, complete=True, synced_at=NOW)
+        kept.save(update(*values, identity=source, table=whole))
+    commands = {
+        "set": ["set", URL, "MC_ROLL_P", "7.5"],
+        "set many": ["set", URL, "MC_ROLL_P", "7.5", "MC_PITCH_P", "7.5", "--json"],
+        "apply": ["apply", URL, str(file), "--yes"],
+        "apply with a reboot": ["apply", URL, str(file), "--yes", "--reboot", "--json"],
+        "apply to see": ["apply", URL, str(file), "--dry-run"],
+        "apply from the cache": ["apply", URL, "cache:9", "--yes"],
+        "restore": ["restore", URL, str(file), "--yes"],
+        "restore to see": ["restore", URL, str(file), "--dry-run"],
+        "signing setup": ["signing", "setup", URL, "--signing-key", str(key), "--link-is-safe"],
+        "signing disable": ["signing", "disable", URL, "--signing-key", str(key), "--link-is-safe"],
+    }
+    return lambda name: commands[name]
+
+
+WRITING = ["set", "set many", "apply", "apply with a reboot", "apply from the cache", "restore"]
+SIGNING = ["signing setup", "signing disable"]
+SHOWING = ["apply to see", "restore to see"]
+
+
+def px4(system: int = 1, **options: Any) -> PX4Vehicle:
+    return PX4Vehicle(system=system, **{"table": TABLE} | options)
+
+
+def copter(system: int = 2, **options: Any) -> ArduPilotVehicle:
+    return ArduPilotVehicle(system=system, live=(), **{"table": TABLE} | options)
+
+
+def untouched(*vehicles: Vehicle) -> bool:
+    """Whether nothing was written to any of them."""
+    return all(
+        not each.requests["PARAM_SET"] and each.signing_key is None and dict(each.values) == TABLE
+        for each in vehicles
+    )
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.35, 0.7, 0.99, 1.15])
+@pytest.mark.parametrize("name", [*WRITING, *SIGNING, *SHOWING])
+def test_with_two_vehicles_on_the_link_none_is_written_to(
+    command: Command, put: Put, words: Callable[[str], list[str]], name: str, phase: float
+) -> None:
+    for first, second in ((0.0, phase), (phase, 0.0)):
+        one, two = px4(), copter()
+        air = Tap(Air([Late(one, first), Late(two, second)]))
+        put(air)
+        done = command(*words(name))
+        assert (done.code, done.out, done.err) == (2, "", LISTED)
+        assert untouched(one, two)
+        assert {type(message) for _, _, message in air.heard} <= {*QUESTIONS}, "nothing but who they are"
+
+
+@pytest.mark.parametrize("name", [*WRITING, *SIGNING])
+@pytest.mark.parametrize("system", [1, 2])
+def test_the_one_that_is_named_is_written_to_and_no_other(
+    command: Command, put: Put, words: Callable[[str], list[str]], name: str, system: int
+) -> None:
+    one, two = px4(), copter()
+    put(Air([one, two] if system == 2 else [two, one]))
+    done = command(*words(name), "--system", system, "--timeout", 30)
+    named, other = (one, two) if system == 1 else (two, one)
+    assert untouched(other)
+    if name == "signing disable":
+        return
+    assert done.code == 0, done.err
+    assert not untouched(named)
+
+
+@pytest.mark.parametrize("name", [*WRITING, *SIGNING])
+def test_the_only_vehicle_need_not_be_named(
+    command: Command, put: Put, words: Callable[[str], list[str]], name: str
+) -> None:
+    one = px4()
+    put(Tap(Air([one])))  # of which it is not known how many there are
+    done = command(*words(name))
+    assert done.code == 0, done.err
+    assert untouched(one) == (name == "signing disable")
+
+
+@pytest.mark.parametrize("name", [*WRITING, *SIGNING])
+def test_a_component_alone_names_no_vehicle(
+    command: Command, put: Put, words: Callable[[str], list[str]], name: str
+) -> None:
+    one, two = px4(), copter()
+    put(Air([Late(two, 0.9), one]))
+    done = command(*words(name), "--component", 1)
+    assert (done.code, done.out, done.err) == (2, "", LISTED)
+    assert untouched(one, two)
+
+
+@pytest.mark.parametrize("name", [*WRITING, *SIGNING])
+@pytest.mark.parametrize("first", [1, 2])
+def test_two_autopilots_of_one_system_are_told_apart_by_the_component(
+    command: Command, put: Put, words: Callable[[str], list[str]], name: str, first: int
+) -> None:
+    one, two = px4(), copter(1, component=2)
+    put(Air([Late(one, 0.0 if first == 1 else 0.9), Late(two, 0.9 if first == 1 else 0.0)]))
+    done = command(*words(name))
+    assert (done.code, done.out) == (2, "")
+    assert done.err == (
+        "paramclient: 2 autopilots in system 1 on this link: 1/1 PX4 quadrotor, 1/2 ArduPilot quadrotor. "
+        "Choose one with --component.\n"
+    )
+    assert untouched(one, two)
+    if name in WRITING and name != "apply from the cache":  # which has no table of component 2
+        assert command(*words(name), "--component", 2, "--timeout", 30).code == 0
+        assert (untouched(one), untouched(two)) == (True, False)
+
+
+@pytest.mark.parametrize("first", [0.0, 0.9])
+def test_a_system_alone_means_its_component_1_whichever_is_heard_first(
+    command: Command, put: Put, words: Callable[[str], list[str]], first: float
+) -> None:
+    one, two = px4(), copter(1, component=2)
+    put(Air([Late(one, first), Late(two, 0.9 - first)]))
+    assert command(*words("set"), "--system", 1).code == 0
+    assert (untouched(one), untouched(two)) == (False, True)
+
+
+def test_a_system_that_is_not_there_is_no_other(
+    command: Command, put: Put, words: Callable[[str], list[str]]
+) -> None:
+    one = px4()
+    put(Air([one, copter()]))
+    for name in WRITING:
+        done = command(*words(name), "--system", 12)
+        assert (done.code, done.out) == (3, "")
+    assert untouched(one)
+
+
+# who comes and goes
+
+
+@pytest.mark.parametrize("name", ["apply", "apply with a reboot", "apply from the cache", "restore"])
+def test_a_vehicle_that_comes_while_the_other_is_read_stops_the_write(
+    command: Command, put: Put, cache: Path, words: Callable[[str], list[str]], name: str
+) -> None:
+    table = {**TABLE, **{f"PARAM_{number:03}": number for number in range(300)}}
+    one, two = px4(table=table, burst=1, period=0.02), copter()
+    put(Air([one, Late(two, 4.0)]))
+    done = command(*words(name))
+    assert (done.code, done.out) == (2, "")
+    assert done.err.endswith(LISTED)
+    assert (one.requests["PARAM_SET"], two.requests["PARAM_SET"]) == (0, 0)
+    assert one.requests["PARAM_REQUEST_LIST"]
+    with ParamCache(cache) as kept:
+        found = [each for each in kept.vehicles() if each.identity.system == 1]
+        assert not any(kept.snapshots(each.key) for each in found), "nothing to restore was kept"
+
+
+def test_a_vehicle_that_comes_while_the_other_describes_itself_stops_the_write(
+    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = px4(), copter()
+    put(Air([one, Late(two, 3.0)]))
+
+    async def slowly(*_: object, **__: object) -> None:
+        await anyio.sleep(4.0)
+
+    monkeypatch.setattr("paramclient.cli.parameters.known_of_session", slowly)
+    done = command("set", URL, "MC_ROLL_P", "7.5")
+    assert (done.code, done.out, done.err) == (2, "", LISTED)
+    assert untouched(one, two)
+
+
+def test_another_vehicle_in_the_place_of_one_that_vanished_is_not_written_to(
+    command: Command, put: Put, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = px4(), copter()
+    put(Air([Late(one, 0.0, until=3.0), Late(two, 12.0)]))
+
+    async def slowly(*_: object, **__: object) -> None:
+        await anyio.sleep(15.0)
+
+    monkeypatch.setattr("paramclient.cli.parameters.known_of_session", slowly)
+    done = command("set", URL, "MC_ROLL_P", "7.5")
+    assert (done.code, done.out) == (2, "")
+    assert done.err == (
+        "paramclient: 1/1 px4 was chosen and is not heard any more, 2/1 ardupilot is. Nothing was written. "
+        "Choose one with --system.\n"
+    )
+    assert untouched(one, two)
+
+
+def test_a_vehicle_that_vanished_before_is_not_there(
+    command: Command, put: Put, words: Callable[[str], list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    one, two = px4(), copter()
+    put(Air([Late(one, 0.0, until=0.5), Late(two, 9.0)]))
+    done = command(*words("set"))
+    assert done.code in (0, 3)
+    assert untouched(two)
+
+
+# whose values
+
+
+@pytest.mark.parametrize("dry", [[], ["--dry-run"]])
+def test_values_are_not_taken_of_one_of_several_vehicles(
+    command: Command, monkeypatch: pytest.MonkeyPatch, dry: list[str]
+) -> None:
+    target, (one, two) = px4(5), (px4(), copter())
+    links = {URL: SimLink(target, URL), SOURCE: SimLink(Air([one, Late(two, 0.9)]), SOURCE)}
+    monkeypatch.setattr(connection, "ParamClient", lambda url, **options: ParamClient(links[url], **options))
+    done = command("apply", URL, SOURCE, "--yes", *dry)
+    assert (done.code, done.out, done.err) == (2, "", LISTED)
+    assert untouched(target, one, two)
+
+
+# everybody
+
+
+@pytest.mark.parametrize("name", ["apply", "apply with a reboot", "apply from the cache"])
+def test_all_names_every_vehicle(
+    command: Command, put: Put, words: Callable[[str], list[str]], name: str
+) -> None:
+    one, two = px4(), copter()
+    put(Air([one, Late(two, 0.9)]))
+    assert command(*words(name), "--all").code == 0
+    assert one.values["MC_ROLL_P"] == two.values["MC_ROLL_P"] == 7.5
+
+
+# time
+
+
+class Watch:
+    """Notes when each PARAM_SET goes out, counted from the first heartbeat of a vehicle."""
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        self.tap = Tap(endpoint)
+        self.first_heard: float | None = None
+
+    def receive(self, data: bytes, now: float) -> None:
+        self.tap.receive(data, now)
+
+    def tick(self, now: float) -> None:
+        self.tap.tick(now)
+
+    def next_deadline(self) -> float | None:
+        return self.tap.next_deadline()
+
+    def data_to_send(self) -> list[bytes]:
+        data = self.tap.data_to_send()
+        if data and self.first_heard is None:
+            self.first_heard = anyio.current_time()
+        return data
+
+    def written_after(self) -> float:
+        assert self.first_heard is not None
+        first = next(at for at, _, message in self.tap.heard if isinstance(message, wire.ParamSet))
+        return first - self.first_heard
+
+
+@pytest.mark.parametrize(
+    ("named", "least", "most"),
+    [
+        ([], LOOK_TIME, LOOK_TIME + 0.1),
+        (["--component", "1"], LOOK_TIME, LOOK_TIME + 0.1),
+        (["--system", "1"], 0.0, 0.1),
+        (["--system", "1", "--component", "1"], 0.0, 0.1),
+    ],
+)
+def test_a_write_waits_for_as_long_as_is_promised(
+    command: Command, put: Put, named: list[str], least: float, most: float
+) -> None:
+    watch = Watch(px4())
+    put(watch)
+    assert command("set", URL, "MC_ROLL_P", "7.5", *named).code == 0
+    assert least <= watch.written_after() <= most
+
+
+@pytest.mark.parametrize("air", [lambda one: one, lambda one: Air([one]), lambda one: Air([Air([one])])])
+def test_a_simulated_link_with_one_vehicle_is_not_looked_at_for_a_second(
+    command: Command, monkeypatch: pytest.MonkeyPatch, air: Callable[[Vehicle], Endpoint]
+) -> None:
+    link = SimLink(air(px4()), "sim:px4")
+    assert link.has_one_vehicle
+    behind(monkeypatch, URL)(link)
+    done = command("set", URL, "MC_ROLL_P", "7.5", "--timeout", "0.9")
+    assert done.code == 0, done.err
+
+
+def test_who_sets_a_shorter_time_is_told_what_is_missing(command: Command, put: Put) -> None:
+    one = px4()
+    put(Tap(one))
+    done = command("set", URL, "MC_ROLL_P", "7.5", "--timeout", "1")
+    assert (done.code, done.out) == (3, "")
+    assert "an autopilot, and 1.2 s more to see that it is the only one" in done.err
+    assert untouched(one)
+
+
+# over a service
+
+
+@pytest.fixture
+def served(monkeypatch: pytest.MonkeyPatch) -> Callable[[Endpoint], None]:
+    """Puts simulated vehicles behind a service that has the link."""
+
+    def place(far_end: Endpoint) -> None:
+        def client(url: str, **options: Any) -> ServedClient:
+            return ServedClient(SimLink(far_end, "sim:custom"))
+
+        monkeypatch.setattr(connection, "ParamClient", client)
+
+    return place
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.9])
+@pytest.mark.parametrize("name", WRITING)
+def test_over_a_service_none_is_written_to_either(
+    command: Command,
+    served: Callable[[Endpoint], None],
+    words: Callable[[str], list[str]],
+    name: str,
+    phase: float,
+) -> None:
+    one, two = px4(), copter()
+    served(Air([Late(one, 0.0), Late(two, phase)]))
+    done = command(*words(name))
+    assert (done.code, done.out) == (2, "")
+    assert done.err == LISTED
+    assert untouched(one, two)
+    assert command(*words("set"), "--system", 2).code == 0
+    assert (untouched(one), untouched(two)) == (True, False)
+
+
+def test_a_generic_vehicle_is_one_too(command: Command, put: Put) -> None:
+    one, two = px4(), GenericVehicle(TABLE, system=3)
+    put(Air([one, Late(two, 0.8)]))
+    done = command("set", URL, "MC_ROLL_P", "7.5")
+    assert done.code == 2
+    assert "1/1 PX4 quadrotor, 3/1 " in done.err

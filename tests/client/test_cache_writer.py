@@ -1,0 +1,954 @@
+"""The client and its cache: starting from it, keeping it right, and going on without it."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import math
+import os
+import signal
+import threading
+from collections.abc import Callable, Collection
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import anyio
+import anyio.from_thread
+import anyio.lowlevel
+import pytest
+
+from paramclient import (
+    CacheError,
+    ClientClosed,
+    Component,
+    FetchResult,
+    NoReply,
+    ParamCache,
+    ParamClient,
+    Trust,
+    UsageError,
+)
+from paramclient.cache import CachedComponent
+from paramclient.client import cache_writer
+from paramclient.client import component as component_module
+from paramclient.model.paramset import ParamSet
+from paramclient.protocol import wire
+from paramclient.provision import apply
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
+from tests.caches import full_disk, read_only, rubbish, set_aside, start
+from tests.shell import (
+    VALUES,
+    Radio,
+    Tap,
+    bits,
+    generic,
+    outcome,
+    residue,
+    settled,
+    small_px4,
+    swift_loop,
+    swiftly,
+    until,
+)
+
+ODD = ("CAL_ACC0_XOFF", "PARAM_03", "PARAM_07")
+"""Volatile parameters that cannot be told from the hash alone: two are of no group that usually is."""
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "cache" / "parameters.sqlite3"
+
+
+async def session(
+    endpoint: Endpoint, path: Path | ParamCache, work: Callable[[Component], Any] | None = None
+) -> FetchResult:
+    """One session with the first autopilot: a fetch, and what else there is to do."""
+    async with ParamClient(endpoint, cache=path) as client:
+        component = await client.component()
+        result = await component.fetch_all()
+        await component.refreshed()
+        if work is not None:
+            await work(component)
+        return result
+
+
+async def while_away(vehicle: PX4Vehicle, **values: float) -> None:
+    """Somebody changes values while nobody listens to the vehicle."""
+    for name, value in values.items():
+        vehicle.set_param(name, value)
+    await asyncio.sleep(5.0)
+    vehicle.tick(anyio.current_time())
+    vehicle.data_to_send()
+
+
+def kept(path: Path, system: int = 1) -> dict[str, int]:
+    """The values that the cache holds."""
+    with ParamCache(path) as cache:
+        return bits(cache.component(system=system).params)
+
+
+def trusts(component: Component, names: Collection[str] | None = None) -> set[Trust]:
+    return {param.trust for name, param in component.params.items() if names is None or name in names}
+
+
+# Starting from it
+
+
+@pytest.mark.parametrize("make", [PX4Vehicle, small_px4], ids=["903 parameters", "25 parameters"])
+@swiftly
+async def test_an_unchanged_vehicle_is_not_downloaded_again(
+    path: Path, make: Callable[[], PX4Vehicle]
+) -> None:
+    vehicle = make()
+    volatile = {name for name in vehicle.params if vehicle._entry(name).volatile}
+    first = await session(vehicle, path)
+    assert first.source == "stream"
+    tap = Tap(vehicle)
+    async with ParamClient(Air.symmetric([tap], delay=0.1), cache=path) as client:
+        component = await client.component()
+        assert bits(component.params) == bits(vehicle.params), "from the cache, before anything was asked"
+        assert component.state == "cached"
+        assert trusts(component, volatile) == {Trust.CACHED}
+        result = await component.fetch_all()
+        assert anyio.current_time() - component._heard_at < 0.21, "one round trip after it was heard"
+        assert (result.source, result.complete, result.hash) == ("cache", True, vehicle.announced_hash())
+        assert bits(result.params) == bits(vehicle.params)
+        assert trusts(component, component.params.keys() - volatile) == {Trust.VERIFIED}
+        assert trusts(component, volatile) == {Trust.CACHED}
+        assert (
+            repr(component) == f"<Component 1/1 px4 synced {len(vehicle.params)} params from cache in 0.00 s>"
+        )
+        await component.refreshed()
+        assert trusts(component, volatile) == {Trust.LIVE}
+    reads = [message.param_id for message in tap.messages(wire.ParamRequestRead)]
+    assert sorted(reads) == sorted([wire.HASH_CHECK, *volatile])
+    assert not tap.messages(wire.ParamRequestList)
+    assert kept(path) == bits(vehicle.params)
+
+
+@swiftly
+async def test_a_fetch_waits_for_the_cached_table(path: Path) -> None:
+    vehicle = small_px4()
+    await session(vehicle, path)
+    async with ParamClient(Air.symmetric([vehicle], delay=0.1), cache=path) as client:
+        await until(lambda: client.components)
+        assert (await client.components[1, 1].fetch_all()).source == "cache"
+
+
+@swiftly
+async def test_volatile_values_are_read_afresh_after_a_hit(path: Path) -> None:
+    vehicle = small_px4()
+    await session(vehicle, path)
+    await while_away(vehicle, PARAM_03=9.5)
+
+    async def check(component: Component) -> None:
+        assert component.params["PARAM_03"].value == 9.5
+
+    assert (await session(vehicle, path, check)).source == "cache"
+    assert kept(path) == bits(vehicle.params)
+
+
+@swiftly
+async def test_refreshed_returns_at_once_where_nothing_is_to_be_read(path: Path) -> None:
+    async with ParamClient(small_px4(), cache=path) as client:
+        component = await client.component()
+        await component.refreshed()
+        await component.fetch_all()
+        began = anyio.current_time()
+        await component.refreshed()
+        assert anyio.current_time() - began < 0.001
+
+
+@swiftly
+async def test_waiting_for_volatile_values_has_an_end(path: Path) -> None:
+    vehicle = small_px4()
+    await session(vehicle, path)
+    tap = Tap(vehicle)
+    async with ParamClient(tap, cache=path) as client:
+        component = await client.component()
+        await component.fetch_all()
+        tap.is_mute = True
+        with pytest.raises(NoReply, match="no hash covers") as caught:
+            await component.refreshed(timeout=0.5)
+        assert math.isclose(caught.value.waited, 0.5, abs_tol=0.01)
+        cancelled = asyncio.create_task(component.refreshed())
+        waiting = asyncio.create_task(outcome(component.refreshed()))
+        await settled()
+        cancelled.cancel()
+        await asyncio.wait([cancelled])
+        assert not waiting.done()
+    assert isinstance(await waiting, ClientClosed)
+    assert not residue(component)
+
+    tap.is_mute = False
+    async with ParamClient(tap, cache=path) as client:
+        component = await client.component()
+        assert (await component.fetch_all()).source == "cache"
+        tap.is_mute = True
+        await component.refreshed()
+        assert Trust.CACHED in trusts(component), "what cannot be read is not made to look fresh"
+
+
+@swiftly
+async def test_a_download_can_be_asked_for_all_the_same(path: Path) -> None:
+    vehicle = small_px4()
+    await session(vehicle, path)
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        assert (await component.fetch_all(refresh=True)).source == "stream"
+        assert (await component.fetch_all()).source == "cache", "the next one finds the table of this session"
+        assert trusts(component) == {Trust.LIVE}
+
+
+@swiftly
+async def test_a_change_while_we_were_away_is_a_miss(path: Path) -> None:
+    vehicle = small_px4()
+    await session(vehicle, path)
+    await while_away(vehicle, PARAM_01=1000, PARAM_05=5000)
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        changes = component.changes()
+        result = await component.fetch_all()
+        assert result.source == "stream"
+        assert result.hash == vehicle.announced_hash()
+        told = {(await anext(changes)).name for _ in range(2)}
+        assert told == {"PARAM_01", "PARAM_05"}
+    assert kept(path) == bits(vehicle.params)
+    with ParamCache(path) as cache:
+        lines = cache.component().history()
+        assert [(line.name, line.old.value, line.new and line.new.value, line.by) for line in lines] == [
+            ("PARAM_01", 1, 1000, "vehicle"),
+            ("PARAM_05", 5, 5000, "vehicle"),
+        ]
+    assert (await session(vehicle, path)).source == "cache"
+
+
+@swiftly
+async def test_what_the_vehicle_no_longer_has_goes_from_the_cache(path: Path) -> None:
+    larger = PX4Vehicle(table=VALUES)
+    await session(larger, path)
+    smaller = PX4Vehicle(table=VALUES, not_in_use=["PARAM_04"])
+    result = await session(smaller, path)
+    assert (result.source, result.count) == ("stream", 23)
+    assert kept(path) == bits(smaller.params)
+    assert (await session(smaller, path)).source == "cache"
+
+
+@swiftly
+async def test_a_vehicle_without_a_hash_is_shown_from_the_cache_and_downloaded(path: Path) -> None:
+    vehicle = ArduPilotVehicle(ftp=False, live=())
+    await session(vehicle, path)
+    tap = Tap(vehicle)
+    async with ParamClient(tap, cache=path) as client:
+        component = await client.component()
+        assert bits(component.params) == bits(vehicle.params)
+        assert trusts(component) == {Trust.CACHED}
+        assert (await component.fetch_all()).source == "stream"
+        assert trusts(component) == {Trust.LIVE}
+    assert not [each for each in tap.messages(wire.ParamRequestRead) if each.param_id == wire.HASH_CHECK]
+
+
+@swiftly
+async def test_everyone_on_the_link_starts_from_the_cache(path: Path) -> None:
+    vehicles = [small_px4(system=system) for system in (1, 2, 3)]
+    camera = generic(system=1, component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)
+    for source in ("stream", "cache"):
+        async with ParamClient(Air([*vehicles, camera]), cache=path) as client:
+            everything = await client.fetch_all()
+            assert {result.source for address, result in everything.results.items() if address[1] == 1} == {
+                source
+            }
+            assert everything.results.keys() == {(1, 1), (2, 1), (3, 1), (1, 100)}
+            assert not everything.silent
+    assert [vehicle.requests["PARAM_REQUEST_LIST"] for vehicle in vehicles] == [1, 1, 1]
+    with ParamCache(path) as cache:
+        assert len(cache.components()) == 4
+        assert bits(cache.component(system=1, component=100).params) == bits(camera.params)
+
+
+class Reticent(PX4Vehicle):
+    """It can be told not to answer messages of some kinds."""
+
+    unanswered: tuple[type[wire.Message], ...] = ()
+
+    def _take(self, frame: wire.Frame) -> None:
+        if not isinstance(wire.decode(frame), self.unanswered):
+            super()._take(frame)
+
+
+PARAMETER_REQUESTS = (wire.ParamRequestRead, wire.ParamRequestList)
+
+
+@pytest.mark.parametrize("unanswered", [PARAMETER_REQUESTS, (*PARAMETER_REQUESTS, wire.CommandLong)])
+@swiftly
+async def test_a_silent_component_with_a_cached_table_holds_nobody_up(path: Path, unanswered: Any) -> None:
+    vehicle, silent = small_px4(), Reticent(system=2, table=VALUES)
+    async with ParamClient(Air([vehicle, silent]), cache=path) as client:
+        assert not (await client.fetch_all()).silent
+    silent.unanswered = unanswered
+    async with ParamClient(Air([vehicle, silent]), cache=path) as client:
+        began = anyio.current_time()
+        everything = await client.fetch_all()
+        assert anyio.current_time() - began < 5.0
+        assert everything.results.keys() == {(1, 1)}
+        assert everything.silent.keys() == {(2, 1)}
+
+
+# Who it is
+
+
+@swiftly
+async def test_two_vehicles_with_one_system_id_keep_two_tables(path: Path) -> None:
+    vehicles = small_px4(uid=0xA), small_px4(uid=0xB)
+    vehicles[1].set_param("PARAM_01", 77)
+    for source in ("stream", "cache"):
+        for vehicle in vehicles:
+            result = await session(vehicle, path)
+            assert result.source == source
+            assert bits(result.params) == bits(vehicle.params)
+    with ParamCache(path) as cache:
+        assert len(cache.vehicles()) == 2
+        assert not any(cache.history(each.key) for each in cache.vehicles())
+
+
+@pytest.mark.parametrize("known", [False, True])
+@swiftly
+async def test_another_vehicle_takes_the_place_within_a_session(path: Path, known: bool) -> None:
+    first, second = small_px4(uid=0xA), small_px4(uid=0xB)
+    second.set_param("PARAM_01", 77)
+    if known:
+        await session(second, path)
+    first.tick(swift_loop().time())
+    second.reboot(swift_loop().time(), down=math.inf)
+    async with ParamClient(Air([first, second]), cache=path) as client:
+        component = await client.component()
+        await component.fetch_all()
+        first.reboot(anyio.current_time(), down=math.inf)
+        second.reboot(anyio.current_time(), down=10.0)
+        await asyncio.sleep(10.5)
+        assert component.identity.uid == f"{0xB:016x}"
+        if known:
+            assert bits(component.params) == bits(second.params)
+        result = await component.fetch_all()
+        assert result.source == ("cache" if known else "stream")
+        assert bits(result.params) == bits(second.params)
+        await asyncio.sleep(1.0)
+    with ParamCache(path) as cache:
+        tables = {each.identity.uid: cache.load(each.key, 1) for each in cache.vehicles()}
+        for vehicle, uid in ((first, 0xA), (second, 0xB)):
+            table = tables[f"{uid:016x}"]
+            assert table is not None
+            assert bits(table.params) == bits(vehicle.params)
+            assert table.hash == vehicle.announced_hash()
+            assert table.complete
+        assert not any(cache.history(each.key) for each in cache.vehicles()), "nothing was changed"
+
+
+@swiftly
+async def test_the_end_of_a_table_is_no_news_of_the_vehicle_that_has_gone(path: Path) -> None:
+    first, second = small_px4(uid=0xA), small_px4(uid=0xB)
+    first.tick(swift_loop().time())
+    second.reboot(swift_loop().time(), down=math.inf)
+    async with ParamClient(Air([first, second]), cache=path) as client:
+        component = await client.component()
+        await component.fetch_all()
+        first.reboot(anyio.current_time(), down=math.inf)
+        second.reboot(anyio.current_time(), down=10.0)
+        gone = await anext(component.changes())
+        assert gone.new is None
+        await client._writer.flush()  # which the clock may bring about at any moment
+    with ParamCache(path) as cache:
+        table = cache.load(f"uid:{0xA:016x}", 1)
+        assert table is not None
+        assert bits(table.params) == bits(first.params)
+
+
+@swiftly
+async def test_another_vehicle_takes_the_place_while_the_cache_is_read(path: Path) -> None:
+    await session(small_px4(uid=0xA), path)
+    tap = Tap(small_px4(uid=0xA))
+    token = anyio.lowlevel.current_token()
+    version = wire.encode(wire.AutopilotVersion(0, uid=0xB), system=1, component=1, sequence=0)
+
+    class Interrupted(ParamCache):
+        def load(self, key: str, component: int) -> CachedComponent | None:
+            if key == f"uid:{0xA:016x}":
+                tap.is_mute = True
+                anyio.from_thread.run_sync(hear_of_another, token=token)
+            return super().load(key, component)
+
+    def hear_of_another() -> None:
+        client._station.receive(version, "sim", anyio.current_time())
+        client._dispatch()
+
+    with Interrupted(path) as cache:
+        async with ParamClient(tap, cache=cache) as client:
+            component = await client.component()
+            await asyncio.sleep(1.0)
+            assert component.identity.uid == f"{0xB:016x}"
+            assert not component.params, "the table that was read is not its own"
+
+
+@swiftly
+async def test_a_vehicle_that_does_not_say_who_it_is(path: Path) -> None:
+    vehicle = Reticent(table=VALUES)
+    vehicle.unanswered = (wire.CommandLong,)
+    async with ParamClient(vehicle, cache=path) as client:
+        began = anyio.current_time()
+        component = await client.component()
+        assert anyio.current_time() - began < 0.01, "nothing is cached that could be waited for"
+        assert (await component.fetch_all()).complete
+        await asyncio.sleep(20.0)
+        assert component.identity.uid is None
+    assert kept(path) == bits(vehicle.params), "kept under its system id and link"
+    vehicle.reboot(anyio.current_time())
+    async with ParamClient(vehicle, cache=path) as client:
+        began = anyio.current_time()
+        component = await client.component(timeout=0.5)
+        assert not component.params, "not yet"
+        assert math.isclose(anyio.current_time() - began, 0.5, abs_tol=0.01)
+        assert await client.component() is component
+        assert 0.5 < anyio.current_time() - began < component_module.IDENTITY_PATIENCE + 0.01
+        assert bits(component.params) == bits(vehicle.params)
+        assert (await component.fetch_all()).complete
+    vehicle.reboot(anyio.current_time())
+    async with ParamClient(vehicle, cache=path) as client:
+        waiting = asyncio.create_task(outcome(client.component()))
+        await asyncio.sleep(0.1)
+    await settled()
+    assert isinstance(waiting.result(), ClientClosed)
+
+
+@pytest.mark.parametrize("fetched", [True, False])
+@swiftly
+async def test_an_identity_that_comes_long_after_the_values(path: Path, fetched: bool) -> None:
+    await session(PX4Vehicle(table=VALUES), path)
+    changed = Reticent(table={**VALUES, "PARAM_01": 99}, not_in_use=["PARAM_02"])
+    changed.unanswered = (wire.CommandLong,)
+    tap = Tap(changed)
+    async with ParamClient(tap, cache=path) as client:
+        component = await client.component()
+        if fetched:
+            assert (await component.fetch_all()).complete
+        else:
+            await component.get("PARAM_01")
+        await asyncio.sleep(10.0)
+        assert component.identity.key.startswith("system:1@")
+        changed.unanswered = ()
+        tap.is_mute = True
+        await asyncio.sleep(6.0)
+        tap.is_mute = False
+        await asyncio.sleep(2.0)
+        assert component.identity.key.startswith("uid:")
+        assert component.params["PARAM_01"].value == 1, "it may be another one that was heard before"
+        if fetched:
+            assert (await component.fetch_all()).source == "stream"
+        else:
+            await component.get("PARAM_01")
+    with ParamCache(path) as cache:
+        cached = cache.load(component.identity.key, 1)
+        assert cached is not None
+        assert cached.params["PARAM_01"].value == 99
+        assert ("PARAM_02" in cached.params) != fetched
+    assert (await session(changed, path)).source == ("cache" if fetched else "stream")
+    with ParamCache(path) as cache:
+        cached = cache.load(component.identity.key, 1)
+        assert cached is not None
+        assert bits(cached.params) == bits(changed.params)
+
+
+# Keeping it right
+
+
+@pytest.mark.parametrize("volatile", [("CAL_ACC0_XOFF",), ODD], ids=["proven", "not proven"])
+@pytest.mark.parametrize("fetched", [True, False])
+@swiftly
+async def test_after_our_own_set_the_next_session_hits_where_the_hash_is_computed(
+    path: Path, volatile: Collection[str], fetched: bool
+) -> None:
+    """Where it cannot be, it may stand for more than our set: for what was not heard as well."""
+    vehicle = small_px4(volatile=volatile)
+    await session(vehicle, path)
+    for name, value in (("PARAM_01", 100), ("PARAM_04", 400), ("PARAM_01", 101)):
+        async with ParamClient(vehicle, cache=path) as client:
+            component = await client.component()
+            if fetched:
+                assert (await component.fetch_all()).source == "cache"
+            await component.set(name, value)
+        assert (await session(vehicle, path)).source == ("stream" if volatile is ODD else "cache"), name
+        assert kept(path) == bits(vehicle.params)
+    with ParamCache(path) as cache:
+        lines = cache.component().history("PARAM_01")
+        assert [(line.new and line.new.value, line.by) for line in lines] == [(100, "us"), (101, "us")]
+
+
+@swiftly
+async def test_a_change_of_ours_tells_who_asked_for_it(path: Path) -> None:
+    """And counts as ours: the hash is computed, and the next session hits."""
+    vehicle = small_px4()
+    await session(vehicle, path)
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        assert (await component.fetch_all()).source == "cache"
+        changes = component.changes()
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(partial(component.set, "PARAM_01", 100, asker="anna@10.0.0.2"))
+            tasks.start_soon(partial(component.set, "PARAM_02", 200, asker="ben@10.0.0.3 (script)"))
+        told = {}
+        for _ in range(2):
+            change = await anext(changes)
+            told[change.name] = change.by
+    assert told == {"PARAM_01": "us for anna@10.0.0.2", "PARAM_02": "us for ben@10.0.0.3 (script)"}
+    with ParamCache(path) as cache:
+        assert {line.name: line.by for line in cache.component().history()} == told
+    assert (await session(vehicle, path)).source == "cache"
+
+
+@swiftly
+async def test_what_was_written_is_in_the_history_however_short_it_stood(path: Path) -> None:
+    vehicle = small_px4()
+    await session(vehicle, path)
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        before = (await component.get("PARAM_01")).value
+        async with anyio.create_task_group() as tasks:
+            for value, asker in ((100, "anna"), (101, "ben"), (before, "anna"), (100, None)):
+                tasks.start_soon(partial(component.set, "PARAM_01", value, asker=asker))
+        vehicle.set_param("PARAM_01", 7)
+        await component.get("PARAM_01")
+    with ParamCache(path) as cache:
+        lines = cache.component().history("PARAM_01")
+    authors = ["us for anna", "us for ben", "us for anna", "us", "vehicle"]
+    assert [(line.new and line.new.value, line.by) for line in lines] == [
+        *zip([100, 101, before, 100, 7], authors, strict=True)
+    ]
+    assert [line.old.value for line in lines] == [before, 100, 101, before, 100]
+
+
+@swiftly
+async def test_a_write_is_told_of_as_ours_also_where_nobody_waits_for_it_any_more(path: Path) -> None:
+    vehicle = small_px4()
+    await session(vehicle, path)
+    async with ParamClient(Air.symmetric([vehicle], delay=0.2), cache=path) as client:
+        component = await client.component()
+        await component.fetch_all()
+        await component.get("PARAM_01")
+        with anyio.move_on_after(0.1):
+            await component.set("PARAM_01", 100, asker="anna")
+        await asyncio.sleep(1)
+        assert component.params["PARAM_01"].value == 100
+        await asyncio.sleep(10)
+        vehicle.set_param("PARAM_01", 7)
+        await asyncio.sleep(1)
+        await component.get("PARAM_01")
+    with ParamCache(path) as cache:
+        lines = cache.component().history("PARAM_01")
+    assert [(line.new and line.new.value, line.by) for line in lines] == [
+        (100, "us for anna"),
+        (7, "vehicle"),
+    ]
+
+
+@swiftly
+async def test_a_write_is_in_the_history_also_where_the_cache_knew_nothing_before(path: Path) -> None:
+    vehicle = small_px4()
+    before = vehicle.params["PARAM_01"].value
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        await component.set("PARAM_01", 100, asker="anna")
+        await component.fetch_all()
+        await component.set("PARAM_02", 200)
+    with ParamCache(path) as cache:
+        lines = cache.component().history()
+    told = [(line.name, line.new and line.new.value, line.by) for line in lines]
+    assert told == [("PARAM_01", 100, "us for anna"), ("PARAM_02", 200, "us")]
+    assert lines[0].old.value == before
+
+
+@pytest.mark.parametrize("asker", ["", "x" * 129, "a\nb", "Änne", "\x7f"])
+@swiftly
+async def test_who_asks_is_told_in_printable_ascii(path: Path, asker: str) -> None:
+    vehicle = small_px4()
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        with pytest.raises(UsageError, match="who asks for a change is told in 1 to 128 printable ASCII"):
+            await component.set("PARAM_01", 100, asker=asker)
+        with pytest.raises(UsageError, match="who asks"):
+            await apply(component, ParamSet({}), asker=asker)
+
+
+@swiftly
+async def test_after_many_sets_at_once_the_next_session_hits(path: Path) -> None:
+    vehicle = PX4Vehicle()
+    await session(vehicle, path)
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        names = [name for name, param in vehicle.params.items() if isinstance(param.value, float)][:40]
+        await asyncio.gather(*(component.set(name, number / 8) for number, name in enumerate(names)))
+    assert (await session(vehicle, path)).source == "cache"
+
+
+@swiftly
+async def test_a_set_that_moves_the_count_leads_to_a_download_and_a_right_table(path: Path) -> None:
+    vehicle = PX4Vehicle()
+    await session(vehicle, path)
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        await component.set("CAL_MAG2_ID", 12345)
+        await asyncio.sleep(1.0)
+    result = await session(vehicle, path)
+    assert result.count == 919
+    assert bits(result.params) == bits(vehicle.params)
+    assert (await session(vehicle, path)).source == "cache"
+
+
+@swiftly
+async def test_what_another_station_changes_is_kept_with_its_name(path: Path) -> None:
+    vehicle = small_px4()
+    radio = Radio(vehicle)
+    async with ParamClient(radio, cache=path) as client:
+        component = await client.component()
+        await component.fetch_all()
+        await asyncio.sleep(1.0)
+        message = wire.ParamSet(1, 1, "PARAM_01", (55).to_bytes(4, "little"), 6)
+        radio.other = [wire.encode(message, system=254, component=190, sequence=0)]
+        await anext(component.changes())
+        await component.set("PARAM_02", 22)
+        vehicle.set_param("PARAM_04", 44)
+        await asyncio.sleep(1.0)
+        with ParamCache(path) as cache:
+            assert cache.component().params["PARAM_04"].value == 44, "while the client is open"
+    with ParamCache(path) as cache:
+        told = {line.name: line.by for line in cache.component().history()}
+        assert told == {"PARAM_01": "station 254/190", "PARAM_02": "us", "PARAM_04": "vehicle"}
+    assert (await session(vehicle, path)).source == "cache"
+
+
+@swiftly
+async def test_closing_writes_what_is_new(path: Path) -> None:
+    vehicle = small_px4()
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        await until(lambda: component.identity.uid is not None)
+        await settled()
+        await component.get("PARAM_01")
+    assert kept(path) == {"PARAM_01": 1}
+
+    async def failing() -> None:
+        async with ParamClient(vehicle, cache=path) as client:
+            component = await client.component()
+            await component.get("PARAM_02")
+            raise ValueError("mine")
+
+    with pytest.raises(ValueError, match="mine"):
+        await failing()
+    assert kept(path) == {"PARAM_01": 1, "PARAM_02": 2}
+    with anyio.CancelScope() as scope:
+        async with ParamClient(vehicle, cache=path) as client:
+            component = await client.component()
+            await component.get("PARAM_04")
+            scope.cancel()
+            await anyio.sleep(math.inf)
+    assert kept(path) == {"PARAM_01": 1, "PARAM_02": 2, "PARAM_04": 4}
+
+
+@swiftly
+async def test_what_goes_from_the_table_goes_from_the_cache(path: Path) -> None:
+    await session(small_px4(), path)
+    async with ParamClient(small_px4(), cache=path) as client:
+        component = await client.component()
+        component._machine.table.remove(lambda param: param.name == "PARAM_01")
+    assert "PARAM_01" not in kept(path)
+
+
+@swiftly
+async def test_a_table_is_never_called_whole_that_is_not(path: Path) -> None:
+    vehicle = PX4Vehicle(burst=1, period=0.05, table=VALUES)
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        assert not (await component.fetch_all(timeout=0.6)).complete
+    with ParamCache(path) as cache:
+        cached = cache.component()
+        assert 5 < len(cached.params) < 20
+        assert not cached.complete
+        assert cached.hash is None
+        assert cached.count == 24
+    result = await session(vehicle, path)
+    assert (result.source, result.complete) == ("stream", True)
+
+
+@swiftly
+async def test_an_index_that_never_comes(path: Path) -> None:
+    class Holey(GenericVehicle):
+        def _send_value(self, entry: Any, **how: Any) -> None:
+            if entry.name != "PARAM_05":
+                super()._send_value(entry, **how)
+
+    for known in (0, 23):
+        async with ParamClient(Holey(VALUES), cache=path) as client:
+            component = await client.component()
+            assert len(component.params) == known
+            result = await component.fetch_all()
+            assert (result.count, result.received, result.missing) == (24, 23, (5,))
+            assert not result.complete
+            assert component.state == "partial"
+    with ParamCache(path) as cache:
+        assert not cache.component().complete
+        assert "PARAM_05" not in cache.component().params
+
+
+@swiftly
+async def test_two_clients_share_one_cache(path: Path) -> None:
+    one, two = small_px4(system=1), small_px4(system=2)
+    await asyncio.gather(session(one, path), session(two, path))
+    assert (kept(path, 1), kept(path, 2)) == (bits(one.params), bits(two.params))
+    results = await asyncio.gather(session(one, path), session(two, path), session(one, path))
+    assert [result.source for result in results] == ["cache"] * 3
+    with ParamCache(path) as cache:
+        both = await asyncio.gather(session(one, cache), session(two, cache))
+        assert [result.source for result in both] == ["cache"] * 2
+
+
+# With it, and without
+
+
+@swiftly
+async def test_a_cache_that_was_given_stays_open(path: Path) -> None:
+    with ParamCache(path) as cache:
+        async with ParamClient(small_px4(), cache=cache) as client:
+            assert client.cache is cache
+            await (await client.component()).fetch_all()
+        assert len(cache.component().params) == 25
+    async with ParamClient(small_px4(), cache=path) as client:
+        await client.component()
+    assert client.cache is not None
+    with pytest.raises(CacheError, match="closed"):
+        client.cache.components()
+
+
+@swiftly
+async def test_the_users_cache_is_used_unless_told_otherwise(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    async with ParamClient(small_px4(), cache=False) as client:
+        assert client.cache is None
+        component = await client.component()
+        await component.fetch_all()
+        await component.set("PARAM_01", 5)
+        await asyncio.sleep(1.0)
+        assert not any(thread.name == "paramclient cache" for thread in threading.enumerate())
+    assert not any(tmp_path.iterdir())  # noqa: ASYNC240 - an empty folder
+    for cache in (None, True):
+        async with ParamClient(small_px4(), cache=cache) as client:
+            assert client.cache is not None
+            assert client.cache.path == tmp_path / "paramclient" / "parameters.sqlite3"
+            assert (await (await client.component()).fetch_all()).source == ("cache" if cache else "stream")
+
+
+async def goes_on_without(path: Path | ParamCache, caplog: pytest.LogCaptureFixture) -> None:
+    """A session works, one warning tells why nothing is kept, and one at its end how much is lost."""
+    vehicle = small_px4()
+    with caplog.at_level(logging.WARNING):
+        async with ParamClient(vehicle, cache=path) as client:
+            component = await client.component()
+            assert bits((await component.fetch_all()).params) == bits(vehicle.params)
+            await component.set("PARAM_01", 5)
+            await asyncio.sleep(20.0)
+            assert (await component.get("PARAM_01")).value == 5
+    assert [record.name for record in caplog.records] == ["paramclient.client.cache_writer"] * 2, caplog.text
+    why, lost = [record.getMessage() for record in caplog.records]
+    assert "going on without the cache" in why
+    assert f"not written to the cache, and lost: {len(vehicle.params)} values and 2 earlier values" in lost
+
+
+@swiftly
+async def test_a_folder_that_cannot_be_written_to(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "file").write_text("in the way")
+    await goes_on_without(tmp_path / "file" / "cache", caplog)
+
+
+@swiftly
+async def test_a_folder_that_can_only_be_read(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    await session(small_px4(system=9), path)
+    with read_only(path.parent):
+        await goes_on_without(path, caplog)
+        caplog.clear()
+        assert (await session(small_px4(system=9), path)).source == "cache", "what can be read is used"
+
+
+@swiftly
+async def test_a_full_disk(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    await session(small_px4(system=9), path)
+    with full_disk(at=100):
+        await goes_on_without(path, caplog)
+    caplog.clear()
+    assert (await session(small_px4(system=9), path)).source == "cache", "what was there is still there"
+    assert not caplog.records
+
+
+@swiftly
+async def test_a_cache_that_somebody_closed(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    cache = ParamCache(path)
+    cache.close()
+    await goes_on_without(cache, caplog)
+
+
+@swiftly
+async def test_a_damaged_file_is_set_aside(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    vehicle = small_px4()
+    await session(vehicle, path)
+    path.write_bytes(rubbish(20_000))  # noqa: ASYNC240 - a small file
+    assert (await session(vehicle, path)).source == "stream"
+    assert [record.name for record in caplog.records] == ["paramclient.cache"]
+    assert len(set_aside(path)) == 1
+    assert (await session(vehicle, path)).source == "cache"
+
+
+@swiftly
+async def test_what_could_not_be_written_is_written_later(
+    path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    class Moody(ParamCache):
+        is_broken = False
+
+        def __enter__(self) -> Moody:
+            return self
+
+        def save(self, update: Any, **more: Any) -> None:
+            if self.is_broken:
+                raise CacheError("no room")
+            super().save(update, **more)
+
+    vehicle = small_px4()
+    with Moody(path) as cache:
+        async with ParamClient(vehicle, cache=cache) as client:
+            component = await client.component()
+            await component.get("PARAM_01")
+            await asyncio.sleep(1.0)
+            cache.is_broken = True
+            await component.fetch_all()
+            await asyncio.sleep(cache_writer.RETRY_INTERVAL * 3)
+            cache.is_broken = False
+            await asyncio.sleep(cache_writer.RETRY_INTERVAL + 1.0)
+            assert kept(path) == bits(vehicle.params)
+            cache.is_broken = True
+            await component.set("PARAM_01", 5)
+            await asyncio.sleep(1.0)
+            cache.is_broken = False
+        told = [record.getMessage() for record in caplog.records]
+        assert told == ["going on without the cache: no room"] * 2, "once for each time that it began"
+    assert kept(path) == bits(vehicle.params)
+    assert (await session(vehicle, path)).source == "cache"
+
+
+KILLED_SESSION = """
+import anyio, sys
+from paramclient import ParamClient
+from paramclient.sim import PX4Vehicle
+
+async def main():
+    async with ParamClient(PX4Vehicle(burst=1, period=0.002), cache=sys.argv[1]) as client:
+        component = await client.component()
+        changes = component.changes()
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(component.fetch_all)
+            async for _ in changes:
+                print(len(component.params), flush=True)
+
+anyio.run(main)
+"""
+
+
+@pytest.mark.parametrize("after", [300, 600, 850])
+def test_a_process_that_is_killed_during_a_download(path: Path, after: int) -> None:
+    process = start(KILLED_SESSION, path)
+    assert process.stdout is not None
+    for line in process.stdout:
+        if int(line) >= after:
+            break
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    with ParamCache(path) as cache:
+        cached = cache.component()
+        assert not cache.notes
+    assert 0 < len(cached.params) < 903
+    assert not cached.complete
+    assert cached.hash is None
+    real = bits(PX4Vehicle().params)
+    assert bits(cached.params).items() <= real.items()
+
+
+# Defaults, and whether there is a file
+
+
+def said(path: Path) -> tuple[int, bool | None]:
+    """How many defaults the cache knows of the first vehicle, and whether it gives its table as a file."""
+    with ParamCache(path) as cache:
+        params = cache.component(system=1).params.values()
+        return sum(param.default is not None for param in params), cache.components()[0].file_works
+
+
+@swiftly
+async def test_defaults_are_kept_over_sessions_and_go_with_the_firmware(path: Path) -> None:
+    vehicle = ArduPilotVehicle(live_period=0)
+    result = await session(vehicle, path)
+    defaults = {name: param.default for name, param in result.params.items()}
+    assert said(path) == (1382, True)
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        assert {name: param.default for name, param in component.params.items()} == defaults
+        assert len(component.params.changed()) == 41
+    vehicle._version = replace(vehicle._version, git_hash=b"01234567")
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        assert component.params.changed() == {}
+        before = component.params["STAT_RUNTIME"].value
+        await component.set("STAT_RUNTIME", int(before) + 5)  # something is written, and no fetch
+    assert said(path) == (0, None), "those of the other firmware are not passed off as this one's"
+    assert len(kept(path)) == 1382
+    assert (await session(vehicle, path)).source == "ftp"
+    assert said(path) == (1382, True)
+
+
+@pytest.mark.parametrize("kind", ["no file", "silent"])
+@swiftly
+async def test_that_there_is_no_file_is_remembered_for_the_firmware(path: Path, kind: str) -> None:
+    vehicle = ArduPilotVehicle(live_period=0)
+    server = vehicle._ftp
+    assert server is not None
+    rows = server.params
+    if kind == "no file":
+        server.params = lambda: None
+    else:
+        vehicle._ftp = None
+    asked = Tap(vehicle)
+    first = await session(asked, path)
+    assert (first.source, first.complete) == ("stream", True)
+    assert "so they were listed" in first.notes[0]
+    assert said(path)[1] is False
+    assert asked.messages(wire.FileTransfer)
+    asked.heard.clear()
+    second = await session(asked, path)
+    assert (second.source, second.notes) == ("stream", ())
+    assert not asked.messages(wire.FileTransfer)
+    vehicle._ftp, server.params = server, rows
+    assert (await session(asked, path)).source == "stream", "nobody has asked"
+    vehicle._version = replace(vehicle._version, flight_sw_version=67502081)
+    assert (await session(asked, path)).source == "ftp"
+    assert said(path)[1] is True
+
+
+@swiftly
+async def test_the_first_fetch_waits_until_it_is_known_whether_there_is_a_file() -> None:
+    air = Air.symmetric([ArduPilotVehicle(live_period=0)], delay=0.2)
+    async with ParamClient(air, cache=False) as client:
+        component = await client.component()
+        assert (await component.fetch_all()).source == "ftp"
+    async with ParamClient(air, cache=False) as client:
+        await client.component()
+        together = await client.fetch_all(refresh=True)
+        assert [result.source for result in together.results.values()] == ["ftp"]

@@ -1,0 +1,1566 @@
+"""The client and its components: life and death, calls, time-outs, several vehicles, links, changes."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import logging
+import math
+import os
+import socket
+import threading
+import time
+from collections.abc import Callable, Coroutine, Mapping
+from pathlib import Path
+from typing import Any
+
+import anyio
+import anyio.abc
+import pytest
+
+from paramclient import (
+    Change,
+    ClientClosed,
+    Component,
+    Encoding,
+    LinkError,
+    NoReply,
+    ParamClient,
+    ParamErrorCode,
+    ParamType,
+    Progress,
+    Refused,
+    TypeMismatch,
+    UnknownParameter,
+    UsageError,
+    ValueNotApplied,
+)
+from paramclient.client import client as client_module
+from paramclient.client import link_task
+from paramclient.client.component import IDENTITY_PATIENCE
+from paramclient.links import Peer, create_link, serve_endpoint
+from paramclient.protocol import wire
+from paramclient.protocol.station import Station
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle
+from tests.shell import (
+    PATIENCE,
+    VALUES,
+    FlakyLink,
+    Radio,
+    Tap,
+    a_client,
+    bits,
+    generic,
+    outcome,
+    residue,
+    settled,
+    small_px4,
+    swift_loop,
+    swiftly,
+    tasks_beside,
+    until,
+)
+from tests.ways import DIRECT, direct_only, looks, pytest_generate_tests, way
+
+__all__ = ["pytest_generate_tests", "way"]
+
+Call = Callable[[ParamClient, Component], Coroutine[Any, Any, object]]
+
+CALLS: dict[str, Call] = {
+    "get": lambda client, component: component.get("PARAM_01"),
+    "set": lambda client, component: component.set("PARAM_01", 77),
+    "fetch_all": lambda client, component: component.fetch_all(),
+    "changes": lambda client, component: changes_of(component),
+    "client.component": lambda client, component: client.component(system=99, timeout=None),
+    "client.fetch_all": lambda client, component: client.fetch_all(),
+}
+"""The public calls that wait."""
+
+
+async def changes_of(component: Component, count: int = 1) -> list[Change]:
+    """The next changes of a component."""
+    changes = component.changes()
+    return [await anext(changes) for _ in range(count)]
+
+
+# Life and death
+
+
+@swiftly
+async def test_what_the_body_raises_comes_out_as_it_is() -> None:
+    class Stop(BaseException):
+        pass
+
+    errors: list[BaseException] = [
+        ValueError(),
+        Stop(),
+        asyncio.CancelledError(),
+        ExceptionGroup("", [OSError()]),
+    ]
+    for error in errors:
+        try:
+            async with a_client(generic()) as client:
+                await client.component()
+                raise error
+        except BaseException as caught:
+            assert caught is error  # noqa: PT017 - pytest.raises would want one type for all of them
+        else:
+            pytest.fail("nothing was raised")
+        assert not tasks_beside()
+
+
+@swiftly
+async def test_an_error_of_a_call_comes_out_as_it_is() -> None:
+    async def session() -> None:
+        async with a_client(generic(param_error=True)) as client:
+            await (await client.component()).get("NOT_THERE")
+
+    with pytest.raises(UnknownParameter):
+        await session()
+
+
+@swiftly
+async def test_the_task_of_a_client_can_be_cancelled() -> None:
+    entered = asyncio.Event()
+
+    async def session() -> None:
+        async with a_client(generic()) as client:
+            await client.component()
+            entered.set()
+            await asyncio.sleep(math.inf)
+
+    task = asyncio.create_task(session())
+    await entered.wait()
+    task.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await task
+    assert task.cancelled()
+    assert not tasks_beside()
+
+
+@swiftly
+async def test_a_time_limit_around_the_client_ends_it() -> None:
+    task = asyncio.current_task()
+    assert task is not None
+    with pytest.raises(TimeoutError) as caught:
+        async with asyncio.timeout(0.5), a_client(generic()) as client:
+            await client.component(system=99)
+    assert not isinstance(caught.value, NoReply)
+    with anyio.move_on_after(0.5) as scope:
+        async with a_client(generic()) as client:
+            await client.component(system=99)
+    assert scope.cancelled_caught
+    assert task.cancelling() == 0
+    await asyncio.sleep(1.0)
+    assert not tasks_beside()
+
+
+@swiftly
+async def test_a_time_limit_inside_the_client_leaves_it_open() -> None:
+    async with a_client(generic()) as client:
+        component = await client.component()
+        with pytest.raises(TimeoutError):
+            async with asyncio.timeout(0.5):
+                await client.component(system=99)
+        with anyio.move_on_after(0.5) as scope:
+            await client.component(system=99)
+        assert scope.cancelled_caught
+        assert (await component.get("PARAM_01")).value == 1
+
+
+@swiftly
+async def test_a_client_is_opened_once() -> None:
+    client = a_client(generic())
+    async with client:
+        with pytest.raises(UsageError, match="opened once"):
+            await client.__aenter__()
+        await client.component()
+    with pytest.raises(UsageError, match="opened once"):
+        await client.__aenter__()
+
+    twice = a_client(generic())
+    second = asyncio.create_task(outcome(twice.__aenter__()))
+    async with twice:
+        assert isinstance(await second, UsageError)
+        await twice.component()
+
+
+def test_a_client_can_be_made_before_the_event_loop() -> None:
+    client = a_client(generic())
+
+    async def use() -> None:
+        async with client:
+            assert (await (await client.component()).get("PARAM_01")).value == 1
+
+    asyncio.run(use())
+
+
+@swiftly
+async def test_calls_on_a_client_that_is_not_open() -> None:
+    client = a_client(small_px4())
+    for before in (client.component(), client.fetch_all()):
+        with pytest.raises(ClientClosed, match="not open"):
+            await before
+    async with client:
+        component = await client.component()
+        await component.fetch_all()
+    for call in CALLS.values():
+        with pytest.raises(ClientClosed, match="was closed"):
+            await call(client, component)
+    for after in (component.refreshed(), component.fetch_all(refresh=True)):
+        with pytest.raises(ClientClosed, match="was closed"):
+            await after
+    assert len(component.params) == 25, "what was known stays readable"
+    assert not residue(component)
+
+
+@swiftly
+async def test_closing_ends_everyone_who_waits() -> None:
+    tap = Tap(generic())
+    async with a_client(tap) as client:
+        component = await client.component()
+        tap.is_mute = True
+        waiting = {
+            name: asyncio.create_task(outcome(call(client, component))) for name, call in CALLS.items()
+        }
+        await settled()
+        assert not any(task.done() for task in waiting.values())
+    for name, task in waiting.items():
+        error = await task
+        assert isinstance(error, ClientClosed), name
+        assert error.link == client.link.name
+    assert not residue(component)
+    assert not tasks_beside()
+
+
+@swiftly
+async def test_closing_while_the_link_is_away() -> None:
+    tap = Tap(generic())
+    link = FlakyLink(tap)
+    async with a_client(link) as client:
+        component = await client.component()
+        tap.is_mute = True
+        waiting = [asyncio.create_task(outcome(call(client, component))) for call in CALLS.values()]
+        await settled()
+        await link.drop(stays_away=True)
+        await asyncio.sleep(1.0)
+        assert not any(task.done() for task in waiting)
+    assert [type(await task) for task in waiting] == [ClientClosed] * len(CALLS)
+    assert not tasks_beside()
+
+
+@direct_only("it is about a link of its own")
+@pytest.mark.asyncio
+@pytest.mark.parametrize("cached", [False, True])
+async def test_nothing_is_left_behind(tmp_path: Path, cached: bool) -> None:
+    async with Served(small_px4(), "udpin") as served:
+        before = tasks_beside(), threading.enumerate(), open_files()
+        for _ in range(2):
+            url = f"udpout:127.0.0.1:{served.port}"
+            async with ParamClient(url, cache=tmp_path / "cache" if cached else False) as client:
+                component = await client.component()
+                await component.fetch_all()
+                await component.set("PARAM_01", 5)
+            del client, component
+            assert (tasks_beside(), threading.enumerate(), open_files()) == before
+        gc.collect()
+
+
+@direct_only("it is about a link of its own")
+@pytest.mark.asyncio
+async def test_the_port_is_free_again_at_once() -> None:
+    async with a_client("udpin:127.0.0.1:0") as client:
+        port = client.link.address[1]  # type: ignore[attr-defined]  # only sockets have one
+    async with a_client(f"udpin:127.0.0.1:{port}"):
+        pass
+    async with a_client(f"tcpin:127.0.0.1:{port}"):
+        pass
+
+
+@direct_only("it is about a link of its own")
+@pytest.mark.asyncio
+async def test_a_link_that_cannot_be_opened(tmp_path: Path) -> None:
+    before = tasks_beside(), threading.enumerate(), open_files()
+    with socket.create_server(("127.0.0.1", 0)) as taken, socket.socket(type=socket.SOCK_DGRAM) as busy:
+        busy.bind(("127.0.0.1", 0))
+        names = [f"tcpin:127.0.0.1:{taken.getsockname()[1]}", f"udpin:127.0.0.1:{busy.getsockname()[1]}"]
+        for name in names:
+            with pytest.raises(LinkError, match="in use") as caught:
+                async with ParamClient(name, cache=tmp_path / "cache"):
+                    pass
+            assert caught.value.link == name
+            assert isinstance(caught.value.__cause__, OSError)
+    with pytest.raises(LinkError, match="refused") as caught:
+        async with ParamClient(f"tcp:127.0.0.1:{taken_port(names[0])}", cache=tmp_path / "cache"):
+            pass
+    assert isinstance(caught.value.__cause__, ConnectionRefusedError)
+    assert (tasks_beside(), threading.enumerate(), open_files()) == before
+    assert not (tmp_path / "cache").exists()
+
+
+def taken_port(name: str) -> int:
+    return int(name.rsplit(":", 1)[1])
+
+
+def open_files() -> int:
+    return len(os.listdir("/dev/fd"))  # noqa: PTH208 - numbers, not paths
+
+
+class Served:
+    """A vehicle on a listening link of this kind, in a task of its own.
+
+    Attributes:
+        port: where it listens.
+    """
+
+    def __init__(self, endpoint: Endpoint, kind: str) -> None:
+        self.port = 0
+        self._endpoint = endpoint
+        self._kind = kind
+
+    async def __aenter__(self) -> Served:
+        link: Any = create_link(f"{self._kind}:127.0.0.1:{self.port}")
+        self._task = asyncio.create_task(serve_endpoint(self._endpoint, link))
+        await until(lambda: link.address is not None)
+        self.port = link.address[1]
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        self._task.cancel()
+        await asyncio.wait([self._task])
+
+
+# On the link
+
+
+@swiftly
+async def test_the_heartbeat_of_a_ground_station_goes_out_every_second() -> None:
+    tap = Tap(generic())
+    async with a_client(tap, system=200, component=25):
+        await asyncio.sleep(5.5)
+    beats = [
+        (when, frame, message) for when, frame, message in tap.heard if isinstance(message, wire.Heartbeat)
+    ]
+    assert [round(when - beats[0][0], 3) for when, _, _ in beats] == [0, 1, 2, 3, 4, 5]
+    for _, frame, message in beats:
+        assert (frame.system, frame.component) == (200, 25)
+        assert (message.type, message.autopilot) == (wire.MAV_TYPE_GCS, wire.MAV_AUTOPILOT_INVALID)
+
+
+@swiftly
+async def test_our_ids_are_those_of_a_ground_station_unless_told() -> None:
+    tap = Tap(generic())
+    async with a_client(tap) as client:
+        await client.component()
+    assert {(frame.system, frame.component) for _, frame, _ in tap.heard} == {(255, 190)}
+    for bad in (0, 256, -1):
+        with pytest.raises(UsageError, match="1 to 255"):
+            a_client(tap, system=bad)
+        with pytest.raises(UsageError, match="1 to 255"):
+            a_client(tap, component=bad)
+
+
+@swiftly
+async def test_a_component_is_asked_who_it_is() -> None:
+    async with a_client(ArduPilotVehicle()) as client:
+        component = await client.component()
+        await asyncio.sleep(0.5)
+        assert component.autopilot == "ardupilot"
+        assert component.identity.uid is not None
+        assert component.identity.git_hash == "fbb78585"
+        assert component.encoding is Encoding.C_CAST
+        assert "ArduPilot" in component.encoding_reason
+
+
+@swiftly
+async def test_the_user_knows_better_how_values_are_laid_out() -> None:
+    async with a_client(generic(), encoding=Encoding.C_CAST) as client:
+        component = await client.component()
+        assert component.encoding is Encoding.C_CAST
+        assert component.encoding_reason == "chosen by the user"
+        assert (await component.get("PARAM_01")).value == 0, "1 as the bits of a float32 is next to nothing"
+
+
+@direct_only("the numbers of a service are those of a moment ago")
+@swiftly
+async def test_bytes_are_counted_both_ways() -> None:
+    tap = Tap(generic())
+    async with a_client(tap) as client:
+        assert client.bytes_received == 0
+        await (await client.component()).get("PARAM_01")
+        assert client.bytes_sent == sum(12 + len(frame.payload) for _, frame, _ in tap.heard)
+        assert client.bytes_received > 2 * 21
+
+
+# Finding a component
+
+
+@swiftly
+async def test_the_first_autopilot_is_the_component() -> None:
+    camera = generic(component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)
+    async with a_client(Air([camera, generic(system=7, component=1), generic(system=9)])) as client:
+        component = await client.component()
+        assert (component.system, component.component) == (7, 1)
+        assert await client.component() is component
+        assert await client.component(system=9) is client.components[9, 1]
+        assert await client.component(component=100) is client.components[1, 100]
+        assert await client.component(system=1, component=100) is client.components[1, 100]
+        assert set(client.components) == {(1, 100), (7, 1), (9, 1)}
+        with pytest.raises(TypeError):
+            client.components[1, 1] = component  # type: ignore[index]  # that it is read-only is the point
+
+
+@swiftly
+async def test_a_component_is_waited_for() -> None:
+    vehicle = generic()
+    vehicle.reboot(1000.0, down=3.0)
+    async with a_client(vehicle) as client:
+        began = anyio.current_time()
+        await client.component()
+        assert 2.9 < anyio.current_time() - began < 3.1
+
+
+@swiftly
+async def test_a_component_that_is_heard_before_its_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a firmware that does not send its heartbeat on request; others are known at once."""
+    vehicle = small_px4()
+    answer = vehicle._on_command
+
+    def without_heartbeat(request: wire.CommandLong, sender: wire.Frame) -> None:
+        if request.params[0] != wire.HEARTBEAT_ID:
+            answer(request, sender)
+
+    monkeypatch.setattr(vehicle, "_on_command", without_heartbeat)
+    vehicle.tick(1000.0)
+    vehicle.data_to_send()
+    vehicle.set_param("PARAM_01", 5)
+    async with a_client(vehicle) as client:
+        waiting = [asyncio.create_task(client.component()) for _ in range(2)]
+        named = await client.component(1, 1, timeout=0.4)
+        assert named.encoding_reason == "the vehicle's capability PARAM_ENCODE_BYTEWISE"
+        await asyncio.sleep(0.5)
+        assert looks(client.components[1, 1]) == "<Component 1/1 unknown partial 1 of 25 params>"
+        assert not any(task.done() for task in waiting)
+        await asyncio.sleep(0.51)
+        assert [task.result().autopilot for task in waiting] == ["px4", "px4"]
+
+
+@swiftly
+async def test_a_component_that_never_says_what_it_is_is_given_in_the_end() -> None:
+    async with a_client(Mute()) as client:
+        began = anyio.current_time()
+        component = await client.component(component=7)
+        assert 3.0 < anyio.current_time() - began < 5.0
+        assert component.encoding_reason == "the standard's encoding, as nothing says otherwise"
+
+
+class Mute:
+    """Sends one PARAM_VALUE at the beginning, and nothing else ever."""
+
+    def __init__(self) -> None:
+        value = wire.ParamValue("A", bytes(4), 6, 1, 0)
+        self.out = [wire.encode(value, system=1, component=7, sequence=0)]
+
+    def receive(self, data: bytes, now: float) -> None:
+        """Take it and do nothing."""
+
+    def tick(self, now: float) -> None:
+        """Do nothing."""
+
+    def next_deadline(self) -> float | None:
+        return None
+
+    def data_to_send(self) -> list[bytes]:
+        out, self.out = self.out, []
+        return out
+
+
+@swiftly
+@pytest.mark.parametrize(
+    ("wanted", "words"),
+    [
+        ({}, "an autopilot"),
+        ({"system": 3}, "an autopilot with system id 3"),
+        ({"component": 100}, "component */100"),
+        ({"system": 3, "component": 100}, "component 3/100"),
+    ],
+)
+async def test_a_component_that_is_not_there(wanted: dict[str, Any], words: str) -> None:
+    async with a_client(generic(autopilot=wire.MAV_AUTOPILOT_INVALID)) as client:
+        with pytest.raises(NoReply) as caught:
+            await client.component(**wanted, timeout=2.5)
+        error = caught.value
+        assert (error.awaited, error.attempts, round(error.waited, 3)) == (words, 0, 2.5)
+        began = anyio.current_time()
+        with pytest.raises(NoReply):
+            await client.component(**wanted)
+        assert round(anyio.current_time() - began, 3) == client_module.HEARING_PATIENCE
+
+
+# Reading and writing
+
+
+@swiftly
+async def test_a_read_gives_the_value_the_vehicle_has_now() -> None:
+    vehicle = small_px4()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        assert await component.get("PARAM_03") == vehicle.param("PARAM_03")
+        vehicle.set_param("PARAM_05", 1234)
+        param = await component.get("PARAM_05")
+        assert (param.value, param.type, param.index) == (1234, ParamType.INT32, 6)
+        assert (await component.get(6)).name == "PARAM_05"
+        assert component.params["PARAM_05"].value == 1234
+
+
+@swiftly
+async def test_the_hash_can_be_read_like_a_parameter_and_is_none() -> None:
+    vehicle = small_px4()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        param = await component.get("_HASH_CHECK")
+        assert (param.value, param.type, param.index) == (vehicle.announced_hash(), ParamType.UINT32, None)
+        assert "_HASH_CHECK" not in component.params
+        with pytest.raises(UsageError, match="_HASH_CHECK is no parameter"):
+            await component.set("_HASH_CHECK", 0)
+
+
+@swiftly
+async def test_equal_reads_share_one_request_and_others_run_beside() -> None:
+    vehicle = generic()
+    air = Air.symmetric([vehicle], delay=0.2)
+    async with a_client(air) as client:
+        component = await client.component()
+        await component.get("PARAM_00")
+        await anyio.sleep(1.0)  # its repeats, sent before the round trip was known, arrive
+        vehicle.requests.clear()
+        began = anyio.current_time()
+        names = ["PARAM_01"] * 5 + ["PARAM_02"] * 5 + [f"PARAM_{number:02}" for number in range(3, 11)]
+        params = await asyncio.gather(*map(component.get, names))
+        assert [param.name for param in params] == names
+        assert vehicle.requests["PARAM_REQUEST_READ"] == 10
+        assert anyio.current_time() - began < 0.45, "all in one round trip"
+
+
+@swiftly
+async def test_a_cancelled_read_leaves_the_others_their_request() -> None:
+    vehicle = generic()
+    async with a_client(Air.symmetric([vehicle], delay=0.2)) as client:
+        component = await client.component()
+        await component.get("PARAM_00")
+        await anyio.sleep(1.0)  # its repeats, sent before the round trip was known, arrive
+        vehicle.requests.clear()
+        first, second = (asyncio.create_task(component.get("PARAM_01")) for _ in range(2))
+        await asyncio.sleep(0.1)
+        first.cancel()
+        assert (await second).value == 1
+        assert vehicle.requests["PARAM_REQUEST_READ"] == 1
+        assert first.cancelled()
+
+
+@swiftly
+async def test_writes_to_one_name_are_done_in_order_and_others_beside() -> None:
+    vehicle = generic()
+    tap = Tap(vehicle)
+    async with a_client(Air.symmetric([tap], delay=0.1)) as client:
+        component = await client.component()
+        await component.fetch_all()
+        began = anyio.current_time()
+        results = await asyncio.gather(
+            *(component.set("PARAM_01", value) for value in (10, 11, 12)),
+            *(component.set(f"PARAM_{number:02}", -number) for number in (2, 4, 5)),
+        )
+        assert [result.actual for result in results] == [10, 11, 12, -2, -4, -5]
+        assert all(result.status == "accepted" and result.attempts == 1 for result in results)
+        assert anyio.current_time() - began < 0.65, "three round trips, and not six"
+    sent = [
+        (message.param_id, int.from_bytes(message.raw, "little")) for message in tap.messages(wire.ParamSet)
+    ]
+    assert [value for name, value in sent if name == "PARAM_01"] == [10, 11, 12]
+    assert vehicle.param("PARAM_01").value == 12
+
+
+@swiftly
+async def test_a_write_learns_the_type_first() -> None:
+    tap = Tap(small_px4())
+    async with a_client(tap) as client:
+        component = await client.component()
+        result = await component.set("PARAM_03", 2)
+        assert (result.status, result.requested, result.actual, result.attempts) == ("accepted", 2, 2.0, 1)
+        assert result.param == await component.get("PARAM_03")
+        await component.set("PARAM_03", 3)
+    assert [message.param_type for message in tap.messages(wire.ParamSet)] == [ParamType.REAL32] * 2
+    assert len(tap.messages(wire.ParamRequestRead)) - len(reads_of_hash(tap)) == 2, (
+        "once to learn, once to get"
+    )
+
+
+def reads_of_hash(tap: Tap) -> list[wire.ParamRequestRead]:
+    return [each for each in tap.messages(wire.ParamRequestRead) if each.param_id == wire.HASH_CHECK]
+
+
+@swiftly
+async def test_a_write_that_the_vehicle_adjusts() -> None:
+    async with a_client(ArduPilotVehicle()) as client:
+        component = await client.component()
+        result = await component.set("RTL_ALT", 1234.7)
+        assert (result.status, result.adjusted, result.requested, result.actual) == (
+            "adjusted",
+            True,
+            1234.7,
+            1234,
+        )
+        assert str(result) == "RTL_ALT = 1234 (adjusted from 1234.7)"
+        assert (await component.set("rtl_alt", 1000)).param.name == "RTL_ALT"
+
+
+@swiftly
+async def test_a_write_that_is_refused_says_why() -> None:
+    vehicle = ArduPilotVehicle(read_only=["RTL_ALT"], param_error=True)
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        with pytest.raises(Refused) as caught:
+            await component.set("RTL_ALT", 2000)
+        assert caught.value.code == ParamErrorCode.READ_ONLY
+        assert (caught.value.system, caught.value.component, caught.value.name) == (1, 1, "RTL_ALT")
+        with pytest.raises(UnknownParameter):
+            await component.set("NOT_THERE", 2000)
+        with pytest.raises(UnknownParameter):
+            await component.get(5000)
+
+
+@swiftly
+async def test_an_unknown_name_is_told_from_silence() -> None:
+    async with a_client(small_px4()) as client:
+        component = await client.component()
+        with pytest.raises(UnknownParameter, match="NOT_THERE"):
+            await component.get("NOT_THERE")
+        with pytest.raises(UnknownParameter, match="NOT_THERE"):
+            await component.set("NOT_THERE", 1)
+        assert not residue(component)
+
+
+class Stubborn(GenericVehicle):
+    """It answers every PARAM_SET with the value that it has."""
+
+    def _write(self, entry: Any, bits: int) -> None:
+        return
+
+
+class Retyping(GenericVehicle):
+    """It calls its parameters REAL32 when they are read, and INT32 when they are written."""
+
+    def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
+        kind = ParamType.REAL32 if request.param_type == ParamType.INT32 else ParamType.INT32
+        self._send(wire.ParamValue(request.param_id, request.raw, kind, 24, 1))
+
+
+@swiftly
+async def test_a_vehicle_that_keeps_its_value_without_a_reason() -> None:
+    async with a_client(Stubborn(VALUES)) as client:
+        component = await client.component()
+        with pytest.raises(ValueNotApplied) as caught:
+            await component.set("PARAM_01", 9)
+        assert (caught.value.requested, caught.value.actual, caught.value.name) == (9, 1, "PARAM_01")
+        assert not residue(component)
+
+
+@swiftly
+async def test_a_vehicle_that_changes_the_type() -> None:
+    async with a_client(Retyping(VALUES)) as client:
+        component = await client.component()
+        with pytest.raises(TypeMismatch):
+            await component.set("PARAM_01", 9)
+        assert not residue(component)
+
+
+@swiftly
+async def test_what_cannot_be_right_is_not_sent() -> None:
+    table: dict[str, Any] = {"SMALL": (ParamType.UINT8, 1), "WHOLE": 1}
+    tap = Tap(GenericVehicle(table))
+    async with a_client(tap) as client:
+        component = await client.component()
+        await component.fetch_all()
+        await settled()
+        tap.heard.clear()
+        for name, value in [
+            ("SMALL", 300),
+            ("SMALL", -1),
+            ("WHOLE", 1.5),
+            ("WHOLE", 2**31),
+            ("WHOLE", math.nan),
+        ]:
+            with pytest.raises(UsageError):
+                await component.set(name, value)
+        for bad_name in ("SEVENTEEN_LETTERS", "GRÖSSE", ""):
+            with pytest.raises(UsageError):
+                await component.set(bad_name, 1)
+            with pytest.raises(UsageError):
+                await component.get(bad_name)
+        bad_value: Any
+        for bad_value in ("1", None, b"123", [1]):
+            with pytest.raises(UsageError):
+                await component.set("WHOLE", bad_value)
+        for bad_index in (-1, 65535):
+            with pytest.raises(UsageError):
+                await component.get(bad_index)
+        await settled()
+        assert not tap.heard
+        assert not residue(component)
+
+
+@swiftly
+async def test_a_value_that_turns_out_not_to_fit_is_not_written() -> None:
+    tap = Tap(generic())
+    async with a_client(tap) as client:
+        component = await client.component()
+        with pytest.raises(UsageError):
+            await component.set("PARAM_01", 1.5)
+        assert not tap.messages(wire.ParamSet)
+
+
+# Time-outs
+
+
+@swiftly
+async def test_every_call_has_a_time_limit_of_its_own() -> None:
+    tap = Tap(generic())
+    async with a_client(tap) as client:
+        component = await client.component()
+        await asyncio.sleep(0.1)
+        tap.is_deaf = True
+        limited = {
+            "PARAM_01 of 1/1": component.get("PARAM_01", timeout=2.5),
+            "parameter 5 of 1/1": component.get(5, timeout=2.5),
+            "PARAM_SET PARAM_01 to 1/1": component.set("PARAM_01", 2, timeout=2.5),
+            "the parameters of 1/1": component.fetch_all(timeout=2.5),
+            "the parameters of any component": client.fetch_all(timeout=2.5),
+            "the parameters of any component of system 1": client.fetch_all(1, timeout=2.5),
+        }
+        for awaited, call in limited.items():
+            with pytest.raises(NoReply) as caught:
+                await call
+            error = caught.value
+            assert error.awaited == awaited
+            assert math.isclose(error.waited, 2.5, abs_tol=0.01), awaited
+            assert (error.attempts > 1) == ("PARAM_SET" not in awaited), "a write first asks for the type"
+            assert not residue(component)
+
+
+@swiftly
+async def test_calls_without_a_time_limit_end_by_themselves() -> None:
+    tap = Tap(generic())
+    async with a_client(tap) as client:
+        component = await client.component()
+        tap.is_deaf = True
+        for name in ("get", "set", "fetch_all", "client.fetch_all"):
+            began = anyio.current_time()
+            with pytest.raises(NoReply) as caught:
+                await CALLS[name](client, component)
+            assert caught.value.attempts >= 4, name
+            assert caught.value.waited <= anyio.current_time() - began + 1e-6 < 60, name
+            assert not residue(component)
+
+
+@swiftly
+async def test_a_fetch_whose_time_is_over_gives_what_came() -> None:
+    slow = generic(burst=1, period=0.1)
+    async with a_client(slow) as client:
+        component = await client.component()
+        result = await component.fetch_all(timeout=1.05)
+        assert 9 <= result.received <= 11
+        assert result.count == 24
+        assert not result.complete
+        assert result.missing == tuple(range(result.received, 24))
+        assert result.notes == ("The time given for the fetch was over.",)
+        assert math.isclose(result.elapsed, 1.05, abs_tol=0.001)
+        assert list(result.params) == list(VALUES)[: result.received]
+        assert not residue(component)
+        both = await client.fetch_all(timeout=1.0)
+        assert not both.complete
+        assert both.results[1, 1].missing
+        whole = await component.fetch_all()
+        assert whole.complete
+        assert dict(whole.params) == slow.params
+
+
+# Fetching
+
+
+@swiftly
+async def test_a_fetch_brings_every_parameter() -> None:
+    by_list = (small_px4(), generic(), ArduPilotVehicle(ftp=False))
+    for vehicle in (*by_list, ArduPilotVehicle()):
+        async with a_client(vehicle) as client:
+            component = await client.component()
+            assert component.state == "new"
+            result = await component.fetch_all()
+            assert result.complete
+            assert result.source == ("stream" if vehicle in by_list else "ftp")
+            assert bits(result.params) == bits(vehicle.params)
+            assert component.params == result.params
+            assert (component.state, component.count) == ("synced", len(vehicle.params))
+            assert (
+                component.hash
+                == result.hash
+                == (vehicle.announced_hash() if isinstance(vehicle, PX4Vehicle) else None)
+            )
+            assert component.round_trip is not None
+
+
+@swiftly
+@pytest.mark.parametrize("refresh", [False, True])
+async def test_a_first_fetch_waits_to_hear_whether_there_is_a_file(refresh: bool) -> None:
+    """The list of ArduPilot takes several times longer, on a radio ten times."""
+    for of_all in (False, True):
+        async with a_client(Air.symmetric([ArduPilotVehicle()], delay=0.2)) as client:
+            component = await client.component()
+            assert component.identity.uid is None  # it has not said who it is yet
+            if of_all:
+                results = (await client.fetch_all(refresh=refresh)).results
+                assert [result.source for result in results.values()] == ["ftp"]
+            else:
+                assert (await component.fetch_all(refresh=refresh)).source == "ftp"
+
+
+@swiftly
+async def test_a_first_fetch_does_not_wait_for_long_to_hear_that() -> None:
+    class Unknown(ArduPilotVehicle):
+        def _on_command(self, request: wire.CommandLong, sender: wire.Frame) -> None:
+            """It never says who it is."""
+
+    async with a_client(Unknown()) as client:
+        component = await client.component()
+        began = anyio.current_time()
+        result = await component.fetch_all()
+        # the heartbeat says ArduPilot, so the file is tried whatever it says of itself
+        assert (result.complete, result.source) == (True, "ftp")
+        assert anyio.current_time() - began < IDENTITY_PATIENCE + 2.0  # simulated seconds
+
+
+@swiftly
+async def test_fetches_at_the_same_time_are_one() -> None:
+    vehicle = generic(period=0.1)
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        first, second, third = await asyncio.gather(
+            component.fetch_all(), component.fetch_all(refresh=True), component.fetch_all(timeout=9)
+        )
+        assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
+        assert first.params == second.params == third.params
+
+
+@swiftly
+async def test_progress_is_told() -> None:
+    async with a_client(generic(burst=1, period=0.05)) as client:
+        component = await client.component()
+        seen: list[Progress] = []
+        await component.fetch_all(progress=seen.append)
+        assert 10 <= len(seen) <= 14
+        assert [each.received for each in seen] == sorted(each.received for each in seen)
+        assert seen[-1].received == seen[-1].total == 24
+        assert 15 < seen[-1].rate < 25
+
+        several: list[Mapping[tuple[int, int], Progress]] = []
+        await client.fetch_all(refresh=True, progress=several.append)
+        assert several[-1][1, 1].received == 24
+
+        def stop(progress: Progress) -> None:
+            raise ValueError(progress)
+
+        with pytest.raises(ValueError, match="Progress"):
+            await component.fetch_all(refresh=True, progress=stop)
+        await settled()
+        assert not residue(component)
+
+
+# Several vehicles
+
+
+@swiftly
+async def test_several_vehicles_are_fetched_side_by_side() -> None:
+    vehicles: dict[tuple[int, int], Any] = {
+        (1, 1): small_px4(period=0.1, burst=1),
+        (1, 100): generic(
+            component=100, autopilot=wire.MAV_AUTOPILOT_INVALID, table={"ZOOM": 1, "FOCUS": 2.5}
+        ),
+        (2, 1): generic(system=2, table={"OTHER": 7}),
+        (3, 1): ArduPilotVehicle(system=3),
+    }
+    async with a_client(Air(list(vehicles.values()))) as client:
+        everything = await client.fetch_all()
+        assert everything.complete
+        assert not everything.silent
+        assert everything.results.keys() == vehicles.keys()
+        for address, result in everything.results.items():
+            assert bits(result.params) == bits(vehicles[address].params)
+            assert client.components[address].params == result.params
+        one_system = await client.fetch_all(1, refresh=True)
+        assert one_system.results.keys() == {(1, 1), (1, 100)}
+
+
+@swiftly
+async def test_one_request_is_enough_for_all_components_of_a_system() -> None:
+    camera = generic(component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)
+    tap = Tap(Air([generic(), camera]))
+    async with a_client(tap) as client:
+        await client.component()
+        both = await client.fetch_all(1)
+        assert both.results.keys() == {(1, 1), (1, 100)}
+        assert both.complete
+    assert [(each.target_system, each.target_component) for each in tap.messages(wire.ParamRequestList)] == [
+        (1, 0)
+    ]
+
+
+@swiftly
+async def test_a_fetch_under_way_is_not_begun_again_for_all_components() -> None:
+    vehicle = generic(burst=1, period=0.1)
+    camera = generic(component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)
+    async with a_client(Air([vehicle, camera])) as client:
+        component = await client.component()
+        one = asyncio.create_task(component.fetch_all())
+        await asyncio.sleep(1.0)
+        both = await client.fetch_all()
+        assert both.complete
+        assert both.results[1, 1].params == (await one).params
+        assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
+
+
+class Silent(GenericVehicle):
+    """A component that sends heartbeats and nothing else."""
+
+    def _take(self, frame: wire.Frame) -> None:
+        return
+
+
+@swiftly
+@pytest.mark.parametrize("autopilot", [wire.MAV_AUTOPILOT_GENERIC, wire.MAV_AUTOPILOT_INVALID])
+async def test_a_silent_component_holds_nobody_up(autopilot: int) -> None:
+    silent = Silent(VALUES, component=100, autopilot=autopilot), Silent(VALUES, system=2, autopilot=autopilot)
+    async with a_client(Air([*silent, generic()])) as client:
+        component = await client.component(system=1, component=1)
+        began = anyio.current_time()
+        assert (await component.fetch_all()).complete
+        assert anyio.current_time() - began < 0.5
+        began = anyio.current_time()
+        everything = await client.fetch_all(refresh=True)
+        assert anyio.current_time() - began < 3.0
+        assert everything.results.keys() == {(1, 1)}
+        assert everything.silent.keys() == {(1, 100), (2, 1)}
+        for error in everything.silent.values():
+            assert isinstance(error, NoReply)
+            assert error.attempts >= 2
+        assert everything.complete
+        assert (await component.get("PARAM_01")).value == 1
+        assert not any(residue(each) for each in client.components.values())
+
+
+@swiftly
+async def test_whoever_is_late_to_speak_is_fetched_too() -> None:
+    late = generic(system=2)
+    late.reboot(1000.0, down=0.9)
+    async with a_client(Air([generic(), late])) as client:
+        assert (await client.fetch_all()).results.keys() == {(1, 1), (2, 1)}
+
+
+@swiftly
+async def test_a_link_without_an_autopilot_can_be_fetched() -> None:
+    async with a_client(generic(component=100, autopilot=wire.MAV_AUTOPILOT_INVALID)) as client:
+        assert (await client.fetch_all()).results.keys() == {(1, 100)}
+        assert (await client.fetch_all(1)).results.keys() == {(1, 100)}
+        with pytest.raises(NoReply, match="system 2"):
+            await client.fetch_all(2)
+
+
+@swiftly
+async def test_a_ground_station_is_not_asked_for_parameters() -> None:
+    class Station(Silent):
+        def __init__(self) -> None:
+            super().__init__(VALUES, system=254, component=190)
+            self._heartbeat = wire.Heartbeat(wire.MAV_TYPE_GCS, wire.MAV_AUTOPILOT_INVALID)
+
+    tap = Tap(Air([Station(), generic()]))
+    async with a_client(tap) as client:
+        everything = await client.fetch_all()
+        assert everything.results.keys() == {(1, 1)}
+        assert not everything.silent
+    assert not [each for each in tap.messages(wire.ParamRequestList) if each.target_system == 254]
+
+
+@swiftly
+async def test_a_lossy_link_to_one_vehicle_is_not_given_up_early() -> None:
+    tap = Tap(generic())
+    async with a_client(tap) as client:
+        await client.component()
+        tap.is_deaf = True
+        fetch = asyncio.create_task(client.fetch_all())
+        await asyncio.sleep(6.0)
+        tap.is_deaf = False
+        assert (await fetch).complete
+
+
+# Changes
+
+
+@swiftly
+async def test_changes_tell_what_was_and_what_is() -> None:
+    vehicle = small_px4()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        first, second = component.changes(), component.changes()
+        await component.get("PARAM_01")
+        vehicle.set_param("PARAM_01", 40)
+        await until(lambda: component.params["PARAM_01"].value == 40)
+        change = await anext(first)
+        assert (change.name, change.old) == ("PARAM_01", None)
+        assert change.new is not None
+        assert change.new.value == 40, "two changes that nobody fetched have become one"
+        await component.set("PARAM_01", 41)
+        change = await anext(first)
+        assert change.old is not None
+        assert change.new is not None
+        assert (change.old.value, change.new.value, change.by) == (40, 41, "us")
+        change = await anext(second)
+        assert change.old is None
+        assert change.new is not None
+        assert change.new.value == 41
+
+
+@swiftly
+async def test_a_change_that_is_taken_back_is_none() -> None:
+    async with a_client(small_px4()) as client:
+        component = await client.component()
+        await component.get("PARAM_01")
+        changes = component.changes()
+        for value in (5, 6, 1):
+            await component.set("PARAM_01", value)
+        await component.set("PARAM_02", 5)
+        assert (await anext(changes)).name == "PARAM_02"
+
+
+@swiftly
+async def test_what_waits_is_bounded_by_the_table() -> None:
+    vehicle = small_px4()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        await component.fetch_all()
+        changes = component.changes()
+        for value in range(100, 150):
+            for name in ("PARAM_01", "PARAM_02"):
+                await component.set(name, value)
+        given = [await anext(changes), await anext(changes)]
+        assert sorted(change.name for change in given) == ["PARAM_01", "PARAM_02"]
+        with pytest.raises(TimeoutError):
+            await asyncio.wait_for(anext(changes), 1.0)
+
+
+@swiftly
+async def test_several_tasks_may_wait_for_the_changes_of_one_subscription() -> None:
+    async with a_client(small_px4()) as client:
+        component = await client.component()
+        changes = component.changes()
+        tasks = [asyncio.create_task(outcome(anext(changes))) for _ in range(3)]
+        await settled()
+        await component.get("PARAM_01")
+        await component.get("PARAM_02")
+        await settled()
+    names = sorted(
+        each.name if isinstance(each, Change) else type(each).__name__ for each in [await t for t in tasks]
+    )
+    assert names == ["ClientClosed", "PARAM_01", "PARAM_02"]
+
+
+@swiftly
+async def test_who_listens_late_or_once_more_is_told_of_what_changes_from_then_on() -> None:
+    async with a_client(small_px4()) as client:
+        component = await client.component()
+        await component.fetch_all()
+        for name in ("PARAM_02", "PARAM_04"):
+            changes = component.changes()
+            await component.set(name, 77)
+            assert (await anext(changes)).name == name
+            del changes
+            await component.set("PARAM_06", 77)
+            await component.set("PARAM_06", 78)
+
+
+@swiftly
+async def test_changes_end_with_the_client_and_what_waits_comes_first() -> None:
+    async with a_client(small_px4()) as client:
+        component = await client.component()
+        changes = component.changes()
+        await component.get("PARAM_01")
+    assert (await anext(changes)).name == "PARAM_01"
+    for _ in range(2):
+        with pytest.raises(ClientClosed):
+            await anext(changes)
+    with pytest.raises(ClientClosed):
+        async for _ in component.changes():
+            pass
+
+
+@swiftly
+async def test_nobody_is_told_who_has_gone() -> None:
+    async with a_client(small_px4()) as client:
+        component = await client.component()
+        changes = component.changes()
+        assert len(component._subscriptions) == 1
+        del changes
+        assert not component._subscriptions
+
+
+@swiftly
+async def test_changes_by_other_stations_are_told_from_the_vehicles_own() -> None:
+    vehicle = small_px4()
+    radio = Radio(vehicle)
+    async with a_client(radio) as client:
+        component = await client.component()
+        await component.fetch_all()
+        changes = component.changes()
+        message = wire.ParamSet(1, 1, "PARAM_01", (55).to_bytes(4, "little"), ParamType.INT32)
+        radio.other.append(wire.encode(message, system=254, component=190, sequence=0))
+        change = await anext(changes)
+        assert (change.name, change.by) == ("PARAM_01", "station 254/190")
+        vehicle.set_param("PARAM_02", 66)
+        change = await anext(changes)
+        assert (change.name, change.by) == ("PARAM_02", "vehicle")
+
+
+# Links that drop
+
+
+@swiftly
+async def test_calls_go_on_when_the_link_is_back(way: str) -> None:
+    vehicle = generic(burst=1, period=0.1)
+    link = FlakyLink(vehicle)
+    async with a_client(link) as client:
+        component = await client.component()
+        changes = component.changes()
+        fetch = asyncio.create_task(component.fetch_all())
+        await asyncio.sleep(1.0)
+        read = asyncio.create_task(component.get("PARAM_20"))
+        write = asyncio.create_task(component.set("PARAM_22", 5))
+        await link.drop(stays_away=True)
+        await asyncio.sleep(4.0)
+        if way == DIRECT:
+            assert repr(client) == "<ParamClient tcp:flaky:5760 away, 1 component>"
+        assert not any(task.done() for task in (fetch, read, write))
+        link.is_away = False
+        assert (await read).value == 20
+        assert (await write).status == "accepted"
+        result = await fetch
+        assert result.complete
+        assert bits(component.params) == bits(vehicle.params)
+        assert (await anext(changes)).name == "PARAM_00"
+        assert "open" in repr(client)
+        assert not residue(component)
+
+
+@swiftly
+async def test_what_waited_is_asked_for_at_once_when_the_link_is_back() -> None:
+    link = FlakyLink(Air.symmetric([generic()], delay=0.5))
+    async with a_client(link) as client:
+        component = await client.component()
+        await component.get("PARAM_00")
+        await link.drop()
+        await settled()
+        read = asyncio.create_task(component.get("PARAM_01"))
+        await until(lambda: link.openings == 2)
+        came_back = anyio.current_time()
+        await read
+        assert anyio.current_time() - came_back < 1.1, "one round trip, and no time-out before it"
+
+
+@direct_only("a service waits for its links, so client.component() goes on")
+@swiftly
+async def test_a_link_that_stays_away_fails_the_calls_and_not_the_client(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    tap = Tap(generic())
+    link = FlakyLink(tap)
+    async with a_client(link) as client:
+        component = await client.component()
+        tap.is_mute = True
+        waiting = {
+            name: asyncio.create_task(outcome(call(client, component))) for name, call in CALLS.items()
+        }
+        await settled()
+        changes = waiting.pop("changes")
+        limited = asyncio.create_task(outcome(component.get("PARAM_05", timeout=2)))
+        await link.drop(stays_away=True)
+        went_away = anyio.current_time()
+        assert isinstance(await limited, NoReply)
+        for name, task in waiting.items():
+            error = await task
+            assert type(error) is LinkError, name
+            assert "refused" in str(error)
+            assert math.isclose(anyio.current_time() - went_away, link_task.LINK_PATIENCE, abs_tol=0.1)
+        for call in ("get", "set", "fetch_all", "client.component", "client.fetch_all"):
+            with pytest.raises(LinkError, match="refused"):
+                await CALLS[call](client, component)
+        assert not residue(component)
+        await asyncio.sleep(30.0)
+        attempts = link.openings
+        await asyncio.sleep(30.0)
+        assert 5 <= link.openings - attempts <= 7, "one every five seconds"
+        tap.is_mute = False
+        link.is_away = False
+        await asyncio.sleep(5.1)
+        assert (await component.get("PARAM_01")).value == 1
+        assert (await component.fetch_all()).complete
+        assert isinstance(await changes, list), "a subscription waits on"
+    told = [record for record in caplog.records if record.levelno >= logging.WARNING]
+    assert len(told) == 1
+    assert "trying to open it again" in told[0].getMessage()
+
+
+@direct_only("the errors are made anew from what the service says")
+@swiftly
+async def test_the_errors_of_a_long_absence_do_not_grow() -> None:
+    link = FlakyLink(generic())
+    async with a_client(link) as client:
+        component = await client.component()
+        await link.drop(stays_away=True)
+        await asyncio.sleep(20.0)
+        lengths = set()
+        for _ in range(5):
+            with pytest.raises(LinkError) as caught:
+                await component.get("PARAM_01")
+            lengths.add(len(caught.traceback))
+        assert len(lengths) == 1
+
+
+@direct_only("a service opens it again")
+@swiftly
+async def test_a_link_that_cannot_come_back_ends_every_call() -> None:
+    tap = Tap(generic())
+    link = FlakyLink(tap)
+    link.reconnects = False
+    async with a_client(link) as client:
+        component = await client.component()
+        tap.is_mute = True
+        waiting = {
+            name: asyncio.create_task(outcome(call(client, component))) for name, call in CALLS.items()
+        }
+        await settled()
+        await link.drop()
+        for name, task in waiting.items():
+            assert type(await task) is LinkError, name
+        for name, call in CALLS.items():
+            assert type(await outcome(call(client, component))) is LinkError, name
+        assert "closed" in repr(client)
+        assert not residue(component)
+    assert isinstance(await outcome(component.get("PARAM_01")), ClientClosed)
+
+
+@direct_only("it is about a link of its own")
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
+async def test_a_vehicle_over_real_sockets(kind: str) -> None:
+    with anyio.fail_after(PATIENCE):
+        vehicle = PX4Vehicle(stream=kind == "tcpin")
+        far = "udpout" if kind == "udpin" else "tcp"
+        async with Served(vehicle, kind) as served, a_client(f"{far}:127.0.0.1:{served.port}") as client:
+            component = await client.component()
+            result = await component.fetch_all()
+            assert result.complete
+            assert result.hash == vehicle.announced_hash()
+            assert (await component.set("MC_ROLL_P", 7.25)).status == "accepted"
+            assert (await component.get("MC_ROLL_P")).value == 7.25
+        assert vehicle.param("MC_ROLL_P").value == 7.25
+
+
+@direct_only("it is about a link of its own")
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
+async def test_a_client_that_listens(kind: str) -> None:
+    with anyio.fail_after(PATIENCE):
+        async with a_client(f"{kind}:127.0.0.1:0") as client, anyio.create_task_group() as tasks:
+            port = client.link.address[1]  # type: ignore[attr-defined]  # only sockets have one
+            far = f"{'udpout' if kind == 'udpin' else 'tcp'}:127.0.0.1:{port}"
+            vehicles = [generic(system=system, stream=kind == "tcpin") for system in (1, 2)]
+            for vehicle in vehicles:
+                tasks.start_soon(serve_endpoint, vehicle, create_link(far))
+            for system in (1, 2):
+                component = await client.component(system=system)
+                assert (await component.fetch_all()).complete
+                await component.set("PARAM_01", system * 10)
+            assert [vehicle.param("PARAM_01").value for vehicle in vehicles] == [10, 20]
+            tasks.cancel_scope.cancel()
+
+
+@direct_only("it is about a link of its own")
+@pytest.mark.asyncio
+async def test_a_tcp_connection_that_breaks_during_a_download() -> None:
+    vehicle = generic(burst=1, period=0.03, stream=True)
+    served = Served(vehicle, "tcpin")
+    async with asyncio.timeout(PATIENCE), served, a_client(f"tcp:127.0.0.1:{served.port}") as client:
+        component = await client.component()
+        changes = component.changes()
+        fetch = asyncio.create_task(component.fetch_all())
+        await anext(changes)
+        await served.__aexit__()
+        assert not fetch.done()
+        await served.__aenter__()
+        result = await fetch
+        assert result.complete
+        assert bits(result.params) == bits(vehicle.params)
+
+
+@direct_only("it is about a link of its own")
+@pytest.mark.asyncio
+async def test_a_tcp_server_that_stays_away(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link_task, "LINK_PATIENCE", 0.3)
+    monkeypatch.setattr(link_task, "FIRST_BACKOFF", 0.05)
+    monkeypatch.setattr(link_task, "LONGEST_BACKOFF", 0.1)
+    served = Served(generic(stream=True), "tcpin")
+    async with asyncio.timeout(PATIENCE), served, a_client(f"tcp:127.0.0.1:{served.port}") as client:
+        component = await client.component()
+        await served.__aexit__()
+        with pytest.raises(LinkError, match="refused") as caught:
+            await component.get("PARAM_01")
+        assert isinstance(caught.value.__cause__, ConnectionRefusedError)
+        await served.__aenter__()
+        await until(lambda: " open, " in repr(client))
+        assert (await component.get("PARAM_01")).value == 1
+
+
+# Rests
+
+
+class Chatter(Tap):
+    """An endpoint beside which telemetry comes at an even pace.
+
+    Attributes:
+        portions: what was handed over, as it was taken together.
+    """
+
+    def __init__(self, endpoint: Endpoint, interval: float) -> None:
+        super().__init__(endpoint)
+        self.portions: list[list[bytes]] = []
+        self._interval = interval
+        self._next_at = -math.inf
+        self._count = 0
+        self._said: list[bytes] = []
+
+    def say(self, data: bytes) -> None:
+        """Send this beside all else."""
+        self._said.append(data)
+
+    def tick(self, now: float) -> None:
+        super().tick(now)
+        if self._next_at == -math.inf:
+            self._next_at = now
+        while self._next_at <= now:
+            self._count += 1
+            payload = self._count.to_bytes(4, "little").rjust(28, b"\1")
+            self.say(wire.build_frame(30, payload, system=1, component=1, sequence=0))
+            self._next_at += self._interval
+
+    def next_deadline(self) -> float:
+        return min(self._next_at, super().next_deadline() or math.inf)
+
+    def data_to_send(self) -> list[bytes]:
+        said, self._said = self._said, []
+        portion = super().data_to_send() + said
+        if portion:
+            self.portions.append(portion)
+        return portion
+
+
+async def known_component(client: ParamClient) -> Component:
+    """The component, after it has said who it is."""
+    component = await client.component()
+    await until(lambda: not client._station.is_waiting)
+    return component
+
+
+@direct_only("it is about the reader of a link")
+@swiftly
+async def test_telemetry_alone_lets_the_reader_rest() -> None:
+    vehicle = Chatter(generic(), 1 / 2000)
+    async with a_client(vehicle) as client:
+        await known_component(client)
+        vehicle.portions.clear()
+        await asyncio.sleep(1.0)
+        assert sum(map(len, vehicle.portions)) >= 1950
+        assert len(vehicle.portions) < 1.2 / link_task.REST
+
+
+@direct_only("it is about the reader of a link")
+@swiftly
+async def test_nothing_rests_while_an_answer_is_awaited() -> None:
+    vehicle = Chatter(generic(), 1 / 2000)
+    async with a_client(vehicle) as client:
+        component = await known_component(client)
+        vehicle.is_deaf = True
+        call = asyncio.create_task(component.get("PARAM_01"))
+        await settled()
+        vehicle.portions.clear()
+        await asyncio.sleep(0.1)
+        assert not call.done()
+        assert len(vehicle.portions) >= 190
+        call.cancel()
+
+
+@direct_only("it is about the reader of a link")
+@swiftly
+async def test_what_comes_during_a_rest_is_taken_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    taken: list[bytes] = []
+    receive = Station.receive
+
+    def record(station: Station, data: bytes, peer: Peer, now: float, moment: float) -> bool:
+        taken.append(data)
+        return receive(station, data, peer, now, moment)
+
+    monkeypatch.setattr(Station, "receive", record)
+    vehicle = small_px4()
+    chatter = Chatter(vehicle, 1 / 2000)
+    async with a_client(chatter) as client:
+        component = await known_component(client)
+        for value in range(50, 70):
+            vehicle.set_param("PARAM_04", value)
+            vehicle.set_param("PARAM_01", value + 100)
+            await asyncio.sleep(0.025)
+        await asyncio.sleep(0.1)
+        assert component.params["PARAM_01"].value == vehicle.param("PARAM_01").value
+        given = [data for portion in chatter.portions for data in portion]
+        assert len(taken) >= 1000
+        assert taken == given
+
+
+@direct_only("it is about the reader of a link")
+@swiftly
+async def test_a_change_waits_for_the_end_of_a_rest_at_the_most() -> None:
+    vehicle = Chatter(generic(), 1 / 2000)
+    async with a_client(vehicle) as client:
+        component = await known_component(client)
+        changes = component.changes()
+        for value in range(20):
+            await asyncio.sleep(0.0137)
+            began = anyio.current_time()
+            message = wire.ParamValue("PARAM_01", bytes((value + 1, 0, 0, 0)), ParamType.INT32, 24, 1)
+            vehicle.say(wire.encode(message, system=1, component=1, sequence=0))
+            with anyio.fail_after(1.0):
+                assert (await anext(changes)).name == "PARAM_01"
+            assert anyio.current_time() - began < link_task.REST + 0.001
+
+
+@direct_only("it is about the reader of a link")
+@swiftly
+async def test_a_busy_link_shortens_the_rests() -> None:
+    vehicle = Chatter(generic(), 1 / 20_000)
+    async with a_client(vehicle) as client:
+        await known_component(client)
+        await asyncio.sleep(0.1)
+        vehicle.portions.clear()
+        await asyncio.sleep(0.5)
+        largest = max(map(len, vehicle.portions))
+    assert 0.9 * link_task.MOST_PER_REST < largest < 1.1 * link_task.MOST_PER_REST
+
+
+@direct_only("it is about the reader of a link")
+@pytest.mark.parametrize("call", ["get", "set", "fetch_all", "client.fetch_all"])
+@swiftly
+async def test_a_call_ends_a_rest_at_once(call: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def seconds(rest: float) -> float:
+        """How long the call takes where a rest, once begun, would last until our next heartbeat."""
+        monkeypatch.setattr(link_task, "REST", rest)
+        vehicle = Chatter(small_px4(), 0.005)
+        async with a_client(vehicle) as client:
+            component = await known_component(client)
+            vehicle.heard.clear()
+            await until(lambda: vehicle.messages(wire.Heartbeat))
+            await asyncio.sleep(0.05)
+            began = anyio.current_time()
+            await CALLS[call](client, component)
+            return anyio.current_time() - began
+
+    monkeypatch.setattr(link_task, "MOST_PER_REST", math.inf)
+    with_rests, without = await seconds(60.0), await seconds(0.0)
+    assert with_rests < without + 0.05
+
+
+@direct_only("it is about the reader of a link")
+@swiftly
+async def test_closing_does_not_wait_for_the_end_of_a_rest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link_task, "REST", 60.0)
+    monkeypatch.setattr(link_task, "MOST_PER_REST", math.inf)
+    async with a_client(Chatter(generic(), 0.005)) as client:
+        await known_component(client)
+        await asyncio.sleep(1.0)
+        began = anyio.current_time()
+    assert anyio.current_time() - began < 0.01
+    assert not tasks_beside()
+
+
+# How they look
+
+
+@direct_only("the words name the link")
+@swiftly
+async def test_their_looks_tell_how_they_stand() -> None:
+    client = a_client(Air([small_px4(burst=1, period=0.05), generic(system=2)]))
+    assert repr(client) == "<ParamClient sim:custom closed, 0 components>"
+    async with client:
+        component = await client.component()
+        assert repr(client) == "<ParamClient sim:custom open, 2 components>"
+        assert repr(component) == "<Component 1/1 px4 new 0 params>"
+        fetch = asyncio.create_task(component.fetch_all())
+        await asyncio.sleep(0.5)
+        assert repr(component) == "<Component 1/1 px4 fetching 9 of 25 params>"
+        result = await fetch
+        assert (
+            repr(component) == f"<Component 1/1 px4 synced 25 params from stream in {result.elapsed:.2f} s>"
+        )
+        assert repr(component.params) == "<ParamMap 25 params>"
+        assert repr(await client.component(system=2)) == "<Component 2/1 generic new 0 params>"
+    assert repr(client) == "<ParamClient sim:custom closed, 2 components>"
+
+
+@swiftly
+async def test_a_program_that_is_held_up_takes_what_has_come_before_it_counts_as_lost() -> None:
+    """As by a call that blocks the event loop for half a second, in the middle of a list."""
+    loop = swift_loop()
+    px4 = PX4Vehicle()
+    async with a_client(px4) as client:
+        vehicle = await client.component()
+        loop.call_later(0.41, lambda: setattr(loop, "now", loop.now + 0.5))
+        result = await vehicle.fetch_all()
+    assert result.complete
+    hash_reads = 1  # goes out with the list request
+    assert (result.lost, result.repeated, px4.requests["PARAM_REQUEST_READ"]) == (0, 0, hash_reads)
+
+
+@swiftly
+async def test_the_autopilots_are_the_vehicles_without_what_they_carry(way: str) -> None:
+    camera = generic(system=1, component=100)
+    vehicles = [generic(system=3), small_px4(), camera, generic(system=2, component=7)]
+    async with a_client(Air(vehicles)) as client:
+        assert client.autopilots == [] or way != DIRECT, "a service may have heard them before"
+        await client.fetch_all()
+        addresses = [(each.system, each.component) for each in client.autopilots]
+        assert addresses == [(1, 1), (2, 7), (3, 1)]
+        assert len(client.components) == 4
+
+
+@swiftly
+@pytest.mark.parametrize("index", [-1, 32_768, 1.5])
+async def test_what_is_no_index_is_refused_and_ends_nothing(index: Any) -> None:
+    async with a_client(generic()) as client:
+        component = await client.component()
+        with pytest.raises(UsageError, match=f"parameter index {index}: indices are 0 to 32767"):
+            await component.get(index)
+        assert (await component.get(0)).index == 0
+
+
+@swiftly
+async def test_what_a_fetch_can_accept() -> None:
+    async with a_client(generic()) as client:
+        component = await client.component()
+        with pytest.raises(UsageError, match='accept is "verified" or "sampled", not \'all\''):
+            await component.fetch_all(accept="all")
+        with pytest.raises(UsageError, match="a sample has at least one parameter, not 0"):
+            await component.fetch_all(accept="sampled", sample=0)
+        assert (await component.fetch_all(accept="sampled", sample=10**9, seed=time.time_ns())).complete

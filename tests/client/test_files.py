@@ -1,0 +1,364 @@
+"""The files of a component, as users of the client see them."""
+
+from __future__ import annotations
+
+import asyncio
+from contextlib import suppress
+from typing import Any
+
+import anyio
+import pytest
+
+from paramclient import ClientClosed, NoReply, ParamClient, UsageError
+from paramclient.client.client import SESSION_PATIENCE
+from paramclient.client.files import Ftp
+from paramclient.errors import FileErrorCode, FileTransferError, LinkError
+from paramclient.links import SimLink
+from paramclient.model.values import ParamType, crc32_px4
+from paramclient.protocol.ftp import DirectoryEntry
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
+from tests.shell import FlakyLink, Tap, a_client, outcome, swiftly, tasks_beside
+
+LOG = bytes(range(256)) * 200
+"""A file of 51,200 bytes, which takes a second."""
+FILES = {"/APM/LOGS/1.BIN": LOG, "/APM/a.txt": b"hello", "/APM/empty": b""}
+
+
+def with_files(**options: Any) -> ArduPilotVehicle:
+    vehicle = ArduPilotVehicle(live_period=0, **options)
+    vehicle.files.update(FILES)
+    return vehicle
+
+
+async def files_of(client: ParamClient) -> Ftp:
+    return client.ftp(await client.component())
+
+
+@pytest.mark.parametrize("make", [ArduPilotVehicle, PX4Vehicle])
+@swiftly
+async def test_files_are_read_written_listed_and_checked(make: Any) -> None:
+    vehicle = make()
+    vehicle.files.update(FILES)
+    async with a_client(vehicle) as client:
+        files = await files_of(client)
+        assert repr(files) == "<Ftp 1/1>"
+        assert await files.read("/APM/a.txt") == b"hello"
+        assert await files.read("/APM/empty") == b""
+        assert await files.read("/APM/LOGS/1.BIN") == LOG
+        assert await files.list("/APM") == (
+            DirectoryEntry("LOGS", None),
+            DirectoryEntry("a.txt", 5),
+            DirectoryEntry("empty", 0),
+        )
+        assert await files.checksum("/APM/LOGS/1.BIN") == crc32_px4(LOG)
+        await files.write("/APM/new", LOG[:1000])
+        assert vehicle.files["/APM/new"] == LOG[:1000]
+        await files.write("/APM/new", b"")
+        assert await files.read("/APM/new") == b""
+        await anyio.sleep(1.0)
+        assert not vehicle.open_files
+
+
+@swiftly
+async def test_the_progress_of_a_read_is_told() -> None:
+    told: list[tuple[int, int | None]] = []
+    async with a_client(with_files()) as client:
+        files = await files_of(client)
+        await files.read("/APM/LOGS/1.BIN", progress=lambda *state: told.append(state))
+    received = [state[0] for state in told]
+    assert received == sorted(received)
+    assert received[-1] == len(LOG)
+    assert len(told) > 5
+    assert {state[1] for state in told} <= {None, len(LOG)}
+
+
+@swiftly
+async def test_a_file_that_is_too_long_is_not_taken() -> None:
+    vehicle = with_files()
+    async with a_client(vehicle) as client:
+        files = await files_of(client)
+        with pytest.raises(FileTransferError, match="longer than 1000 bytes"):
+            await files.read("/APM/LOGS/1.BIN", limit=1000)
+        await anyio.sleep(2.0)
+        assert not vehicle.open_files
+        assert await files.read("/APM/a.txt", limit=5) == b"hello"
+
+
+@swiftly
+async def test_a_refusal_comes_in_words() -> None:
+    async with a_client(with_files()) as client:
+        files = await files_of(client)
+        for call in (files.read("/none"), files.list("/none"), files.checksum("/none")):
+            with pytest.raises(FileTransferError, match=r"1/1 .* /none: file not found") as caught:
+                await call
+            error = caught.value
+            assert (error.code, error.path, error.is_not_found) == (
+                FileErrorCode.FILE_NOT_FOUND,
+                "/none",
+                True,
+            )
+        with pytest.raises(UsageError, match="path"):
+            await files.read("")
+        with pytest.raises(UsageError, match="239 bytes"):
+            await files.write("/" * 240, b"")
+
+
+@swiftly
+async def test_a_time_limit_ends_a_read_and_closes_the_file() -> None:
+    vehicle = with_files()
+    async with a_client(vehicle) as client:
+        files = await files_of(client)
+        began = anyio.current_time()
+        with pytest.raises(NoReply, match=r"the file /APM/LOGS/1.BIN of 1/1"):
+            await files.read("/APM/LOGS/1.BIN", timeout=0.3)
+        assert anyio.current_time() - began < 0.41  # with a round trip for the closing
+        await anyio.sleep(1.0)
+        assert not vehicle.open_files
+
+
+@swiftly
+async def test_cancellation_closes_the_file() -> None:
+    vehicle = with_files()
+    async with a_client(vehicle) as client:
+        files = await files_of(client)
+        with anyio.move_on_after(0.3):
+            await files.read("/APM/LOGS/1.BIN")
+        assert vehicle.open_files == ["/APM/LOGS/1.BIN"]
+        assert await files.read("/APM/a.txt") == b"hello"
+        with anyio.move_on_after(0.1):
+            await files.write("/APM/new", LOG)
+        await anyio.sleep(1.0)
+        assert not vehicle.open_files
+        assert client.components[1, 1]._machine.files.is_idle
+
+
+@pytest.mark.parametrize("how", ["timeout", "error", "cancelled", "scope"])
+@swiftly
+async def test_a_client_leaves_no_file_open_at_whatever_moment_it_ends(how: str) -> None:
+    requests = 0
+    for step in range(1, 40):
+        vehicle = ArduPilotVehicle(live_period=0)
+
+        async def session(vehicle: ArduPilotVehicle, seconds: float) -> None:
+            async with a_client(Air.symmetric([vehicle], delay=0.02)) as client:
+                component = await client.component()
+                if how == "error":
+                    fetching = asyncio.ensure_future(outcome(component.fetch_all()))
+                    await anyio.sleep(seconds)
+                    assert not fetching.done()
+                    raise RuntimeError("of the body")
+                with suppress(NoReply):
+                    await component.fetch_all(timeout=seconds if how == "timeout" else None)
+
+        async def session_in_a_scope(vehicle: ArduPilotVehicle, seconds: float) -> None:
+            with anyio.move_on_after(seconds) as scope:
+                await session(vehicle, seconds)
+            assert scope.cancelled_caught
+
+        run = session_in_a_scope if how == "scope" else session
+        task = asyncio.ensure_future(run(vehicle, step / 100))
+        if how == "cancelled":
+            await anyio.sleep(step / 100)
+            task.cancel()
+        await asyncio.wait([task])
+        assert task.cancelled() == (how == "cancelled")
+        assert not tasks_beside()
+        assert how == "cancelled" or bool(task.exception()) == (how == "error")
+        assert not vehicle.open_files
+        requests += vehicle.requests["FILE_TRANSFER_PROTOCOL"]
+    assert requests > 80
+
+
+@pytest.mark.parametrize(
+    ("fault", "longest"),
+    [
+        ("none", 1.1),
+        ("deaf", SESSION_PATIENCE),
+        ("dropped", 0),
+        ("failed", 0),
+        ("drops", 0.1),
+        ("fails", 0.1),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+@swiftly
+async def test_a_scope_around_a_client_ends_it_whatever_the_link_does(fault: str, longest: float) -> None:
+    vehicle = with_files()
+    tap = Tap(Air.symmetric([vehicle], delay=0.05))
+    link = FlakyLink(tap) if fault in ("dropped", "drops") else SimLink(tap)
+
+    async def close_later() -> None:
+        await anyio.sleep(0.1)
+        await link.close()
+
+    with anyio.CancelScope() as scope:
+        async with a_client(link) as client:
+            files = await files_of(client)
+            reading = asyncio.ensure_future(outcome(files.read("/APM/LOGS/1.BIN")))
+            await anyio.sleep(0.3)
+            assert vehicle.open_files
+            tap.is_deaf = fault == "deaf"
+            if fault in ("dropped", "failed"):
+                await link.close()
+                await anyio.sleep(0.01)
+            if fault in ("drops", "fails"):
+                closing = asyncio.ensure_future(close_later())
+            scope.cancel()
+            cancelled_at = anyio.current_time()
+            await anyio.sleep_forever()
+    assert scope.cancelled_caught
+    took = anyio.current_time() - cancelled_at
+    assert took <= longest + 0.01, "a burst of a second, which the vehicle ends first, and a round trip"
+    if fault in ("drops", "fails"):
+        await closing
+    ending = await reading
+    assert isinstance(ending, LinkError)
+    assert isinstance(ending, ClientClosed) == (fault != "failed")
+    assert bool(vehicle.open_files) == (fault != "none")
+    assert not tasks_beside()
+
+
+@swiftly
+async def test_tasks_that_are_cancelled_each_for_itself_leave_no_file_open() -> None:
+    """As `asyncio.run` does with all that remain when its main task has ended."""
+    vehicle = with_files()
+
+    async def session() -> None:
+        async with a_client(Air.symmetric([vehicle], delay=0.02)) as client:
+            await (await client.component()).fetch_all()
+
+    fetching = asyncio.ensure_future(session())
+    await anyio.sleep(0.25)
+    assert vehicle.open_files
+    for task in asyncio.all_tasks() - {asyncio.current_task()}:
+        task.cancel()
+    began = anyio.current_time()
+    await asyncio.wait([fetching])
+    assert fetching.cancelled()
+    assert anyio.current_time() - began < 0.5
+    assert not vehicle.open_files
+    assert not tasks_beside()
+
+
+@swiftly
+async def test_the_file_is_closed_when_its_content_is_given() -> None:
+    vehicle = with_files()
+    async with a_client(Air.symmetric([vehicle], delay=0.02)) as client:
+        component = await client.component()
+        for _ in range(3):
+            began = anyio.current_time()
+            assert (await component.fetch_all()).source == "ftp"
+            assert not vehicle.open_files
+            assert anyio.current_time() - began < 0.55
+        assert await client.ftp(component).read("/APM/a.txt") == b"hello"
+        assert not vehicle.open_files
+
+
+@swiftly
+async def test_reads_are_done_in_order() -> None:
+    ended: list[str] = []
+    async with a_client(with_files()) as client:
+        files = await files_of(client)
+
+        async def read(path: str) -> None:
+            await files.read(path)
+            ended.append(path)
+
+        async with anyio.create_task_group() as tasks:
+            for path in ("/APM/LOGS/1.BIN", "/APM/a.txt", "/APM/empty"):
+                tasks.start_soon(read, path)
+                await asyncio.sleep(0)
+            tasks.start_soon(client.components[1, 1].fetch_all)
+        assert ended == ["/APM/LOGS/1.BIN", "/APM/a.txt", "/APM/empty"]
+        last = client.components[1, 1]._machine.fetches.last
+        assert last is not None
+        assert last.source == "ftp"
+
+
+@swiftly
+async def test_nothing_is_asked_of_a_component_that_is_lost() -> None:
+    tap = Tap(with_files())
+    async with a_client(tap) as client:
+        component = await client.component()
+        files = client.ftp(component)
+        assert await files.read("/APM/a.txt") == b"hello"
+        tap.is_mute = tap.is_deaf = True
+        await anyio.sleep(4.0)
+        reading = asyncio.ensure_future(outcome(files.read("/APM/LOGS/1.BIN")))
+        waiting = asyncio.ensure_future(outcome(files.read("/APM/a.txt")))
+        await anyio.sleep(1.5)
+        assert component.state == "lost"
+        for each in (reading, waiting):
+            assert each.done()
+            error = await each
+            assert isinstance(error, NoReply)
+            assert "(lost)" in str(error)
+        began = anyio.current_time()
+        for call in (files.read("/x"), files.write("/x", b""), files.list("/x"), files.checksum("/x")):
+            with pytest.raises(NoReply, match="lost"):
+                await call
+        assert anyio.current_time() - began < 0.01
+        tap.is_mute = tap.is_deaf = False
+        await anyio.sleep(3.0)
+        assert await files.read("/APM/a.txt") == b"hello"
+        await anyio.sleep(1.0)
+        assert component._machine.files.is_idle
+
+
+@swiftly
+async def test_a_read_goes_on_when_the_link_is_back() -> None:
+    link = FlakyLink(with_files())
+    async with a_client(link) as client:
+        files = await files_of(client)
+        reading = asyncio.ensure_future(files.read("/APM/LOGS/1.BIN"))
+        await anyio.sleep(0.3)
+        await link.drop()
+        assert await reading == LOG
+
+
+@swiftly
+async def test_a_link_that_stays_away_ends_it() -> None:
+    link = FlakyLink(with_files())
+    async with a_client(link) as client:
+        files = await files_of(client)
+        reading = asyncio.ensure_future(outcome(files.read("/APM/LOGS/1.BIN")))
+        await anyio.sleep(0.3)
+        await link.drop(stays_away=True)
+        assert isinstance(await reading, LinkError)
+        with pytest.raises(LinkError):
+            await files.read("/APM/a.txt")
+
+
+@swiftly
+async def test_the_client_s_end_ends_it() -> None:
+    async with a_client(with_files()) as client:
+        files = await files_of(client)
+        reading = asyncio.ensure_future(outcome(files.read("/APM/LOGS/1.BIN")))
+        await anyio.sleep(0.3)
+    assert isinstance(await reading, ClientClosed)
+    with pytest.raises(ClientClosed):
+        await files.list("/")
+    assert not tasks_beside()
+
+
+@swiftly
+async def test_a_bad_link_only_takes_longer() -> None:
+    vehicle = with_files()
+    async with a_client(Air.symmetric([vehicle], loss=0.2, delay=0.02, seed=4)) as client:
+        files = await files_of(client)
+        assert await files.read("/APM/LOGS/1.BIN") == LOG
+        await files.write("/APM/new", LOG[:3000])
+        assert vehicle.files["/APM/new"] == LOG[:3000]
+
+
+@swiftly
+async def test_a_neighbour_of_a_large_integer_can_be_set() -> None:
+    big = (1 << 24) + 1
+    vehicle = ArduPilotVehicle(table=[SimParam("BIG", ParamType.INT32, big)], live_period=0)
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        await component.fetch_all()
+        assert component.params["BIG"].value == big
+        result = await component.set("BIG", big - 1)
+        assert (result.status, result.actual) == ("accepted", big - 1)
+        assert component.params["BIG"].value == vehicle.params["BIG"].value == big - 1

@@ -1,0 +1,504 @@
+"""A vehicle that lies: what it may cost, and what it cannot do."""
+
+from __future__ import annotations
+
+import gc
+import importlib
+import os
+import re
+import tracemalloc
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import anyio
+import pytest
+
+from paramclient import FileTransferError, NoReply, ParamCache, ParamClient
+from paramclient.cli import connection as session_room
+from paramclient.cli import run as run_command
+from paramclient.client import cache_writer
+from paramclient.client import events as events_room
+from paramclient.client.events import Changes
+from paramclient.links import SimLink
+from paramclient.protocol import component as component_room
+from paramclient.protocol import station as station_room
+from paramclient.protocol.events import ComponentForgotten
+from paramclient.protocol.ftp import blocks as blocks_room
+from paramclient.protocol.ftp import file_read as reading_room
+from paramclient.protocol.ftp import transfers as transfers_room
+from paramclient.protocol.ftp.blocks import Blocks
+from paramclient.protocol.ftp.packets import MOST_DATA
+from paramclient.protocol.params import change_origin as authors_room
+from paramclient.protocol.params import list_download as download_room
+from paramclient.protocol.params import sync as sync_room
+from paramclient.protocol.params import table as table_room
+from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.change_origin import Authors
+from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.table import Room, Table
+from paramclient.protocol.requests.round_trip import INITIAL_TIMEOUT
+from paramclient.protocol.station import Station
+from paramclient.protocol.stats import traffic as traffic_room
+from paramclient.protocol.vehicle.presence import LOST_AFTER
+from paramclient.protocol.wire import (
+    MOST_PARAMETERS,
+    NO_INDEX,
+    AutopilotVersion,
+    Heartbeat,
+    Message,
+    ParamRequestRead,
+    ParamValue,
+    encode,
+    text_of,
+)
+from paramclient.protocol.wire.codec import MOST_TEXTS
+from paramclient.sim import Air
+from tests.liar import ESCAPE, LIES, LiarVehicle
+from tests.shell import bits, generic, small_px4, swiftly
+from tests.simulation import PEER, Simulation, known, listing_ardupilot, param_value
+
+ROOT = Path(__file__).parents[2]
+
+
+def say(session: Simulation, message: Message, *, system: int = 1, component: int = 1) -> None:
+    """Let a vehicle say something, without a vehicle."""
+    data = encode(message, system=system, component=component, sequence=0)
+    session.station.receive(data, PEER, session.now)
+
+
+def beat(session: Simulation, *, system: int = 1, component: int = 1, autopilot: int = 0) -> None:
+    say(session, Heartbeat(2, autopilot), system=system, component=component)
+
+
+# Numbers that cannot be
+
+
+@pytest.mark.parametrize("count", [MOST_PARAMETERS + 1, NO_INDEX - 1, NO_INDEX])
+def test_a_count_above_what_can_be_asked_for_is_none(count: int) -> None:
+    """PARAM_REQUEST_READ has a signed index: one above 32767 cannot even be written down."""
+    session = Simulation()
+    beat(session)
+    say(session, param_value("A", 1.0, index=MOST_PARAMETERS, count=count))
+    table = session.machine.table
+    assert (table.count, table.params["A"].index) == (None, None)
+    fetch = session.machine.begin_fetch(session.now)
+    say(session, param_value("B", 1.0, index=count - 1, count=count))
+    read = session.machine.read("NOT_THERE", session.now)
+    session.run(60)  # with the question for an index that is known to be there
+    assert isinstance(read.error, NoReply)
+    assert isinstance(fetch.error, NoReply)
+    assert all(request.param_index < 10 for request in session.sent_of(ParamRequestRead))
+
+
+def test_the_largest_count_is_one() -> None:
+    session = Simulation()
+    beat(session)
+    say(session, param_value("A", 1.0, index=MOST_PARAMETERS - 1, count=MOST_PARAMETERS))
+    assert session.machine.table.count == MOST_PARAMETERS
+    assert session.machine.table.params["A"].index == MOST_PARAMETERS - 1
+    session.machine.read(MOST_PARAMETERS - 1, session.now)
+    session.exchange()
+    assert MOST_PARAMETERS - 1 in [request.param_index for request in session.sent_of(ParamRequestRead)]
+
+
+def test_a_cached_count_above_what_can_be_asked_for_is_none() -> None:
+    session = Simulation()
+    beat(session)
+    session.machine.use_cached(
+        {"A": known("A", 1.0, index=40_000)},
+        session.now,
+        count=NO_INDEX - 1,
+        confirmed=None,
+        complete=True,
+        volatile=frozenset(),
+        volatile_known=False,
+    )
+    assert (session.machine.table.count, session.machine.table.complete) == (None, False)
+    assert session.machine.table.params["A"].index is None
+
+
+# More than there can be
+
+
+def heard(table: Table, name: str) -> None:
+    table.hear(ParamValue(name, bytes(4), 9, 10, NO_INDEX), "vehicle")
+
+
+def test_a_table_holds_so_many_names_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(table_room, "MOST_NAMES", 3)
+    table = Table()
+    for name in "ABCD":
+        heard(table, name)
+    assert [*table.params] == ["A", "B", "C"]
+    assert table.take("E", 9, 0, 0, None, is_older=False) is None
+    assert table.fill({"F": known("F")}) == []
+    assert [*table.params] == ["A", "B", "C"]
+    assert table.take("C", 9, 1, 0, None, is_older=False) is not None
+    table.remove(lambda param: param.name == "A")
+    heard(table, "D")
+    assert [*table.params] == ["B", "C", "D"]
+
+
+def test_the_tables_of_a_link_share_a_room(monkeypatch: pytest.MonkeyPatch) -> None:
+    """When it is full, each may still hold as many as an autopilot has."""
+    monkeypatch.setattr(table_room, "MOST_NAMES_OF_LINK", 6)
+    monkeypatch.setattr(table_room, "ENOUGH_NAMES", 2)
+    room = Room()
+    liar, honest = Table(room=room), Table(room=room)
+    for name in "ABCDEFGH":
+        heard(liar, name)
+    assert [*liar.params] == [*"ABCDEF"]
+    for name in "ABCD":
+        heard(honest, name)
+    assert [*honest.params] == [*"AB"]
+    liar.forget()
+    assert room.taken == 2
+    for name in "CDEFGH":
+        heard(honest, name)
+    assert len(honest.params) == room.taken == 6
+
+
+def test_a_link_has_so_many_components_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that are there keep their place; a lost one without a parameter gives it up."""
+    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 3)
+    session = Simulation()
+    for system in (1, 2, 3, 4):
+        beat(session, system=system)
+    say(session, param_value("A", 1.0), system=2)
+    session.events.clear()
+    assert [*session.station.components] == [(1, 1), (2, 1), (3, 1)]
+    for _ in range(20):  # the first is heard, the others are lost, and the second has told of a parameter
+        session.run(1)
+        beat(session, system=1)
+    beat(session, system=4)
+    beat(session, system=5)
+    session.exchange()
+    assert [*session.station.components] == [(1, 1), (2, 1), (4, 1)]
+    forgotten = [event for event in session.events if isinstance(event, ComponentForgotten)]
+    assert [(event.machine.system, event.machine.component) for event in forgotten] == [(3, 1)]
+
+
+def test_ten_thousand_components_cost_what_a_thousand_do() -> None:
+    session = Simulation()
+    beat(session)
+    tracemalloc.start()
+    for number in range(10_000):
+        beat(session, system=2 + number % 250, component=1 + number // 250)
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(session.station.components) == station_room.MOST_COMPONENTS
+    assert held < station_room.MOST_COMPONENTS * 30_000
+
+
+def test_a_flood_of_random_systems_from_random_peers_stays_within_the_page_of_the_bounds() -> None:
+    session = Simulation()
+    tracemalloc.start()
+    for number in range(12_000):
+        data = encode(Heartbeat(2, 12), system=1 + number % 250, component=1 + number // 250, sequence=0)
+        for peer in range(1 + number % 3):
+            session.station.receive(data, ("10.0.0.1", 10_000 * peer + number % 5_000), session.now)
+        session.station.events()
+        session.station.data_to_send()
+    held, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert len(session.station.components) == station_room.MOST_COMPONENTS
+    assert held < station_room.MOST_COMPONENTS * 28_000, "as docs/bounds.md says"
+
+
+def test_changes_that_nobody_takes_are_so_many_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(events_room, "MOST_CHANGES", 3)
+    changes = Changes()
+    for name in "ABCDE":
+        changes.push(Change(name, None, known(name)))
+    assert [*changes._waiting] == ["C", "D", "E"]
+
+
+def test_what_is_remembered_of_changes_is_so_much_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(authors_room, "MOST_CHANGES", 3)
+    authors = Authors()
+    for at, name in enumerate("ABCDABCD"):
+        authors.changed(name, at / 100, False)
+    assert [*authors._changed_at] == ["B", "C", "D"]
+    for _ in range(2):
+        for name in "BCDE":
+            authors.changed(name, 0.1, False)
+    assert len(authors._doubts) <= 3
+
+
+def test_names_that_go_are_told_to_the_cache_up_to_a_bound(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(table_room, "MOST_GONE", 4)
+    table = Table()
+    for name in "ABCDE":
+        heard(table, name)
+    assert len(table.take_dirty()) == 5
+    table.forget()
+    assert [*table.dirty] == [*"ABCD"]
+    heard(table, "F")  # what is there is always told
+    assert "F" in table.dirty
+
+
+def test_a_value_that_flips_is_asked_for_only_so_often(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(component_room, "MOST_DOUBTED", 2)
+    session = Simulation()
+    beat(session)
+    for value in (1.0, 2.0):
+        for name in "ABCDE":
+            say(session, param_value(name, value))
+    session.run(1.2)
+    assert len(session.machine.reads) == 2
+
+
+def test_so_many_texts_are_remembered_and_no_more() -> None:
+    """Those that come again and again are one object each."""
+    known_well = text_of(b"MC_ROLL_P")
+    for number in range(2 * MOST_TEXTS):
+        text_of(b"NAME%d" % number)
+        assert text_of(b"MC_ROLL_P") is known_well
+    assert text_of.cache_info().currsize == MOST_TEXTS
+
+
+def test_a_file_has_so_many_gaps_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What would leave one more is passed over; all else still fits, and the file is whole in the end."""
+    monkeypatch.setattr(blocks_room, "MOST_GAPS", 2)
+    blocks = Blocks()
+    for offset in (2, 6, 10, 14):
+        blocks.take(offset, b"ab")
+    assert (blocks.reached, blocks.received, [*blocks.missing(9)]) == (8, 4, [0, 4])
+    for offset in (0, 4, 8, 10, 12, 14):
+        blocks.take(offset, b"cd")
+    blocks.ends_at(16)
+    assert blocks.is_complete
+    assert blocks.content == b"cdabcdabcdcdcdcd"
+
+
+def test_a_file_comes_in_so_many_pieces_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(reading_room, "SPARE_PIECES", 10)
+    session = Simulation(LiarVehicle("crumbs", system=1))
+    job = session.meet().files.read("/crumbs", session.now, limit=10 * MOST_DATA)
+    session.until(lambda: job.done)
+    assert isinstance(job.error, FileTransferError)
+    assert "too many pieces" in str(job.error)
+    assert job._blocks.pieces == reading_room.SMALLEST_SHARE * 10 + 10 + 1
+
+
+def test_a_directory_has_so_many_entries_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transfers_room, "MOST_ENTRIES", 100)
+    session = Simulation(LiarVehicle("endless file", system=1))
+    job = session.meet().files.list("/endless", session.now)
+    assert len(session.outcome(job)) == 100
+
+
+def test_what_is_remembered_of_the_reads_of_a_file_is_so_much_and_no_more() -> None:
+    session = Simulation(LiarVehicle("crumbs", system=1))
+    job = session.meet().files.read("/crumbs", session.now)
+    for number in range(2 * reading_room.LATE_KEPT):
+        job._flights[number] = reading_room._Flight(number, number, session.now, 0, False)
+        job._give_up(number)
+    for _ in range(3 * reading_room.BURSTS_KEPT):
+        job._burst(session.now)
+        job._burst_attempts = 0
+    assert len(job._late) == reading_room.LATE_KEPT
+    assert len(job._bursts) == reading_room.BURSTS_KEPT
+
+
+def test_a_resync_tells_of_so_many_names_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sync_room, "MOST_NAMES", 3)
+    session = Simulation(listing_ardupilot())
+    session.fetch()
+    say(session, param_value("ONE_MORE", 1.0, count=9))  # another count: it has fallen behind
+    for name in "ABCDE":
+        session.machine.sync.changed(name, "vehicle")
+    assert len(session.machine.sync._moved) == 3
+
+
+def test_one_head_after_the_other_keeps_no_turn() -> None:
+    """Each `_HASH_CHECK` says that the list begins; without a list it is over with the usual time-out."""
+    honest, liar = listing_ardupilot(), LiarVehicle("endless hashes")
+    session = Simulation(honest, liar)
+    session.meet()
+    session.until(lambda: (66, 1) in session.station.components)
+    fetch = session.station.components[66, 1].begin_fetch(session.now)
+    session.run(0.2)
+    assert session.fetch(limit=5).complete
+    session.until(lambda: fetch.done, limit=60)
+    assert isinstance(fetch.error, NoReply)
+
+
+# Others on the same link
+
+
+@pytest.fixture(scope="module")
+def usual() -> float:
+    """Seconds that a vehicle's list takes that is alone on its link."""
+    return Simulation(listing_ardupilot()).fetch().elapsed
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_no_lie_keeps_another_vehicle_from_being_fetched(
+    lie: str, usual: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """While the liar is fetched as well: its list is waited for once, and its values count for it alone."""
+    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 50)
+    honest, liar = listing_ardupilot(), LiarVehicle(lie)
+    station = Station(link="sim:test", is_stream=False, upkeep=Upkeep(30.0))
+    session = Simulation(honest, liar, station=station)
+    session.meet()
+    session.until(lambda: (66, 1) in session.station.components)
+    liars = session.station.components[66, 1]
+    fetch = liars.begin_fetch(session.now)
+    session.run(0.2)
+    result = session.fetch(limit=60)
+    assert result.elapsed < usual + 2 * INITIAL_TIMEOUT
+    assert result.complete
+    truth = {name: entry.bits for name, entry in honest.params.items()}
+    assert {name: param.bits for name, param in result.params.items()} == truth
+    assert all(len(machine.table.params) <= 4_000 for machine in session.station.components.values())
+    liars.end_fetch(fetch, session.now)
+
+
+MOST_GROWTH = 300_000
+"""Bytes by which the memory may differ between two moments of one session, without anything that stays."""
+
+
+def test_all_lies_at_once_cost_no_more_than_so_much_memory() -> None:
+    """When all that has a bound has reached it, nothing grows any more."""
+    names, components = 100, 10
+    with (
+        mock.patch.object(table_room, "MOST_NAMES", names),
+        mock.patch.object(station_room, "MOST_COMPONENTS", components),
+        mock.patch.object(authors_room, "MOST_CHANGES", 100),
+        mock.patch.object(traffic_room, "MOST_COMPONENTS", components),
+        mock.patch.object(component_room, "MOST_PARAMETERS", 1_000),
+        mock.patch.object(table_room, "MOST_PARAMETERS", 1_000),
+        mock.patch.object(download_room, "MOST_PARAMETERS", 1_000),
+    ):
+        tracemalloc.start()
+        text_of.cache_clear()  # what it holds from before is not traced, and its next growth would be
+        for number in range(MOST_TEXTS):
+            text_of(b"%d" % number)  # what remembers names is full
+        liars = [LiarVehicle(*list(LIES)[start::3], system=66 + start, rate=150) for start in range(3)]
+        station = Station(link="sim:test", is_stream=False, upkeep=Upkeep(30.0), counts_traffic=True)
+        held: list[int] = []
+        for now in range(4):
+            for liar in liars:
+                liar.tick(float(now))
+                for data in liar.data_to_send():
+                    station.receive(data, PEER, float(now))
+            station.tick(float(now))
+            for data, _ in station.data_to_send():
+                for liar in liars:
+                    liar.receive(data, float(now))
+            station.events()
+            gc.collect()  # what is in a circle and wanted by nobody does not count
+            held.append(tracemalloc.get_traced_memory()[0])
+            for machine in [*station.components.values()][:3]:
+                if machine.fetch is None:
+                    machine.begin_fetch(float(now))
+        tracemalloc.stop()
+        assert len(station.components) == components
+        assert max(len(machine.table.params) for machine in station.components.values()) <= names
+    assert held[-1] - held[-2] < MOST_GROWTH, held
+
+
+# The client, the cache, the terminal
+
+
+@pytest.mark.parametrize(("lies", "kept"), [((), 3), (("restless identity",), 0)], ids=["slowly", "at once"])
+@swiftly
+async def test_one_that_is_another_vehicle_each_time_fills_no_cache(
+    lies: tuple[str, ...],
+    kept: int,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    monkeypatch.setattr(cache_writer, "MOST_VEHICLES", 3)
+    liar = LiarVehicle(*lies, rate=1)
+    path = tmp_path / "cache" / "parameters.sqlite3"
+    async with ParamClient(Air([liar, small_px4()]), cache=path) as client:
+        await client.component(66, 1)
+        vehicle = await client.component(1, 1)
+        assert (await vehicle.fetch_all()).complete
+        for number in range(4):
+            liar.say(AutopilotVersion(16, uid=number + 1))
+            liar.say(param_value(f"V{number}"))
+            await anyio.sleep(LOST_AFTER + 2 * cache_writer.FLUSH_INTERVAL)  # till then it may be two
+            assert len(client._writer._bringing) <= 1
+    with ParamCache(path) as cache:
+        systems = [each.identity.system for each in cache.vehicles()]
+        assert systems.count(66) == kept
+        assert bits(cache.component(system=1).params) == bits(vehicle.params)
+    assert os.listdir(tmp_path) == ["cache"]  # noqa: PTH208 - nothing stands outside of its folder
+    assert os.listdir(path.parent) == ["parameters.sqlite3"]  # noqa: PTH208 - as above
+    assert [record.message for record in caplog.records] == [
+        "66/1: too many vehicles on this link, so it is not cached"
+    ]
+
+
+@swiftly
+async def test_so_many_tables_are_kept_and_no_more(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cache_writer, "MOST_TABLES", 2)
+    vehicles = [small_px4(system=system) for system in (1, 2, 3)]
+    async with ParamClient(Air(vehicles), cache=tmp_path / "cache.sqlite3") as client:
+        await client.component(3, 1)
+        assert len((await client.fetch_all()).results) == 3
+    with ParamCache(tmp_path / "cache.sqlite3") as cache:
+        assert len(cache.components()) == 2
+
+
+@swiftly
+async def test_a_component_that_is_forgotten_ends_what_listens_to_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 2)
+    liar = LiarVehicle("obedient")
+    async with ParamClient(Air([generic(), liar]), cache=False) as client:
+        await client.component(1, 1)
+        other = await client.component(66, 1)
+        changes = other.changes()
+        await anyio.sleep(10)
+        other._machine.presence.is_lost = True
+        liar.say(Heartbeat(2, 12), 77)
+        with pytest.raises(NoReply, match=r"66/1 \(lost\)"):
+            await anext(changes)
+        assert [*client.components] == [*client._station.components] == [(1, 1), (77, 1)]
+        with pytest.raises(NoReply):
+            await other.get("A")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [("fetch",), ("watch", "--duration", "2"), ("link", "--duration", "2"), ("get",)],
+    ids=lambda each: each[0],
+)
+def test_no_escape_code_reaches_the_terminal(
+    words: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def client(url: str, **options: Any) -> ParamClient:
+        return ParamClient(SimLink(LiarVehicle("escape codes"), url), **options)
+
+    monkeypatch.setattr(session_room, "ParamClient", client)
+    verb, *options = words
+    named = ["--no-cache"] if verb != "get" else [ESCAPE]
+    run_command([verb, "sim:custom", *named, *options])
+    printed = capsys.readouterr()
+    assert printed.out + printed.err
+    assert "\x1b" not in printed.out + printed.err
+    assert "\x07" not in printed.out + printed.err
+
+
+BOUND = re.compile(r"^\| [^|]+ \| ([^|]+) \| ([^|]+) \|", re.MULTILINE)
+CONSTANT = re.compile(r"`([a-z_.]+)\.([A-Z_]+)`")
+
+
+def test_the_page_of_the_bounds_says_what_they_are() -> None:
+    rows = BOUND.findall((ROOT / "docs" / "bounds.md").read_text(encoding="utf-8"))
+    named = 0
+    for most, names in rows:
+        for room, name in CONSTANT.findall(names):
+            bound = getattr(importlib.import_module(f"paramclient.{room}"), name)
+            named += 1
+            if re.fullmatch(r"[0-9,]+", most):
+                assert bound == int(most.replace(",", "")), name
+            elif most.endswith(" MiB"):
+                assert bound == int(most.removesuffix(" MiB")) << 20, name
+    assert named > 35

@@ -1,0 +1,324 @@
+"""A client that never sends a byte: its table fills by what others on the link ask for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+
+import anyio
+import pytest
+
+from paramclient import (
+    NoReply,
+    ParamCache,
+    ParamClient,
+    ParamType,
+    Policy,
+    SyncState,
+    Trust,
+    UsageError,
+)
+from paramclient.cli import run
+from paramclient.model.values import Encoding, encode
+from paramclient.protocol import wire
+from paramclient.protocol.params.passive import LONGEST_PAUSE, OVERHEARING_PATIENCE
+from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.station import Station
+from paramclient.sim import Endpoint
+from tests.shell import Radio, bits, generic, residue, small_px4, swiftly
+from tests.simulation import is_so, param_value
+
+LIST = wire.ParamRequestList(1, 1)
+HASH = wire.ParamRequestRead(1, 1, wire.HASH_CHECK, -1)
+
+
+class Channel(Radio):
+    """A channel on which another station asks the vehicle, and which can lose what that answers."""
+
+    def __init__(self, endpoint: Endpoint) -> None:
+        super().__init__(endpoint)
+        self.loses: Callable[[wire.Message], bool] = lambda message: False
+        self._sequence = 0
+
+    def ask(self, *messages: wire.Message, system: int = 254) -> None:
+        for message in messages:
+            self._sequence = (self._sequence + 1) % 256
+            self.other.append(wire.encode(message, system=system, component=190, sequence=self._sequence))
+
+    def data_to_send(self) -> list[bytes]:
+        framer = wire.Framer(stream=False)
+        kept = []
+        for data in super().data_to_send():
+            message = wire.decode(framer.receive(data)[0])
+            if message is None or not self.loses(message):
+                kept.append(data)
+        return kept
+
+
+def listener(link: Endpoint, **options: object) -> ParamClient:
+    return ParamClient(link, **{"cache": False, "listen_only": True} | options)  # type: ignore[arg-type]  # any
+
+
+@swiftly
+async def test_not_a_byte_is_sent() -> None:
+    channel = Channel(small_px4())
+    async with listener(channel) as client:
+        component = await client.component()
+        assert (component.autopilot, component.state) == ("px4", "new")
+        assert component.identity.uid is None
+        with pytest.raises(NoReply):
+            await component.fetch_all(timeout=10.0)
+        channel.is_mute = True
+        await anyio.sleep(30.0)
+        assert component.state == "lost"
+        channel.is_mute = False
+        await anyio.sleep(60.0)
+        assert component.state == "new"
+        assert not client._station.is_waiting
+        assert residue(component) == []
+        assert client.bytes_sent == 0
+    assert channel.heard == []
+
+
+@swiftly
+async def test_the_list_that_another_station_asks_for_fills_the_table() -> None:
+    vehicle = small_px4()
+    channel = Channel(vehicle)
+    async with listener(channel) as client:
+        component = await client.component()
+        channel.ask(LIST)
+        result = await component.fetch_all()
+        assert bits(result.params) == bits(vehicle.params)
+        assert (result.source, result.missing, result.count) == ("stream", (), 25)
+        assert result.hash == component.hash == vehicle.announced_hash()
+        assert component.sync_state is SyncState.SYNCED
+        assert {param.trust for param in component.params.values()} == {Trust.LIVE}
+        began = anyio.current_time()
+        again = await component.fetch_all()
+        assert anyio.current_time() - began < 0.01
+        assert again.params == result.params
+        assert again.hash == vehicle.announced_hash()
+        everyone = await client.fetch_all()
+        assert everyone.results[1, 1].hash == vehicle.announced_hash()
+    assert channel.heard == []
+
+
+@swiftly
+async def test_what_others_set_is_told_with_its_author() -> None:
+    channel = Channel(generic())
+    async with listener(channel) as client:
+        component = await client.component()
+        channel.ask(LIST)
+        await component.fetch_all()
+        changes = component.changes()
+        raw = encode(7, ParamType.INT32, Encoding.BYTEWISE)
+        # also of a station with the ids that a client has
+        channel.ask(wire.ParamSet(1, 1, "PARAM_01", raw, ParamType.INT32), system=255)
+        change = await anext(changes)
+        assert (change.name, change.by) == ("PARAM_01", "station 255/190")
+        assert component.params["PARAM_01"].value == 7
+        assert component.sync_state is SyncState.SYNCED
+
+
+@swiftly
+async def test_what_would_have_to_be_sent_is_refused_at_once() -> None:
+    channel = Channel(small_px4())
+    async with listener(channel) as client:
+        component = await client.component()
+        calls: list[Callable[[], Awaitable[object]]] = [
+            lambda: component.get("PARAM_01"),
+            lambda: component.get(0),
+            lambda: component.set("PARAM_01", 1),
+            lambda: client.ftp(component).read("@PARAM/param.pck"),
+            lambda: component.fetch_all(refresh=True),
+            lambda: client.fetch_all(refresh=True),
+        ]
+        began = anyio.current_time()
+        for call in calls:
+            with pytest.raises(UsageError, match="where nothing is sent"):
+                await call()
+        assert anyio.current_time() - began < 0.01
+        assert residue(component) == []
+        await component.refreshed()
+    assert channel.heard == []
+
+
+def test_what_may_be_asked_cannot_be_said_where_nothing_is() -> None:
+    for options in ({"policy": Policy.HASH_ONLY}, {"watch_interval": 5.0}):
+        with pytest.raises(UsageError, match="here nothing is sent"):
+            listener(small_px4(), **options)
+    listener(small_px4(), watch_interval=0, policy="auto")
+
+
+@pytest.mark.parametrize("timeout", [None, 3.0])
+@swiftly
+async def test_nobody_asks(timeout: float | None) -> None:
+    async with listener(Channel(generic())) as client:
+        component = await client.component()
+        for fetch_all in (component.fetch_all, client.fetch_all):
+            began = anyio.current_time()
+            with pytest.raises(NoReply) as error:
+                await fetch_all(timeout=timeout)
+            waited = anyio.current_time() - began
+            assert waited == pytest.approx(timeout or OVERHEARING_PATIENCE, abs=0.1)
+            assert error.value.attempts == 0
+        assert residue(component) == []
+
+
+@swiftly
+async def test_a_list_with_gaps_ends_when_it_pauses_and_goes_on_with_what_others_read() -> None:
+    vehicle = small_px4()
+    channel = Channel(vehicle)
+    channel.loses = lambda each: isinstance(each, wire.ParamValue) and each.param_index in (3, 9)
+    async with listener(channel) as client:
+        component = await client.component()
+        channel.ask(LIST)
+        began = anyio.current_time()
+        result = await component.fetch_all()
+        assert result.missing == (3, 9)
+        assert result.received == 23
+        assert LONGEST_PAUSE <= anyio.current_time() - began < LONGEST_PAUSE + 3.0
+        assert (component.state, component.sync_state) == ("partial", SyncState.UNSYNCED)
+        assert (await client.fetch_all()).results[1, 1].missing == (3, 9)
+        channel.loses = lambda each: False
+        channel.ask(wire.ParamRequestRead(1, 1, "", 3), wire.ParamRequestRead(1, 1, "", 9))
+        result = await component.fetch_all()
+        assert (result.missing, result.hash) == ((), vehicle.announced_hash())
+
+
+@swiftly
+async def test_time_that_is_over_gives_what_has_come() -> None:
+    channel = Channel(small_px4())
+    channel.loses = lambda each: isinstance(each, wire.ParamValue) and each.param_index == 24
+    async with listener(channel) as client:
+        component = await client.component()
+        channel.ask(LIST)
+        result = await component.fetch_all(timeout=2.0)
+        assert result.missing == (24,)
+        assert "time given" in result.notes[0]
+
+
+@swiftly
+async def test_a_cached_table_is_confirmed_by_a_hash_that_others_ask_for(tmp_path: Path) -> None:
+    vehicle = small_px4()
+    path = tmp_path / "cache"
+    channel = Channel(vehicle)
+    version = wire.CommandLong(1, 1, wire.MAV_CMD_REQUEST_MESSAGE, (148.0,) + (0.0,) * 6)
+    async with listener(channel, cache=path) as client:
+        component = await client.component()
+        channel.ask(version, LIST)
+        assert (await component.fetch_all()).source == "stream"
+    with ParamCache(path) as cache:
+        kept = cache.component(system=1)
+        assert (kept.hash, kept.complete, kept.volatile_known) == (vehicle.announced_hash(), True, True)
+    async with listener(channel, cache=path) as client:
+        component = await client.component()
+        channel.ask(version)
+        await anyio.sleep(2.0)
+        assert (component.state, len(component.params)) == ("cached", 25)
+        channel.ask(HASH)
+        result = await component.fetch_all()
+        assert (result.source, result.hash) == ("cache", vehicle.announced_hash())
+        trusts = {param.name: param.trust for param in component.params.values()}
+        assert trusts["PARAM_01"] is Trust.VERIFIED
+        assert trusts["PARAM_03"] is Trust.CACHED  # which no hash covers, and nobody may ask for
+        # it changes unheard, and the next hash shows it
+        channel.is_mute = True
+        channel._endpoint.set_param("PARAM_01", 77)  # type: ignore[attr-defined]  # of a simulated vehicle
+        await anyio.sleep(2.0)
+        channel.is_mute = False
+        channel.ask(HASH)
+        await anyio.sleep(2.0)
+        assert component.sync_state is SyncState.UNSYNCED
+        assert component.params["PARAM_01"].trust is Trust.CACHED
+        channel.ask(LIST)
+        result = await component.fetch_all()
+        assert (result.source, result.hash) == ("stream", vehicle.announced_hash())
+        assert component.params["PARAM_01"].value == 77
+    assert channel.heard == []
+
+
+def test_the_command_listens_too(capsys: pytest.CaptureFixture[str]) -> None:
+    patience = ("--timeout", "0.3", "--no-cache", "--listen-only")
+    assert run(["fetch", "sim:px4", *patience]) == 3
+    assert "for which nobody was heard asking" in capsys.readouterr().err
+    assert run(["get", "sim:px4", "MC_ROLL_P", *patience]) == 2
+    assert "where nothing is sent" in capsys.readouterr().err
+    assert run(["link", "sim:px4", "--listen-only", "--json", "--seconds", "0.3"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["frames"] > 0
+    assert report["bytes_sent"] == 0
+
+
+# the core
+
+
+def station_that_listens() -> Station:
+    station = Station(link="test", is_stream=False, upkeep=Upkeep.chosen(None, "auto", listen_only=True))
+    say(station, wire.Heartbeat(2, wire.MAV_AUTOPILOT_GENERIC, system_status=4), 0.0)
+    return station
+
+
+def say(station: Station, message: wire.Message, now: float) -> None:
+    station.receive(wire.encode(message, system=1, component=1, sequence=0), "peer", now)
+
+
+def tell(station: Station, count: int, *indices: int, now: float = 1.0, prefix: str = "P") -> None:
+    for index in indices:
+        say(station, param_value(f"{prefix}{index}", 1.0, index=index, count=count), now)
+
+
+def test_a_table_is_whole_when_every_index_has_come_in_whatever_order() -> None:
+    station = station_that_listens()
+    machine = station.components[1, 1]
+    tell(station, 4, 3, 1, 0, 1, 65535)
+    assert is_so(not machine.table.complete)
+    tell(station, 4, 2)
+    assert is_so(machine.table.complete)
+    assert is_so(machine.sync.synced)
+
+
+def test_another_count_or_another_name_makes_everything_count_again() -> None:
+    station = station_that_listens()
+    machine = station.components[1, 1]
+    tell(station, 4, 0, 1, 2)
+    tell(station, 3, 0, 1)
+    assert is_so(not machine.table.complete)
+    tell(station, 3, 2)
+    assert is_so(machine.table.complete)
+    assert sorted(machine.table.params) == ["P0", "P1", "P2"]
+    tell(station, 4, 0, 1, 2)
+    tell(station, 4, 2, prefix="Q")
+    tell(station, 4, 3)
+    assert is_so(not machine.table.complete)
+    tell(station, 4, 0, 1)
+    assert is_so(machine.table.complete)
+    assert sorted(machine.table.params) == ["P0", "P1", "P3", "Q2"]
+
+
+def test_what_came_before_a_restart_does_not_count() -> None:
+    station = station_that_listens()
+    machine = station.components[1, 1]
+    tell(station, 3, 0, 1)
+    say(station, wire.Heartbeat(2, wire.MAV_AUTOPILOT_GENERIC, system_status=wire.MAV_STATE_BOOT), 1.0)
+    tell(station, 3, 2)
+    assert is_so(not machine.sync.synced)
+    tell(station, 3, 0, 1)
+    assert is_so(machine.sync.synced)
+
+
+def test_silence_costs_nothing_and_nothing_is_due() -> None:
+    station = station_that_listens()
+    machine = station.components[1, 1]
+    tell(station, 3, 0, 1)
+    for now in range(1, 100):
+        station.tick(float(now))
+    assert station.data_to_send() == []
+    assert station.bytes_sent == 0
+    assert station.next_deadline() == float("inf")
+    assert machine.presence.is_lost
+    station.pause()
+    station.resume(200.0)
+    station.tick(200.0)
+    assert station.data_to_send() == []

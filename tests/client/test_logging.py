@@ -1,0 +1,203 @@
+"""What a client tells of its steps, and counts."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import anyio
+import pytest
+
+from paramclient import UnknownParameter
+from paramclient.cli import run
+from paramclient.protocol import wire
+from paramclient.protocol.station import Station
+from paramclient.protocol.stats.trace import Told
+from paramclient.sim import Air
+from tests.shell import FlakyLink, Tap, a_client, generic, small_px4, swiftly
+
+WATCHED = "paramclient"
+
+
+def told(caplog: pytest.LogCaptureFixture, room: str = "protocol") -> list[str]:
+    return [each.getMessage() for each in caplog.records if each.name == f"{WATCHED}.{room}"]
+
+
+@swiftly
+async def test_each_step_is_told_in_one_line(caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    vehicle, path = small_px4(), tmp_path / "cache"
+    with caplog.at_level(logging.DEBUG, WATCHED):
+        async with a_client(vehicle, cache=path) as client:
+            component = await client.component()
+            await component.fetch_all()
+            await component.get("PARAM_01")
+            await component.set("PARAM_01", 9)
+    steps = told(caplog)
+    for step in (
+        r"to system 1: COMMAND_LONG 512 \(148\)",
+        r"1/1: the list is wanted, 0 there",
+        r"to system 1: PARAM_REQUEST_LIST",
+        r"1/1: <FetchResult 1/1 25 params from stream in [0-9.]+ s>",
+        r"to system 1: PARAM_REQUEST_READ PARAM_01",
+        r"1/1 PARAM_01: answered [0-9.]+ s after try 1",
+        r"to system 1: PARAM_SET PARAM_01 to 09000000 of type 6",
+        r"1/1 PARAM_01: accepted after try 1",
+    ):
+        assert sum(bool(re.fullmatch(step, each)) for each in steps) == 1, step
+    assert len(steps) < 15, "values of a list are not told one by one"
+    assert told(caplog, "client.client")[0] == "sim:custom: open"
+    assert told(caplog, "client.client")[-1] == "sim:custom: closing"
+    assert any("nothing" in each for each in told(caplog, "client.cache_writer"))
+    caplog.clear()
+    with caplog.at_level(logging.DEBUG, WATCHED):
+        async with a_client(vehicle, cache=path) as client:
+            await (await client.component()).fetch_all()
+    crc = f"{vehicle.announced_hash():08x}"
+    assert f"1/1: hash {crc} announced, {crc} here" in told(caplog)
+    assert any("<CachedComponent 1/1 px4 25 params" in each for each in told(caplog, "client.cache_writer"))
+
+
+@swiftly
+async def test_what_is_not_answered_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    vehicle = Tap(generic())
+    with caplog.at_level(logging.DEBUG, WATCHED):
+        async with a_client(vehicle) as client:
+            component = await client.component()
+            with pytest.raises(UnknownParameter):
+                await component.get("NO_SUCH")
+            await anyio.sleep(1.0)
+            stats = client.stats
+    steps = told(caplog)
+    assert any(re.fullmatch(r"1/1 NO_SUCH: no answer to try 1 in [0-9.]+ s", each) for each in steps)
+    assert any(re.fullmatch(r"1/1 NO_SUCH: given up after try [0-9]+", each) for each in steps)
+    assert stats.retries > 0
+
+
+@swiftly
+async def test_a_link_that_drops_and_returns_is_told(caplog: pytest.LogCaptureFixture) -> None:
+    link = FlakyLink(generic())
+    with caplog.at_level(logging.DEBUG, WATCHED):
+        async with a_client(link) as client:
+            await client.component()
+            await link.drop()
+            await anyio.sleep(3.0)
+    levels = {each.levelname for each in caplog.records if each.name == "paramclient.client.link_task"}
+    assert levels == {"WARNING", "INFO"}
+
+
+def test_nothing_is_printed_unless_somebody_asks() -> None:
+    program = """
+import asyncio, logging, paramclient
+names = [name for name in logging.root.manager.loggerDict if name.startswith("paramclient")]
+assert names and not any(logging.getLogger(name).handlers for name in names)
+async def main():
+    async with paramclient.ParamClient("sim:px4", cache=False) as client:
+        await (await client.component()).get("MC_ROLL_P")
+asyncio.run(main())
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, timeout=60
+    )
+    assert (done.stdout, done.stderr) == ("", "")
+
+
+def test_words_are_made_up_only_when_they_are_wanted() -> None:
+    lines: list[tuple[object, ...]] = []
+    station = Station(link="test", is_stream=False, trace=lambda *line: lines.append(line))
+    beat = wire.Heartbeat(2, wire.MAV_AUTOPILOT_PX4, system_status=4)
+    station.receive(wire.encode(beat, system=1, component=1, sequence=0), "peer", 0.0)
+    assert [type(line[-1]) for line in lines] == [Told]
+    assert str(lines[0][-1]) == "COMMAND_LONG 512 (148)"
+
+
+@pytest.mark.parametrize(
+    ("message", "words"),
+    [
+        (wire.ParamRequestRead(1, 1, "A", -1), "PARAM_REQUEST_READ A"),
+        (wire.ParamRequestRead(1, 1, "", 17), "PARAM_REQUEST_READ 17"),
+        (wire.FileTransfer(0, 1, 1, bytes((0, 0, 0, 4)) + bytes(247)), "FILE_TRANSFER_PROTOCOL operation 4"),
+        (wire.StatusText(6, "secret"), "StatusText"),
+    ],
+)
+def test_messages_in_words(message: wire.Message, words: str) -> None:
+    assert str(Told(message)) == words
+
+
+def test_the_command_tells_its_steps(capsys: pytest.CaptureFixture[str]) -> None:
+    level = logging.getLogger(WATCHED).level
+    for option in ("-v", "--verbose"):
+        assert run(["get", "sim:px4", "MC_ROLL_P", "--no-cache", option]) == 0
+        told = capsys.readouterr()
+        assert "protocol: to system 1: PARAM_REQUEST_READ MC_ROLL_P\n" in told.err
+        assert "MC_ROLL_P" in told.out
+        assert "protocol" not in told.out
+    assert run(["link", "sim:px4", "--seconds", "0.1", "-v"]) == 0
+    assert "client: sim:px4: open\n" in capsys.readouterr().err
+    assert run(["get", "sim:px4", "MC_ROLL_P", "--no-cache"]) == 0
+    assert capsys.readouterr().err == ""
+    assert logging.getLogger(WATCHED).level == level
+
+
+def test_what_comes_from_the_wire_is_printed_harmlessly(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(["get", "sim:px4", "BAD\x1b[31m", "-v", "--no-cache"]) == 2
+    assert "\x1b" not in capsys.readouterr().err
+
+
+# numbers
+
+
+@swiftly
+async def test_numbers_tell_what_was_done(tmp_path: Path) -> None:
+    vehicle, path = small_px4(), tmp_path / "cache"
+    async with a_client(vehicle, cache=path) as client:
+        before = client.stats
+        assert (before.frames_received, before.reads, before.round_trips) == (0, 0, {})
+        component = await client.component()
+        await component.fetch_all()
+        await component.get("PARAM_01")
+        await component.set("PARAM_01", 9)
+        await anyio.sleep(1.0)
+        stats = client.stats
+        assert (stats.downloads, stats.cache_hits, stats.writes, stats.retries) == (1, 0, 1, 0)
+        assert stats.reads >= 1
+        assert stats.bytes_received == client.bytes_received > 25 * 37
+        assert stats.bytes_sent == client.bytes_sent
+        assert stats.frames_received > 26
+        assert stats.frames_sent >= 4
+        assert (stats.skipped, stats.damaged, stats.lost, stats.repeated) == (0, 0, None, None)
+        assert stats.round_trips == {(1, 1): component.round_trip}
+        with pytest.raises(dataclasses.FrozenInstanceError):
+            stats.reads = 0  # type: ignore[misc]  # that is the point
+    async with a_client(vehicle, cache=path) as client:
+        await (await client.component()).fetch_all()
+    assert (client.stats.downloads, client.stats.cache_hits) == (0, 1)
+
+
+@swiftly
+async def test_losses_are_counted_where_that_was_asked_for() -> None:
+    air = Air.symmetric([generic()], seed=1, loss=0.2)
+    async with a_client(air, traffic=True) as client:
+        await client.component()
+        await (await client.component()).fetch_all()
+        await anyio.sleep(5.0)
+        stats, report = client.stats, client.traffic_report()
+    assert stats.lost == sum(each.lost for each in report.components)
+    assert stats.lost
+    assert stats.repeated == 0
+
+
+def test_damage_is_counted_over_all_peers_that_ever_were() -> None:
+    station = Station(link="test", is_stream=True)
+    beat = wire.Heartbeat(2, wire.MAV_AUTOPILOT_PX4, system_status=4)
+    good = wire.encode(beat, system=1, component=1, sequence=0)
+    bad = good[:-1] + bytes((good[-1] ^ 1,))
+    for peer in range(300):
+        station.receive(b"no" + bad + good, peer, 0.0)
+    station.receive(b"", 299, 0.0)
+    assert station.framing == (300, 300 * (2 + len(bad)), 300)
+    station.pause()
+    assert station.framing == (300, 300 * (2 + len(bad)), 300)

@@ -1,0 +1,569 @@
+"""When a value came from the link: it is kept from the socket to the cache, and decides what counts there."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import sys
+from collections.abc import AsyncIterator, Callable, Sequence
+from contextlib import asynccontextmanager, closing
+from pathlib import Path
+from typing import Any
+
+import anyio
+import pytest
+from hypothesis import settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, initialize, rule, run_state_machine_as_test
+
+from paramclient import Param, ParamCache, ParamType
+from paramclient.cache import HistoryEntry, UnixTimes
+from paramclient.client import suspend_detection
+from paramclient.client.cache_writer import WriteThrough
+from paramclient.client.link_task import Carrier
+from paramclient.links import Peer, create_link
+from paramclient.links.clock_offset import seconds_ahead
+from paramclient.protocol import wire
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.params.table import Table
+from paramclient.protocol.station import Station
+from paramclient.protocol.wire import NO_INDEX, AutopilotVersion, Heartbeat, Message, ParamValue
+from tests.shell import PATIENCE, a_client, small_px4, swift_loop, swiftly, until
+from tests.simulation import param_value
+
+NOW = 1_795_000_000.0
+"""Unix seconds when the clock of the core stands at 0."""
+
+
+# In the table
+
+
+def heard(table: Table, value: int, by: str, moment: float) -> None:
+    table.hear(param_value("A", value, index=0, kind=ParamType.INT32), by, moment)
+
+
+def test_a_value_that_is_heard_again_has_the_later_moment() -> None:
+    table = Table()
+    heard(table, 1, "vehicle", 1.0)
+    heard(table, 1, "vehicle", 2.0)
+    assert table.params.moments == {"A": 2.0}
+    assert table.take_overwritten() == [], "it is no change"
+
+
+def test_what_was_overwritten_keeps_its_own_moments() -> None:
+    table = Table()
+    heard(table, 1, "vehicle", 1.0)
+    heard(table, 2, "us", 2.0)
+    heard(table, 2, "us", 2.5)
+    heard(table, 3, "us", 3.0)
+    heard(table, 3, "us", 3.5)
+    assert [(each.param.value, each.by, each.moment) for each in table.take_overwritten()] == [
+        (1, "vehicle", 1.0),
+        (2, "us", 2.0),
+        (2, "us", 2.5),
+        (3, "us", 3.0),
+    ]
+    assert table.params.moments == {"A": 3.5}
+    assert table.take_overwritten() == []
+
+
+def test_a_change_that_is_heard_again_keeps_the_moment_of_the_change() -> None:
+    table = Table()
+    heard(table, 1, "vehicle", 1.0)
+    table.take_dirty()
+    heard(table, 2, "station 254/190", 2.0)
+    heard(table, 2, "vehicle", 2.5)
+    [(param, by, moment)] = table.take_overwritten()
+    assert (param.value, by, moment) == (2, "station 254/190", 2.0)
+
+
+def test_what_did_not_reach_the_cache_is_given_back_with_its_moments() -> None:
+    table = Table()
+    heard(table, 1, "vehicle", 1.0)
+    table.take_dirty()
+    heard(table, 2, "vehicle", 2.0)
+    for again in (2.5, 3.0, 3.5):
+        changed, params = table.changed, table.params.copy()
+        news = (table.take_dirty(), table.take_overwritten(), table.take_gone(), changed, params)
+        table.give_back(*news)
+        assert table.dirty == {"A": "vehicle"}
+        heard(table, 2, "vehicle", again)
+    assert [(each.param.value, each.moment) for each in table.take_overwritten()] == [(2, 2.0)]
+
+
+@pytest.mark.parametrize("by", ["vehicle", "us"])
+def test_what_is_replaced_on_its_way_to_a_cache_that_does_not_take_it_is_kept(by: str) -> None:
+    table = Table()
+    heard(table, 1, "vehicle", 1.0)
+    table.take_dirty()
+    heard(table, 2, "vehicle", 2.0)
+    changed, params = table.changed, table.params.copy()
+    news = (table.take_dirty(), table.take_overwritten(), table.take_gone(), changed, params)
+    heard(table, 3, by, 3.0)
+    table.give_back(*news)
+    assert [(each.param.value, each.moment) for each in table.take_overwritten()] == [(2, 2.0)]
+    assert table.take_dirty() == {"A": by}
+
+
+def test_what_is_gone_was_found_missing_when_the_last_value_came() -> None:
+    table = Table()
+    heard(table, 1, "vehicle", 1.0)
+    table.hear(param_value("B", 1.0, index=0, count=1), "vehicle", 2.0)
+    table.settle({0: "B"})
+    assert table.take_gone() == {"A": 2.0}
+    assert table.params.moments == {"B": 2.0}
+
+
+def test_a_file_counts_from_when_it_was_asked_for() -> None:
+    table = Table()
+    heard(table, 1, "vehicle", 1.0)
+    table.take("A", ParamType.INT32, 2, 0, None, 1.5, is_older=False)
+    assert table.params.moments == {"A": 1.5}
+    heard(table, 3, "vehicle", 2.0)
+    for value in (2, 3):  # also where the file has what was heard since
+        table.take("A", ParamType.INT32, value, 0, None, 1.7, is_older=True)
+        assert table.params.moments == {"A": 2.0}
+
+
+def test_what_is_cached_keeps_the_moment_at_which_it_was_observed() -> None:
+    table = Table()
+    param = Param("A", 1, ParamType.INT32, 0, 1)
+    table.fill({"A": param}, moments={"A": -500.0})
+    assert table.params.moments == {"A": -500.0}
+    table.renew({"A": Param("A", 2, ParamType.INT32, 0, 2)}, {"A": -400.0})
+    assert table.params.moments == {"A": -400.0}
+
+
+def test_sleep_that_the_clock_leaves_out_makes_everything_older() -> None:
+    table = Table()
+    for number, moment in ((1, 1.0), (2, 2.0)):
+        heard(table, number, "us", moment)
+    table.hear(param_value("B", 1.0, index=1), "vehicle", 3.0)
+    table.remove(lambda param: param.name == "B")
+    table.age(1000.0)
+    assert table.params.moments == {"A": -998.0}
+    assert [each.moment for each in table.take_overwritten()] == [-999.0]
+    assert table.take_gone() == {"B": -997.0}
+    assert table.slept == 1000.0
+
+
+# On the way to the cache
+
+
+def test_moments_become_unix_times() -> None:
+    times = UnixTimes(NOW + 10.0, NOW)
+    assert [times(moment) for moment in (1.0, 10.0, 11.0)] == [NOW + 1.0, NOW + 10.0, NOW + 10.0]
+    assert times(-2 * NOW) == 0.0
+
+
+def test_after_a_small_step_of_the_clock_nothing_is_older_than_what_was_written() -> None:
+    times = UnixTimes(NOW + 10.0, NOW - 1.0, since=8.0, not_before=NOW + 8.0)
+    assert [times(moment) for moment in (7.0, 8.0, 8.5, 9.5)] == [NOW + 6.0, NOW + 8.0, NOW + 8.0, NOW + 8.5]
+
+
+def test_an_interruption_between_two_clocks_is_no_difference() -> None:
+    now = 0.0
+    interruptions = iter([0.0, 0.02, 0.0, 0.03, 0.0, 0.0])
+
+    def look(ahead: float) -> float:
+        nonlocal now
+        now += 1e-6
+        return now + ahead
+
+    def interrupted() -> float:
+        nonlocal now
+        now += next(interruptions, 0.0)
+        return look(NOW)
+
+    def interrupting() -> float:
+        nonlocal now
+        now += next(interruptions, 0.0)
+        return look(0.0)
+
+    assert seconds_ahead(interrupted, interrupting) == pytest.approx(NOW, abs=2e-6)
+
+
+# Two programs, one cache
+
+NAMES = "ABC"
+SIDES = st.integers(0, 1)
+
+
+class Side:
+    """One program: what waits in its socket, its core, and its way to the cache."""
+
+    def __init__(self, cache: ParamCache, now: Callable[[], float]) -> None:
+        self.socket: list[tuple[float, bytes]] = []
+        self.station = Station(link="x", is_stream=False)
+        self.writer = WriteThrough(
+            cache,
+            owned=False,
+            identity_of=self.station.identity_of,
+            is_doubted=lambda machine: False,  # there is one vehicle
+            clock=lambda: NOW + now(),
+            now=now,
+        )
+
+    @property
+    def machine(self) -> ComponentMachine:
+        return self.station.components[1, 1]
+
+
+class Programs(RuleBasedStateMachine):
+    """Two programs that follow one vehicle and share a cache, each read and flushed whenever it is.
+
+    The model is what the vehicle had at each moment. Whatever stands in the cache was so then.
+    """
+
+    caches: Callable[[], tuple[ParamCache, ParamCache]]
+
+    @initialize()
+    def begin(self) -> None:
+        self.now = 100.0
+        self.sequence = 0
+        self.truth: dict[str, list[tuple[float, int | None]]] = {name: [(99.0, 0)] for name in NAMES}
+        self.told: dict[str, float] = {}
+        self.runner = asyncio.Runner()
+        self.opened = self.caches()
+        for left in self.opened[0].vehicles():
+            self.opened[0].remove(left.key)
+        self.sides = [Side(cache, lambda: self.now) for cache in self.opened]
+        self.announce(Heartbeat(2, 12, 0), 3)
+        self.announce(AutopilotVersion(0, 1, uid=7), 3)
+        for side in self.sides:
+            self.read_all(side)
+        for number, side in enumerate(self.sides):
+            identity = side.station.identity_of(side.machine)
+            assert identity is not None
+            self.runner.run(side.writer.bring(side.machine, identity))
+            self.list_all(number)
+
+    def teardown(self) -> None:
+        if not hasattr(self, "sides"):
+            return
+        for number, side in enumerate(self.sides):
+            self.read_all(side)
+            self.flush(number)
+        for side, cache in zip(self.sides, self.opened, strict=True):
+            self.runner.run(side.writer.close())
+            cache.close()
+        self.runner.close()
+
+    # what happens
+
+    @rule(name=st.sampled_from(NAMES), value=st.integers(0, 2), at=st.integers(1, 3))
+    def changes(self, name: str, value: int, at: int) -> None:
+        """The vehicle changes a value; it is heard by one program, or by both."""
+        self.become(name, value)
+        self.announce(self.value_of(name), at)
+
+    @rule(number=SIDES, name=st.sampled_from(NAMES), value=st.integers(0, 2), at=st.integers(1, 3))
+    def is_set(self, number: int, name: str, value: int, at: int) -> None:
+        """One program sets a value."""
+        self.sides[number].machine.write(name, value, self.now)
+        self.sides[number].station.data_to_send()
+        self.changes(name, value, at)
+
+    @rule(name=st.sampled_from(NAMES))
+    def goes(self, name: str) -> None:
+        """The vehicle has a parameter no more, and tells nobody."""
+        self.become(name, None)
+
+    @rule(number=SIDES, count=st.integers(1, 4))
+    def reads(self, number: int, count: int) -> None:
+        """One program reads some of what waits in its socket."""
+        side = self.sides[number]
+        for _ in range(min(count, len(side.socket))):
+            self.now += 1e-4
+            arrived, data = side.socket.pop(0)
+            side.station.receive(data, None, self.now, arrived)
+
+    @rule(number=SIDES)
+    def lists(self, number: int) -> None:
+        """One program downloads everything. The other one is held up meanwhile, and its socket fills."""
+        self.list_all(number)
+
+    @rule(number=SIDES)
+    def flushes(self, number: int) -> None:
+        """One program writes what is new."""
+        self.flush(number)
+
+    @rule(seconds=st.sampled_from([0.01, 3.0, 20.0]))
+    def waits(self, seconds: float) -> None:
+        """Time passes."""
+        self.now += seconds
+
+    # how
+
+    def become(self, name: str, value: int | None) -> None:
+        self.now += 0.001
+        self.truth[name].append((self.now, value))
+
+    def announce(self, message: Message, at: int) -> None:
+        """Send a message: it arrives in one socket a little later than in the other one."""
+        self.sequence = (self.sequence + 1) % 256
+        data = wire.encode(message, system=1, component=1, sequence=self.sequence)
+        for number, side in enumerate(self.sides):
+            if at & 1 << number:
+                self.now += 1e-5
+                side.socket.append((self.now, data))
+
+    def value_of(self, name: str, index: int = NO_INDEX) -> ParamValue:
+        present = [each for each in NAMES if self.truth[each][-1][1] is not None]
+        value = self.truth[name][-1][1]
+        assert value is not None
+        return ParamValue(name, value.to_bytes(4, "little"), ParamType.INT32, len(present), index)
+
+    def list_all(self, number: int) -> None:
+        side = self.sides[number]
+        self.read_all(side)
+        present = [name for name in NAMES if self.truth[name][-1][1] is not None]
+        for index, name in enumerate(present):
+            self.announce(self.value_of(name, index), 3)
+        self.read_all(side)
+        if present:  # else not even a count was heard
+            side.machine.table.settle(dict(enumerate(present)))
+            side.machine.table.complete = True
+            side.writer.synced(side.machine, is_whole=True)
+
+    def read_all(self, side: Side) -> None:
+        self.reads(self.sides.index(side), len(side.socket))
+
+    def flush(self, number: int) -> None:
+        side = self.sides[number]
+        table = side.machine.table
+        for name in table.dirty:
+            if name in table.params:
+                self.told[name] = max(self.told.get(name, 0.0), table.params.moments[name])
+        assert self.runner.run(side.writer.flush())
+        self.now += 0.001
+        self.check()
+
+    # what must be so
+
+    def check(self) -> None:
+        if not self.opened[0].components():
+            return
+        cached = self.opened[0].component(system=1)
+        for name, param in cached.params.items():
+            at = cached.heard_at[name]
+            assert self.so_at(name, at) == param.value, f"{name} was not {param.value!r} at {at - NOW}"
+            assert at >= NOW + self.told.get(name, 0.0) - 1e-6, "the latest observation counts"
+        for name in NAMES:
+            self.check_lines(name, cached.history(name))
+
+    def check_lines(self, name: str, lines: Sequence[HistoryEntry]) -> None:
+        before: int | None = None
+        for line in lines:
+            new = None if line.new is None else line.new.value
+            assert self.so_at(name, line.at) == new, f"{name} was not {new!r} at {line.at - NOW}: {lines}"
+            assert before in (None, line.old.value), f"the lines of {name} are no chain: {lines}"
+            assert line.old.value != new
+            before = new  # type: ignore[assignment]  # every value here is a whole number
+        assert [line.at for line in lines] == sorted(line.at for line in lines)
+
+    def so_at(self, name: str, at: float) -> int | None:
+        return [value for since, value in self.truth[name] if NOW + since <= at + 1e-6][-1]
+
+
+def interleaved(caches: Callable[[], tuple[ParamCache, ParamCache]], examples: int, steps: int = 30) -> None:
+    """Run two programs side by side, at random."""
+    machine = type("Machine", (Programs,), {"caches": staticmethod(caches)})
+    run_state_machine_as_test(
+        machine, settings=settings(max_examples=examples, stateful_step_count=steps, deadline=None)
+    )
+
+
+def test_whatever_two_programs_write_to_a_file_was_so(tmp_path: Path) -> None:
+    path = tmp_path / "cache"
+    interleaved(lambda: (ParamCache(path), ParamCache(path)), examples=100)
+
+
+# From the socket
+
+
+@pytest.mark.asyncio
+@pytest.mark.skipif(sys.platform != "linux", reason="only Linux is asked when a datagram arrived")
+async def test_what_is_read_late_is_told_apart_by_when_it_arrived() -> None:
+    link = create_link("udpin:127.0.0.1:0")
+    await link.open()
+    with closing(socket.socket(socket.AF_INET, socket.SOCK_DGRAM)) as sender:
+        sender.connect(link.address)  # type: ignore[attr-defined]  # of a link over sockets
+        is_told = False
+        with anyio.fail_after(PATIENCE):
+            while not is_told:  # the kernel begins to note arrivals a moment after it was asked to
+                sender.send(b"\xfd")
+                await anyio.sleep(0.02)
+                await link.receive()
+                is_told = link.arrived_at[0] < anyio.current_time() - 0.015  # type: ignore[attr-defined]
+        sent = [anyio.current_time()]
+        for _ in range(3):
+            sender.send(b"\xfd")
+            await anyio.sleep(0.05)
+            sent.append(anyio.current_time())
+        assert len(await link.receive()) == 3
+        arrived_at = link.arrived_at  # type: ignore[attr-defined]
+        assert len(arrived_at) == 3
+        for before, at, after in zip(sent, arrived_at, sent[1:], strict=False):
+            assert before - 0.001 <= at <= after + 0.001
+        sender.send(b"\xfd")
+        await link.receive()
+        [at] = link.arrived_at  # type: ignore[attr-defined]
+        assert sent[-1] - 0.001 <= at <= anyio.current_time() + 0.001
+    await link.close()
+
+
+class Scripted:
+    """A link that gives what a test puts into it."""
+
+    name = "scripted"
+    is_stream = False
+    reconnects = False
+
+    def __init__(self) -> None:
+        self._reads: list[list[tuple[Peer, bytes]]] = []
+        self._is_there = anyio.Event()
+
+    def arrive(self, *chunks: bytes) -> None:
+        self._reads.append([("peer", chunk) for chunk in chunks])
+        self._is_there.set()
+
+    async def receive(self) -> list[tuple[Peer, bytes]]:
+        while not self._reads:
+            self._is_there = anyio.Event()
+            await self._is_there.wait()
+        return self._reads.pop(0)
+
+    async def send(self, data: bytes, peer: Peer | None) -> None:
+        raise AssertionError("nobody sends here")
+
+    async def open(self) -> None: ...
+
+    async def close(self) -> None: ...
+
+
+class Telling(Scripted):
+    """One whose system tells when something arrived."""
+
+    arrived_at: Sequence[float] = ()
+
+
+class Asking(Station):
+    """A station that has something to do every 0.1 s; it notes of each chunk when it came from the link."""
+
+    def __init__(self) -> None:
+        super().__init__(link="scripted", is_stream=False)
+        self.came: dict[bytes, float] = {}
+
+    def receive(self, data: bytes, peer: Peer, now: float, moment: float | None = None) -> bool:
+        assert moment is not None
+        self.came[data] = moment
+        return False
+
+    def tick(self, *_: Any, **__: Any) -> None: ...
+
+    def next_deadline(self, *, everyone: bool = True) -> float:
+        return anyio.current_time() + 0.1
+
+
+@asynccontextmanager
+async def carried(link: Scripted) -> AsyncIterator[dict[bytes, float]]:
+    """What came over a link, and when, as its station was told."""
+    station = Asking()
+    mover = Carrier(link, station, dispatch=lambda: None, end=lambda error: None, may_rest=False)
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(mover.read)
+        tasks.start_soon(mover.send)
+        await anyio.sleep(1.0)
+        yield station.came
+        tasks.cancel_scope.cancel()
+
+
+@swiftly
+async def test_what_the_system_tells_of_the_arrival_counts() -> None:
+    async with carried(link := Telling()) as came:
+        link.arrive(b"0")
+        await anyio.sleep(1.0)
+        now = anyio.current_time()
+        link.arrived_at = [now - 0.5, now - 0.25]
+        link.arrive(b"1", b"2")
+        await anyio.sleep(0.01)
+        assert [came[b"1"], came[b"2"]] == pytest.approx([now - 0.5, now - 0.25], abs=0.001)
+        link.arrived_at = [now - 500.0]
+        link.arrive(b"3")
+        await anyio.sleep(0.01)
+        assert came[b"3"] == pytest.approx(now, abs=0.001), "the clock was set: it came after the last read"
+
+
+@swiftly
+async def test_what_is_read_at_once_came_just_now() -> None:
+    async with carried(link := Scripted()) as came:
+        await anyio.sleep(5.0)
+        link.arrive(b"1")
+        now = anyio.current_time()
+        await anyio.sleep(0.01)
+        assert came[b"1"] == pytest.approx(now, abs=0.001)
+
+
+@swiftly
+async def test_what_was_read_late_is_no_newer_than_the_last_look() -> None:
+    async with carried(link := Scripted()) as came:
+        link.arrive(b"1")
+        now = anyio.current_time()
+        await anyio.sleep(0.01)
+        link.arrive(*[b"2"] * 128)
+        swift_loop().now += 0.5  # nothing is done here meanwhile
+        link.arrive(b"3")
+        await anyio.sleep(0.01)
+        assert [came[b"2"], came[b"3"]] == pytest.approx([now] * 2, abs=0.001), "the buffer was full"
+        await anyio.sleep(0.01)
+        link.arrive(b"4")
+        late = anyio.current_time()
+        await anyio.sleep(0.2)
+        link.arrive(b"5")
+        await anyio.sleep(0.01)
+        assert came[b"4"] <= late
+        assert came[b"5"] == pytest.approx(late + 0.2, abs=0.001)
+
+
+@swiftly
+async def test_what_came_before_this_computer_slept_is_as_old_as_that(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asleep = 0.0
+    monkeypatch.setattr(suspend_detection, "time_asleep", lambda: asleep)
+    async with carried(link := Telling()) as came:
+        link.arrive(b"0")
+        await anyio.sleep(0.05)
+        asleep = 3600.0
+        now = anyio.current_time()
+        link.arrived_at = [now - 3600.04]
+        link.arrive(b"1")
+        await anyio.sleep(0.01)
+        assert came[b"1"] == pytest.approx(now - 3600.04, abs=0.001)
+
+
+@swiftly
+async def test_a_station_that_slept_writes_when_things_were_observed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its value is written after an hour of sleep, and is older than what another program saw meanwhile."""
+    asleep = 0.0
+    monkeypatch.setattr(suspend_detection, "time_asleep", lambda: asleep)
+    vehicle = small_px4()
+    with ParamCache(tmp_path / "cache") as other:
+        async with a_client(vehicle, cache=tmp_path / "cache") as client:
+            component = await client.component()
+            await component.fetch_all()
+            await anyio.sleep(2.0)
+            vehicle.set_param("PARAM_01", 5)  # and it tells so
+            await until(lambda: component.params["PARAM_01"].value == 5)
+            observed_at = swift_loop().now + swift_loop().ahead
+            assert not other.history(other.component(system=1).key), "it is not written yet"
+            asleep = 3600.0
+            swift_loop().ahead += 3600.0
+            await anyio.sleep(2.0)
+        [line] = other.history(other.component(system=1).key, name="PARAM_01")
+    assert line.new is not None
+    assert line.new.value == 5
+    assert line.at == pytest.approx(observed_at, abs=0.01)

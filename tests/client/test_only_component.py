@@ -1,0 +1,215 @@
+"""The call that refuses when several vehicles are there: with a link of one's own, and over a service."""
+
+from __future__ import annotations
+
+import anyio
+import pytest
+
+from paramclient import AmbiguousVehicle, Component, LinkError, NoReply, UsageError
+from paramclient.protocol import wire
+from paramclient.protocol.vehicle_selection import LOOK_TIME
+from paramclient.remote import RemoteClient
+from paramclient.service import Hub, create_app
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from tests.asgi import ASGITransport
+from tests.served import met, problem, service
+from tests.shell import FlakyLink, Late, Tap, a_client, outcome, small_px4, swift_loop, swiftly, until
+from tests.ways import direct_only, pytest_generate_tests, way
+
+__all__ = ["pytest_generate_tests", "way"]
+
+TEXT = "2 vehicles on this link: 1/1 PX4 quadrotor, 2/1 ArduPilot quadrotor."
+
+
+def px4(system: int = 1) -> PX4Vehicle:
+    return small_px4(system=system)
+
+
+def copter(system: int = 2) -> ArduPilotVehicle:
+    return ArduPilotVehicle(system=system, table={"RTL_ALT": 1500})
+
+
+def address(component: Component) -> tuple[int, int]:
+    return component.system, component.component
+
+
+@swiftly
+async def test_the_only_vehicle_is_given_when_it_is_certain_and_at_once_from_then_on() -> None:
+    began = swift_loop().now
+    async with a_client(Tap(Air([Late(px4(), 0.5)]))) as client:
+        found = await client.only_component()
+        assert address(found) == (1, 1)
+        assert 0.5 + LOOK_TIME <= swift_loop().now - began < 0.5 + LOOK_TIME + 0.1
+        before = swift_loop().now
+        for again in (
+            await client.only_component(),
+            await client.only_component(1),
+            await client.only_component(1, 1),
+            await client.only_component(component=1),
+        ):
+            assert again is found
+        assert swift_loop().now - before < 0.05
+
+
+@pytest.mark.parametrize("phase", [0.0, 0.4, 0.99])
+@swiftly
+async def test_several_are_refused_with_the_list_as_soon_as_they_are_heard(phase: float) -> None:
+    began = swift_loop().now
+    tap = Tap(Air([Late(copter(), phase), px4()]))
+    async with a_client(tap) as client:
+        with pytest.raises(AmbiguousVehicle) as caught:
+            await client.only_component()
+        assert swift_loop().now - began < phase + 0.1
+    error = caught.value
+    assert str(error) == f"{TEXT} Choose one with the argument system."
+    assert error.vehicles == ("1/1 PX4 quadrotor", "2/1 ArduPilot quadrotor")
+    assert (error.choose_by, error.summary) == ("system", TEXT)
+    assert isinstance(error, UsageError | ValueError)
+    assert {type(message) for _, _, message in tap.heard} <= {wire.Heartbeat, wire.CommandLong}
+
+
+class Unheard(Tap):
+    """A vehicle of which no heartbeat comes through until it was asked for one."""
+
+    def data_to_send(self) -> list[bytes]:
+        is_asked = any(message.params[0] == wire.HEARTBEAT_ID for message in self.messages(wire.CommandLong))
+        framer = wire.Framer(wire.UNDERSTOOD, stream=False)
+        return [
+            data
+            for data in super().data_to_send()
+            if is_asked or not any(frame.message_id == wire.HEARTBEAT_ID for frame in framer.receive(data))
+        ]
+
+
+@swiftly
+async def test_a_vehicle_that_sends_telemetry_is_found_although_its_heartbeats_are_lost() -> None:
+    other = Unheard(small_px4(system=2, telemetry=10))
+    async with a_client(Tap(Air([px4(), other]))) as client:
+        with pytest.raises(AmbiguousVehicle, match="2 vehicles"):
+            await client.only_component()
+
+
+@swiftly
+async def test_who_is_named_is_given_beside_others() -> None:
+    async with a_client(Air([px4(), copter(), px4(3)])) as client:
+        assert address(await client.only_component(2)) == (2, 1)
+        assert address(await client.only_component(3, 1)) == (3, 1)
+        with pytest.raises(AmbiguousVehicle, match="3 vehicles"):
+            await client.only_component(component=1)
+
+
+@swiftly
+async def test_the_first_one_is_still_given_by_the_other_call() -> None:
+    async with a_client(Air([px4(), Late(copter(), 0.3)])) as client:
+        assert address(await client.component()) == (1, 1)
+        assert address(await client.component(2)) == (2, 1)
+
+
+@swiftly
+async def test_a_time_limit_holds_for_everything() -> None:
+    async with a_client(Tap(Air([Late(px4(), 0.5)]))) as client:
+        with pytest.raises(NoReply, match="an autopilot") as caught:
+            await client.only_component(timeout=0.4)
+        assert 0.3 < caught.value.waited < 0.5
+        with pytest.raises(NoReply, match=r"an autopilot, and 1\.2 s more to see that it is the only one"):
+            await client.only_component(timeout=1.0)
+        with pytest.raises(NoReply, match="system id 7"):
+            await client.only_component(7, timeout=0.1)
+        assert address(await client.only_component()) == (1, 1)
+
+
+@swiftly
+async def test_a_call_may_be_cancelled_and_made_again() -> None:
+    async with a_client(Tap(Air([px4()]))) as client:
+        for _ in range(3):
+            with anyio.move_on_after(0.3) as scope:
+                await client.only_component()
+            assert scope.cancelled_caught
+        assert address(await client.only_component()) == (1, 1)
+
+
+@swiftly
+async def test_a_vehicle_that_was_lost_is_waited_for() -> None:
+    async with a_client(Air([px4(), Late(copter(), 0.0, until=2.0)])) as client:
+        assert isinstance(await outcome(client.only_component()), AmbiguousVehicle)
+        await anyio.sleep(8.0)
+        assert client.components[2, 1].state == "lost"
+        assert address(await client.only_component()) == (1, 1)
+        with pytest.raises(NoReply, match="system id 2"):
+            await client.only_component(2, timeout=3.0)
+
+
+@direct_only("the link is at hand")
+@swiftly
+async def test_after_an_absence_of_the_link_a_second_one_is_looked_for_again() -> None:
+    link = FlakyLink(Air([px4(), copter()]))
+    tap = link.endpoint = Tap(Air([px4(), Late(copter(), 4.0)]))
+    async with a_client(link) as client:
+        await client.only_component()
+        await link.drop()
+        await until(lambda: client._carrier.is_away)
+        began = swift_loop().now
+        found = await client.only_component()
+        assert swift_loop().now - began >= LOOK_TIME
+        assert address(found) == (1, 1)
+        assert not tap.messages(wire.ParamSet)
+
+
+@swiftly
+async def test_a_client_that_is_closed_says_so() -> None:
+    async with a_client(Tap(Air([px4()]))) as client:
+        pass
+    with pytest.raises(LinkError):
+        await client.only_component()
+
+
+# several links of a service
+
+
+@direct_only("it has services of its own")
+@swiftly
+async def test_the_vehicles_on_all_links_of_a_service_count() -> None:
+    other = FlakyLink(Air([copter()]))
+    async with service(px4(), other) as (hub, browser):
+        found = await met(browser)
+        assert found["system"] in (1, 2)
+        told = problem(await browser.post("/api/v1/find", json={"only": True}), 409, "ambiguous-vehicle")
+        assert told["vehicles"] == [
+            "1/1 PX4 quadrotor on sim:custom",
+            "2/1 ArduPilot quadrotor on tcp:flaky:5760",
+        ]
+        assert told["choose_by"] == "system"
+        assert (await met(browser, only=True, system=2))["link"] == "tcp:flaky:5760"
+        answer = await browser.post("/api/v1/find?link=sim:custom", json={"only": True})
+        assert (answer.json()["system"], answer.json()["component"]) == (1, 1)
+        answer = await browser.post("/api/v1/find?link=nowhere", json={"only": True})
+        problem(answer, 404, "unknown-link")
+        assert len(hub.lines) == 2
+
+
+@direct_only("it has services of its own")
+@swiftly
+async def test_one_address_on_two_links_of_a_service_is_chosen_by_the_link() -> None:
+    async with Hub([px4(), FlakyLink(Late(small_px4(uid=77), 0.9))], cache=False, fetches=False) as hub:
+        app = create_app(hub)
+        for arguments in ((), (1,), (1, 1)):
+            async with RemoteClient("http://127.0.0.1:8765", transport=ASGITransport(app)) as client:
+                with pytest.raises(AmbiguousVehicle, match=r"1/1 PX4 quadrotor on sim:custom, .*\?link=NAME"):
+                    await client.only_component(*arguments)
+        name = "http://127.0.0.1:8765?link=tcp:flaky:5760"
+        async with RemoteClient(name, transport=ASGITransport(app)) as client:
+            found = await client.only_component()
+            assert found.link_name == "tcp:flaky:5760"
+
+
+@direct_only("it has services of its own")
+@swiftly
+async def test_a_link_that_cannot_be_opened_has_no_vehicle() -> None:
+    away = FlakyLink(Air([copter()]))
+    away.is_away = True
+    async with service(px4(), away) as (_, browser):
+        assert (await met(browser, only=True))["system"] == 1
+        away.is_away = False
+        await until(lambda: away.openings > 1, pause=0.1)
+        await anyio.sleep(2.0)
+        problem(await browser.post("/api/v1/find", json={"only": True}), 409, "ambiguous-vehicle")

@@ -1,0 +1,368 @@
+"""Captures: every frame of a link, both ways, in a file that other programs read too."""
+
+from __future__ import annotations
+
+import errno
+import io
+import json
+import logging
+import os
+import struct
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import anyio
+import pytest
+
+from paramclient import ParamClient, UsageError
+from paramclient.cli import run
+from paramclient.client import recording
+from paramclient.client.recording import Capture
+from paramclient.links.tlog import LATEST, LONGEST_LEAP, Record, packed_time, read_records
+from paramclient.protocol import wire
+from paramclient.protocol.stats.sniffer import MOST_PEERS, FrameCutter
+from paramclient.sim import ArduPilotVehicle
+from tests.recordings import DATA, NAMES, read
+from tests.shell import VALUES, FlakyLink, Tap, a_client, settled, small_px4, swiftly
+
+NOW = 1_700_000_000.0
+
+
+def frame(number: int, *, system: int = 1) -> bytes:
+    return wire.encode(
+        wire.StatusText(6, f"line {number}"), system=system, component=1, sequence=number % 256
+    )
+
+
+def log_of(*frames: bytes, at: float = NOW) -> bytes:
+    return b"".join(packed_time(at + number) + data for number, data in enumerate(frames))
+
+
+def records(data: bytes) -> list[Record]:
+    return list(read_records(io.BytesIO(data)))
+
+
+def messages(path: Path) -> list[wire.Message]:
+    framer = wire.Framer(wire.UNDERSTOOD, stream=False)
+    found = [
+        wire.decode(each) for record in records(path.read_bytes()) for each in framer.receive(record.data)
+    ]
+    assert framer.skipped == 0
+    return [message for message in found if message is not None]
+
+
+# reading
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_recordings_are_read_frame_by_frame(name: str) -> None:
+    found = records((DATA / f"{name}.tlog").read_bytes())
+    expected = read(name)
+    assert [each.data for each in found] == [each.data for each in expected]
+    assert [each.at - found[0].at for each in found] == pytest.approx(
+        [each.time for each in expected], abs=1e-6
+    )
+
+
+@pytest.mark.parametrize("size", [1, 7, 64])
+def test_a_log_is_read_whatever_its_blocks(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("paramclient.links.tlog.BLOCK", size)
+    frames = [frame(number) for number in range(5)]
+    assert [each.data for each in records(log_of(*frames))] == frames
+
+
+def test_what_is_no_record_is_stepped_over() -> None:
+    first, second, third = (frame(number) for number in range(3))
+    torn = log_of(second)[:-5]
+    found = records(log_of(first) + torn + b"\xfd" * 3 + log_of(second, third))
+    assert found[0] == Record(NOW, first)
+    assert found[-1] == Record(NOW + 1, third)
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [(20.0, NOW), (315_964_800.0, NOW), (NOW, 315_964_800.0), (NOW, NOW - LONGEST_LEAP - 10), (20.0, 30.0)],
+    ids=["set from 1970", "set from 1980", "lost", "joined", "never set"],
+)
+@pytest.mark.parametrize("behind", [2, 9])
+def test_a_clock_that_is_set_costs_no_frame(first: float, second: float, behind: int) -> None:
+    frames = [frame(number) for number in range(3 + behind)]
+    found = records(log_of(*frames[:3], at=first) + log_of(*frames[3:], at=second))
+    assert [each.data for each in found] == frames
+    assert (found[0].at, found[3].at) == (first, second)
+
+
+def test_no_frame_is_later_than_the_latest_time() -> None:
+    """Not in many steps either: dates end with the year 9999."""
+    step = LONGEST_LEAP - 1
+    data = b"".join(packed_time(LATEST - step + number * step) + frame(number) for number in range(9))
+    assert [each.at for each in records(data)] == [LATEST - step, LATEST]
+
+
+@pytest.mark.parametrize("damaged", [0, 2, 4])
+def test_a_time_that_is_damaged_costs_one_frame(damaged: int) -> None:
+    frames = [frame(number) for number in range(5)]
+    data = bytearray(log_of(*frames))
+    data[(8 + len(frames[0])) * damaged + 1] ^= 0x01  # by nine years
+    found = records(bytes(data))
+    assert [each.data for each in found] == frames[:damaged] + frames[damaged + 1 :]
+    assert all(each.at < NOW + 5 for each in found)
+
+
+@pytest.mark.parametrize("missing", range(1, 12))
+def test_a_record_that_the_end_cuts_off_is_left_out(missing: int) -> None:
+    whole = log_of(frame(1), frame(2))
+    assert [each.data for each in records(whole[:-missing])] == [frame(1)]
+
+
+def test_what_is_no_log_has_no_records() -> None:
+    assert records(b"") == []
+    assert records(bytes(range(256)) * 40) == []
+    assert records(b"FRAME_CLASS 1\n" * 500) == []
+
+
+# writing
+
+
+@swiftly
+async def test_everything_on_the_link_is_written_both_ways(tmp_path: Path) -> None:
+    vehicle = Tap(small_px4())
+    path = tmp_path / "flight.tlog"
+    before = time.time()
+    async with a_client(vehicle, tlog=path) as client:
+        component = await client.component()
+        await component.fetch_all()
+        await component.set("PARAM_01", 5)
+        received = client.bytes_received
+    written = records(path.read_bytes())
+    ours = [each for each in written if each.data[5] == 255]
+    assert [each.data for each in ours] == [wire_frame(each) for each in vehicle.heard]
+    assert sum(len(each.data) for each in written) - sum(len(each.data) for each in ours) == received
+    assert [each.at for each in written] == sorted(each.at for each in written)
+    assert before - 0.001 <= written[0].at <= written[-1].at <= time.time()
+    said = messages(path)
+    listed = {each.param_id for each in said if isinstance(each, wire.ParamValue)}
+    assert listed >= VALUES.keys()
+    assert [each.param_id for each in said if isinstance(each, wire.ParamSet)] == ["PARAM_01"]
+
+
+def wire_frame(heard: tuple[float, wire.Frame, wire.Message]) -> bytes:
+    _, each, message = heard
+    return wire.encode(
+        message, system=each.system, component=each.component, sequence=each.sequence, version=each.version
+    )
+
+
+def test_pymavlink_reads_what_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+
+    @swiftly
+    async def session() -> None:
+        async with a_client(ArduPilotVehicle(ftp=False), tlog=path) as client:
+            await (await client.component()).fetch_all()
+
+    session()
+    program = f"""
+import json
+from pymavlink import mavutil
+log = mavutil.mavlink_connection({str(path)!r})
+found = []
+while (message := log.recv_match()) is not None:
+    found.append((message.get_type(), message.get_srcSystem(), message._timestamp))
+print(json.dumps(found))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, check=True, timeout=60)
+    theirs = json.loads(done.stdout)
+    ours = records(path.read_bytes())
+    framer = wire.Framer(stream=False)
+    names = [wire.message_name(each.message_id) for record in ours for each in framer.receive(record.data)]
+    assert [name for name, _, _ in theirs] == names
+    assert names.count("PARAM_VALUE") >= 1382
+    # its last two bits of the time are the number of a link
+    assert [at for _, _, at in theirs] == pytest.approx([each.at for each in ours], abs=5e-6)
+
+
+def test_the_command_writes_logs_too(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "flight.tlog"
+    assert run(["get", "sim:px4", "MC_ROLL_P", "--no-cache", "--tlog", str(path)]) == 0
+    assert [each.param_id for each in messages(path) if isinstance(each, wire.ParamValue)] == ["MC_ROLL_P"]
+    assert run(["get", "sim:px4", "MC_ROLL_P", "--no-cache", "--tlog", str(path)]) == 2
+    assert "flight.tlog exists" in capsys.readouterr().err
+    assert run(["link", "sim:px4", "--seconds", "0.1", "--tlog", str(tmp_path / "link.tlog")]) == 0
+    assert messages(tmp_path / "link.tlog")
+
+
+@pytest.mark.parametrize("now", [-86400.0, 30.0])
+@swiftly
+async def test_a_clock_that_was_never_set_ends_nothing(
+    now: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("paramclient.client.recording.time.time", lambda: now)
+    path = tmp_path / "flight.tlog"
+    async with a_client(small_px4(), tlog=path) as client:
+        assert (await (await client.component()).get("PARAM_07")).value == VALUES["PARAM_07"]
+    assert {each.at for each in records(path.read_bytes())} == {max(0.0, now)}
+    assert any(isinstance(each, wire.ParamValue) for each in messages(path))
+
+
+@swiftly
+async def test_no_key_and_no_signature_is_in_the_log(tmp_path: Path) -> None:
+    """As the guide to message signing asks: a log is passed on, and a key is not."""
+    key = wire.SigningKey(bytes(range(32)))
+    path = tmp_path / "signed.tlog"
+    vehicle = Tap(small_px4(signing_key=key, usb=True))
+    async with a_client(vehicle, tlog=path, signing=key) as client:
+        component = await client.component()
+        await component.get("PARAM_01")
+        await component.setup_signing(wire.SigningKey(bytes(range(1, 33))), link_is_safe=True)
+    assert any(isinstance(message, wire.SetupSigning) for _, _, message in vehicle.heard)
+    written = records(path.read_bytes())
+    assert {each.data[2] for each in written} == {0}, "no frame says that it is signed"
+    framer = wire.Framer(stream=False)
+    assert [len(framer.receive(each.data)) for each in written] == [1] * len(written)
+    assert not any(isinstance(each, wire.SetupSigning) for each in messages(path))
+    assert any(isinstance(each, wire.ParamValue) for each in messages(path))
+    assert bytes(range(1, 33)) not in path.read_bytes()
+
+
+def test_a_signature_is_taken_off_and_nothing_else() -> None:
+    plain = frame(7)
+    signer = wire.Signer(wire.SigningKey(bytes(range(32))), link_id=1, timestamp=5)
+    assert wire.unsign_frame(wire.sign_frame(plain, signer)) == plain
+    assert wire.unsign_frame(plain) == plain
+    old = wire.encode(wire.ParamRequestList(1, 1), system=1, component=1, sequence=1, version=1)
+    assert wire.unsign_frame(old) == old
+
+
+@swiftly
+async def test_a_log_that_exists_is_not_written_over(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(b"precious")
+    vehicle = small_px4()
+    with pytest.raises(UsageError, match=r"flight\.tlog exists"):
+        async with a_client(vehicle, tlog=path):
+            raise AssertionError("it was opened")
+    assert path.read_bytes() == b"precious"
+    with pytest.raises(UsageError, match="cannot be made: No such file or directory"):
+        async with a_client(vehicle, tlog=tmp_path / "nowhere" / "flight.tlog"):
+            raise AssertionError("it was opened")
+
+
+@swiftly
+async def test_a_full_disk_ends_the_log_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "flight.tlog"
+    room = 300
+    write = os.write
+
+    def limited(file: int, data: bytes) -> int:
+        left = room - os.fstat(file).st_size
+        if left <= 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(file, data[:left])
+
+    vehicle = small_px4()
+    with caplog.at_level(logging.WARNING):
+        async with a_client(vehicle, tlog=path) as client:
+            component = await client.component()
+            await anyio.sleep(1.0)
+            monkeypatch.setattr(os, "write", limited)
+            assert (await component.fetch_all()).complete
+            await anyio.sleep(5.0)
+            assert (await component.get("PARAM_01")).value == 1
+    assert [record.name for record in caplog.records] == ["paramclient.client.recording"], caplog.text
+    assert f"nothing more is written to {path}: No space left on device" in caplog.text
+    assert messages(path)  # whole frames, and nothing behind them
+
+
+@swiftly
+async def test_memory_does_not_follow_a_disk_that_falls_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(recording, "MOST_UNWRITTEN", 1000)
+    log = Capture(tmp_path / "flight.tlog", is_stream=False)
+    await log.open()
+    for number in range(100):
+        log.received(frame(number), "vehicle")
+        assert log._size <= 1000 + len(frame(number))
+    assert not log._unwritten
+    assert "the disk does not keep up" in caplog.text
+    await log.close()
+    assert (tmp_path / "flight.tlog").read_bytes() == b""
+
+
+def test_streams_are_cut_into_whole_frames() -> None:
+    cutter = FrameCutter(stream=True)
+    first, second = frame(1), frame(2, system=2)
+    assert cutter.cut(b"noise" + first[:12], "one") == []
+    assert cutter.cut(second[:5], "two") == []
+    assert cutter.cut(first[12:], "one") == [first]
+    assert cutter.cut(second[5:] + b"\xfd", "two") == [second]
+    assert cutter.cut(b"", "two") == []
+    assert cutter.cut(first, "two") == [first]
+    damaged = first[:-1] + bytes((first[-1] ^ 1,))
+    assert cutter.cut(damaged + second, "one") == [second]
+    # a header that promises more than ever comes hides what stands behind it only until the end
+    assert cutter.cut(b"\xfd\xff\x00\x00\x00\x01\x01\x00\x00\x00" + first, "one") == []
+    assert cutter.flush() == [first]
+    for number in range(MOST_PEERS + 10):
+        cutter.cut(first[:5], number)
+    assert len(cutter._sniffers) == MOST_PEERS
+
+
+class Stream(FlakyLink):
+    is_stream = True
+
+
+@swiftly
+async def test_a_stream_that_drops_is_not_continued(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    link = Stream(Pieces([frame(1)[:9], frame(2)]))
+    async with a_client(link, tlog=path) as client:
+        await settled()
+        await link.drop()
+        await anyio.sleep(2.0)
+        assert link.openings == 2
+        assert client.bytes_received
+    lines = [each.text for each in messages(path) if isinstance(each, wire.StatusText)]
+    assert lines == ["line 2"]
+
+
+class Pieces:
+    """An endpoint that says one thing for each opening of the link."""
+
+    def __init__(self, pieces: Sequence[bytes]) -> None:
+        self._pieces = [*pieces]
+        self._is_due = True
+
+    def receive(self, data: bytes, now: float) -> None:
+        self._is_due = bool(self._pieces)  # our heartbeat, once for each opening
+
+    def tick(self, now: float) -> None:
+        return
+
+    def next_deadline(self) -> float | None:
+        return None
+
+    def data_to_send(self) -> list[bytes]:
+        if self._is_due and self._pieces:
+            self._is_due = False
+            return [self._pieces.pop(0)]
+        return []
+
+
+@pytest.mark.asyncio
+async def test_a_client_that_nobody_speaks_to_writes_its_own_heartbeats(tmp_path: Path) -> None:
+    path = tmp_path / "flight.tlog"
+    async with ParamClient("udpout:127.0.0.1:9", cache=False, tlog=path):
+        with anyio.fail_after(10):
+            while not path.stat().st_size:  # noqa: ASYNC110 - nobody tells
+                await anyio.sleep(0.01)
+    [said, *_] = messages(path)
+    assert said == wire.Heartbeat(wire.MAV_TYPE_GCS, wire.MAV_AUTOPILOT_INVALID, system_status=4)
+    (at,) = struct.unpack_from(">Q", path.read_bytes())
+    assert abs(at / 1e6 - time.time()) < 60

@@ -1,0 +1,617 @@
+"""Many vehicles on one link: nothing is done for all of them that one of them is the reason of."""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import math
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+import anyio
+import anyio.lowlevel
+import pytest
+
+from paramclient import ParamCache, ParamClient
+from paramclient.cache import CachedComponent, TableUpdate
+from paramclient.client import cache_writer, event_loop_share, link_task
+from paramclient.client.cache_writer import DOWNLOAD_INTERVAL, LEAST_NEW
+from paramclient.client.event_loop_share import LONGEST_TURN
+from paramclient.client.link_task import HELD_UP, MOST_BEHIND, Carrier
+from paramclient.links import Peer
+from paramclient.model.values import ParamType
+from paramclient.protocol import station as station_room
+from paramclient.protocol import wire
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import ComponentLost
+from paramclient.protocol.params.fetch import Fetch
+from paramclient.protocol.station import Station
+from paramclient.protocol.wire import MAV_AUTOPILOT_PX4, Heartbeat
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, PX4Vehicle, SimParam, Vehicle
+from tests.shell import Tap, swift_loop, swiftly
+
+MANY = 250
+PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
+
+
+def hear(station: Station, system: int, now: float) -> None:
+    frame = wire.encode(PX4, system=system, component=1, sequence=0)
+    station.receive(frame, "peer", now)
+
+
+@pytest.fixture
+def looks(monkeypatch: pytest.MonkeyPatch) -> Counter[int]:
+    """How often the deadlines of each system were worked out."""
+    looks: Counter[int] = Counter()
+    whole = ComponentMachine.next_deadline
+
+    def counted(machine: ComponentMachine) -> float:
+        looks[machine.system] += 1
+        return whole(machine)
+
+    monkeypatch.setattr(ComponentMachine, "next_deadline", counted)
+    return looks
+
+
+def test_what_one_says_makes_nobody_look_at_the_others(looks: Counter[int]) -> None:
+    station = Station(link="x", is_stream=False)
+    for system in range(1, MANY + 1):
+        hear(station, system, 0.0)
+    station.tick(0.0)
+    station.next_deadline()
+    looks.clear()
+    hear(station, 7, 0.1)
+    station.tick(0.1, everyone=False)
+    station.next_deadline(everyone=False)
+    assert set(looks) == {7}
+    assert looks[7] <= 3
+
+
+def test_a_deadline_is_kept_whoever_was_looked_at_meanwhile() -> None:
+    """Those who were asked who they are and say nothing are asked again in time."""
+    station = Station(link="x", is_stream=False)
+    for system in range(1, 11):
+        hear(station, system, system / 100)
+    station.tick(0.1, everyone=False)
+    station.data_to_send()
+    assert station.next_deadline(everyone=False) == 0.26  # the first timeout, 0.25 s
+    asked: list[tuple[float, int]] = []
+    now = 0.1
+    while len(set(asked)) < 10:
+        now = station.next_deadline(everyone=False)
+        station.tick(now, everyone=False)
+        for data, _ in station.data_to_send():
+            for frame in wire.Framer(wire.UNDERSTOOD, stream=False).receive(data):
+                message = wire.decode(frame)
+                if isinstance(message, wire.CommandLong):
+                    asked.append((round(now, 3), message.target_system))
+    assert sorted(set(asked)) == [(round(0.25 + system / 100, 3), system) for system in range(1, 11)]
+
+
+def test_what_was_asked_of_one_goes_out_when_it_was_touched() -> None:
+    station = Station(link="x", is_stream=False)
+    hear(station, 1, 0.0)
+    hear(station, 2, 0.0)
+    station.tick(0.0)
+    station.next_deadline()
+    machine = station.components[2, 1]
+    for index in range(40):  # more than may go out at once
+        machine.reads.ask(index, 0.0)
+    station.touch(machine)
+    assert station.next_deadline(everyone=False) == pytest.approx(machine.reads.pace.next_at())
+    assert station.next_deadline(everyone=False) == station.next_deadline()
+
+
+def test_what_is_due_of_many_at_once_is_done_in_parts() -> None:
+    station = Station(link="x", is_stream=False)
+    for system in range(1, MANY + 1):
+        hear(station, system, 0.0)
+    station.events()
+    ticks = 0
+    now = 100.0  # all of them are lost by now
+    while station.next_deadline() <= now:
+        station.tick(now, everyone=not ticks)
+        ticks += 1
+        lost = [event for event in station.events() if isinstance(event, ComponentLost)]
+        assert len(lost) <= station_room.MOST_AT_ONCE
+    assert all(machine.presence.is_lost for machine in station.components.values())
+    assert ticks >= MANY / station_room.MOST_AT_ONCE
+
+
+def test_who_was_forgotten_leaves_no_deadline_to_whoever_comes_in_its_place(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """One that is lost makes room for another, and is asked for a parameter although it is gone."""
+    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 2)
+    station = Station(link="x", is_stream=False)
+    hear(station, 1, 0.0)
+    hear(station, 2, 0.0)
+    gone = station.components[1, 1]
+    for second in range(1, 20):
+        hear(station, 2, float(second))
+        station.tick(float(second), everyone=False)
+        station.next_deadline(everyone=False)
+    assert gone.presence.is_lost
+    station.touch(gone)
+    hear(station, 3, 20.0)
+    gone.reads.ask("A", 20.0)
+    station.touch(gone)
+    hear(station, 2, 20.0)
+    for second in range(20, 60):
+        station.tick(float(second), everyone=False)
+        assert station.next_deadline(everyone=False) > second
+    assert [*station.components] == [(2, 1), (3, 1)]
+    assert all(machine.presence.is_lost for machine in station.components.values()), "by their own deadlines"
+    assert station.autopilot_of(1) is None
+
+
+@pytest.mark.parametrize("loss", [0.0, 0.2])
+def test_it_makes_no_difference_who_is_looked_at(loss: float) -> None:
+    """A whole session of twelve, with and without looking at everyone."""
+    ends = []
+    for everyone in (True, False):
+        vehicles = [small(system) for system in range(1, 13)]
+        air = Air.symmetric(vehicles, loss=loss, delay=0.01, seed=5)
+        fetches, now = session(air, vehicles, everyone=everyone)
+        assert all(fetch.result is not None and fetch.result.complete for fetch in fetches)
+        ends.append(now)
+    assert ends[1] <= 1.1 * ends[0]
+
+
+def small(system: int) -> Vehicle:
+    table = [SimParam(f"P_{index:03}", ParamType.INT32, index * system) for index in range(150)]
+    if system % 2:
+        return PX4Vehicle(system=system, table=table)
+    return ArduPilotVehicle(system=system, table=table, ftp=False)
+
+
+def session(air: Air, vehicles: list[Vehicle], *, everyone: bool) -> tuple[list[Fetch], float]:
+    """All of them are fetched at once, as soon as they have said who they are."""
+    station = Station(link="x", is_stream=False)
+    fetches: list[Fetch] = []
+    now = 0.0
+    air.tick(now)
+    while not (fetches and all(fetch.done for fetch in fetches)):
+        assert now < 120.0
+        station.tick(now, everyone=everyone)
+        machines = list(station.components.values())
+        if not fetches and len(machines) == len(vehicles) and all(each.who.settled for each in machines):
+            fetches = [machine.begin_fetch(now) for machine in machines]
+            for machine in machines:
+                station.touch(machine)
+        for data, _ in station.data_to_send():
+            air.receive(data, now)
+        deadline = air.next_deadline()
+        ours = station.next_deadline(everyone=everyone)
+        now = max(min(ours, math.inf if deadline is None else deadline), now + 1e-7)
+        air.tick(now)
+        for data in air.data_to_send():
+            station.receive(data, None, now)
+    return fetches, now
+
+
+def test_whether_anything_is_awaited_is_asked_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[int] = []
+    whole = inspect.getattr_static(ComponentMachine, "is_waiting")
+
+    def counted(machine: ComponentMachine) -> bool:
+        asked.append(machine.system)
+        return bool(whole.fget(machine))
+
+    monkeypatch.setattr(ComponentMachine, "is_waiting", property(counted))
+    station = Station(link="x", is_stream=False)
+    for system in range(1, MANY + 1):
+        hear(station, system, 0.0)
+    for system in range(1, MANY):
+        station.components[system, 1].who.settled = True
+        station.components[system, 1].who._is_asking = False
+    assert station.is_waiting
+    asked.clear()
+    assert station.is_waiting
+    assert asked == [MANY]
+
+
+class SlowCache(ParamCache):
+    """One that has hundreds of others to read first."""
+
+    def load(self, key: str, component: int) -> CachedComponent | None:
+        time.sleep(0.3)
+        return super().load(key, component)
+
+
+@pytest.mark.asyncio
+async def test_a_cached_table_that_is_being_read_is_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "cache.sqlite3"
+    async with ParamClient(small(1), cache=path) as client:
+        await (await client.component()).fetch_all()
+    monkeypatch.setattr("paramclient.client.component.IDENTITY_PATIENCE", 0.05)
+    with SlowCache(path) as cache:
+        async with ParamClient(small(1), cache=cache) as client:
+            assert (await client.fetch_all()).results[1, 1].source == "cache"
+
+
+class Flood:
+    """A link that brings so many datagrams every few milliseconds, as it is told."""
+
+    name = "flood"
+    is_stream = False
+    reconnects = False
+    interval = 0.005
+
+    def __init__(self) -> None:
+        self.size = 0
+        self.is_stuck = anyio.Event()
+
+    async def open(self) -> None: ...
+
+    async def close(self) -> None: ...
+
+    async def send(self, data: bytes, peer: Peer | None) -> None: ...
+
+    async def receive(self) -> list[tuple[Peer, bytes]]:
+        await anyio.sleep(self.interval)
+        while not self.size:
+            await self.is_stuck.wait()
+        return [("peer", b"x")] * self.size
+
+
+class Watched(Station):
+    """A station with a deadline every ten milliseconds, that notes when it looks at what is due."""
+
+    def __init__(self) -> None:
+        super().__init__(link="flood", is_stream=False)
+        self.ticks: list[float] = []
+        self.most_lists = math.inf
+        self.on_receive: Callable[[], None] = lambda: None
+
+    def receive(self, data: bytes, peer: Peer, now: float, moment: float | None = None) -> bool:
+        self.on_receive()
+        return True
+
+    def tick(
+        self, now: float, *, everyone: bool = True, most_lists: float = math.inf, is_crowded: bool = False
+    ) -> None:
+        self.ticks.append(now)
+        self.most_lists = most_lists
+
+    def next_deadline(self, *, everyone: bool = True) -> float:
+        return anyio.current_time() + 0.01
+
+
+async def carry(link: Flood, station: Watched, seconds: float, dispatch: Callable[[], None]) -> None:
+    whole = Carrier(link, station, dispatch=dispatch, end=lambda error: None)
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(whole.read)
+        tasks.start_soon(whole.send)
+        await anyio.sleep(seconds)
+        tasks.cancel_scope.cancel()
+
+
+@swiftly
+async def test_time_outs_wait_until_what_has_come_is_read() -> None:
+    link, station = Flood(), Watched()
+    link.size = event_loop_share.MANY
+    began = anyio.current_time()
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(carry, link, station, 2.0, lambda: None)
+        await anyio.sleep(1.0)
+        meanwhile = [at for at in station.ticks if at > began + link.interval]
+        assert not meanwhile, "more was there after each reading"
+        link.size = event_loop_share.MANY - 1
+        await anyio.sleep(0.1)
+        assert station.ticks[-1] > began + 1.0
+        assert len(station.ticks) > 5
+        assert station.most_lists > 1
+
+
+@swiftly
+async def test_time_outs_do_not_wait_for_ever() -> None:
+    link, station = Flood(), Watched()
+    link.size = event_loop_share.MANY
+    began = anyio.current_time()
+    await carry(link, station, MOST_BEHIND + 1.0, lambda: None)
+    meanwhile = [at - began for at in station.ticks if at > began + link.interval]
+    assert MOST_BEHIND <= meanwhile[0] < MOST_BEHIND + 0.1
+    assert 50 < len(meanwhile) < 1.0 / LONGEST_TURN
+    assert station.most_lists == 1, "and no further list begins"
+
+
+class Starved(Watched):
+    """Other programs have the processor whenever it has said until when to wait."""
+
+    def next_deadline(self, *, everyone: bool = True) -> float:
+        swift_loop().call_later(0.001, self._starve)
+        return super().next_deadline(everyone=everyone)
+
+    def _starve(self) -> None:
+        swift_loop().now += HELD_UP + 0.002
+
+
+@swiftly
+async def test_time_outs_wait_while_other_programs_have_the_processor() -> None:
+    """What has come is there, but the reader had no turn meanwhile."""
+    link, station = Flood(), Starved()
+    link.size = event_loop_share.MANY
+    link.interval = LONGEST_TURN + 0.003  # the sender wakes before it
+    began = anyio.current_time()
+    await carry(link, station, 1.0, lambda: None)
+    assert not [at for at in station.ticks if at > began + link.interval + HELD_UP]
+
+
+@swiftly
+async def test_time_outs_wait_for_nothing_that_does_not_come() -> None:
+    """The last reading brought many, and then the link falls silent."""
+    link, station = Flood(), Watched()
+    link.size = event_loop_share.MANY
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(carry, link, station, 1.0, lambda: None)
+        await anyio.sleep(0.5)
+        link.size = 0
+        silent_at = anyio.current_time()
+        await anyio.sleep(0.2)
+    assert next(at for at in station.ticks if at > silent_at) < silent_at + HELD_UP + 2 * LONGEST_TURN
+
+
+@swiftly
+async def test_time_outs_wait_for_what_waits_for_its_turn() -> None:
+    """Few datagrams were read, among them perhaps the answers, and another link has the turn."""
+    link, station = Flood(), Watched()
+    link.size = event_loop_share.SOME
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(carry, link, station, 3.0, lambda: None)
+        await anyio.sleep(0.5)
+        assert len(station.ticks) > 5
+        async with event_loop_share.Crowd.of_this_loop().turn:
+            await anyio.sleep(2 * link.interval)
+            before = len(station.ticks)
+            await anyio.sleep(0.5)
+            assert len(station.ticks) == before
+        await anyio.sleep(0.1)
+        assert len(station.ticks) > before
+        tasks.cancel_scope.cancel()
+
+
+@swiftly
+async def test_what_comes_at_once_gives_way_to_other_tasks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each datagram takes a millisecond; so do others that are told of what has happened by then."""
+
+    class Clock:
+        now = 0.0
+
+        def perf_counter(self) -> float:
+            return self.now
+
+    def take() -> None:
+        clock.now += 0.001
+        happened.append("read")
+
+    async def beside() -> None:
+        while True:
+            await anyio.lowlevel.checkpoint()
+            happened.append("another")
+
+    clock = Clock()
+    monkeypatch.setattr(link_task, "time", clock)
+    happened: list[str] = []
+    link, station = Flood(), Watched()
+    station.on_receive = take
+    link.size = 100
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(beside)
+        await carry(link, station, 0.008, lambda: happened.append("told"))
+        tasks.cancel_scope.cancel()
+    assert happened.count("read") == 100
+    most = round(LONGEST_TURN / 0.001)
+    rounds = "".join(each[0] for each in happened).split("a")
+    longest = max(part.count("r") for part in rounds)
+    assert longest == most
+    assert all(part.endswith("t") for part in rounds if "r" in part)
+
+
+def test_a_link_has_no_more_lists_than_the_others_leave_it() -> None:
+    readers = event_loop_share.Crowd()
+    most = event_loop_share.ENOUGH_LISTS
+    assert readers.most_lists("a", 10 * most, 1.0) == math.inf, "it has its own measure"
+    assert readers.most_lists("a", 0, 1.0) == math.inf
+    assert readers.most_lists("b", most - 3, 2.0) == math.inf
+    assert readers.most_lists("a", 1, 2.0) == 3
+    assert readers.most_lists("c", 0, 2.0) == 2
+    assert readers.most_lists("d", 9, 2.0) == 2
+    assert readers.most_lists("a", 1, 2.0) == 1
+    readers.left("b")
+    assert readers.most_lists("a", 1, 2.0) == most - 9
+    assert readers.most_lists("c", 0, 2.0, awaited=4) == most - 10
+    assert readers.most_lists("a", 1, 2.0, awaited=1) == most - 13
+
+
+def test_a_list_that_is_only_awaited_takes_no_time_of_others() -> None:
+    readers = event_loop_share.Crowd()
+    readers.most_lists("a", 0, 1.0, awaited=5)
+    assert not readers.is_busy_without("b")
+    readers.most_lists("a", 1, 1.0)
+    assert readers.is_busy_without("b")
+    assert not readers.is_busy_without("a")
+    readers.left("a")
+    assert not readers.is_busy_without("b")
+
+
+def test_no_link_has_lists_beside_each_other_while_more_has_come_on_one_than_was_read() -> None:
+    readers = event_loop_share.Crowd()
+    readers.came("b", event_loop_share.MANY - 1)
+    assert readers.most_lists("a", 0, 1.0) == math.inf
+    readers.came("b", event_loop_share.MANY)
+    assert readers.most_lists("a", 0, 1e6) == 1, "it is not done with them"
+    readers.taken("b", 2.0)
+    assert readers.most_lists("a", 0, 2.0) == 1
+    assert readers.most_lists("a", 0, 2.0 + event_loop_share.LASTING) == math.inf
+    readers.came("b", event_loop_share.MANY - 1)
+    readers.taken("b", 2.0)
+    assert readers.most_lists("a", 0, 2.0) == math.inf
+
+
+def test_links_of_two_event_loops_share_nothing() -> None:
+    async def find() -> event_loop_share.Crowd:
+        assert event_loop_share.Crowd.of_this_loop() is event_loop_share.Crowd.of_this_loop()
+        return event_loop_share.Crowd.of_this_loop()
+
+    assert anyio.run(find) is not anyio.run(find)
+
+
+@swiftly
+async def test_no_list_begins_while_another_link_brings_more_than_is_read() -> None:
+    busy, quiet, station = Flood(), Flood(), Watched()
+    busy.size, quiet.size = event_loop_share.MANY, 1
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(carry, quiet, station, 3.0, lambda: None)
+        await anyio.sleep(0.5)
+        seen = [station.most_lists]
+        tasks.start_soon(carry, busy, Watched(), 2.0, lambda: None)
+        for size in (event_loop_share.MANY, 0, event_loop_share.MANY):
+            busy.size = size
+            busy.is_stuck.set()
+            await anyio.sleep(0.5)
+            seen.append(station.most_lists)
+        assert seen == [math.inf, 1, math.inf, 1]
+        half_a_second = [at for at in station.ticks if at > anyio.current_time() - 0.5]
+        assert len(half_a_second) > 20, "what is due is done all the same"
+        await anyio.sleep(0.6)
+        assert station.most_lists > 1, "that one was closed"
+        tasks.cancel_scope.cancel()
+
+
+@swiftly
+async def test_a_link_that_was_closed_leaves_nothing_behind_whichever_of_its_tasks_ends_last() -> None:
+    station = Watched()
+    station.bursts = lambda now: (event_loop_share.ENOUGH_LISTS, 0)  # type: ignore[method-assign]
+    for first in ("read", "send"):
+        tasks = {}
+        link = Carrier(Flood(), station, dispatch=lambda: None, end=lambda error: None)
+        for name in ("read", "send"):
+            tasks[name] = asyncio.create_task(getattr(link, name)())
+        await anyio.sleep(0.1)
+        readers = event_loop_share.Crowd.of_this_loop()
+        assert readers.most_lists("another", 0, anyio.current_time()) == 1
+        for name in (first, *({*tasks} - {first})):
+            tasks[name].cancel()
+            await anyio.sleep(0.1)
+        assert readers.most_lists("another", 0, anyio.current_time()) == math.inf
+
+
+class Portions(ParamCache):
+    """One that notes what it is given at once."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
+        self.given: list[dict[int, int]] = []
+
+    def save(self, update: object, *, clock: Callable[[], float] | None = None) -> None:
+        assert isinstance(update, list)
+        updates: list[TableUpdate] = update
+        self.given.append({each.identity.system: len(each.params) for each in updates})
+        super().save(updates, clock=clock)
+
+
+@swiftly
+async def test_what_is_new_is_written_in_portions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """No transaction begins another table when it has enough: to gather one takes the loop's time."""
+    monkeypatch.setattr(cache_writer, "PORTION", 200)
+    monkeypatch.setattr(cache_writer, "FLUSH_INTERVAL", 1000.0)  # everything on closing
+    vehicles = [small(system) for system in range(1, 8)]
+    cache = Portions(tmp_path / "cache.sqlite3")
+    with cache:
+        async with ParamClient(Air.symmetric(vehicles), cache=cache) as client:
+            await client.fetch_all()
+            assert not cache.given
+        assert [sum(each.values()) for each in cache.given] == [300, 300, 300, 150]
+        assert sorted(system for each in cache.given for system in each) == [*range(1, 8)]
+        assert len(cache.components()) == 7
+
+
+class Busy(Tap):
+    """A vehicle that does nothing for a while when its parameters are asked for: it has others to see to.
+
+    Args:
+        vehicle: who is asked.
+        seconds: for so long it does not speak, from the first time on; half a second later it hears, too.
+        beats: whether its heartbeats come all the same.
+    """
+
+    def __init__(self, vehicle: Vehicle, seconds: float, *, beats: bool) -> None:
+        super().__init__(vehicle)
+        self._vehicle = vehicle
+        self._seconds = seconds
+        self._beats = beats
+        self._until: float | None = None
+        self._waiting: list[bytes] = []
+
+    def receive(self, data: bytes, now: float) -> None:
+        self.is_deaf = True
+        super().receive(data, now)
+        if self.messages(wire.ParamRequestList) and self._until is None:
+            self._until = now + self._seconds
+        self._waiting.append(data)
+        self.tick(now)
+
+    def tick(self, now: float) -> None:
+        until = -1.0 if self._until is None else self._until
+        self.is_mute = now < until and not self._beats
+        if now >= until + 0.5:
+            waiting, self._waiting = self._waiting, []
+            for data in waiting:
+                self._vehicle.receive(data, now)
+        super().tick(now)
+
+    def next_deadline(self) -> float | None:
+        deadline = super().next_deadline()
+        if not self._waiting or self._until is None:
+            return deadline
+        return min(self._until + 0.5, math.inf if deadline is None else deadline)
+
+
+@swiftly
+async def test_who_answers_no_sooner_than_others_is_waited_for() -> None:
+    """Where another one took a while as well, an answer that is late says nothing."""
+    vehicles = [Busy(small(1), 0.3, beats=True), Busy(small(2), 2.3, beats=True)]
+    async with ParamClient(Air.symmetric(vehicles), cache=False) as client:
+        everything = await client.fetch_all()
+        assert everything.complete
+        assert everything.results.keys() == {(1, 1), (2, 1)}
+
+
+@swiftly
+async def test_who_is_not_heard_at_all_for_a_while_is_waited_for() -> None:
+    """It owes its heartbeats as well, and is not lost."""
+    vehicles: list[Endpoint] = [small(1), *(Busy(small(system), 3.5, beats=False) for system in (2, 3))]
+    async with ParamClient(Air.symmetric(vehicles), cache=False) as client:
+        everything = await client.fetch_all()
+        assert everything.complete
+        assert everything.results.keys() == {(1, 1), (2, 1), (3, 1)}
+
+
+@pytest.mark.parametrize("few", [0, 8])
+@pytest.mark.parametrize("seconds", [5, 40])
+@swiftly
+async def test_tables_that_are_fetched_in_numbers_are_written_once_or_in_growing_parts(
+    tmp_path: Path, seconds: int, few: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each part costs as much as all of the table: so half of it must be new."""
+    monkeypatch.setattr(cache_writer, "FEW_FETCHES", few)
+    vehicles: list[Vehicle] = []
+    for system in range(1, 13):
+        table = [SimParam(f"P_{index:03}", ParamType.INT32, index) for index in range(200)]
+        vehicles.append(PX4Vehicle(system=system, table=table, burst=1, period=seconds / 200))
+    cache = Portions(tmp_path / "cache.sqlite3")
+    with cache:
+        async with ParamClient(Air.symmetric(vehicles), cache=cache) as client:
+            assert (await client.fetch_all()).complete
+    for system in range(1, 13):
+        sizes = [each[system] for each in cache.given if each.get(system)]
+        assert sizes[-1] == 200, "all of it, when it was fetched"
+        parts = sizes[:-1]
+        assert bool(parts) == (seconds > DOWNLOAD_INTERVAL)
+        for number, part in enumerate(parts):
+            assert part >= LEAST_NEW * sum(parts[: number + 1])

@@ -1,0 +1,766 @@
+"""Signing as users have it: keys, timestamps over restarts, clients, commands, and what never shows."""
+
+from __future__ import annotations
+
+import base64
+import logging
+import os
+import pty
+import re
+import select
+import signal
+import subprocess
+import sys
+import traceback
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import anyio
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+import paramclient
+from paramclient import (
+    NoReply,
+    ParamClient,
+    Refusal,
+    Signing,
+    SigningKey,
+    SigningPolicy,
+    UsageError,
+    key_from_environment,
+    read_key,
+)
+from paramclient.cli import connection, run
+from paramclient.cli import signing as signing_commands
+from paramclient.client import signing, signing_timestamps
+from paramclient.client.signing_timestamps import LOOK_INTERVAL, RESERVED, TimestampFile, TimestampKeeper
+from paramclient.links import SimLink
+from paramclient.sim import ArduPilotVehicle, Vehicle
+from tests.shell import VALUES, Tap, small_px4, swift_loop, swiftly
+
+SECRET = bytes(range(101, 133))
+KEY = SigningKey(SECRET)
+OTHER_KEY = SigningKey(bytes(range(1, 33)))
+NOW = 36_000_000_000_000
+PATIENCE = 60.0
+
+FORMS = [SECRET, SECRET.hex().encode(), SECRET.hex().upper().encode(), base64.b64encode(SECRET)]
+FORMS += [repr(SECRET)[2:-1].encode(), ", ".join(map(str, SECRET[:8])).encode()]
+"""How the key could show."""
+
+
+@pytest.fixture(autouse=True)
+def state(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The folder of the user's state, empty; and an environment without a key."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    for name in ("KEY", "KEY_FILE", "PASSPHRASE"):
+        monkeypatch.delenv(f"PARAMCLIENT_SIGNING_{name}", raising=False)
+    return tmp_path / "state" / "paramclient" / "signing"
+
+
+@pytest.fixture
+def key_file(tmp_path: Path) -> Path:
+    return a_file(tmp_path / "vehicle.key", SECRET.hex().encode() + b"\n")
+
+
+def a_file(path: Path, data: bytes, mode: int = 0o600) -> Path:
+    path.write_bytes(data)
+    path.chmod(mode)
+    return path
+
+
+def a_client(link: Any, **options: Any) -> ParamClient:
+    given: dict[str, Any] = {"cache": False, "signing": KEY} | options
+    return ParamClient(link, **given)
+
+
+def signed_vehicle(**options: Any) -> Vehicle:
+    return small_px4(**{"signing_key": KEY} | options)
+
+
+# Keys
+
+
+@pytest.mark.parametrize(
+    "data",
+    [SECRET, SECRET.hex().encode(), b"\n " + SECRET.hex().upper().encode() + b"\r\n", FORMS[3] + b"\n"],
+)
+def test_a_file_holds_a_key_as_it_is_or_as_text(tmp_path: Path, data: bytes) -> None:
+    assert read_key(a_file(tmp_path / "key", data)) == KEY
+
+
+@pytest.mark.parametrize("mode", [0o644, 0o640, 0o604, 0o620, 0o601])
+def test_a_key_that_others_can_get_at_is_refused(tmp_path: Path, mode: int) -> None:
+    path = a_file(tmp_path / "key", SECRET, mode)
+    with pytest.raises(UsageError, match=rf"key: others than its owner .* \(mode {mode:o}\); `chmod 600`"):
+        read_key(path)
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root can give files away")
+def test_a_key_of_another_user_is_refused_also_for_root(tmp_path: Path) -> None:
+    path = a_file(tmp_path / "key", SECRET)
+    os.chown(path, 12345, 0)
+    (tmp_path / "link").symlink_to(path)
+    for named in (path, tmp_path / "link"):
+        with pytest.raises(UsageError, match=r"this signing key belongs to another user \(id 12345\)"):
+            read_key(named)
+    os.chown(path, 0, 0)
+    assert read_key(tmp_path / "link") == KEY
+
+
+@pytest.mark.parametrize(
+    "data", [b"", b"hunter2-hunter2", SECRET[:31], SECRET + b"\n", b"\xff" * 44, bytes(32), b"ab" * 600]
+)
+def test_a_file_without_a_key_is_named_and_not_quoted(tmp_path: Path, data: bytes) -> None:
+    path = a_file(tmp_path / "no.key", data)
+    with pytest.raises(UsageError) as caught:
+        read_key(path)
+    assert str(caught.value).startswith(f"{path}: a signing key ")
+    shown = "".join(traceback.format_exception(caught.value))
+    assert not data or data.decode("latin-1") not in shown
+    assert caught.value.__cause__ is None
+    assert caught.value.__suppress_context__
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"nowhere: the signing key cannot be read: No such file"):
+        read_key(tmp_path / "nowhere")
+
+
+def test_the_environment_names_a_key_in_one_of_three_ways(key_file: Path) -> None:
+    assert key_from_environment({}) is None
+    assert key_from_environment({"PARAMCLIENT_SIGNING_KEY": ""}) is None
+    assert key_from_environment({"PARAMCLIENT_SIGNING_KEY": SECRET.hex()}) == KEY
+    assert key_from_environment({"PARAMCLIENT_SIGNING_KEY": FORMS[3].decode()}) == KEY
+    assert key_from_environment({"PARAMCLIENT_SIGNING_KEY_FILE": str(key_file)}) == KEY
+    by_words = key_from_environment({"PARAMCLIENT_SIGNING_PASSPHRASE": "my words"})
+    assert by_words == SigningKey.from_passphrase("my words")
+    both = {"PARAMCLIENT_SIGNING_KEY": SECRET.hex(), "PARAMCLIENT_SIGNING_PASSPHRASE": "my words"}
+    with pytest.raises(UsageError, match="KEY and PARAMCLIENT_SIGNING_PASSPHRASE"):
+        key_from_environment(both)
+    with pytest.raises(UsageError, match=r"^PARAMCLIENT_SIGNING_KEY: a signing key in text") as caught:
+        key_from_environment({"PARAMCLIENT_SIGNING_KEY": "hunter2-hunter2"})
+    assert "hunter2" not in str(caught.value)
+
+
+def test_what_cannot_be_is_refused_when_it_is_said() -> None:
+    assert Signing(KEY, "signed-only").policy == SigningPolicy.SIGNED_ONLY
+    with pytest.raises(
+        UsageError, match="no signing policy 'none', only signed-only, unsigned-radios, accept"
+    ):
+        Signing(KEY, "none")
+    for link_id in (-1, 256):
+        with pytest.raises(UsageError, match=f"0 to 255, not {link_id}"):
+            Signing(KEY, link_id=link_id)
+
+
+# Timestamps
+
+
+def test_each_session_has_the_lowest_link_id_that_is_free(state: Path) -> None:
+    files = [TimestampFile(state, KEY.fingerprint, None) for _ in range(3)]
+    assert [(file.claim(), file.link_id) for file in files] == [(0, 0), (0, 1), (0, 2)]
+    others = TimestampFile(state, OTHER_KEY.fingerprint, None)
+    others.claim()
+    assert others.link_id == 0
+    files[1].write(NOW)
+    files[1].release()
+    again = TimestampFile(state, KEY.fingerprint, None)
+    assert (again.claim(), again.link_id) == (NOW, 1)
+    wanted = TimestampFile(state, KEY.fingerprint, 2)
+    with pytest.raises(UsageError, match="link id 2 of this signing key is in use by other sessions"):
+        wanted.claim()
+    for file in (*files, again, others):
+        file.release()
+    assert wanted.claim() == 0
+    wanted.release()
+
+
+def test_all_link_ids_in_use_is_said(state: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(signing_timestamps, "LINK_IDS", 2)
+    files = [TimestampFile(state, KEY.fingerprint, None) for _ in range(3)]
+    for file in files[:2]:
+        file.claim()
+    with pytest.raises(UsageError, match="every link id"):
+        files[2].claim()
+    for file in files:
+        file.release()
+
+
+def test_another_process_keeps_its_link_id_until_it_ends(state: Path) -> None:
+    program = (
+        "import sys; from pathlib import Path\n"
+        "from paramclient.client.signing_timestamps import TimestampFile\n"
+        f"file = TimestampFile(Path({str(state)!r}), {KEY.fingerprint!r}, None); file.claim()\n"
+        "print(file.link_id, flush=True); sys.stdin.read()"
+    )
+    file = TimestampFile(state, KEY.fingerprint, None)
+    with subprocess.Popen(
+        [sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as other:
+        assert other.stdout is not None
+        assert other.stdout.readline() == "0\n"
+        file.claim()
+        assert file.link_id == 1
+        file.release()
+        other.kill()
+    file = TimestampFile(state, KEY.fingerprint, None)
+    file.claim()
+    assert file.link_id == 0
+    file.release()
+
+
+def test_what_is_written_is_whole_private_and_no_key(state: Path) -> None:
+    file = TimestampFile(state, KEY.fingerprint, 7)
+    file.claim()
+    file.write(NOW)
+    file.write(NOW + 1)
+    file.release()
+    names = {path.name for path in state.iterdir()}
+    assert names == {f"{KEY.fingerprint}-7.lock", f"{KEY.fingerprint}-7.timestamp"}
+    assert (state / f"{KEY.fingerprint}-7.timestamp").read_text() == f"{NOW + 1}\n"
+    assert {path.stat().st_mode & 0o777 for path in state.iterdir()} == {0o600}
+    assert state.stat().st_mode & 0o777 == 0o700
+
+
+@pytest.mark.parametrize("text", ["", "soon", "-5", "9" * 30, "\xff"])
+def test_a_damaged_file_is_told_and_the_time_of_day_counts(
+    state: Path, text: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = TimestampFile(state, KEY.fingerprint, 0)
+    file.claim()
+    (state / f"{KEY.fingerprint}-0.timestamp").write_text(text, encoding="latin-1")
+    file.release()
+    assert file.claim() == 0
+    assert "holds no timestamp" in caplog.text
+    file.release()
+
+
+def in_session(use: Callable[[Any], None], *, crashes: bool = False, **options: Any) -> None:
+    """A session of the keeper alone."""
+
+    async def live() -> None:
+        keeper = TimestampKeeper(Signing(KEY, **options))
+        signer, _ = await keeper.open()
+        use(signer)
+        await keeper._keep()
+        if crashes:
+            keeper._signer = None  # nothing is written at the end; the lock goes with the process
+        await keeper.close()
+
+    anyio.run(live)
+
+
+class Clock:
+    """The system's clock, which somebody sets."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = NOW
+        for module in (signing, signing_timestamps):
+            monkeypatch.setattr(module, "timestamp_now", lambda: self.now)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    return Clock(monkeypatch)
+
+
+@settings(max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    sessions=st.lists(
+        st.tuples(st.integers(-(10**9), 10**9), st.integers(0, 10**8), st.booleans()), min_size=2, max_size=5
+    ),
+    number=st.uuids(),
+)
+def test_no_timestamp_is_used_twice_whatever_clock_and_crashes_do(
+    tmp_path: Path, clock: Clock, sessions: list[tuple[int, int, bool]], number: object
+) -> None:
+    used = [0]
+    for offset, length, crashes in sessions:
+        clock.now = NOW + offset
+
+        def use(signer: Any, length: int = length) -> None:
+            signer.sign(b"")
+            assert signer.timestamp > used[-1]
+            assert signer.timestamp > clock.now
+            signer.catch_up(signer.timestamp + length)
+            signer.sign(b"")
+            used.append(signer.timestamp)
+
+        in_session(use, crashes=crashes, state=tmp_path / str(number))
+
+
+def test_after_a_good_end_nothing_is_skipped(clock: Clock) -> None:
+    last = []
+    for _ in range(3):
+        in_session(lambda signer: last.append(signer.timestamp))
+    assert last == [NOW, NOW, NOW]
+    in_session(lambda signer: signer.catch_up(NOW + 5))
+    in_session(lambda signer: last.append(signer.timestamp))
+    assert last[-1] == NOW + 5
+
+
+def test_after_a_crash_at_most_a_minute_is_skipped(clock: Clock) -> None:
+    in_session(lambda signer: signer.catch_up(NOW + 5), crashes=True)
+    last = []
+    in_session(lambda signer: last.append(signer.timestamp))
+    assert NOW + 5 < last[0] <= NOW + 5 + RESERVED
+
+
+@swiftly
+async def test_timestamps_are_written_ahead_and_seldom(
+    state: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    written: list[int] = []
+    write = TimestampFile.write
+
+    def note(file: TimestampFile, timestamp: int) -> None:
+        written.append(timestamp)
+        write(file, timestamp)
+
+    monkeypatch.setattr(TimestampFile, "write", note)
+
+    class Wire(Tap):
+        """Sees every frame that goes to the vehicle."""
+
+        frames = 0
+
+        def receive(self, data: bytes, now: float) -> None:
+            self.frames += 1
+            assert int.from_bytes(data[-12:-6], "little") <= written[-1]
+            super().receive(data, now)
+
+    wire = Wire(signed_vehicle(signing_timestamp=NOW))
+    async with a_client(wire) as client:
+        vehicle = await client.component()
+        await vehicle.fetch_all()
+        await anyio.sleep(600.0)
+        assert wire.frames > 600
+        assert len(written) <= 600 * 100_000 / (RESERVED // 2) + 2
+        assert client.signing_report() is not None
+    assert written[-1] - NOW == pytest.approx(600 * 100_000, rel=0.05)
+    assert (state / f"{KEY.fingerprint}-0.timestamp").read_text() == f"{written[-1]}\n"
+
+
+@swiftly
+async def test_a_folder_that_cannot_be_used_is_told_and_costs_no_session(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    file = a_file(tmp_path / "file", b"")
+    async with a_client(signed_vehicle(), signing=Signing(KEY, state=file)) as client:
+        vehicle = await client.component()
+        assert (await vehicle.fetch_all()).complete
+        await anyio.sleep(3 * LOOK_INTERVAL)
+    assert len(caplog.records) == 1
+    assert "the timestamps of signatures cannot be kept (Not a directory)" in caplog.text
+
+
+@swiftly
+async def test_a_disk_that_fails_later_is_told_once(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with a_client(signed_vehicle()) as client:
+        await client.component()
+
+        def fail(*_: object) -> None:
+            raise OSError(28, "No space left on device")
+
+        monkeypatch.setattr(TimestampFile, "write", fail)
+        await anyio.sleep(300.0)
+        assert await (await client.component()).get("PARAM_04")
+    assert [record.levelname for record in caplog.records] == ["WARNING"]
+    assert "No space left on device" in caplog.text
+
+
+# Clients
+
+
+@swiftly
+async def test_a_signed_client(state: Path) -> None:
+    vehicle = signed_vehicle()
+    async with a_client(vehicle) as client, a_client(signed_vehicle()) as other:
+        component = await client.component()
+        assert dict((await component.fetch_all()).params).keys() == vehicle.params.keys()
+        assert (await component.set("PARAM_04", 44)).actual == 44
+        assert vehicle.param("PARAM_04").value == 44
+        report = client.signing_report()
+        assert report is not None
+        assert (report.fingerprint, report.policy) == (KEY.fingerprint, "unsigned-radios")
+        assert report.signed > 10
+        assert [(each.system, each.component, each.link_id) for each in report.streams] == [(1, 1, 0)]
+        beside = other.signing_report()
+        assert beside is not None
+        assert (report.link_id, beside.link_id) == (0, 1)
+    async with ParamClient(small_px4(), cache=False) as unsigned:
+        assert unsigned.signing_report() is None
+
+
+@swiftly
+async def test_a_link_id_of_ones_own_is_taken_once() -> None:
+    mine = Signing(KEY, link_id=9)
+    async with a_client(signed_vehicle(), signing=mine) as client:
+        report = client.signing_report()
+        assert report is not None
+        assert report.link_id == 9
+        second = a_client(signed_vehicle(), signing=mine)
+        with pytest.raises(UsageError, match="link id 9"):
+            await second.__aenter__()
+    async with a_client(signed_vehicle(), signing=mine) as client:
+        await client.component()
+
+
+@swiftly
+async def test_whoever_is_not_heard_for_signatures_is_told_so() -> None:
+    async with a_client(signed_vehicle(), signing=OTHER_KEY) as client:
+        with pytest.raises(NoReply, match=r"an autopilot \(frames were refused, [0-9]+ for: bad signature\)"):
+            await client.component(timeout=3.0)
+    async with a_client(small_px4()) as client:
+        with pytest.raises(NoReply, match=r"system id 1 \(frames were refused, [0-9]+ for: unsigned\) in"):
+            await client.component(1, timeout=3.0)
+        report = client.signing_report()
+        assert report is not None
+        assert report.refused.keys() == {Refusal.UNSIGNED}
+
+
+@swiftly
+async def test_a_key_is_given_only_where_somebody_says_that_the_link_is_safe() -> None:
+    vehicle = ArduPilotVehicle(table=VALUES)
+    async with a_client(vehicle, signing=None) as client:
+        component = await client.component()
+        with pytest.raises(UsageError, match="carries the key in clear"):
+            await component.setup_signing(KEY)
+        assert vehicle.requests["SETUP_SIGNING"] == 0
+        await component.setup_signing(KEY, link_is_safe=True)
+    assert vehicle.signing_key == KEY
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        assert (await component.fetch_all()).complete
+        await component.setup_signing(None, link_is_safe=True)
+    assert vehicle.signing_key is None
+
+
+@swiftly
+async def test_a_vehicle_of_mavlink_1_is_given_no_key() -> None:
+    vehicle = small_px4(mavlink_version=1)
+    async with a_client(vehicle, signing=None) as client:
+        with pytest.raises(UsageError, match="1/1 speaks MAVLink 1"):
+            await (await client.component()).setup_signing(KEY, link_is_safe=True)
+
+
+@swiftly
+async def test_where_all_is_accepted_old_vehicles_are_answered_unsigned() -> None:
+    vehicle = small_px4(mavlink_version=1)
+    async with a_client(vehicle, signing=Signing(KEY, SigningPolicy.ACCEPT_ALL)) as client:
+        component = await client.component()
+        assert (await component.fetch_all()).complete
+        report = client.signing_report()
+        assert report is not None
+        assert (report.signed, report.unsigned > 20) == (0, True)
+
+
+# What never shows
+
+
+def test_the_key_shows_nowhere(
+    tmp_path: Path, state: Path, caplog: pytest.LogCaptureFixture, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A life with everything in it; then all that was written is looked through."""
+    caplog.set_level(logging.DEBUG)
+    shown: list[str] = []
+    cache = tmp_path / "cache.sqlite3"
+
+    @swiftly
+    async def live() -> None:
+        vehicle = small_px4()
+        async with a_client(vehicle, signing=None, cache=cache) as client:
+            component = await client.component()
+            await component.setup_signing(KEY, link_is_safe=True)
+        settings = Signing(KEY)
+        async with a_client(vehicle, signing=settings, cache=cache) as client:
+            component = await client.component()
+            await component.fetch_all()
+            await component.set("PARAM_04", 3)
+            for each in (client, client.signing_report(), component, settings, vehicle.signing_report):
+                shown.extend([repr(each), str(each)])
+            shown.append(repr({name: repr(value) for name, value in vars(client).items()}))
+            for call in (
+                component.setup_signing(OTHER_KEY),
+                component.get("NO_SUCH_NAME", timeout=1.0),
+                component.set("NO_SUCH_NAME", 1, timeout=1.0),
+                a_client(vehicle, signing=Signing(KEY, link_id=0)).__aenter__(),
+            ):
+                with pytest.raises(paramclient.ParamClientError) as caught:
+                    await call
+                shown.extend([repr(caught.value), *traceback.format_exception(caught.value)])
+            try:
+                raise RuntimeError
+            except RuntimeError as error:
+                told = traceback.TracebackException.from_exception(error, capture_locals=True)
+                shown.extend(told.format())
+
+    live()
+    printed = capsys.readouterr()
+    written = [path.read_bytes() for path in tmp_path.rglob("*") if path.is_file()]
+    assert len(written) >= 3
+    assert any(KEY.fingerprint in text for text in shown)
+    everything = [*shown, caplog.text, printed.out, printed.err]
+    for data in [*written, *(text.encode("utf-8", "surrogateescape") for text in everything)]:
+        assert not any(form in data for form in FORMS)
+
+
+# The command
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Callable[[Vehicle], str]:
+    """Puts a vehicle behind every link that a command opens; gives a link's name."""
+
+    def place(vehicle: Vehicle) -> str:
+        link = SimLink(vehicle)
+
+        def client(_: object, **options: Any) -> ParamClient:
+            return ParamClient(link, **options)
+
+        monkeypatch.setattr(connection, "ParamClient", client)
+        monkeypatch.setattr(signing_commands, "create_link", lambda _: link)
+        return "sim:custom"
+
+    return place
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str]) -> Callable[..., tuple[int, str, str]]:
+    """Runs commands in this process, one after the other, in one simulated time."""
+    now = 1000.0
+
+    def run_swiftly(work: Callable[..., Any], *given: Any) -> Any:
+        async def go_on() -> Any:
+            nonlocal now
+            swift_loop().now = now
+            try:
+                return await work(*given)
+            finally:
+                now = swift_loop().now
+
+        return swiftly(go_on)()
+
+    def call(*arguments: object) -> tuple[int, str, str]:
+        with mock.patch.object(anyio, "run", run_swiftly):
+            code = run([str(argument) for argument in arguments])
+        printed = capsys.readouterr()
+        return code, printed.out, printed.err
+
+    return call
+
+
+Command = Callable[..., tuple[int, str, str]]
+
+
+def test_commands_sign_with_the_key_of_a_file_or_the_environment(
+    put: Callable[[Vehicle], str],
+    key_file: Path,
+    command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    url = put(signed_vehicle())
+    get = ("get", url, "PARAM_04", "--json", "--no-cache")
+    code, out, err = command(*get, "--signing-key", key_file, "--signing-policy", "signed-only")
+    assert (code, err) == (0, "")
+    assert '"PARAM_04"' in out
+    monkeypatch.setenv("PARAMCLIENT_SIGNING_KEY_FILE", str(key_file))
+    assert command(*get)[0] == 0
+    monkeypatch.delenv("PARAMCLIENT_SIGNING_KEY_FILE")
+    assert command(*get, "--timeout", 1)[0] == 3
+    key_file.chmod(0o644)
+    code, out, err = command(*get, "--signing-key", key_file)
+    assert (code, out) == (2, "")
+    assert err.count("\n") == 1
+    assert "others than its owner" in err
+    code, _, err = command(*get, "--signing-passphrase", "--signing-key", key_file)
+    assert (code, "exclude each other" in err) == (2, True)
+    code, _, err = command(*get, "--signing-passphrase")
+    assert (code, "no terminal" in err) == (2, True)
+
+
+def test_link_tells_of_signatures(put: Callable[[Vehicle], str], key_file: Path, command: Command) -> None:
+    url = put(signed_vehicle(signing_timestamp=signing.timestamp_now()))
+    code, out, _ = command("link", url, "--seconds", 0.3, "--signing-key", key_file)
+    assert code == 0
+    assert re.search(rf"key {KEY.fingerprint}: [1-9][0-9]* frames proven", out)
+    code, out, _ = command("link", put(small_px4()), "--seconds", 0.3, "--signing-key", key_file)
+    assert code == 0
+    assert re.search(r": 0 frames proven, [1-9][0-9]* refused: unsigned\n", out)
+
+
+def test_setup_and_disable_with_their_proof(
+    put: Callable[[Vehicle], str], key_file: Path, command: Command
+) -> None:
+    vehicle = small_px4()
+    url = put(vehicle)
+    keyed = ("--signing-key", key_file)
+    code, out, err = command("signing", "setup", url, *keyed, "--link-is-safe")
+    assert (code, out, err) == (0, f"1/1 px4 signs with the key {KEY.fingerprint} now\n", "")
+    assert vehicle.signing_key == KEY
+    code, out, err = command("signing", "disable", url, "--link-is-safe", "--timeout", 2)
+    assert (code, out) == (1, "")
+    assert "does not answer what is not signed" in err
+    assert vehicle.signing_key == KEY
+    code, out, err = command("signing", "disable", url, *keyed, "--link-is-safe", "--json")
+    assert (code, err) == (0, "")
+    assert out == ('{"system": 1, "component": 1, "autopilot": "px4", "signs": false, "fingerprint": null}\n')
+    assert vehicle.signing_key is None
+
+
+def test_the_steps_are_told_without_the_key(
+    put: Callable[[Vehicle], str], key_file: Path, command: Command
+) -> None:
+    words = ("--signing-key", key_file, "--link-is-safe", "--verbose")
+    code, _, err = command("signing", "setup", put(small_px4()), *words)
+    assert code == 0
+    assert "protocol: to system 1: SetupSigning\n" in err
+    secret = KEY.secret
+    assert not any(each in err for each in (secret.hex(), repr(secret), str(list(secret)), secret.hex(" ")))
+
+
+def test_a_key_is_changed_with_the_one_before(
+    put: Callable[[Vehicle], str], key_file: Path, tmp_path: Path, command: Command
+) -> None:
+    vehicle = signed_vehicle()
+    setup = ("signing", "setup", put(vehicle), "--link-is-safe", "--timeout", 4, "--signing-key")
+    fresh = a_file(tmp_path / "fresh.key", base64.b64encode(OTHER_KEY.secret))
+    code, _, err = command(*setup, fresh)
+    assert (code, "1/1 does not answer what is signed with the key" in err) == (1, True)
+    code, out, err = command(*setup, fresh, "--present-key", key_file)
+    assert (code, err) == (0, "")
+    assert OTHER_KEY.fingerprint in out
+    assert vehicle.signing_key == OTHER_KEY
+
+
+def test_a_vehicle_that_does_not_obey_is_found_out(
+    put: Callable[[Vehicle], str],
+    key_file: Path,
+    command: Command,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Firmware without signing, and one that takes no orders over this link."""
+    deaf = small_px4()
+    monkeypatch.setattr(deaf, "_take_key", lambda *_: None)
+    code, out, err = command("signing", "setup", put(deaf), "--signing-key", key_file, "--link-is-safe")
+    assert (code, out) == (1, "")
+    assert "1/1 answers, but what it sends is not signed with the key" in err
+    stubborn = signed_vehicle(usb=True)
+    monkeypatch.setattr(stubborn, "_take_key", lambda *_: None)
+    code, out, err = command("signing", "disable", put(stubborn), "--link-is-safe")
+    assert (code, out) == (1, "")
+    assert "1/1 goes on to sign" in err
+
+
+def test_nothing_is_sent_before_the_link_is_said_to_be_safe(
+    put: Callable[[Vehicle], str], key_file: Path, command: Command
+) -> None:
+    vehicle = small_px4()
+    url = put(vehicle)
+    for arguments in (("setup", url, "--signing-key", key_file), ("disable", url)):
+        code, out, err = command("signing", *arguments)
+        assert (code, out) == (2, "")
+        assert "say --link-is-safe" in err
+    code, _, err = command("signing", "setup", url, "--link-is-safe")
+    assert (code, "which key?" in err) == (2, True)
+    assert vehicle.requests == {}
+
+
+class Terminal:
+    """The command at a terminal where somebody types."""
+
+    def __init__(self, *arguments: object, **environment: str) -> None:
+        self.ours, theirs = pty.openpty()
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "paramclient", *map(str, arguments)],
+            stdin=theirs,
+            stdout=theirs,
+            stderr=theirs,
+            start_new_session=True,
+            env={**os.environ, "TERM": "dumb", **environment},
+            cwd=Path(__file__).parents[2],
+            # whoever starts the tests in the background may have Ctrl-C ignored in all that they start
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+        )
+        os.close(theirs)
+        self.seen = b""
+
+    def until(self, text: bytes) -> None:
+        while text not in self.seen:
+            assert select.select([self.ours], [], [], PATIENCE)[0], self.seen
+            try:
+                self.seen += os.read(self.ours, 65536)
+            except OSError:
+                break
+        assert text in self.seen, self.seen
+
+    def type(self, text: bytes) -> None:
+        os.write(self.ours, text)
+
+    def interrupt(self) -> None:
+        """Ctrl-C until it is heeded: one between the prompt and the reading has to wait for a key."""
+        for _ in range(int(PATIENCE)):
+            self.process.send_signal(signal.SIGINT)
+            with suppress(subprocess.TimeoutExpired):
+                self.process.wait(1.0)
+                return
+
+    def close(self) -> int:
+        try:
+            while select.select([self.ours], [], [], PATIENCE)[0]:
+                self.seen += os.read(self.ours, 65536)
+        except OSError:
+            pass
+        try:
+            return self.process.wait(PATIENCE)
+        finally:
+            self.process.kill()
+            os.close(self.ours)
+
+
+@pytest.fixture
+def terminal() -> Iterator[Callable[..., Terminal]]:
+    opened: list[Terminal] = []
+
+    def open_one(*arguments: object, **environment: str) -> Terminal:
+        opened.append(Terminal(*arguments, **environment))
+        return opened[-1]
+
+    yield open_one
+    for each in opened:
+        if each.process.poll() is None:
+            each.process.kill()
+            each.process.wait()
+
+
+def test_a_passphrase_is_typed_unseen_and_the_link_confirmed(terminal: Callable[..., Terminal]) -> None:
+    setup = terminal("signing", "setup", "sim:ardupilot", "--signing-passphrase")
+    setup.until(b"Signing passphrase: ")
+    setup.type("Schlüssel ✈\n".encode())
+    setup.until(b"sim:ardupilot in clear. Is it sure that nobody else can listen or send there? [y/N] ")
+    setup.type(b"yes\n")
+    setup.until(b"now")
+    assert setup.close() == 0
+    key = SigningKey.from_passphrase("Schlüssel ✈")
+    assert f"1/1 ardupilot signs with the key {key.fingerprint} now".encode() in setup.seen
+    assert b"Schl" not in setup.seen
+
+
+def test_whoever_is_not_sure_sends_nothing(terminal: Callable[..., Terminal]) -> None:
+    refused = terminal("signing", "setup", "sim:px4", PARAMCLIENT_SIGNING_KEY=SECRET.hex())
+    refused.until(b"[y/N] ")
+    refused.type(b"\n")
+    assert refused.close() == 2
+    assert b"nothing was sent" in refused.seen
+    ended = terminal("signing", "setup", "sim:px4", "--signing-passphrase")
+    ended.until(b"Signing passphrase: ")
+    ended.interrupt()
+    assert ended.close() == 130

@@ -1,0 +1,273 @@
+"""Suspend and resume: the computer sleeps, and vehicles go on without us."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+from collections.abc import Callable
+
+import anyio
+import pytest
+
+from paramclient import Component, Event, Events, Lost, NoReply, Rebooted, Resynced, SyncState, Trust
+from paramclient.client import suspend_detection
+from paramclient.client.suspend_detection import STANDSTILL, Standstill, time_asleep
+from paramclient.protocol.vehicle.presence import Presence
+from paramclient.protocol.wire import ParamSet, SystemTime
+from paramclient.sim import Air, Endpoint
+from tests.shell import FlakyLink, Tap, a_client, bits, generic, small_px4, swift_loop, swiftly, until
+
+HOURS = 3 * 3600.0
+
+Sleep = Callable[[float], None]
+
+
+@pytest.fixture(params=["the clock goes on", "the clock stands still"])
+def sleep(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Sleep:
+    """What a suspended computer looks like from inside, on Windows and on the others."""
+    asleep = 0.0
+    monkeypatch.setattr(suspend_detection, "time_asleep", lambda: asleep)
+
+    def fall_asleep(seconds: float) -> None:
+        nonlocal asleep
+        if request.param == "the clock goes on":
+            swift_loop().now += seconds
+        else:
+            asleep += seconds
+
+    return fall_asleep
+
+
+class Berth(Tap):
+    """An address that one vehicle takes after the other."""
+
+    def moor(self, vehicle: Endpoint) -> None:
+        self._endpoint = vehicle
+
+
+def drained(events: Events) -> list[Event]:
+    waiting = list(events._waiting)
+    events._waiting.clear()
+    return waiting
+
+
+def trusts(component: Component) -> set[Trust]:
+    return {param.trust for param in component.params.values()}
+
+
+@swiftly
+async def test_what_moved_meanwhile_is_found_and_nobody_is_lost(sleep: Sleep) -> None:
+    tap = Tap(vehicle := small_px4())
+    async with a_client(tap) as client:
+        component = await client.component()
+        await component.fetch_all()
+        await anyio.sleep(10.0)
+        events = client.events()
+        tap.is_mute = True  # the radio wakes up later
+        vehicle.set_param("PARAM_01", 1001)
+        sleep(HOURS)
+        await until(lambda: component.sync_state is SyncState.CHECKING)
+        assert trusts(component) == {Trust.CACHED}
+        await anyio.sleep(1.2)
+        tap.is_mute = False
+        await anyio.sleep(6.0)
+        assert drained(events) == [Resynced(component, ("PARAM_01",), vehicle.announced_hash())]
+        assert bits(component.params) == bits(vehicle.params)
+        assert Trust.CACHED not in trusts(component)
+
+
+@swiftly
+async def test_calls_that_wait_are_asked_again(sleep: Sleep) -> None:
+    tap = Tap(vehicle := small_px4())
+    async with a_client(tap) as client, asyncio.TaskGroup() as tasks:
+        component = await client.component()
+        await component.fetch_all()
+        events = client.events()
+        tap.is_deaf = tap.is_mute = True
+        reading = tasks.create_task(component.get("PARAM_01"))
+        writing = tasks.create_task(component.set("PARAM_02", 22))
+        await anyio.sleep(0.1)
+        sleep(HOURS)
+        await anyio.sleep(2.5)  # the radio, too, wakes up only now
+        tap.is_deaf = tap.is_mute = False
+        assert (await reading).value == 1
+        assert (await writing).actual == 22
+        assert vehicle.params["PARAM_02"].value == 22
+        await anyio.sleep(5.0)
+        assert not any(isinstance(event, Lost) for event in drained(events))
+
+
+@pytest.mark.parametrize("at", [0.0, 0.2, 0.5])
+@swiftly
+async def test_a_fetch_that_is_under_way_goes_on(sleep: Sleep, at: float) -> None:
+    """The hash at the head of the list was announced before: it says nothing of what has moved since."""
+    tap = Tap(vehicle := small_px4(burst=1, period=0.04))
+    async with a_client(tap) as client, asyncio.TaskGroup() as tasks:
+        component = await client.component()
+        fetching = tasks.create_task(component.fetch_all())
+        await anyio.sleep(at)
+        tap.is_mute = True
+        vehicle.set_param("PARAM_00", 77)
+        sleep(HOURS)
+        woken = anyio.current_time()
+        await anyio.sleep(1.0)
+        tap.is_mute = False
+        assert (await fetching).complete
+        assert anyio.current_time() - woken < 10.0
+        for name, param in component.params.items():
+            assert param.trust is Trust.CACHED or param.bits == vehicle.params[name].bits
+        await anyio.sleep(15.0)
+        assert component.sync_state is SyncState.SYNCED
+        assert bits(component.params) == bits(vehicle.params)
+
+
+@swiftly
+async def test_a_write_does_not_reach_the_one_who_has_come_in_its_place(sleep: Sleep) -> None:
+    berth = Berth(small_px4(uid=1))
+    stranger = small_px4(uid=2)
+    async with a_client(berth) as client, asyncio.TaskGroup() as tasks:
+        component = await client.component()
+        await component.fetch_all()
+        berth.is_deaf = True
+        writing = tasks.create_task(_error_of(component, "PARAM_02", 22))
+        await anyio.sleep(0.1)
+        berth.heard.clear()
+        berth.moor(stranger)
+        berth.is_deaf = False
+        sleep(HOURS)
+        assert "another vehicle" in str(await writing)
+        assert berth.messages(ParamSet) == []
+        assert stranger.params["PARAM_02"].value == 2
+
+
+@swiftly
+async def test_nor_does_one_that_is_asked_for_before_anybody_has_noticed(sleep: Sleep) -> None:
+    berth = Berth(small_px4(uid=1))
+    async with a_client(berth) as client:
+        component = await client.component()
+        await component.fetch_all()
+        sleep(HOURS)
+        berth.moor(small_px4(uid=2))
+        assert "another vehicle" in str(await _error_of(component, "PARAM_02", 22))
+        assert berth.messages(ParamSet) == []
+
+
+@swiftly
+async def test_one_that_has_gone_is_lost_soon_and_without_a_storm(sleep: Sleep) -> None:
+    tap = Tap(small_px4())
+    async with a_client(tap) as client, asyncio.TaskGroup() as tasks:
+        component = await client.component()
+        await component.fetch_all()
+        events = client.events()
+        tap.is_deaf = tap.is_mute = True
+        reads = [tasks.create_task(_error_of(component, f"PARAM_{number:02}")) for number in range(20)]
+        await anyio.sleep(0.1)
+        tap.heard.clear()
+        sleep(HOURS)
+        woken = anyio.current_time()
+        async for event in events:
+            if isinstance(event, Lost):
+                break
+        assert 4.5 < anyio.current_time() - woken < 6.5
+        tries, others = 7, 40  # while it counts as present; heartbeats, and what identifies it
+        assert len(tap.heard) < 20 * tries + others, "twenty reads, each with its tries and none beside them"
+        for read in reads:
+            assert isinstance(await read, NoReply)
+        tap.heard.clear()
+        await anyio.sleep(60.0)
+        assert len(tap.heard) < 65, "our heartbeat, and nothing else"
+
+
+@swiftly
+async def test_a_vehicle_that_started_again_meanwhile(sleep: Sleep) -> None:
+    """Its clock tells less than before, and more than the seconds in which ours went."""
+    berth = Berth(small_px4(uid=1))
+    async with a_client(berth) as client:
+        component = await client.component()
+        await component.fetch_all()
+        await anyio.sleep(100.0)
+        events = client.events()
+        sleep(HOURS)
+        restarted = small_px4(uid=1)
+        restarted.tick(anyio.current_time() - 60.0)
+        restarted.data_to_send()
+        berth.moor(restarted)
+        await anyio.sleep(4.0)
+        told = drained(events)
+        assert Rebooted(component) in told
+
+
+@swiftly
+async def test_a_link_that_is_away_when_the_computer_falls_asleep(sleep: Sleep) -> None:
+    """What it comes back to was away for hours, though our clock may know of a second."""
+    vehicle = small_px4()
+    link = FlakyLink(Air.symmetric([vehicle], delay=0.05))
+    async with a_client(link) as client:
+        component = await client.component()
+        await component.fetch_all()
+        events = client.events()
+        await link.drop(stays_away=True)
+        await anyio.sleep(0.1)
+        vehicle.set_param("PARAM_01", 1001)
+        sleep(HOURS)
+        link.is_away = False
+        await until(lambda: component.state == "cached")
+        await anyio.sleep(5.0)
+        assert drained(events) == [Resynced(component, ("PARAM_01",), vehicle.announced_hash())]
+
+
+@swiftly
+async def test_a_short_nap_is_none(sleep: Sleep) -> None:
+    tap = Tap(generic())
+    async with a_client(tap) as client:
+        component = await client.component()
+        await component.fetch_all()
+        tap.heard.clear()
+        sleep(STANDSTILL - 0.1)
+        await anyio.sleep(3.0)
+        assert trusts(component) == {Trust.LIVE}
+        assert len(tap.heard) < 6, "heartbeats alone"
+
+
+async def _error_of(component: Component, name: str, value: float | None = None) -> Exception | None:
+    try:
+        await (component.get(name) if value is None else component.set(name, value))
+    except NoReply as error:
+        return error
+    return None
+
+
+# The clocks
+
+
+def test_who_is_late_by_much_was_away() -> None:
+    clock = Standstill()
+    assert clock.unseen(100.0) is None, "nothing was expected"
+    clock.expect(101.0)
+    assert clock.unseen(101.0 + STANDSTILL - 0.01) is None
+    assert clock.unseen(101.0 + STANDSTILL) == pytest.approx(0.0, abs=0.5)
+    assert clock.unseen(1000.0) is None, "that is known by now"
+
+
+def test_sleep_that_the_clock_leaves_out_is_told_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(suspend_detection, "time_asleep", lambda: 50.0)
+    clock = Standstill()
+    clock.expect(math.inf)
+    monkeypatch.setattr(suspend_detection, "time_asleep", lambda: 50.0 + HOURS)
+    assert clock.unseen(1.0) == HOURS
+    assert clock.unseen(1.0) is None
+
+
+def test_this_computer_is_awake() -> None:
+    assert math.isfinite(before := time_asleep())
+    assert time_asleep() - before < 1.0
+
+
+def test_time_that_the_clock_left_out_counts_for_a_vehicles_own_clock() -> None:
+    presence = Presence()
+    presence.heard(10.0)
+    assert not presence.system_time(SystemTime(0, 100_000_000), 10.0)
+    assert not presence.system_time(SystemTime(0, 3_600_000), 20.0), "an hour of ten seconds: an old message"
+    presence.age(HOURS)
+    assert presence.system_time(SystemTime(0, 3_600_000), 20.0)
+    assert presence.heard(20.0) == HOURS + 10.0

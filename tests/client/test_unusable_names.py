@@ -1,0 +1,185 @@
+"""Names that no parameter file can hold: dropped, counted, and in nobody's way."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from paramclient import ParamCache, ParamClient, UsageError
+from paramclient.cache import TableState
+from paramclient.errors import FileError
+from paramclient.files import FileForm, dumps, loads
+from paramclient.model.paramset import ParamSet as Parameters
+from paramclient.model.paramset import WrittenParam
+from paramclient.model.values import ParamType, is_portable_name
+from paramclient.protocol.wire import NO_INDEX, ParamError, ParamSet, ParamValue, encode
+from paramclient.sim import ArduPilotVehicle, GenericVehicle
+from tests.caches import stored, update
+from tests.commands import Command, Put, behind, in_process, leaping
+from tests.shell import swiftly
+from tests.simulation import PEER, Simulation, known, param_value
+
+UNUSABLE = [
+    "A\nB",
+    "A B",
+    "A\tB",
+    "\x1b[2J",
+    "A,B",
+    "#A",
+    "A;B",
+    "A=B",
+    "@A",
+    "/A",
+    "A:",
+    "\xb5\xdf",
+    "12",
+    "\x7f",
+]
+FORMS = [form for form in FileForm if form is not FileForm.PX4_SCRIPT]  # scripts are read only
+
+
+@pytest.fixture
+def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
+    """Runs the command in this process, on a clock that leaps."""
+    leaping(monkeypatch)
+    return in_process(capsys)
+
+
+@pytest.fixture
+def put(monkeypatch: pytest.MonkeyPatch) -> Put:
+    """Puts a simulated vehicle behind every URL; gives a URL."""
+    return behind(monkeypatch, "sim:px4")
+
+
+def say(session: Simulation, message: ParamValue | ParamSet | ParamError, system: int = 1) -> None:
+    """Let somebody say something under an address."""
+    session.station.receive(encode(message, system=system, component=1, sequence=0), PEER, session.now)
+
+
+def is_held(name: str, form: FileForm) -> bool:
+    """Whether a file of this form keeps a name."""
+    try:
+        data = dumps(Parameters({name: WrittenParam(name, 1.5, ParamType.REAL32)}, 1, 1), form=form)
+        return name in loads(data, form=form).sets[0]
+    except FileError:
+        return False
+
+
+@pytest.mark.parametrize("shape", ["{}", "A{}B", "{}AB", "AB{}"])
+def test_a_name_is_portable_if_every_form_of_file_holds_it(shape: str) -> None:
+    names = [shape.format(chr(number)) for number in range(1, 256)]
+    portable = [name for name in names if is_portable_name(name)]
+    assert portable == [name for name in names if all(is_held(name, form) for form in FORMS)]
+    assert len(portable) > 50
+
+
+def test_a_portable_name_has_1_to_16_characters() -> None:
+    assert [is_portable_name(name) for name in ("", "A", "A" * 16, "A" * 17)] == [False, True, True, False]
+
+
+@pytest.mark.parametrize("name", UNUSABLE)
+def test_what_is_said_under_such_a_name_is_dropped_and_counted(name: str) -> None:
+    session = Simulation(
+        vehicle := GenericVehicle({"A": (ParamType.REAL32, 1.0), "B": (ParamType.REAL32, 2.0)})
+    )
+    session.fetch()
+    say(session, param_value(name, 5.0, index=NO_INDEX, count=2))
+    say(session, param_value(name, 5.0, index=0, count=7))
+    say(session, ParamError(*session.station.own, name, -1, 1))
+    say(session, ParamSet(1, 1, name, bytes(4), 9), system=254)
+    table = session.machine.table
+    assert ([*table.params], table.count, table.left_out, table.left_out_name) == (["A", "B"], 2, 4, name)
+    result = session.fetch(refresh=True)
+    assert (result.complete, [*result.params], result.notes) == (True, [*vehicle.params], ())
+
+
+@pytest.mark.parametrize("ftp", [False, True])
+def test_a_vehicle_with_such_a_name_is_fetched_but_for_its_index(ftp: bool) -> None:
+    odd = {"A": (ParamType.REAL32, 1.0), "B C": (ParamType.REAL32, 2.0), "D": (ParamType.REAL32, 3.0)}
+    session = Simulation(ArduPilotVehicle(table=odd, ftp=ftp))
+    result = session.fetch(limit=30)
+    assert (result.source, [*result.params], result.missing) == ("ftp" if ftp else "stream", ["A", "D"], (1,))
+    assert any("no parameter file can hold the name" in note and "'B C'" in note for note in result.notes)
+    assert not session.machine.table.complete
+    again = session.fetch(limit=30)
+    assert (again.missing, [*again.params]) == ((1,), ["A", "D"])
+
+
+def test_a_cached_list_with_such_a_name_is_downloaded_anew() -> None:
+    session = Simulation(GenericVehicle({"A": (ParamType.REAL32, 1.0), "B": (ParamType.REAL32, 2.0)}))
+    session.meet().use_cached(
+        {"A": known("A", 1.0, index=0), "A\nB": known("A\nB", 1.0, index=1)},
+        session.now,
+        count=2,
+        confirmed=5,
+        complete=True,
+        volatile=frozenset(),
+        volatile_known=False,
+    )
+    table = session.machine.table
+    assert ([*table.params], table.complete, table.hash) == (["A"], False, None)
+    result = session.fetch()
+    assert (result.complete, result.resumed, [*result.params]) == (True, 0, ["A", "B"])
+
+
+@swiftly
+async def test_no_such_name_can_be_asked_for_or_set() -> None:
+    async with ParamClient(GenericVehicle({"A": (ParamType.REAL32, 1.0)}), cache=False) as client:
+        vehicle = await client.component()
+        with pytest.raises(UsageError, match="no parameter file can hold it"):
+            await vehicle.get("A B")
+        with pytest.raises(UsageError, match="no parameter file can hold it"):
+            await vehicle.set("A B", 1.0)
+
+
+class _Forged(GenericVehicle):
+    """A vehicle in whose name somebody else says something too."""
+
+    def data_to_send(self) -> list[bytes]:
+        sent = super().data_to_send()
+        forged = encode(param_value("A\nB", 5.0, index=NO_INDEX, count=2), system=1, component=1, sequence=0)
+        return [*sent, forged] if sent else sent
+
+
+def test_a_forged_value_blocks_no_export(command: Command, put: Put, tmp_path: Path) -> None:
+    vehicle = _Forged({"A": (ParamType.REAL32, 1.0), "B": (ParamType.REAL32, 2.0)})
+    for form in ("qgc", "json"):
+        saved = command("save", put(vehicle), path := tmp_path / form, "--form", form, "--no-cache")
+        assert saved.code == 0, saved.err
+        assert [*loads(path.read_bytes()).sets[0]] == ["A", "B"]
+
+
+def test_such_a_name_in_the_cache_blocks_no_export_and_goes_with_the_next_whole_table(
+    command: Command, put: Put, tmp_path: Path
+) -> None:
+    path = tmp_path / "cache.sqlite3"
+    vehicle = GenericVehicle({"A": (ParamType.INT32, 1), "B": (ParamType.INT32, 2)})
+    assert command("fetch", put(vehicle), "--cache", path).code == 0
+    with ParamCache(path) as cache:
+        [known_vehicle] = cache.vehicles()
+        identity = known_vehicle.identity
+        at = known_vehicle.last_seen
+        state = TableState(count=2, complete=True)
+        cache.save(update(stored("A\nB", 5, at=at), identity=identity, autopilot=0, at=at, table=state))
+        made = cache.snapshot(identity.key, 1, reason="test")
+        kept = cache.component()
+        assert ([*kept.params], kept.left_out, kept.complete) == (["A", "B"], ("A\nB",), True)
+        assert [*cache.state_at(identity.key, 1, made.id)] == ["A", "B"]
+    saved = command("save", "cache:1", tmp_path / "a.params", "--cache", path)
+    assert (saved.code, [*loads((tmp_path / "a.params").read_bytes()).sets[0]]) == (0, ["A", "B"])
+    assert "left out, as no parameter file can hold the name: 'A\\nB'" in saved.err
+    assert r"'A\nB'" in command("show", "1", "--cache", path).err
+    assert command("fetch", put(vehicle), "--refresh", "--cache", path).code == 0
+    with ParamCache(path) as cache:
+        assert cache.component().left_out == ()
+        [line] = cache.history(identity.key, name="A\nB")
+        assert line.new is None
+
+
+def test_a_check_names_them(command: Command, put: Put) -> None:
+    vehicle = _Forged({"A": (ParamType.REAL32, 1.0), "B": (ParamType.REAL32, 2.0)})
+    checked: Any = command("check", put(vehicle), "--json").json
+    assert checked["link"]["unusable_names"] > 0
+    assert any("no parameter file can hold" in finding["text"] for finding in checked["findings"])

@@ -1,0 +1,63 @@
+"""A thread for what blocks: in order, to the end, and no thread left behind."""
+
+from __future__ import annotations
+
+import threading
+
+import anyio
+
+from paramclient.client.worker_thread import Worker
+
+NAME = "a worker of tests"
+
+
+def threads() -> int:
+    return sum(thread.name == NAME for thread in threading.enumerate())
+
+
+def test_it_closes_while_others_ask_for_more() -> None:
+    """Their calls are behind the last one of the closing, and are done and told all the same."""
+    done: list[str] = []
+    may_go_on = threading.Event()
+
+    async def ask(worker: Worker, what: str) -> None:
+        await worker.run(lambda: done.append(what))
+
+    async def main() -> None:
+        worker = Worker(NAME)
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(worker.run, may_go_on.wait)
+            await anyio.lowlevel.checkpoint()
+            tasks.start_soon(worker.close, lambda: done.append("last"))
+            await anyio.lowlevel.checkpoint()
+            for number in range(5):
+                tasks.start_soon(ask, worker, str(number))
+            await anyio.lowlevel.checkpoint()
+            may_go_on.set()
+
+    with_patience(main)
+    assert done == ["last", "0", "1", "2", "3", "4"]
+    assert not threads()
+
+
+def test_what_is_asked_for_when_it_is_closed_is_done_too() -> None:
+    async def main() -> None:
+        worker = Worker(NAME)
+        assert await worker.run(lambda: 1) == 1
+        assert threads() == 1
+        await worker.close(lambda: None)
+        assert not threads()
+        assert await worker.run(lambda: 2) == 2
+        with anyio.fail_after(20):
+            while threads():  # noqa: ASYNC110 - nobody tells
+                await anyio.sleep(0.001)
+
+    with_patience(main)
+
+
+def with_patience(main: object) -> None:
+    """Run it; one that hangs for good is told of, and not waited for."""
+    ended = threading.Thread(target=anyio.run, args=(main,), daemon=True)
+    ended.start()
+    ended.join(20)
+    assert not ended.is_alive()

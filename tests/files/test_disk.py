@@ -1,0 +1,428 @@
+"""Parameter files on disk: read whole, and replaced whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from paramclient import (
+    FileError,
+    FileForm,
+    ParamFile,
+    ParamSet,
+    ParamType,
+    WrittenParam,
+    read_file,
+    write_file,
+)
+from paramclient.errors import UsageError
+from paramclient.files import LARGEST_FILE, dumps, loads
+from paramclient.files.includes import DEPTH_MAX, FILES_MAX
+from paramclient.files.param_file import ENDINGS
+
+ROOT = Path(__file__).parents[2]
+PARAMS = ParamSet({"A": WrittenParam("A", 5, ParamType.INT32), "B": WrittenParam("B", 0.5)}, 1, 1)
+TYPED = ParamSet({"A": PARAMS["A"]}, 1, 1)
+OLD = b"OLD,1\n"
+
+
+def listed(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+def refused(call: Callable[[], object]) -> FileError:
+    with pytest.raises(FileError) as caught:
+        call()
+    return caught.value
+
+
+@pytest.mark.parametrize(("ending", "form"), ENDINGS.items())
+def test_the_ending_names_the_form_that_is_written(ending: str, form: FileForm, tmp_path: Path) -> None:
+    path = tmp_path / f"quad{ending.upper()}"
+    assert write_file(path, TYPED) is form
+    file = read_file(path)
+    assert (file.form, file.source, file.choose().source) == (form, str(path), str(path))
+    assert file.choose()["A"].value == 5
+    assert listed(tmp_path) == [path.name]
+
+
+def test_a_form_that_is_named_counts_more_than_the_ending(tmp_path: Path) -> None:
+    path = tmp_path / "quad.json"
+    assert write_file(str(path), PARAMS, form="mission-planner") is FileForm.MISSION_PLANNER
+    assert path.read_bytes().endswith(b"\nA,5\nB,0.5\n")
+    assert read_file(str(path), form="parm").form is FileForm.PARM
+    with pytest.raises(UsageError, match="no form of file is called 'exe'"):
+        write_file(path, PARAMS, form="exe")
+    with pytest.raises(UsageError, match="no form of file is called 'exe'"):
+        read_file(path, form="exe")
+
+
+def test_an_ending_that_stands_for_nothing_is_refused(tmp_path: Path) -> None:
+    error = refused(lambda: write_file(tmp_path / "quad.txt", PARAMS))
+    assert "the ending '.txt' stands for no form; name one (qgc, parm, mission-planner" in str(error)
+    assert "end in one of .params, .parm, .param" in str(error)
+    assert error.source == str(tmp_path / "quad.txt")
+    assert listed(tmp_path) == []
+
+
+def test_a_file_that_is_there_is_replaced_and_keeps_its_mode(tmp_path: Path) -> None:
+    path = tmp_path / "quad.param"
+    path.write_bytes(OLD)
+    path.chmod(0o640)
+    write_file(path, PARAMS)
+    assert read_file(path).choose()["A"].value == 5
+    assert stat.S_IMODE(path.stat().st_mode) == 0o640
+    assert listed(tmp_path) == ["quad.param"]
+
+
+def test_a_new_file_has_the_mode_that_the_user_wants(tmp_path: Path) -> None:
+    before = os.umask(0o027)
+    try:
+        write_file(tmp_path / "quad.param", PARAMS)
+    finally:
+        os.umask(before)
+    assert stat.S_IMODE((tmp_path / "quad.param").stat().st_mode) == 0o640
+
+
+def test_a_symbolic_link_stays_one(tmp_path: Path) -> None:
+    folder = tmp_path / "real"
+    folder.mkdir()
+    (folder / "quad.param").write_bytes(OLD)
+    link = tmp_path / "link.param"
+    link.symlink_to(folder / "quad.param")
+    write_file(link, PARAMS)
+    assert link.is_symlink()
+    assert read_file(folder / "quad.param").choose()["A"].value == 5
+    assert listed(folder) == ["quad.param"]
+
+
+@pytest.mark.parametrize("call", ["fchmod", "fsync"])
+def test_a_full_disk_leaves_the_old_file_alone(
+    call: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    def full(*_: Any) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    path = tmp_path / "quad.param"
+    path.write_bytes(OLD)
+    monkeypatch.setattr(os, call, full)
+    error = refused(lambda: write_file(path, PARAMS))
+    monkeypatch.undo()
+    assert str(error) == f"{path}: cannot be written: No space left on device"
+    assert isinstance(error.__cause__, OSError)
+    assert path.read_bytes() == OLD
+    assert listed(tmp_path) == ["quad.param"]
+
+
+def test_a_real_limit_leaves_the_old_file_alone(tmp_path: Path) -> None:
+    """A process that may write no more than a kilobyte."""
+    path = tmp_path / "quad.param"
+    path.write_bytes(OLD)
+    program = f"""
+import resource, signal
+from paramclient import FileError, ParamSet, WrittenParam, write_file
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+resource.setrlimit(resource.RLIMIT_FSIZE, (1024, 1024))
+params = ParamSet({{f"P{{at}}": WrittenParam(f"P{{at}}", at) for at in range(1000)}})
+try:
+    write_file({str(path)!r}, params)
+except FileError as error:
+    print(error)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, check=True, timeout=60
+    )
+    assert done.stdout == f"{path}: cannot be written: File too large\n"
+    assert path.read_bytes() == OLD
+    assert listed(tmp_path) == ["quad.param"]
+
+
+def test_whatever_ends_the_call_leaves_no_half_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    def interrupted(_: int) -> None:
+        raise KeyboardInterrupt
+
+    path = tmp_path / "quad.param"
+    path.write_bytes(OLD)
+    monkeypatch.setattr(os, "fsync", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        write_file(path, PARAMS)
+    assert path.read_bytes() == OLD
+    assert listed(tmp_path) == ["quad.param"]
+
+
+def test_the_content_is_on_the_disk_before_the_name_is(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    path = tmp_path / "quad.param"
+    path.write_bytes(OLD)
+    real = os.fsync
+    synced: list[tuple[str, bytes]] = []
+
+    def fsync(descriptor: int) -> None:
+        synced.append((str(Path(f"/proc/self/fd/{descriptor}").readlink()), path.read_bytes()))
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", fsync)
+    write_file(path, PARAMS)
+    (first, before), (second, after) = synced
+    assert Path(first).parent == path.parent
+    assert (first != str(path), before) == (True, OLD)
+    assert (second, after) == (str(tmp_path), path.read_bytes())
+
+
+def test_what_a_form_cannot_say_is_found_before_the_disk_is_touched(tmp_path: Path) -> None:
+    path = tmp_path / "quad.params"
+    path.write_bytes(OLD)
+    error = refused(lambda: write_file(path, PARAMS))
+    assert str(error) == f"{path}: B has no type that MAVLink defines, and this form needs one"
+    assert path.read_bytes() == OLD
+
+
+def test_a_file_as_it_was_read_goes_into_another_form(tmp_path: Path) -> None:
+    first = tmp_path / "quad.param"
+    first.write_text("# mine\nA,5\n# why\nB,0.5\n")
+    write_file(tmp_path / "quad.yaml", read_file(first))
+    file = read_file(tmp_path / "quad.yaml")
+    assert (file.header, file.choose()["B"].comment) == (("mine",), "why")
+    write_file(tmp_path / "back.param", file)
+    assert (tmp_path / "back.param").read_text() == first.read_text()
+
+
+def test_what_cannot_be_opened_says_why(tmp_path: Path) -> None:
+    missing = tmp_path / "none.param"
+    assert str(refused(lambda: read_file(missing))) == (
+        f"{missing}: cannot be read: No such file or directory"
+    )
+    assert "cannot be read: it is no regular file" in str(refused(lambda: read_file(tmp_path)))
+    assert "cannot be read: embedded null byte" in str(refused(lambda: read_file("a\0b")))
+    assert "cannot be written: embedded null byte" in str(refused(lambda: write_file("a\0b.parm", PARAMS)))
+    deep = missing / "quad.param"
+    assert "cannot be written: No such file or directory" in str(refused(lambda: write_file(deep, PARAMS)))
+    folder = tmp_path / "folder.param"
+    folder.mkdir()
+    assert "cannot be written: it is no regular file" in str(refused(lambda: write_file(folder, PARAMS)))
+
+
+def test_a_file_that_nobody_may_read_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """By a system that says no, as a test may run as root."""
+
+    def forbidden(*_: Any) -> int:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    monkeypatch.setattr(os, "open", forbidden)
+    assert "cannot be read: Permission denied" in str(refused(lambda: read_file(tmp_path / "a.parm")))
+    path = tmp_path / "b.parm"
+    assert "cannot be written: Permission denied" in str(refused(lambda: write_file(path, PARAMS)))
+
+
+def test_a_pipe_holds_nobody_up(tmp_path: Path) -> None:
+    pipe = tmp_path / "pipe.param"
+    os.mkfifo(pipe)
+    assert "it is no regular file" in str(refused(lambda: read_file(pipe)))
+    assert "it is no regular file" in str(refused(lambda: write_file(pipe, PARAMS)))
+    assert stat.S_ISFIFO(pipe.stat().st_mode)
+
+
+def test_a_file_that_is_too_large_to_be_one_is_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "huge.param"
+    with path.open("wb") as file:
+        file.truncate(LARGEST_FILE + 1)
+    assert f"no parameter file has more than {LARGEST_FILE} bytes" in str(refused(lambda: read_file(path)))
+
+
+def test_reading_keeps_no_descriptor_open(tmp_path: Path) -> None:
+    path = tmp_path / "quad.param"
+    write_file(path, PARAMS)
+    before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - one more is open while it is listed either way
+    for _ in range(5):
+        read_file(path)
+        refused(lambda: read_file(tmp_path))
+        write_file(path, PARAMS)
+    assert len(os.listdir("/proc/self/fd")) == before  # noqa: PTH208 - as above
+
+
+def test_the_largest_table_fits_into_the_largest_file() -> None:
+    """As many parameters as an index can count, in the longest form, with all that a line can have."""
+    from paramclient.files import dumps
+
+    names = [f"P{at:015d}" for at in range(1000)]
+    params = ParamSet(
+        {
+            name: WrittenParam(name, -1.2345678e-38, ParamType.REAL32, -1.2345678e-38, "x" * 60)
+            for name in names
+        },
+        1,
+        1,
+    )
+    assert len(dumps(params, form="json")) * 65.535 < LARGEST_FILE
+
+
+def test_several_sets_go_into_one_file(tmp_path: Path) -> None:
+    camera = ParamSet({"C": WrittenParam("C", 1, ParamType.INT8)}, 100, 1)
+    for name in ("fleet.params", "fleet.json", "fleet.yaml"):
+        write_file(tmp_path / name, [TYPED, camera])
+        file = read_file(tmp_path / name)
+        assert [(each.component, list(each)) for each in file.sets] == [(1, ["A"]), (100, ["C"])]
+
+
+def test_a_header_tells_people_what_a_plain_list_cannot(tmp_path: Path) -> None:
+    from paramclient import Identity
+
+    who = Identity(3, "udp", "00ff", 12, firmware=0x01110000, git_hash="abc")
+    path = tmp_path / "quad.param"
+    write_file(path, ParamSet(PARAMS.params, 1, 3, who, 1_700_000_000.0, "link udpin:0.0.0.0:14550"))
+    assert read_file(path).header == (
+        "2 parameters of system/component 3/1, px4",
+        "of the vehicle uid:00ff, firmware 1.17.0, commit abc",
+        "as of 2023-11-14T22:13:20Z",
+        "from link udpin:0.0.0.0:14550",
+    )
+
+
+def test_yaml_and_pydantic_are_loaded_by_those_who_need_them() -> None:
+    program = """
+import sys
+from paramclient.files import dumps, loads
+file = loads(b"A 1")
+dumps(file, form="yaml")
+assert not {"pydantic", "yaml"} & set(sys.modules)
+loads(dumps(file, form="json"))
+assert "yaml" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=60)
+
+
+def test_a_file_of_bytes_has_no_name() -> None:
+    file = loads(b"A 1")
+    assert isinstance(file, ParamFile)
+    assert repr(file) == "<ParamFile unnamed parm ?/?: 1>"
+    with pytest.raises(FileError, match=r"^line 1: expected NAME VALUE, found 'x'$"):
+        loads(b"x")
+
+
+# files that include others
+
+
+def tree(folder: Path, **files: str) -> Path:
+    """Files in folders, `__` in a key for a slash and `_parm` for the ending; the path of the first one."""
+    paths = []
+    for key, text in files.items():
+        path = folder / key.replace("__", "/").replace("_parm", ".parm")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+        paths.append(path)
+    return paths[0]
+
+
+def values(path: Path) -> dict[str, object]:
+    return {name: param.value for name, param in read_file(path).sets[0].items()}
+
+
+def test_an_included_file_stands_in_the_place_of_its_line(tmp_path: Path) -> None:
+    first = tree(
+        tmp_path,
+        board__new__defaults_parm="A 1\n@include ../base/defaults.parm  # as on the other board\nB 20\n",
+        board__base__defaults_parm="# of the base\nA 10 # ten\nB 11\n@include more.parm\n",
+        board__base__more_parm="C 12\n",
+    )
+    file = read_file(first)
+    params = file.sets[0]
+    assert values(first) == {"A": 10, "B": 20, "C": 12}
+    assert (params["A"].comment, params["A"].line, params["B"].line) == ("ten", None, 3)
+    base = f"{first.parent}/../base/defaults.parm"
+    assert file.notes == (
+        f"A stands twice: 10 in {base}:2 counts, not 1 in line 1.",
+        f"B stands twice: 20 in line 3 counts, not 11 in {base}:3.",
+    )
+    assert loads(dumps(file)).sets[0] == ParamSet(params.params)
+
+
+def test_a_file_may_do_nothing_but_include_another_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = tree(tmp_path, here__a_parm="@include ../there/b.parm\n", there__b_parm="A 1\n")
+    assert values(first) == {"A": 1}
+    monkeypatch.chdir(first.parent)
+    assert values(Path("a.parm")) == {"A": 1}
+
+
+def test_two_lines_may_include_one_file(tmp_path: Path) -> None:
+    first = tree(tmp_path, a_parm="@include b.parm\nA 2\n@include b.parm\n", b_parm="A 1\n")
+    assert values(first) == {"A": 1}
+
+
+def test_a_delete_line_takes_out_what_stands_above_it(tmp_path: Path) -> None:
+    first = tree(
+        tmp_path,
+        a_parm="A_X 1\nB 1\n@include b.parm\n@delete A_*  # of the other board\n@delete NONE\nA_X 3\n",
+        b_parm="A_X 2\nA_Y 2\nC 2\nD 2\nB 2\n@delete B\n@delete D\n",
+    )
+    assert values(first) == {"B": 1, "C": 2, "A_X": 3}
+    assert read_file(first).notes == (
+        f"@delete B in {tmp_path}/b.parm:6 takes out B.",
+        f"@delete D in {tmp_path}/b.parm:7 takes out D.",
+        "@delete A_* in line 4 takes out A_X, A_Y.",
+        "@delete NONE in line 5 fits no parameter above it.",
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "problem"),
+    [
+        ("@include gone.parm", "x/y/gone.parm cannot be read: No such file or directory"),
+        ("@include ../y", "x/y/../y cannot be read: it is no regular file"),
+        ("@include ../../outside.parm", "lies outside of"),
+        ("@include ../z/../../outside.parm", "lies outside of"),
+        ("@include /etc/hostname", "an absolute path is not followed"),
+        ("@include link.parm", "lies outside of"),
+        ("@include first.parm", "in a circle"),
+        ("@include round.parm", "in a circle"),
+    ],
+)
+def test_what_cannot_be_included_says_so_with_its_line(line: str, problem: str, tmp_path: Path) -> None:
+    first = tree(
+        tmp_path,
+        x__y__first_parm=f"A 1\n{line}\nbad\n",
+        x__y__round_parm="@include first.parm\n",
+        x__z__other_parm="B 1\n",
+        outside_parm="SECRET 1\n",
+    )
+    (first.parent / "link.parm").symlink_to(tmp_path / "outside.parm")
+    error = refused(lambda: read_file(first))
+    told = str(error)
+    assert problem in told
+    assert f"{first}:2: " in told
+    assert "SECRET" not in told
+
+
+def test_an_error_in_an_included_file_names_both_lines(tmp_path: Path) -> None:
+    first = tree(tmp_path, a_parm="A 1\n@include b.parm\n", b_parm="B 1\nbad\n")
+    error = refused(lambda: read_file(first))
+    assert str(error).splitlines() == [
+        f"{tmp_path}/b.parm:2: expected NAME VALUE, found 'bad'",
+        f"{first}:2: includes that file",
+    ]
+    assert (error.source, error.line) == (f"{tmp_path}/b.parm", 2)
+    (tmp_path / "b.parm").write_bytes(b"B 1\n\xff\n")
+    assert "includes that file" in str(refused(lambda: read_file(first)))
+
+
+def test_how_much_is_included_is_limited(tmp_path: Path) -> None:
+    chain = {f"f{number}_parm": f"@include f{number + 1}.parm\n" for number in range(DEPTH_MAX)}
+    assert values(tree(tmp_path, **chain, **{f"f{DEPTH_MAX}_parm": "A 1\n"})) == {"A": 1}
+    (tmp_path / f"f{DEPTH_MAX}.parm").write_text(f"@include f{DEPTH_MAX + 1}.parm\n")
+    assert "in a row" in str(refused(lambda: read_file(tmp_path / "f0.parm")))
+    wide = {f"g{number}_parm": f"@include g{number + 1}.parm\n" * 4 for number in range(DEPTH_MAX)}
+    first = tree(tmp_path, **wide, **{f"g{DEPTH_MAX}_parm": "A 1\n"})
+    assert f"more than {FILES_MAX} files" in str(refused(lambda: read_file(first)))
+    (tmp_path / "large.parm").write_text("# " + "x" * (LARGEST_FILE // 2) + "\nA 1\n")
+    (tmp_path / "twice.parm").write_text("@include large.parm\n@include large.parm\n")
+    assert "too large" in str(refused(lambda: read_file(tmp_path / "twice.parm")))

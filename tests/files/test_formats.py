@@ -1,0 +1,882 @@
+"""Every form of parameter file: exactly back, as other programs read it, and what is refused."""
+
+from __future__ import annotations
+
+import csv
+import math
+import struct
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymavlink.mavparm import MAVParmDict
+
+from paramclient import FileError, FileForm, Identity, Param, ParamFile, ParamSet, ParamType, WrittenParam
+from paramclient.errors import UsageError
+from paramclient.files import dumps, line_formats, loads
+from paramclient.model.values import Encoding, Value, bits_of, decode, from_bits
+
+DATA = Path(__file__).parents[1] / "data"
+TABLES = Path(__file__).parents[2] / "paramclient/sim/tables"
+WRITTEN = [form for form in FileForm if form is not FileForm.PX4_SCRIPT]
+TYPED = [FileForm.QGC, FileForm.JSON, FileForm.YAML]
+PAIRS = [FileForm.PARM, FileForm.MISSION_PLANNER]
+
+finite_bits = st.integers(0, 0xFFFFFFFF).filter(lambda bits: bits & 0x7F800000 != 0x7F800000)
+
+
+def params_of(*params: WrittenParam, system: int | None = 1, component: int | None = 1) -> ParamSet:
+    return ParamSet({param.name: param for param in params}, component, system)
+
+
+def numbered(values: list[Value], kind: ParamType) -> ParamSet:
+    return params_of(*(WrittenParam(f"P{at}", value, kind) for at, value in enumerate(values)))
+
+
+def back(params: ParamSet, form: FileForm) -> ParamSet:
+    """What comes back of a set that goes through a form."""
+    (only,) = loads(dumps(params, form=form), form=form).sets
+    return only
+
+
+def bits(params: ParamSet, kind: ParamType) -> list[int]:
+    return [param.bits_as(kind) for param in params.values()]
+
+
+def failed(data: bytes | str, **options: object) -> FileError:
+    content = data.encode() if isinstance(data, str) else data
+    with pytest.raises(FileError) as caught:
+        loads(content, source="quad.x", **options)  # type: ignore[arg-type]  # each is one of its own
+    return caught.value
+
+
+# exactly back
+
+
+@pytest.mark.parametrize("form", WRITTEN)
+@given(written=st.lists(finite_bits, min_size=1, max_size=60))
+@settings(max_examples=25, deadline=None)
+def test_every_finite_float_comes_back(form: FileForm, written: list[int]) -> None:
+    floats: list[Value] = [from_bits(each, ParamType.REAL32) for each in written]
+    assert bits(back(numbered(floats, ParamType.REAL32), form), ParamType.REAL32) == written
+
+
+@pytest.mark.parametrize("form", WRITTEN)
+@pytest.mark.parametrize("kind", [kind for kind in ParamType if kind.is_integer])
+@given(data=st.data())
+@settings(max_examples=8, deadline=None)
+def test_every_integer_comes_back(form: FileForm, kind: ParamType, data: st.DataObject) -> None:
+    if form is FileForm.PCK and kind not in (ParamType.INT8, ParamType.INT16, ParamType.INT32):
+        with pytest.raises(FileError, match=f"P0 has the type {kind.name}"):
+            dumps(numbered([1], kind), form=form)
+        return
+    low, high = kind.bounds
+    whole: list[int] = data.draw(st.lists(st.integers(low, high), max_size=40))
+    values: list[Value] = [low, high, *whole]
+    read = back(numbered(values, kind), form)
+    assert [param.value for param in read.values()] == values
+    assert all(type(param.value) is int for param in read.values())
+
+
+@pytest.mark.parametrize("form", [FileForm.PARM, *TYPED])
+@given(values=st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=20))
+@settings(max_examples=20, deadline=None)
+def test_every_double_comes_back(form: FileForm, values: list[Value]) -> None:
+    expected = bits(numbered(values, ParamType.REAL64), ParamType.REAL64)
+    assert bits(back(numbered(values, ParamType.REAL64), form), ParamType.REAL64) == expected
+
+
+@pytest.mark.parametrize("form", [*PAIRS, *TYPED[1:]])
+@given(value=st.floats(allow_nan=False) | st.integers(-(2**70), 2**70))
+@settings(max_examples=40, deadline=None)
+def test_a_number_without_a_type_stays_as_it_was_written(form: FileForm, value: float) -> None:
+    read = back(params_of(WrittenParam("A", value)), form)["A"].value
+    assert (type(read), repr(read)) == (type(value), repr(value))
+
+
+@given(name=st.text("ABCXYZabcxyz0189_", min_size=1, max_size=16), written=finite_bits)
+@settings(max_examples=60, deadline=None)
+def test_what_was_read_is_written_as_it_was(name: str, written: int) -> None:
+    """The other way round: text that any of the forms has written is written so again."""
+    value = from_bits(written, ParamType.REAL32)
+    for form in (FileForm.QGC, *PAIRS, FileForm.PCK):
+        if not name.strip("0189_"):
+            continue
+        data = dumps(params_of(WrittenParam(name, value, ParamType.REAL32)), form=form)
+        assert dumps(loads(data, form=form)) == data
+
+
+@pytest.mark.parametrize("form", WRITTEN)
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+def test_plain_nan_and_infinities_come_back(form: FileForm, value: float) -> None:
+    read = back(numbered([value], ParamType.REAL32), form)
+    assert bits(read, ParamType.REAL32) == [bits_of(value, ParamType.REAL32)]
+
+
+@pytest.mark.parametrize("word", ["nan", "NaN", "inf", "Infinity", "-inf"])
+def test_the_words_of_other_programs_are_understood(word: str) -> None:
+    read = loads(f"A {word}\n".encode()).choose()["A"].value
+    assert struct.pack("<d", read) == struct.pack("<d", float(word))
+
+
+@pytest.mark.parametrize("form", TYPED[1:])
+def test_a_document_keeps_what_no_word_says(form: FileForm) -> None:
+    quiet = from_bits(0x7FC12345, ParamType.REAL32)
+    cast, _ = decode(struct.pack("<f", 1e20), ParamType.INT8, Encoding.C_CAST)
+    params = params_of(
+        WrittenParam("NAN", quiet, ParamType.REAL32, math.nan),
+        WrittenParam("CAST", cast, ParamType.INT8),
+        WrittenParam("WIDE", b"\x01\x02\x03\x80", ParamType.UINT64),
+        WrittenParam("FOREIGN", b"\xff\0\0\0", 77),
+        WrittenParam("BARE", b"\x01\0\0\0"),
+        WrittenParam("WHOLE", 2**63, None, comment="no type: 🚁 \x7f \u2028 'x' \"y\" # z"),
+    )
+    read = back(params, form)
+    assert read["NAN"].bits_as(ParamType.REAL32) == 0x7FC12345
+    assert [read[name] for name in list(params)[1:]] == [params[name] for name in list(params)[1:]]
+    assert read["CAST"].is_held_by(Param("CAST", cast, ParamType.INT8, 0, int.from_bytes(cast, "little")))  # type: ignore[arg-type]  # bytes, as asserted above
+
+
+@pytest.mark.parametrize("form", [FileForm.QGC, FileForm.PCK, *PAIRS])
+@pytest.mark.parametrize(
+    ("value", "kind"),
+    [(b"\x01\0\0\0", ParamType.INT32), (from_bits(0x7FC12345, ParamType.REAL32), ParamType.REAL32)],
+)
+def test_other_forms_refuse_what_they_cannot_say(form: FileForm, value: Value, kind: ParamType) -> None:
+    if form is FileForm.PCK and kind is ParamType.REAL32:
+        assert bits(back(numbered([value], kind), form), kind) == [0x7FC12345]
+        return
+    with pytest.raises(FileError, match=r"P0 is .*json and yaml can keep"):
+        dumps(numbered([value], kind), form=form)
+
+
+def test_a_nan_with_bits_and_no_type_cannot_be_kept() -> None:
+    value = from_bits(0x7FC12345, ParamType.REAL32)
+    with pytest.raises(FileError, match="A is a NaN with bits of its own, and has no type"):
+        dumps(params_of(WrittenParam("A", value)), form="json")
+
+
+@pytest.mark.parametrize("form", TYPED[1:])
+def test_a_document_says_whose_parameters_they_are_and_when(form: FileForm) -> None:
+    who = Identity(3, 'udpin:"x"', "00ff", 12, 2, 0x01110000, "abc123", 5, 6, 7, 2**40)
+    first = ParamSet({"A": WrittenParam("A", 1)}, 1, 3, who, 1_700_000_000.25)
+    second = ParamSet({"yes": WrittenParam("yes", 1e-5), "NULL": WrittenParam("NULL", 1e30)}, 100, 3)
+    file = loads(dumps([first, second], form=form), source="fleet.x")
+    assert file.form is form
+    assert [replace(each, source="") for each in file.sets] == [first, second]
+    assert [each.source for each in file.sets] == ["fleet.x", "fleet.x"]
+
+
+def test_a_document_in_yaml_says_the_same_to_another_reader() -> None:
+    """Whatever reads YAML 1.1, where `1e-05` is text and `no` is false."""
+    params = params_of(
+        *(WrittenParam(name, 1e-05, ParamType.REAL32) for name in ("no", "Y", "A-1", "null")),
+        WrittenParam("B", -0.0, ParamType.REAL32, 1e30),
+    )
+    plain = yaml.safe_load(dumps(params, form="yaml"))
+    assert list(plain["sets"][0]["params"]) == list(params)
+    assert plain["sets"][0]["params"]["no"] == {"value": 1e-05, "type": "REAL32", "bits": "3727c5ac"}
+    assert plain["sets"][0]["params"]["B"]["default"] == 1e30
+
+
+@pytest.mark.parametrize("form", [FileForm.QGC, *PAIRS])
+def test_header_comments_and_footer_stay_where_they_are(form: FileForm) -> None:
+    plain = ParamSet({"A": WrittenParam("A", 1, ParamType.INT8, comment="first"), "B": WrittenParam("B", 2)})
+    marked = WrittenParam("B", 2, ParamType.INT8, comment="two\n\n # lines\n#marked")
+    params = ParamSet({"A": plain["A"], "B": marked, "C": WrittenParam("C", 3, ParamType.INT8)}, 1, 1)
+    around = ParamFile((params,), form, "", ("on top", "", "  indented"), ("the", "end"))
+    once = loads(dumps(around), source="x" + form)
+    assert once.sets[0]["A"].comment == "first"
+    assert once.sets[0]["B"].comment == marked.comment
+    assert once.sets[0]["C"].comment == ""
+    assert [line for line in once.header if "n" in line and "-Id" not in line][-2:] == [
+        "on top",
+        "  indented",
+    ]
+    assert once.footer == ("the", "end")
+    assert dumps(loads(dumps(once))) == dumps(once)
+
+
+def test_comments_of_mission_planner_survive() -> None:
+    text = "# for the X500\n# by Jo\nA,1\n\n# above B\nB,2 # beside B\n//off,3\nC,3\n; the end\n"
+    file = loads(text.encode(), source="quad.param")
+    assert file.header == ("for the X500", "by Jo")
+    assert [param.comment for param in file.sets[0].values()] == ["", "above B\nbeside B", "off,3"]
+    assert [param.line for param in file.sets[0].values()] == [3, 6, 8]
+    written = dumps(file).decode()
+    assert written == "# for the X500\n# by Jo\nA,1\n# above B\n# beside B\nB,2\n# off,3\nC,3\n# the end\n"
+    assert replace(loads(written.encode(), source="quad.param"), sets=()) == replace(file, sets=())
+    assert loads(written.encode(), source="quad.param").sets == file.sets
+
+
+@pytest.mark.parametrize("form", [FileForm.QGC, *PAIRS, *TYPED[1:]])
+def test_no_comment_becomes_a_parameter(form: FileForm) -> None:
+    params = params_of(
+        WrittenParam("A", 1, ParamType.INT8, comment="x\nB,2\r\nB 2\rB,2\x0bB,2\u2028B,2\x00\x1b[31m")
+    )
+    around = ParamFile((params,), form, "", ("a\rB,2",), ("z\nB 2\udc80",))
+    file = loads(dumps(around), form=form)
+    assert list(file.sets[0]) == ["A"]
+    assert "\x1b" not in dumps(around).decode()
+
+
+# as others read it
+
+
+@pytest.mark.parametrize("form", PAIRS)
+@given(written=st.lists(finite_bits, min_size=1, max_size=50))
+@settings(max_examples=20, deadline=None)
+def test_mavproxy_reads_the_same_floats(
+    form: FileForm, written: list[int], tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    params = numbered([from_bits(each, ParamType.REAL32) for each in written], ParamType.REAL32)
+    first = replace(params["P0"], comment="a comment, 5")
+    assert read_by_pymavlink(
+        dumps(replace(params, params={**params.params, "P0": first}), form=form), tmp_path_factory
+    ) == dict(zip(params, written, strict=True))
+
+
+def read_by_pymavlink(data: bytes, folders: pytest.TempPathFactory) -> dict[str, int]:
+    path = folders.mktemp("mav") / "x.parm"
+    path.write_bytes(data)
+    theirs = MAVParmDict()
+    assert theirs.load(str(path), use_excludes=False)
+    return {name: bits_of(value, ParamType.REAL32) for name, value in theirs.items()}
+
+
+def test_mavproxy_reads_a_whole_vehicle(
+    tmp_path_factory: pytest.TempPathFactory, capsys: pytest.CaptureFixture[str]
+) -> None:
+    params = loads((DATA / "ardupilot_param.pck").read_bytes()).choose()
+    ours = {name: param.bits_as(ParamType.REAL32) for name, param in params.items()}
+    for form in PAIRS:
+        assert read_by_pymavlink(dumps(params, form=form), tmp_path_factory) == ours
+        assert "Invalid" not in capsys.readouterr().out
+
+
+def test_mission_planner_takes_every_line_that_is_no_comment() -> None:
+    """ParamFile.cs skips lines that begin with `#` and splits others at blanks and commas: two parts."""
+    params = params_of(
+        WrittenParam("A", 1, comment="why"), WrittenParam("B", math.inf), WrittenParam("C", math.nan)
+    )
+    lines = dumps(params, form="mission-planner").decode().splitlines()
+    rows = [line.split(",") for line in lines if line and not line.startswith("#")]
+    assert rows == [["A", "1"], ["B", "Infinity"], ["C", "NaN"]]
+
+
+def test_qgroundcontrol_takes_every_line_that_is_no_comment() -> None:
+    """ParameterManager.cc skips lines that begin with `#` and splits others at tabs; five parts count."""
+    pilot = params_of(
+        WrittenParam("A", 0.1, ParamType.REAL32, comment="why"),
+        WrittenParam("B", -5, ParamType.INT32),
+        WrittenParam("C", -math.inf, ParamType.REAL32),
+        WrittenParam("D", math.nan, ParamType.REAL32),
+        component=None,
+    )
+    camera = params_of(WrittenParam("A", 255, ParamType.UINT8), component=100)
+    lines = dumps([pilot, camera], form="qgc").decode().splitlines()
+    assert lines[0] == "# Onboard parameters for Vehicle 1"
+    assert "# Vehicle-Id Component-Id Name Value Type" in lines
+    rows = [line.split("\t") for line in lines if line and not line.startswith("#")]
+    assert rows == [
+        ["1", "1", "A", "0.1", "9"],
+        ["1", "1", "B", "-5", "6"],
+        ["1", "1", "C", "-inf", "9"],
+        ["1", "1", "D", "nan", "9"],
+        ["1", "100", "A", "255", "1"],
+    ]
+
+
+QGC_TEXT = """# Onboard parameters for Vehicle 1
+#
+# Stack: PX4 Pro
+#
+# Vehicle-Id Component-Id Name Value Type
+1\t1\tMC_ROLL_P\t6.500000000000000000\t9
+1\t1\tBAT1_CAPACITY\t--.------------------\t9
+1\t100\tCAM_MODE\t2\t2
+2\t1\tMC_ROLL_P\t7\t9
+1\t1\tSYS_AUTOSTART\t4001\t6
+"""
+
+
+def test_a_file_of_qgroundcontrol_has_a_set_for_each_component() -> None:
+    file = loads(QGC_TEXT.encode(), source="quad.params")
+    assert file.form is FileForm.QGC
+    assert file.header[0] == "Onboard parameters for Vehicle 1"
+    assert [(each.system, each.component, list(each)) for each in file.sets] == [
+        (1, 1, ["MC_ROLL_P", "BAT1_CAPACITY", "SYS_AUTOSTART"]),
+        (1, 100, ["CAM_MODE"]),
+        (2, 1, ["MC_ROLL_P"]),
+    ]
+    assert file.choose(system=1)["BAT1_CAPACITY"].bits_as(ParamType.REAL32) == 0x7FC00000
+    assert (file.choose(100)["CAM_MODE"].value, file.choose(100)["CAM_MODE"].type) == (2, ParamType.INT8)
+    assert isinstance(file.choose(1, system=2)["MC_ROLL_P"].value, float)
+    with pytest.raises(FileError, match=r"quad.params: more than one fits .*holds 1/1, 1/100, 2/1"):
+        file.choose()
+    with pytest.raises(FileError, match=r"none fits \(any system, component 7\)"):
+        file.choose(7)
+    with pytest.raises(FileError, match=r"none fits \(system 9, the autopilot\)"):
+        file.choose(system=9)
+
+
+def test_a_set_of_nobody_in_particular_fits_everyone() -> None:
+    file = loads(b"A 1\n")
+    assert file.choose() == file.choose(1) == file.choose(42, system=3) == file.sets[0]
+
+
+@pytest.mark.parametrize("name", ["ardupilot_param.pck", "ardupilot_param_withdefaults.pck"])
+def test_what_a_vehicle_has_packed_goes_through_other_forms(name: str) -> None:
+    file = loads((DATA / name).read_bytes(), source=name)
+    assert (file.form, len(file.sets[0]), file.notes) == (FileForm.PCK, 1382, ())
+    with_defaults = "defaults" in name
+    assert all((param.default is not None) is with_defaults for param in file.sets[0].values())
+    params = replace(file.sets[0], system=1, component=1)
+    for form in (FileForm.QGC, FileForm.JSON, FileForm.PARM, FileForm.PCK):
+        read = back(params, form)
+        assert [param.bits_as(params[name].type or 0) for name, param in read.items()] == [
+            param.bits_as(param.type or 0) for param in params.values()
+        ]
+    assert loads(dumps(params, form="pck"), source=name).sets == file.sets
+    assert with_defaults or dumps(params, form="pck") == (DATA / name).read_bytes()
+
+
+def test_a_part_of_a_packed_file_is_told_as_one() -> None:
+    from paramclient.protocol.ftp import param_pck
+
+    entry = param_pck.PackedParam("A", ParamType.INT8, 1)
+    file = loads(param_pck.encode([entry], total=3))
+    assert file.notes == ("The file holds 1 of the vehicle's 3 parameters.",)
+    assert loads(param_pck.encode_upload([entry])).notes == ()
+    assert "holds no parameter" in str(failed(param_pck.encode([])))
+    assert "no packed parameter file: the file is cut off" in str(failed(param_pck.encode([entry])[:-1]))
+
+
+@pytest.mark.parametrize("table", ["px4.csv", "ardupilot.csv"])
+def test_the_tables_of_real_vehicles_go_through_other_forms(table: str) -> None:
+    with (TABLES / table).open(encoding="utf-8") as file:
+        rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
+    params = params_of(
+        *(
+            WrittenParam(row["name"], float(row["value"]), ParamType[row["type"]])
+            for row in rows
+            if row["type"] in ParamType.__members__
+        )
+    )
+    assert len(params) > 900
+    for form in (FileForm.QGC, FileForm.MISSION_PLANNER, FileForm.YAML):
+        assert all(
+            param.bits_as(params[name].type or 0) == params[name].bits_as(params[name].type or 0)
+            for name, param in back(params, form).items()
+        )
+
+
+# scripts of PX4
+
+SCRIPT = """#!/bin/sh
+# @name Generic
+. ${R}etc/init.d/rc.mc_defaults
+
+param set-default -s CA_ROTOR_COUNT 4 # rotors
+param set MC_ROLL_P 6.5
+if param compare SYS_AUTOSTART 0
+then
+\techo none
+fi
+param set-default MAV_TYPE 2
+set MIXER quad_x
+"""
+
+
+def test_a_script_is_read_for_what_it_sets_in_any_case() -> None:
+    file = loads(SCRIPT.encode(), source="4001_quad_x")
+    assert file.form is FileForm.PX4_SCRIPT
+    assert [(each.name, each.value, each.comment, each.line) for each in file.sets[0].values()] == [
+        ("CA_ROTOR_COUNT", 4, "rotors", 5),
+        ("MC_ROLL_P", 6.5, "", 6),
+        ("MAV_TYPE", 2, "", 11),
+    ]
+    assert file.header == ("!/bin/sh", "@name Generic")
+    (note,) = file.notes
+    assert note.startswith("Lines 3, 7, 8, 9, 10, … of the script set no parameter; what other scripts set")
+    with pytest.raises(FileError, match="are read and not written"):
+        dumps(file)
+
+
+@pytest.mark.parametrize(
+    ("lines", "value", "line"),
+    [
+        ("param set A 1\nparam set A 2", 2, 2),
+        ("param set-default A 1\nparam set-default A 2", 2, 2),
+        ("param set-default A 1\nparam set A 2", 2, 2),
+        ("param set A 1\nparam set-default A 2", 1, 1),  # a default replaces no value
+        ("param set A 1\nparam set-default A 2\nparam set A 3", 3, 3),
+    ],
+)
+def test_of_a_name_that_a_script_sets_twice_the_last_value_counts(lines: str, value: int, line: int) -> None:
+    file = loads(lines.encode())
+    param = file.sets[0]["A"]
+    assert (param.value, param.line) == (value, line)
+    assert any(f"{value} in line {line} counts, not" in note for note in file.notes)
+
+
+@pytest.mark.parametrize(
+    ("lines", "line", "problem"),
+    [
+        ("if [ $X ]\nthen\nparam set A 1\nfi", 3, "inside of a condition, loop or function"),
+        ("while x\ndo\n  param set A 1\ndone", 3, "inside of a condition"),
+        ("f() {\nparam set A 1\n}", 2, "inside of a condition"),
+        ("if x; then exit; fi\nparam set A 1", 2, "behind an exit"),
+        ("if x; then param set A 1; fi", 1, "and nothing else"),
+        ("param set A $X", 1, "without variables"),
+        ("param set A ${X}", 1, "without variables"),
+        ("param set A 1; param set B 2", 1, "and nothing else"),
+        ("param set A 1 && param save", 1, "and nothing else"),
+        ("param set A 1,5", 1, "with a number"),
+        ("param set A", 1, "and nothing else"),
+        ("param set A 1\nparam reset", 2, "and nothing else"),
+        ("param set A 1\nparam load /fs/x", 2, "and nothing else"),
+        ("param set A_VERY_LONG_NAME_ 1", 1, "a param_id holds 16"),
+    ],
+)
+def test_what_a_script_sets_only_perhaps_is_refused(lines: str, line: int, problem: str) -> None:
+    error = failed(lines)
+    assert (error.line, problem in str(error)) == (line, True), str(error)
+
+
+def test_a_block_that_is_over_no_longer_counts() -> None:
+    text = (
+        "if x; then\nif y; then\necho\nfi\nelif z; then echo\nfi\ncase a in\nb) echo;;\nesac\nparam set A 1"
+    )
+    assert loads(text.encode()).sets[0]["A"].value == 1
+
+
+# look-alikes
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"A 1\r\nB 0x1F\r\n",
+        b"\xef\xbb\xbfA,1\nB,31\n",
+        "A\t1\nB =\t31\n".encode("utf-16"),
+        b"\xfe\xff" + "A 1\nB 31".encode("utf-16-be"),
+        b"A   1 # x\n\n\t // y\n;z\nB , 31.0 ; w",
+        b"A,1\rB,0X1f\r",
+        b"A 1 @READONLY\nB +31e0",
+        b"A 1\nA 1.0\nB 31\n",
+    ],
+)
+def test_look_alikes_of_a_list_are_read_as_meant(data: bytes) -> None:
+    read = loads(data, source="quad.parm").sets[0]
+    assert {name: param.value for name, param in read.items()} == {"A": 1, "B": 31}
+
+
+def test_a_name_that_comes_twice_with_one_value_is_told() -> None:
+    assert loads(b"A 1\nB 2\nA 1\n").notes == ("A stands with one value in line 1 and line 3.",)
+    assert loads(b"A nan\nA nan\n").notes != ()
+    many = loads(b"A 1\n" * 1000).notes
+    assert (len(many), many[-1]) == (21, "979 more lines repeat a name.")
+    assert loads(b"A 1\n" * 22).notes[-1] == "1 more line repeats a name."
+
+
+@pytest.mark.parametrize(
+    ("text", "value", "note"),
+    [
+        ("A 1\nB 5\nA 2 # new", 2, "A stands twice: 2 in line 3 counts, not 1 in line 1."),
+        ("A 0.0\nA -0.0\nB 5", -0.0, "A stands twice: -0.0 in line 2 counts, not 0.0 in line 1."),
+        ("1\t1\tA\t1\t6\n1\t1\tB\t5\t6\n1\t1\tA\t2\t6\n", 2, "2 (INT32) in line 3 counts, not 1 (INT32)"),
+        ("1\t1\tA\t1\t9\n1\t1\tB\t5\t6\n1\t1\tA\t1\t6\n", 1, "1 (INT32) in line 3 counts, not 1.0 (REAL32)"),
+    ],
+)
+def test_of_a_name_that_comes_twice_the_last_value_counts(text: str, value: float, note: str) -> None:
+    file = loads(text.encode())
+    params = file.sets[0]
+    assert (list(params), repr(params["A"].value)) == (["A", "B"], repr(value))
+    (told,) = file.notes
+    assert note in told
+
+
+def test_the_last_of_three_counts_with_its_comment_and_line() -> None:
+    file = loads(b"A 1 # one\nA 2 # two\nA 3 # three\n")
+    param = file.sets[0]["A"]
+    assert (param.value, param.comment, param.line, len(file.notes)) == (3, "three", 3, 2)
+
+
+def test_two_components_may_have_one_name() -> None:
+    file = loads(b"1\t1\tA\t1\t6\n1\t100\tA\t2\t6\n")
+    assert ([each["A"].value for each in file.sets], file.notes) == ([1, 2], ())
+
+
+def test_what_only_ardupilot_reads_of_a_line_is_kept_as_a_comment() -> None:
+    assert loads(b"A 1 @READONLY # mine\n").sets[0]["A"].comment == "mine\n@READONLY"
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("A,1,5", "expected NAME,VALUE with a decimal point (1.5, not 1,5), found 'A,1,5'"),
+        ("A 1,5", "with a decimal point"),
+        ("A 1.5 m/s", "and nothing behind it (no unit, no further column)"),
+        ("A 1.5m", "with a number"),
+        ("A 1 2", "and nothing behind it"),
+        ("A", "expected NAME VALUE, found 'A'"),
+        ("A,", "with a number"),
+        ("A;5", "expected"),
+        ("A 1_000", "with a number"),
+        ("A \uff11", "with a number"),
+        ("A\u00a01", "expected"),
+        ("A 1e999", "with a number"),
+        ("A " + "9" * 5000, "with a number"),
+        ("A -nan", "with a number"),
+        ("A -0x10", "with a number"),
+        ("A 1.#INF", "with a number"),
+        ("A,-1.#IND", "with a number"),
+        ("A 1.#QNAN00 # said a printf", "with a number"),
+        ("A None", "with a number"),
+        ("1 2", "with a parameter's name"),
+        ("Ä 2", "with a parameter's name"),
+        ("AÄ 2", "only printable ASCII"),
+        ("A: 2", "with a parameter's name"),
+        ("A_VERY_LONG_NAME_ 2", "a param_id holds 16"),
+        ("@include other.parm", "only a file on the disk can include another one"),
+        ("@include", "a line for ArduPilot's tools that is not known"),
+        ("@delete", "a line for ArduPilot's tools that is not known"),
+        ("@delete A B", "not known"),
+        ("@delete A", "the file holds no parameter"),
+        ("A 1\n" + "@delete A\n" * 257, "at most 256 lines with @delete"),
+        ("<html>", "expected"),
+        ("hello world", "with a number"),
+    ],
+)
+def test_look_alikes_that_nobody_can_be_sure_of_are_refused(text: str, problem: str) -> None:
+    assert problem in str(failed(text))
+
+
+@pytest.mark.parametrize(
+    ("row", "problem"),
+    [
+        ("1\t1\tB\t1,5\t9", "a number with a decimal point in the fourth column"),
+        ("1\t1\tB\t1.5\t6", "1.5 is not a whole number"),
+        ("1\t1\tB\t300\t1", "300 does not fit UINT8"),
+        ("1\t1\tB\t1e39\t9", "beyond the range of a float32"),
+        ("1\t1\tB\t1\t11", "a type from 1 to 10"),
+        ("0\t1\tB\t1\t9", "from 1 to 255"),
+        ("1\t1\t2\t1\t9", "a parameter's name"),
+        ("1\t1\tA_VERY_LONG_NAME_\t1\t9", "a param_id holds 16"),
+        ("1\t1\tB\t1\t9\tx", "vehicle, component, name, value and type, with tabs"),
+        ("1\t1\tB\t1", "vehicle, component"),
+        ("B,1", "vehicle, component"),
+    ],
+)
+def test_a_bad_row_of_qgroundcontrol_is_refused(row: str, problem: str) -> None:
+    error = failed(f"1\t1\tA\t1\t9\n{row}\n")
+    assert (error.line, problem in str(error)) == (2, True), str(error)
+
+
+def test_all_bad_lines_are_listed_but_no_more_than_anyone_reads() -> None:
+    error = failed("A 1\n" + "bad\n" * 50)
+    assert str(error).splitlines()[:2] == [
+        "quad.x:2: expected NAME VALUE, found 'bad'",
+        "quad.x:3: expected NAME VALUE, found 'bad'",
+    ]
+    assert str(error).splitlines()[20:] == ["and 30 more bad lines"]
+    assert (error.source, error.line, error.expected) == ("quad.x", 2, "NAME VALUE")
+    long = "x" * 10_000
+    assert len(str(failed(f"A 1\n{long}"))) < 300
+    assert (
+        len(str(failed(f'{{"paramclient": 1, "sets": [{{"params": {{"A": {{"value": "{long}"}}}}}}]}}')))
+        < 400
+    )
+    assert len(str(failed(f'{{"{long}": 1, "{long}": 2}}'))) < 300
+    assert len(str(failed(f"paramclient: 1\n{long}: 1\n{long}: 2\n"))) < 300
+
+
+@pytest.mark.parametrize(
+    ("data", "problem", "line"),
+    [
+        (b"", "the file is empty", None),
+        (b" \n\n", "holds no parameter", None),
+        (b"# only a comment\n", "holds no parameter", None),
+        (b"A 1\nB \xff\n", "expected UTF-8 text, found the byte 0xff", 2),
+        (b"A 1\n\x00\x01", "found the character 0x00", 2),
+        (b"\x7fELF\x02", "found the character 0x7f", 1),
+        (b"\x1f\x8b\x08\x00", "found the byte 0x8b", 1),
+        (b"\x1b\x67\x05", "no packed parameter file", None),
+        ("A 1\n".encode("utf-16-le"), "found the character 0x00", 1),
+    ],
+)
+def test_what_is_no_parameter_file_says_so(data: bytes, problem: str, line: int | None) -> None:
+    error = failed(data)
+    assert (problem in str(error), error.line) == (True, line), str(error)
+
+
+@given(data=st.binary(max_size=200), form=st.sampled_from([None, *FileForm]))
+@settings(max_examples=300, deadline=None)
+def test_rubbish_leads_to_an_error_or_to_parameters(data: bytes, form: FileForm | None) -> None:
+    try:
+        file = loads(data, form=form)
+    except FileError:
+        return
+    assert file.sets
+
+
+@given(
+    text=st.text("{}[]:,-\"'&*!|>#%@\n\t A1e.0xparmclientsetvu", max_size=80),
+    form=st.sampled_from(list(FileForm)),
+)
+@settings(max_examples=400, deadline=None)
+def test_so_does_rubbish_that_looks_like_something(text: str, form: FileForm) -> None:
+    try:
+        loads(text.encode(), form=form)
+    except FileError:
+        return
+
+
+# which form
+
+
+@pytest.mark.parametrize(
+    ("text", "source", "form"),
+    [
+        ("A 1", "x.parm", "parm"),
+        ("A,1", "x.parm", "parm"),
+        ("A 1", "x.param", "mission-planner"),
+        ("A 1", "x", "parm"),
+        ("A,1", "x.txt", "mission-planner"),
+        ("A,1", "x.params", "mission-planner"),
+        ("A 1", "x.json", "parm"),
+        ("1 1 A 1 9", "x.param", "qgc"),
+        ("param set A 1", "x.param", "px4-script"),
+        ("#!/bin/sh\n. x\nparam set A 1", "x.param", "px4-script"),
+        ("#! mine\nA 1", "x.parm", "parm"),
+        ('{"paramclient": 1, "sets": [{"params": {"A": {"value": 1}}}]}', "x.param", "json"),
+        ("# hi\nparamclient: 1\nsets: [{params: {A: {value: 1}}}]", "x.param", "yaml"),
+        ("---\nparamclient: 1\nsets: [{params: {A: {value: 1}}}]", "x", "yaml"),
+        ("sets: [{params: {A: {value: 1}}}]\nparamclient: 1", "x.yml", "yaml"),
+    ],
+)
+def test_the_content_tells_the_form(text: str, source: str, form: str) -> None:
+    file = loads(text.encode(), source=source)
+    assert (file.form, file.sets[0]["A"].value, file.sets[0].source) == (form, 1, source)
+
+
+def test_a_form_that_is_named_is_taken_at_its_word() -> None:
+    assert loads(b"A 1", form="mission-planner").form is FileForm.MISSION_PLANNER
+    assert "vehicle, component" in str(failed("A 1", form="qgc"))
+    with pytest.raises(UsageError, match=r"no form of file is called 'xml'; there are qgc, parm"):
+        loads(b"A 1", form="xml")
+    with pytest.raises(UsageError, match="a form is needed"):
+        dumps(params_of(WrittenParam("A", 1)))
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"), [("bad", "expected JSON"), ("A: 1", "paramclient: the field is missing")]
+)
+def test_the_ending_says_what_was_expected_where_the_content_does_not(text: str, problem: str) -> None:
+    with pytest.raises(FileError, match=problem):
+        loads(text.encode(), source="x.json" if text == "bad" else "x.yaml")
+
+
+# what cannot be written
+
+
+@pytest.mark.parametrize(
+    ("params", "form", "problem"),
+    [
+        (params_of(), "parm", "there is no parameter to write"),
+        (
+            params_of(WrittenParam("A", 1)),
+            "qgc",
+            "A has no type that MAVLink defines, and this form needs one",
+        ),
+        (
+            params_of(WrittenParam("A", 1, ParamType.INT8), system=None),
+            "qgc",
+            "the set has none: give it one",
+        ),
+        (params_of(WrittenParam("A", 1)), "pck", "A has no type, and a packed file holds INT8, INT16"),
+        (params_of(WrittenParam("A B", 1)), "parm", "the name 'A B' cannot stand in a line"),
+        (params_of(WrittenParam("@A", 1)), "parm", "the name '@A' cannot stand in a line"),
+        (params_of(WrittenParam("A#", 1, ParamType.INT8)), "qgc", "the name 'A#' cannot stand in a line"),
+        (params_of(WrittenParam("A=", 1)), "mission-planner", "the name 'A=' cannot stand in a line"),
+        (params_of(WrittenParam("A", 300, ParamType.INT8)), "json", "300 does not fit INT8"),
+    ],
+)
+def test_what_a_form_cannot_say_is_refused(params: ParamSet, form: str, problem: str) -> None:
+    with pytest.raises(FileError) as caught:
+        dumps(params, form=form, target="out.x")
+    assert str(caught.value).startswith("out.x: ")
+    assert problem in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("params", "problem"),
+    [
+        (params_of(WrittenParam("A", 1), system=256), "ids from 1 to 255, not 256"),
+        (params_of(WrittenParam("A", 1), component=0), "ids from 1 to 255, not 0"),
+        (params_of(WrittenParam("", 1)), "at least one character"),
+        (params_of(WrittenParam("A_VERY_LONG_NAME_", 1)), "a param_id holds 16"),
+        (replace(params_of(WrittenParam("A", 1)), at=math.inf), "inf is no time in unix seconds"),
+        (replace(params_of(WrittenParam("A", 1)), at=1e300), "is no time in unix seconds"),
+    ],
+)
+@pytest.mark.parametrize("form", ["parm", "json", "yaml"])
+def test_what_nobody_could_read_again_is_not_written(params: ParamSet, problem: str, form: str) -> None:
+    with pytest.raises(FileError, match=problem):
+        dumps(params, form=form)
+
+
+@pytest.mark.parametrize("form", [*PAIRS, FileForm.PCK])
+def test_a_form_for_one_component_refuses_two(form: FileForm) -> None:
+    two = [params_of(WrittenParam("A", 1, ParamType.INT8), component=each) for each in (1, 100)]
+    with pytest.raises(FileError, match=f"the form {form} holds one component, and there are 1/1, 1/100"):
+        dumps(two, form=form)
+
+
+def test_two_sets_of_one_component_are_refused() -> None:
+    two = [params_of(WrittenParam("A", 1, ParamType.INT8), component=each) for each in (1, None)]
+    with pytest.raises(FileError, match=r"two sets are of one component, 1/\?"):
+        dumps(two, form="qgc")
+
+
+# the document
+
+
+@pytest.mark.parametrize(
+    ("fields", "problem"),
+    [
+        ('"value": 1, "type": "INT8", "bits": "00000002"', "value 1 and bits 00000002 (2) contradict"),
+        ('"value": 1, "bits": "00000001"', "bits say nothing without a type"),
+        ('"value": 1, "type": "INT8", "bits": "1"', "8 or 16 hexadecimal digits"),
+        ('"value": 1, "type": "INT8", "bits": "00000101"', "more than the type has"),
+        ('"value": 1, "type": "INT9"', "no type is called 'INT9'"),
+        ('"value": 1, "type": "TYPE_3"', "no type is called 'TYPE_3'"),
+        ('"value": 1, "type": 6', "found 6"),
+        ('"value": 1.5, "type": "INT8"', "1.5 is not a whole number"),
+        ('"value": 300, "type": "INT8"', "300 does not fit INT8"),
+        ('"value": 1, "type": "INT8", "default": 300', "300 does not fit INT8"),
+        ('"value": true', "expected a number"),
+        ('"value": null', "expected a number"),
+        ('"value": "1"', "expected a number"),
+        ('"value": "nan"', "expected a number"),
+        ('"value": [1]', "expected a number"),
+        ('"value": 1e999', "beyond the range of a double"),
+        ('"value": NaN', "NaN is no JSON"),
+        ('"value": 1, "units": "m"', "no such field is known"),
+        ('"type": "INT8"', "the field is missing"),
+        ('"value": 1, "value": 2', "'value' stands twice"),
+        ('"value": 1, "comment": 5', "found 5"),
+    ],
+)
+def test_a_field_that_cannot_be_right_is_refused(fields: str, problem: str) -> None:
+    error = failed(
+        f'{{"paramclient": 1, "sets": [{{"params": {{"OK": {{"value": 1}}, "A": {{{fields}}}}}}}]}}'
+    )
+    assert problem in str(error)
+    assert error.source == "quad.x"
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("{", "expected JSON"),
+        ("{}", "paramclient: the field is missing"),
+        ('{"paramclient": 2, "sets": []}', "paramclient"),
+        ('{"paramclient": 1, "sets": []}', "holds no parameter"),
+        ('{"paramclient": 1, "sets": [{"params": {}}]}', "holds no parameter"),
+        ('{"paramclient": 1, "sets": [{"at": 5, "params": {}}]}', "is written as 2026"),
+        ('{"paramclient": 1, "sets": [{"at": "2026-01-31T12:00:00", "params": {}}]}', "needs its zone"),
+        ('{"paramclient": 1, "sets": [{"at": "soon", "params": {}}]}', "is written as 2026"),
+        ('{"paramclient": 1, "sets": [{"at": "1700000000", "params": {}}]}', "is written as 2026"),
+        ('{"paramclient": 1, "sets": [{"at": "2026-02-31T12:00:00Z", "params": {}}]}', "found '2026-02-31"),
+        ('{"paramclient": 1, "sets": [{"system": 256, "params": {}}]}', "sets.0.system"),
+        ('{"paramclient": 1, "sets": [{"params": {"": {"value": 1}}}]}', "at least one character"),
+        ('{"paramclient": 1, "sets": [{"params": {"\\u001b": {"value": 1}}}]}', "only printable ASCII"),
+        (
+            '{"paramclient": 1, "sets": [{"params": {"A": {"value": 1}, "A": {"value": 1}}}]}',
+            "'A' stands twice",
+        ),
+        ('{"a":' * 100_000, "nested that deep"),
+        ('{"A": %s}' % ("9" * 5000), "9…' is beyond the range of every type"),
+        ('{"A": %s.0}' % ("9" * 5000), "9…' is beyond the range of a double"),
+    ],
+)
+def test_a_document_that_is_none_is_refused(text: str, problem: str) -> None:
+    assert problem in str(failed(text))
+
+
+def test_errors_in_a_document_name_the_line_of_the_parameter() -> None:
+    bad = "".join(f',\n"B{at}": {{"value": 1, "type": "?"}}' for at in range(30))
+    error = failed(f'{{"paramclient": 1, "sets": [{{"params": {{\n"A": {{"value": 1}}{bad}}}}}]}}')
+    lines = str(error).splitlines()
+    assert lines[0].startswith("quad.x:3: sets.0.params.B0: no type is called '?'")
+    assert lines[1].startswith("quad.x:4: sets.0.params.B1: ")
+    assert lines[20:] == ["and 10 more"]
+    assert error.line == 3
+
+
+@pytest.mark.parametrize(
+    ("value", "problem"),
+    [
+        *(
+            (trap, "expected a number")
+            for trap in ("NO", "on", "1:30", "010", "0o17", "1_000", ".5", "0x10", "~")
+        ),
+        ("2026-01-31", "expected a number"),
+        ("&a 1", "an anchor or a tag"),
+        ("!!float 1", "an anchor or a tag"),
+        ("!!python/object:os.system x", "an anchor or a tag"),
+        ("*a", "an alias"),
+        ("[" * 30 + "]" * 30, "more than 20 levels"),
+        ("9" * 5000, "9…' is beyond the range of every type"),
+        ("1, value: 2", "'value' stands twice"),
+        ("1, 2: 3", "a key that is no text"),
+        ("{", "expected YAML"),
+        ("1, <<: {}", "no such field"),
+    ],
+)
+def test_traps_of_yaml_are_refused(value: str, problem: str) -> None:
+    error = failed(f"paramclient: 1\nsets:\n- params:\n    A: {{value: {value}}}\n")
+    assert problem in str(error)
+
+
+def test_yaml_reads_numbers_as_json_does() -> None:
+    rows = "".join(f"    {name}: {{value: {name[1:]}}}\n" for name in ("A1e3", "A-1.5E-3", "A0", "A-7"))
+    rows += "    NO: {value: 1}\n    null: {value: 2}\n"
+    text = f"# mine\nparamclient: 1\nheader: [x]\nsets:\n- params:\n{rows}"
+    with pytest.raises(FileError, match="a key that is no text"):
+        loads(text.encode())
+    file = loads(text.replace("null", '"null"').encode())
+    assert [param.value for param in file.sets[0].values()] == [1000.0, -0.0015, 0, -7, 1, 2]
+    assert file.header == ("x",)
+
+
+def test_yaml_without_its_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("paramclient.files.document.find_spec", lambda _: None)
+    data = dumps(params_of(WrittenParam("A", 1)), form="yaml")
+    with pytest.raises(FileError, match=r"pip install 'paramclient\[yaml\]'"):
+        loads(data)
+
+
+def test_a_file_shows_what_it_holds() -> None:
+    file = loads(b"A 1", source="x.parm")
+    assert repr(file) == "<ParamFile x.parm parm ?/?: 1>"
+
+
+def test_a_letter_of_a_higher_plane_in_a_header_can_be_read_again() -> None:
+    """YAML knows no surrogates, which JSON writes such letters with."""
+    file = loads("# for the \N{HELICOPTER} of Jo \U0004f78d\n\nRC1_MIN,1100\n".encode())
+    for form in (FileForm.YAML, FileForm.JSON):
+        assert loads(dumps(file, form=form)).header == file.header
+
+
+def test_lines_that_delete_look_at_so_many_parameters_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(line_formats, "DELETE_LOOKS_MAX", 5)
+    rows = "A 1\nB 2\n"
+    assert len(loads(f"{rows}@delete X\n@delete A\nC 3\n".encode(), source="a.parm").sets[0]) == 2
+    with pytest.raises(FileError, match=r"a\.parm:5: .* look at 5 parameters"):
+        loads(f"{rows}@delete X\n@delete X\n@delete X\n".encode(), source="a.parm")

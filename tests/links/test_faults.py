@@ -1,0 +1,446 @@
+"""What befalls links from outside: networks that come and go, names that move, ports that others want."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import os
+import selectors
+import socket
+from collections.abc import Callable
+from typing import Any
+
+import anyio
+import anyio.lowlevel
+import pytest
+
+from paramclient.client import link_task
+from paramclient.errors import LinkError
+from paramclient.links import Link, Peer, create_link, serve_endpoint, udp
+from paramclient.protocol import wire
+from tests.cable import PATIENCE
+from tests.shell import a_client, bits, generic
+
+HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
+GONE = [errno.ENETDOWN, errno.ENETUNREACH, errno.EADDRNOTAVAIL, errno.EINVAL]
+
+
+class Net:
+    """A network that can be unplugged: while it is, every datagram is refused for this reason."""
+
+    def __init__(self, patch: pytest.MonkeyPatch) -> None:
+        self.reason: int | None = None
+        transmit = udp.UdpLink._transmit
+        connected = udp.UdpOut._transmit
+
+        def sent_by(original: Callable[..., None]) -> Callable[..., None]:
+            def send(link: udp.UdpLink, sock: socket.socket, data: bytes, address: Any) -> None:
+                if self.reason is not None and not getattr(link, "is_the_vehicles", False):
+                    raise OSError(self.reason, os.strerror(self.reason))
+                original(link, sock, data, address)
+
+            return send
+
+        patch.setattr(udp.UdpLink, "_transmit", sent_by(transmit))
+        patch.setattr(udp.UdpOut, "_transmit", sent_by(connected))
+
+
+@pytest.fixture
+def net(monkeypatch: pytest.MonkeyPatch) -> Net:
+    return Net(monkeypatch)
+
+
+@pytest.fixture
+def names(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """What names stand for: an address, or what happens when somebody asks."""
+    known: dict[str, Any] = {}
+
+    async def getaddrinfo(host: str, port: int, **_: object) -> list[Any]:
+        await anyio.lowlevel.checkpoint()
+        found = known[host]
+        if callable(found):
+            found = await found()
+        return [(socket.AF_INET, 0, 0, "", (found, port))]
+
+    monkeypatch.setattr(anyio, "getaddrinfo", getaddrinfo)
+    return known
+
+
+def listening(host: str = "127.0.0.1", port: int = 0) -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.bind((host, port))
+    sock.settimeout(PATIENCE)
+    return sock
+
+
+async def failure(link: Link) -> LinkError:
+    with anyio.fail_after(PATIENCE), pytest.raises(LinkError) as caught:  # noqa: PT012 - after what has come
+        while True:
+            await link.receive()
+    return caught.value
+
+
+# The network goes
+
+
+@pytest.mark.parametrize("reason", GONE)
+@pytest.mark.asyncio
+async def test_a_network_that_is_away_for_moments_costs_what_is_sent_then(
+    net: Net, reason: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(udp, "UNREACHABLE_PATIENCE", 0.0)
+    with listening() as vehicle:
+        link: Any = create_link(f"udpout:127.0.0.1:{vehicle.getsockname()[1]}")
+        await link.open()
+        for number in range(3):
+            net.reason = reason
+            await link.send(b"lost", None)
+            net.reason = None
+            await link.send(bytes([number]), None)
+            assert vehicle.recv(10) == bytes([number])
+        assert link.lost_sends == 3
+        await link.close()
+
+
+@pytest.mark.parametrize("name", ["udpout:127.0.0.1:14999", "udpin:127.0.0.1:0"])
+@pytest.mark.parametrize("reason", GONE)
+@pytest.mark.asyncio
+async def test_a_socket_with_no_way_out_is_made_anew_on_its_port(
+    net: Net, name: str, reason: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(udp, "UNREACHABLE_PATIENCE", 0.0)
+    link: Any = create_link(name)
+    await link.open()
+    address = link.address
+    with listening() as vehicle:
+        if name.startswith("udpin"):
+            vehicle.sendto(HEARTBEAT, address)
+            await link.receive()
+        net.reason = reason
+        await link.send(b"1", None)
+        async with anyio.create_task_group() as tasks:
+            errors: list[LinkError] = []
+
+            async def wait() -> None:
+                errors.append(await failure(link))
+
+            tasks.start_soon(wait)
+            await anyio.lowlevel.checkpoint()
+            with pytest.raises(LinkError, match=r"no way out from 127\.0\.0\.1 any more: ") as caught:
+                await link.send(b"2", None)
+        assert str(errors[0]) == str(caught.value)
+        assert isinstance(caught.value.__cause__, OSError)
+        net.reason = None
+        await link.open()
+        assert link.address == address
+        await link.send(b"3", None)
+    await link.close()
+
+
+@pytest.mark.asyncio
+async def test_a_socket_for_every_address_needs_no_other(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Linux sends with the address that it has by then."""
+    monkeypatch.setattr(udp, "UNREACHABLE_PATIENCE", 0.0)
+    link: Any = create_link("udpin:0.0.0.0:0")
+    await link.open()
+    with listening() as vehicle:
+        vehicle.sendto(HEARTBEAT, ("127.0.0.1", link.address[1]))
+        await link.receive()
+        net.reason = errno.ENETUNREACH
+        for _ in range(5):
+            await link.send(b"1", None)
+        net.reason = None
+        await link.send(b"2", None)
+        assert vehicle.recv(10) == b"2"
+    await link.close()
+
+
+@pytest.mark.asyncio
+async def test_an_address_that_goes_and_comes_back(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A whole session: `udpin` on an address that this computer loses for a while."""
+    monkeypatch.setattr(udp, "UNREACHABLE_PATIENCE", 0.0)
+    monkeypatch.setattr(link_task, "FIRST_BACKOFF", 0.01)
+    is_gone = [False]
+    bind = udp.UdpIn._open
+
+    async def open_if_there(link: udp.UdpIn, opening: int) -> None:
+        if is_gone[0]:
+            raise OSError(errno.EADDRNOTAVAIL, os.strerror(errno.EADDRNOTAVAIL))
+        await bind(link, opening)
+
+    monkeypatch.setattr(udp.UdpIn, "_open", open_if_there)
+    vehicle = generic(burst=50, period=0.001)
+    with anyio.fail_after(PATIENCE):
+        async with a_client("udpin:127.0.0.1:0") as client, anyio.create_task_group() as tasks:
+            far: Any = create_link(f"udpout:127.0.0.1:{client.link.address[1]}")  # type: ignore[attr-defined]
+            far.is_the_vehicles = True
+            tasks.start_soon(serve_endpoint, vehicle, far)
+            component = await client.component()
+            is_gone[0], net.reason = True, errno.ENETUNREACH
+            while " away, " not in repr(client):
+                with anyio.move_on_after(0.05):
+                    await component.get("PARAM_01")
+            await anyio.sleep(0.05)
+            is_gone[0], net.reason = False, None
+            assert (await component.fetch_all()).complete
+            assert bits(component.params) == bits(vehicle.params)
+            tasks.cancel_scope.cancel()
+
+
+@pytest.mark.parametrize("kind", ["udpin", "udpout"])
+@pytest.mark.asyncio
+async def test_a_socket_that_fails_is_opened_again(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the system says; and what is only the answer to an earlier datagram is passed over."""
+    script: list[int] = []
+
+    class Faulty(socket.socket):
+        def recvfrom_into(self, *arguments: Any) -> Any:
+            if script:
+                number = script.pop(0)
+                raise OSError(number, os.strerror(number))
+            return super().recvfrom_into(*arguments)
+
+    with listening() as far, monkeypatch.context() as patch:
+        patch.setattr(socket, "socket", Faulty)
+        port = far.getsockname()[1]
+        link: Any = create_link("udpin:127.0.0.1:0" if kind == "udpin" else f"udpout:127.0.0.1:{port}")
+        assert link.reconnects
+        await link.open()
+        script += [errno.ECONNRESET, errno.ECONNREFUSED, errno.ENETRESET]
+        far.sendto(HEARTBEAT, link.address)
+        [(_, data)] = await link.receive()
+        assert data == HEARTBEAT
+        script.append(errno.EIO)
+        far.sendto(HEARTBEAT, link.address)
+        assert "cannot receive: Input/output error" in str(await failure(link))
+        await link.open()
+        far.sendto(HEARTBEAT, link.address)
+        assert [data for _, data in await link.receive()] == [HEARTBEAT]
+        await link.close()
+
+
+# A name gets another address
+
+
+@pytest.mark.asyncio
+async def test_udpout_follows_a_name_while_nothing_comes(
+    names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(udp, "LOOK_AGAIN", 0.02)
+    names["drone"] = "127.0.0.1"
+    with listening() as before, listening("127.0.0.2", before.getsockname()[1]) as after:
+        link: Any = create_link(f"udpout:drone:{before.getsockname()[1]}")
+        await link.open()
+        local = link.address[1]
+        await link.send(HEARTBEAT, None)
+        before.recv(100)
+        names["drone"] = "127.0.0.2"
+        assert str(await failure(link)) == f"{link.name}: drone is at 127.0.0.2 now"
+        await link.open()
+        assert link.address[1] == local
+        await link.send(HEARTBEAT, None)
+        assert after.recv(100) == HEARTBEAT
+        await link.close()
+
+
+@pytest.mark.asyncio
+async def test_a_name_that_nobody_knows_for_a_while_changes_nothing(
+    names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(udp, "LOOK_AGAIN", 0.01)
+    asked = anyio.Event()
+
+    async def unknown() -> str:
+        asked.set()
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    with listening() as far:
+        names["drone"] = "127.0.0.1"
+        link: Any = create_link(f"udpout:drone:{far.getsockname()[1]}")
+        await link.open()
+        names["drone"] = unknown
+        async with anyio.create_task_group() as tasks:
+            got: list[tuple[Peer, bytes]] = []
+
+            async def receive() -> None:
+                got.extend(await link.receive())
+
+            tasks.start_soon(receive)
+            await asked.wait()
+            await anyio.sleep(0.03)
+            far.sendto(HEARTBEAT, link.address)
+        assert [data for _, data in got] == [HEARTBEAT]
+        await link.close()
+
+
+@pytest.mark.asyncio
+async def test_what_comes_does_not_wait_for_a_slow_resolver(
+    names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(udp, "LOOK_AGAIN", 0.01)
+    with listening() as far:
+
+        async def slow() -> str:
+            far.sendto(HEARTBEAT, link.address)
+            await anyio.sleep_forever()
+            raise AssertionError
+
+        names["drone"] = "127.0.0.1"
+        link: Any = create_link(f"udpout:drone:{far.getsockname()[1]}")
+        await link.open()
+        names["drone"] = slow
+        with anyio.fail_after(PATIENCE):
+            assert [data for _, data in await link.receive()] == [HEARTBEAT]
+        await link.close()
+
+
+@pytest.mark.asyncio
+async def test_tcp_asks_for_a_name_at_each_opening(names: dict[str, Any]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as before:
+        port = before.getsockname()[1]
+        with socket.create_server(("127.0.0.2", port)) as after:
+            names["drone"] = "127.0.0.1"
+            link: Any = create_link(f"tcp:drone:{port}")
+            await link.open()
+            before.accept()[0].close()
+            names["drone"] = "127.0.0.2"
+            await failure(link)
+            await link.open()
+            after.settimeout(PATIENCE)
+            after.accept()[0].close()
+            await link.close()
+
+
+# Others want the port
+
+
+@pytest.mark.parametrize("kind", ["udpin", "tcpin", "udpout"])
+@pytest.mark.parametrize("theirs", ["127.0.0.1", "0.0.0.0"])
+@pytest.mark.parametrize("options", [[socket.SO_REUSEADDR], [socket.SO_REUSEADDR, socket.SO_REUSEPORT]])
+@pytest.mark.asyncio
+async def test_nobody_gets_a_port_that_we_have(kind: str, theirs: str, options: list[int]) -> None:
+    """Two programs on one port would each get a part of what comes, or the wrong one all of it."""
+    link: Any = create_link(f"{kind}:127.0.0.1:{14999 if kind == 'udpout' else 0}")
+    await link.open()
+    transport = socket.SOCK_STREAM if kind == "tcpin" else socket.SOCK_DGRAM
+    with socket.socket(socket.AF_INET, transport) as other:
+        for option in options:
+            other.setsockopt(socket.SOL_SOCKET, option, 1)
+        with pytest.raises(OSError, match="Address already in use"):  # noqa: PT012 - it may let itself be bound
+            other.bind((theirs, link.address[1]))
+            other.listen()
+    await link.close()
+
+
+@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
+@pytest.mark.parametrize("ours", ["127.0.0.1", "0.0.0.0"])
+@pytest.mark.asyncio
+async def test_nor_do_we_get_one_that_others_would_share(kind: str, ours: str) -> None:
+    transport = socket.SOCK_STREAM if kind == "tcpin" else socket.SOCK_DGRAM
+    with socket.socket(socket.AF_INET, transport) as other:
+        for option in (socket.SO_REUSEADDR, socket.SO_REUSEPORT):
+            other.setsockopt(socket.SOL_SOCKET, option, 1)
+        other.bind(("127.0.0.1", 0))
+        if kind == "tcpin":
+            other.listen()
+        port = other.getsockname()[1]
+        with pytest.raises(LinkError, match=f"port {port} is in use by another program"):
+            await create_link(f"{kind}:{ours}:{port}").open()
+
+
+# Listening where one file cannot stand for many sockets, as on Windows
+
+
+@pytest.fixture
+def without_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(selectors, "DefaultSelector", selectors.SelectSelector)
+
+
+@pytest.mark.usefixtures("without_a_file")
+@pytest.mark.asyncio
+async def test_tcpin_hears_all_of_its_clients() -> None:
+    link: Any = create_link("tcpin:127.0.0.1:0")
+    await link.open()
+    clients = [socket.create_connection(link.address, timeout=PATIENCE) for _ in range(3)]
+    got: dict[Peer, bytes] = {}
+    with anyio.fail_after(PATIENCE):
+        for number, client in enumerate(clients):
+            client.send(bytes([number]))
+            got.update(await link.receive())
+        assert sorted(got.values()) == [b"\0", b"\1", b"\2"]
+        clients[1].close()
+        assert [data for _, data in await link.receive()] == [b""]
+        for _ in range(3):
+            with anyio.move_on_after(0.001):
+                await link.receive()
+        clients[2].send(b"after")
+        assert [data for _, data in await link.receive()] == [b"after"]
+        await link.send(b"to all", None)
+        assert [clients[number].recv(10) for number in (0, 2)] == [b"to all", b"to all"]
+    async with anyio.create_task_group() as tasks:
+        errors: list[LinkError] = []
+
+        async def wait() -> None:
+            errors.append(await failure(link))
+
+        tasks.start_soon(wait)
+        await anyio.wait_all_tasks_blocked()
+        await link.close()
+    assert "closed" in str(errors[0])
+    for client in clients:
+        client.close()
+
+
+@pytest.mark.usefixtures("without_a_file")
+@pytest.mark.asyncio
+async def test_a_session_over_such_a_listener() -> None:
+    vehicle = generic(stream=True, burst=50, period=0.001)
+    with anyio.fail_after(PATIENCE):
+        async with a_client("tcpin:127.0.0.1:0") as client, anyio.create_task_group() as tasks:
+            port = client.link.address[1]  # type: ignore[attr-defined]
+            tasks.start_soon(serve_endpoint, vehicle, create_link(f"tcp:127.0.0.1:{port}"))
+            component = await client.component()
+            assert (await component.fetch_all()).complete
+            assert bits(component.params) == bits(vehicle.params)
+            tasks.cancel_scope.cancel()
+
+
+# An event loop that cannot wait for sockets, as that of Windows
+
+
+class BlindLoop(asyncio.SelectorEventLoop):
+    """anyio then waits for them in a thread of its own."""
+
+
+def not_there(*_: object) -> None:
+    raise NotImplementedError
+
+
+for name in ("add_reader", "add_writer", "remove_reader", "remove_writer"):
+    setattr(BlindLoop, name, not_there)
+
+
+@pytest.mark.usefixtures("without_a_file")
+@pytest.mark.parametrize(("ours", "theirs"), [("udpin", "udpout"), ("tcpin", "tcp"), ("tcp", "tcpin")])
+def test_a_session_on_a_loop_that_cannot_wait_for_sockets(ours: str, theirs: str) -> None:
+    async def session() -> None:
+        vehicle = generic(stream="tcp" in ours, burst=50, period=0.001)
+        with anyio.fail_after(PATIENCE):
+            async with anyio.create_task_group() as tasks:
+                client = a_client(f"{ours}:127.0.0.1:0") if ours.endswith("in") else None
+                if client is None:
+                    far: Any = create_link(f"{theirs}:127.0.0.1:0")
+                    await tasks.start(serve_endpoint, vehicle, far)
+                    client = a_client(f"{ours}:127.0.0.1:{far.address[1]}")
+                async with client:
+                    if ours.endswith("in"):
+                        link: Any = client.link
+                        there = create_link(f"{theirs}:127.0.0.1:{link.address[1]}")
+                        tasks.start_soon(serve_endpoint, vehicle, there)
+                    component = await client.component()
+                    assert (await component.fetch_all()).complete
+                    assert bits(component.params) == bits(vehicle.params)
+                    tasks.cancel_scope.cancel()
+
+    with asyncio.Runner(loop_factory=BlindLoop) as runner:
+        runner.run(session())

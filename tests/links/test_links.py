@@ -1,0 +1,1359 @@
+"""Links: names, sockets on loopback, simulated vehicles in the process and on the wire."""
+
+from __future__ import annotations
+
+import errno
+import os
+import resource
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import anyio
+import anyio.lowlevel
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from paramclient.errors import LinkError, UsageError
+from paramclient.links import (
+    Link,
+    LinkKind,
+    LinkSpec,
+    Peer,
+    SimLink,
+    create_link,
+    link,
+    parse_link,
+    serve_endpoint,
+    tcp,
+    udp,
+)
+from paramclient.protocol import wire
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
+from tests.cable import Cable
+
+HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
+PATIENCE = 20.0  # seconds after which a test gives up; nothing waits that long when all is well
+RMEM_MAX = int(Path("/proc/sys/net/core/rmem_max").read_text())
+
+
+def frame(number: int) -> bytes:
+    """A PARAM_VALUE that differs from every other by its index."""
+    value = wire.ParamValue("SYS_AUTOSTART", bytes(4), 6, 2000, number)
+    return wire.encode(value, system=1, component=1, sequence=number % 256)
+
+
+def open_files() -> int:
+    return len(os.listdir("/dev/fd"))  # noqa: PTH208 - numbers, not paths
+
+
+async def collect(link: Link, count: int) -> list[tuple[Peer, bytes]]:
+    """Receive until so many chunks have come."""
+    found: list[tuple[Peer, bytes]] = []
+    with anyio.fail_after(PATIENCE):
+        while len(found) < count:
+            found += await link.receive()
+    return found
+
+
+@asynccontextmanager
+async def opened(name: str) -> AsyncIterator[Any]:
+    """A link by its name, open. `Any`, because tests also look at what only some kinds have."""
+    link = create_link(name)
+    await link.open()
+    try:
+        yield link
+    finally:
+        await link.close()
+
+
+@contextmanager
+def udp_socket(to: tuple[str, int] | None = None, *, host: str = "127.0.0.1") -> Iterator[socket.socket]:
+    """The far side on UDP: bound to a port of its own, blocking, connected where an address is given."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with socket.socket(family, socket.SOCK_DGRAM) as sock:
+        sock.bind((host, 0))
+        sock.settimeout(PATIENCE)
+        if to is not None:
+            sock.connect(to)
+        yield sock
+
+
+def free_udp_port() -> int:
+    with udp_socket() as sock:
+        return int(sock.getsockname()[1])
+
+
+@contextmanager
+def tcp_listener(backlog: int = 8) -> Iterator[socket.socket]:
+    with socket.create_server(("127.0.0.1", 0), backlog=backlog) as listener:
+        listener.settimeout(PATIENCE)
+        yield listener
+
+
+def ipv6_works() -> bool:
+    try:
+        with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as sock:
+            sock.bind(("::1", 0))
+    except OSError:
+        return False
+    return True
+
+
+LOOPBACKS = ["127.0.0.1", *(["::1"] if ipv6_works() else [])]
+
+
+@dataclass
+class Post:
+    """An endpoint that hands over what the test puts in, and keeps what it is given. Looks every ms."""
+
+    inbox: list[bytes] = field(default_factory=list)
+    outbox: list[bytes] = field(default_factory=list)
+    now: float | None = None
+
+    def receive(self, data: bytes, now: float) -> None:
+        self.inbox.append(data)
+
+    def tick(self, now: float) -> None:
+        self.now = now
+
+    def next_deadline(self) -> float | None:
+        return None if self.now is None else self.now + 0.001
+
+    def data_to_send(self) -> list[bytes]:
+        out, self.outbox = self.outbox, []
+        return out
+
+    def send(self, data: bytes) -> None:
+        self.outbox.append(data)
+
+    def recv(self, size: int) -> bytes:
+        return self.inbox.pop(0)
+
+
+@asynccontextmanager
+async def connected(kind: str) -> AsyncIterator[tuple[Any, Any]]:
+    """An open link of a kind, and its far side (a socket or a `Post`); each has heard of the other."""
+    with ExitStack() as stack:
+        far: Any
+        link: Any
+        if kind == "sim":
+            far = Post()
+            link = create_link(far)
+            await link.open()
+        elif kind == "udpin":
+            link = create_link("udpin:127.0.0.1:0")
+            await link.open()
+            far = stack.enter_context(udp_socket(link.address))
+        elif kind == "udpout":
+            far = stack.enter_context(udp_socket())
+            link = create_link(f"udpout:127.0.0.1:{far.getsockname()[1]}")
+            await link.open()
+            far.connect(link.address)
+        elif kind == "serial":
+            far = stack.enter_context(Cable(Path(stack.enter_context(TemporaryDirectory()))))
+            link = create_link(far.link)
+            await link.open()
+        elif kind == "tcp":
+            listener = stack.enter_context(tcp_listener())
+            link = create_link(f"tcp:127.0.0.1:{listener.getsockname()[1]}")
+            await link.open()
+            far = stack.enter_context(listener.accept()[0])
+        else:
+            link = create_link("tcpin:127.0.0.1:0")
+            await link.open()
+            far = stack.enter_context(socket.create_connection(link.address, timeout=PATIENCE))
+        try:
+            far.send(HEARTBEAT)
+            await collect(link, 1)
+            yield link, far
+        finally:
+            await link.close()
+
+
+def stream_of(far: Any, size: int) -> bytes:
+    """So many bytes, and what comes with the last of them; a stream gives them in pieces of any size."""
+    heard = b""
+    while len(heard) < size:
+        heard += far.recv(1000)
+    return heard
+
+
+KINDS = ["udpin", "udpout", "tcp", "tcpin", "serial", "sim"]
+
+
+def answer_with(patch: pytest.MonkeyPatch, *addresses: tuple[socket.AddressFamily, str, int]) -> None:
+    """Let every host name have these addresses."""
+
+    async def getaddrinfo(*_: object, **__: object) -> list[Any]:
+        return [(family, 0, 0, "", (host, port)) for family, host, port in addresses]
+
+    patch.setattr(anyio, "getaddrinfo", getaddrinfo)
+
+
+# Names
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("udpin:0.0.0.0:14550", "udpin:0.0.0.0:14550"),
+        ("udpin://0.0.0.0:14550", "udpin:0.0.0.0:14550"),
+        ("udp:0.0.0.0:14550", "udpin:0.0.0.0:14550"),
+        ("udp:127.0.0.1:14550", "udpin:127.0.0.1:14550"),
+        ("udp://127.0.0.1:14550", "udpin:127.0.0.1:14550"),
+        ("udp://:14540", "udpin:0.0.0.0:14540"),
+        ("udpin::14550", "udpin:0.0.0.0:14550"),
+        ("udpin:14550", "udpin:0.0.0.0:14550"),
+        ("udpin:0", "udpin:0.0.0.0:0"),
+        ("127.0.0.1:14550", "udpin:127.0.0.1:14550"),
+        ("localhost:14550", "udpin:localhost:14550"),
+        (":14550", "udpin:0.0.0.0:14550"),
+        ("[::1]:14550", "udpin:[::1]:14550"),
+        ("udpin:[::]:14550", "udpin:[::]:14550"),
+        ("udpin:[0:0:0:0:0:0:0:1]:00080", "udpin:[::1]:80"),
+        ("udpin:[fe80::1%eth0]:14550", "udpin:[fe80::1%eth0]:14550"),
+        ("UDPIN:LocalHost:14550", "udpin:localhost:14550"),
+        (" udpin:0.0.0.0:14550\n", "udpin:0.0.0.0:14550"),
+        ("udpout:192.168.1.2:14550", "udpout:192.168.1.2:14550"),
+        ("udpout://vehicle_7.local:14550", "udpout:vehicle_7.local:14550"),
+        ("tcp:127.0.0.1:5760", "tcp:127.0.0.1:5760"),
+        ("tcp://127.0.0.1:5760", "tcp:127.0.0.1:5760"),
+        ("tcpout://127.0.0.1:5760", "tcp:127.0.0.1:5760"),
+        ("tcp:[::1]:5760", "tcp:[::1]:5760"),
+        ("tcpin:0.0.0.0:5760", "tcpin:0.0.0.0:5760"),
+        ("tcpin://:5760", "tcpin:0.0.0.0:5760"),
+        ("tcpin:5760", "tcpin:0.0.0.0:5760"),
+        ("serial:/dev/ttyACM0:57600", "serial:/dev/ttyACM0:57600"),
+        ("serial:///dev/ttyACM0:57600", "serial:/dev/ttyACM0:57600"),
+        ("serial:/dev/ttyACM0", "serial:/dev/ttyACM0:57600"),
+        ("/dev/ttyACM0,115200", "serial:/dev/ttyACM0:115200"),
+        ("/dev/ttyACM0:115200", "serial:/dev/ttyACM0:115200"),
+        ("/dev/ttyACM0", "serial:/dev/ttyACM0:57600"),
+        ("/dev/by-path/pci-0000:00:14.0-usb,921600", "serial:/dev/by-path/pci-0000:00:14.0-usb:921600"),
+        ("com5:115200", "serial:COM5:115200"),
+        ("serial:COM5,115200", "serial:COM5:115200"),
+        ("serial:///dev/ttyUSB0,9600", "serial:/dev/ttyUSB0:9600"),
+        ("/dev/cu.usbmodem14101", "serial:/dev/cu.usbmodem14101:57600"),
+        ("/dev/cu.usbserial-D307:57600", "serial:/dev/cu.usbserial-D307:57600"),
+        (
+            "/dev/serial/by-id/usb-Hex_ProfiCNC_CubeOrange_2E-if00:921600",
+            "serial:/dev/serial/by-id/usb-Hex_ProfiCNC_CubeOrange_2E-if00:921600",
+        ),
+        (
+            "/dev/serial/by-path/pci-0000:00:14.0-usb-0:1:1.0",
+            "serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:1:1.0:57600",
+        ),
+        (
+            "serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:1:1.0-port0:115200",
+            "serial:/dev/serial/by-path/pci-0000:00:14.0-usb-0:1:1.0-port0:115200",
+        ),
+        ("sim:px4", "sim:px4"),
+        ("sim:px4?", "sim:px4"),
+        ("sim://ArduPilot", "sim:ardupilot"),
+        ("sim:px4?seed=1&loss=.05&delay=0.05", "sim:px4?delay=0.05&loss=0.05&seed=1"),
+        ("sim:px4?jitter=-0&rate=1e3&queue=0", "sim:px4?jitter=0.0&queue=0&rate=1000.0"),
+        (
+            "sim:ardupilot?duplicate=1&reorder=0.5&bit_errors=1e-05&system=255&param_error=1",
+            "sim:ardupilot?bit_errors=1e-05&duplicate=1.0&param_error=1&reorder=0.5&system=255",
+        ),
+    ],
+)
+def test_every_spelling_has_one_canonical_name(text: str, name: str) -> None:
+    spec = parse_link(text)
+    assert str(spec) == spec.name == name
+    assert parse_link(name) == spec
+
+
+def test_a_spec_tells_what_the_name_says() -> None:
+    assert parse_link("udpout://[FE80::2]:14550") == LinkSpec(LinkKind.UDPOUT, "fe80::2", 14550)
+    assert parse_link("COM5:115200") == LinkSpec(LinkKind.SERIAL, "COM5", 115200)
+    assert parse_link("sim:px4?seed=3&loss=0.5").options == (("loss", 0.5), ("seed", 3))
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("", "no kind of link"),
+        ("14550", "no kind of link"),
+        ("udpin", "no kind of link"),
+        ("vehicle.params", "no kind of link"),
+        ("/home/me/vehicle.params", "no kind of link"),
+        ("./px4:1", "no kind of link"),
+        ("http://127.0.0.1:80", "a service has links and is none"),
+        ("mavlink:px4", "'mavlink' is no|is no port"),
+        ("udpin:", "port is missing"),
+        ("udpin:0.0.0.0", "port is missing"),
+        ("udpin:0.0.0.0:", "port is missing"),
+        ("udpin:0.0.0.0:65536", "'65536' is no port"),
+        ("udpin:0.0.0.0:-1", "'-1' is no port"),
+        ("udpin:0.0.0.0:+5", "is no port"),
+        ("udpin:0.0.0.0:١٢", "is no port"),
+        ("udpin:٣", "is no port"),
+        ("udpout:14550", "host is missing"),
+        ("udpout::14550", "host is missing"),
+        ("udpout:10.0.0.1:0", "ports go from 1"),
+        ("tcp:14550", "host is missing"),
+        ("tcp://:5760", "host is missing"),
+        ("udpin:::1:14550", "stands in brackets"),
+        ("udpin:[::g]:14550", "'::g' is no IPv6 address"),
+        ("udpin:[127.0.0.1]:14550", "is no IPv6 address"),
+        ("udpout:256.0.0.1:14550", "is no IPv4 address"),
+        ("udpout:10.1:14550", "is no IPv4 address"),
+        ("udpout:-x:14550", "is no host name"),
+        ("udpout:a..b:14550", "is no host name"),
+        (f"udpout:{'a' * 64}:14550", "is no host name"),
+        (f"udpout:{'a.' * 127}a:14550", "is no host name"),
+        ("udpout:me@host:14550", "is no host name"),
+        ("udpin:0.0.0.0:14550/", "is no port"),
+        ("serial:ttyACM0:57600", "a device and a baud rate"),
+        ("serial:/dev/tty ACM0", "a device and a baud rate"),
+        ("/dev/ttyACM0:0", "from 300 to 20000000"),
+        ("/dev/ttyUSB0,57", "from 300 .* not 57"),
+        ("COM3:99999999", "from 300 to 20000000"),
+        ("sim:", "px4 and ardupilot"),
+        ("sim:ardupilot4", "px4 and ardupilot"),
+        ("sim:px4?loss", "NAME=VALUE"),
+        ("sim:px4?colour=red", "'colour' is no option"),
+        ("sim:px4?loss=0.1&loss=0.2", "given twice"),
+        ("sim:px4?loss=", "no number"),
+        ("sim:px4?loss=1.1", "from 0 to 1"),
+        ("sim:px4?loss=nan", "from 0 to 1"),
+        ("sim:px4?delay=-1", "from 0 to 3600"),
+        ("sim:px4?rate=0", "from 1 to"),
+        ("sim:px4?queue=100", "needs a rate"),
+        ("sim:px4?seed=1.5", "whole number"),
+        ("sim:px4?system=0", "from 1 to 255"),
+        ("sim:px4?param_error=yes", "from 0 to 1"),
+    ],
+)
+def test_a_bad_name_says_what_is_wrong_and_which_forms_exist(text: str, problem: str) -> None:
+    with pytest.raises(UsageError, match=problem) as caught:
+        parse_link(text)
+    for form in ("udpin:HOST:PORT", "udpout:", "tcp:", "tcpin:", "serial:", "sim:px4", "sim:ardupilot"):
+        assert form in str(caught.value)
+
+
+def test_a_name_is_a_string_and_a_long_one_is_cut_in_the_error() -> None:
+    with pytest.raises(UsageError, match="not int"):
+        parse_link(14550)  # type: ignore[arg-type]  # what is tested
+    with pytest.raises(UsageError) as caught:
+        parse_link("x" * 100_000)
+    assert len(str(caught.value)) < 2000
+
+
+SCHEMES = "udp udpin udpout tcp tcpin tcpout serial sim http"
+MARKS = ": : : // / ? & = [ ] , % . -"
+WORDS = (
+    "px4 ardupilot [::1] 127.0.0.1 localhost 14550 0 99999 /dev/ttyACM0 COM3 loss seed queue rate 0.5 1e400 é"
+)
+PIECES = st.sampled_from(f"{SCHEMES} {MARKS} {WORDS}".split())
+
+
+@given(st.text() | st.lists(PIECES, max_size=10).map("".join))
+def test_any_text_is_a_link_or_a_usage_error(text: str) -> None:
+    try:
+        spec = parse_link(text)
+    except UsageError:
+        return
+    assert parse_link(spec.name) == spec
+    assert parse_link(spec.name).name == spec.name
+
+
+# Making links
+
+
+def test_what_is_a_link_already_is_taken_as_it_is() -> None:
+    link = SimLink(Post(), "sim:mine")
+    assert create_link(link) is link
+    assert isinstance(create_link(parse_link("udpin:14550")), Link)
+    wrapped = create_link(PX4Vehicle())
+    assert isinstance(wrapped, SimLink)
+    assert wrapped.name == "sim:custom"
+    with pytest.raises(UsageError, match="not by object"):
+        create_link(object())  # type: ignore[arg-type]  # what is tested
+
+
+@pytest.mark.parametrize(
+    ("name", "is_stream", "reconnects"),
+    [
+        ("udpin:127.0.0.1:0", False, True),
+        ("udpout:127.0.0.1:14550", False, True),
+        ("tcp:127.0.0.1:5760", True, True),
+        ("tcpin:127.0.0.1:0", True, False),
+        ("serial:/dev/ttyACM0:57600", True, True),
+        ("sim:px4", False, False),
+    ],
+)
+def test_a_link_tells_its_kind(name: str, is_stream: bool, reconnects: bool) -> None:
+    link = create_link(name)
+    assert (link.name, link.is_stream, link.reconnects) == (name, is_stream, reconnects)
+    assert repr(link).endswith(f"{name} closed>")
+
+
+def test_the_simulators_are_imported_only_for_sim_links() -> None:
+    code = (
+        "import sys, paramclient.links as links\n"
+        "links.create_link('udpin:14550')\n"
+        "assert 'paramclient.sim' not in sys.modules\n"
+        "links.create_link('sim:px4')\n"
+        "assert 'paramclient.sim' in sys.modules\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
+# What all kinds have in common
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", KINDS)
+async def test_bytes_go_both_ways(kind: str) -> None:
+    async with connected(kind) as (link, far):
+        far.send(frame(1))
+        [(peer, data)] = await collect(link, 1)
+        assert data == frame(1)
+        await link.send(frame(2), peer)
+        await link.send(frame(3), "nobody")
+        await link.send(frame(4), None)
+        if link.is_stream:
+            assert stream_of(far, len(frame(2) + frame(4))) == frame(2) + frame(4)
+        else:
+            assert [far.recv(1000), far.recv(1000)] == [frame(2), frame(4)]
+        assert repr(link).endswith("open>")
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", KINDS)
+async def test_closing_wakes_the_receiver(kind: str) -> None:
+    async with connected(kind) as (link, _), anyio.create_task_group() as tasks:
+        failures: list[LinkError] = []
+
+        async def receive() -> None:
+            with pytest.raises(LinkError) as caught:
+                await link.receive()
+            failures.append(caught.value)
+
+        tasks.start_soon(receive)
+        for _ in range(10):  # the simulated end never lets all tasks come to rest
+            await anyio.lowlevel.checkpoint()
+        await link.close()
+        with anyio.fail_after(PATIENCE):
+            while not failures:
+                await anyio.lowlevel.checkpoint()
+        assert failures[0].link == link.name
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", KINDS)
+async def test_a_closed_link_says_so_and_can_be_closed_again(kind: str) -> None:
+    async with connected(kind) as (link, _):
+        await link.close()
+        await link.close()
+        with pytest.raises(LinkError, match="not open"):
+            await link.receive()
+        with pytest.raises(LinkError, match="not open"):
+            await link.send(HEARTBEAT, None)
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", KINDS)
+async def test_nothing_is_left_behind(kind: str) -> None:
+    await anyio.lowlevel.checkpoint()
+    files, threads = open_files(), threading.enumerate()
+    async with connected(kind) as (link, _):
+        address: Any = getattr(link, "address", None)
+        await link.close()
+        if kind in ("udpin", "tcpin"):
+            async with opened(f"{kind}:127.0.0.1:{address[1]}") as again:
+                assert again.address == address
+    assert open_files() == files
+    assert threading.enumerate() == threads
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", KINDS)
+async def test_a_receive_that_is_cancelled_at_any_moment_loses_nothing(kind: str) -> None:
+    steps = 6
+    sent: list[bytes] = []
+    got: list[bytes] = []
+    async with connected(kind) as (link, far):
+
+        async def receive() -> None:
+            got.extend(data for _, data in await link.receive())
+
+        for before in range(steps):
+            for after in range(steps):
+                async with anyio.create_task_group() as tasks:
+                    tasks.start_soon(receive)
+                    for _ in range(before):
+                        await anyio.lowlevel.checkpoint()
+                    sent.append(frame(len(sent)))
+                    far.send(sent[-1])
+                    for _ in range(after):
+                        await anyio.lowlevel.checkpoint()
+                    tasks.cancel_scope.cancel()
+        with anyio.fail_after(PATIENCE):
+            while len(b"".join(got)) < len(b"".join(sent)):
+                await receive()
+    assert b"".join(got) == b"".join(sent)
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", KINDS)
+async def test_a_send_that_is_cancelled_at_any_moment_sends_all_or_nothing(kind: str) -> None:
+    async with connected(kind) as (link, far):
+        done: list[int] = []
+
+        async def send(number: int) -> None:
+            await link.send(frame(number), None)
+            done.append(number)
+
+        for steps in range(5):
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(send, steps)
+                for _ in range(steps):
+                    await anyio.lowlevel.checkpoint()
+                tasks.cancel_scope.cancel()
+        assert 0 < len(done) < 5
+        await link.send(HEARTBEAT, None)
+        expected = b"".join(map(frame, done)) + HEARTBEAT
+        assert stream_of(far, len(expected)) == expected
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", KINDS)
+async def test_an_open_that_is_cancelled_at_any_moment_leaves_nothing_and_can_be_repeated(kind: str) -> None:
+    await anyio.lowlevel.checkpoint()
+    files = open_files()
+    async with connected(kind) as (link, _):
+        await link.close()
+        less = open_files()
+        for steps in range(6):
+            async with anyio.create_task_group() as tasks:
+                tasks.start_soon(link.open)
+                for _ in range(steps):
+                    await anyio.lowlevel.checkpoint()
+                tasks.cancel_scope.cancel()
+            await link.close()
+            assert open_files() == less
+        await link.open()
+    assert open_files() == files
+
+
+# UDP
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("host", LOOPBACKS)
+async def test_udp_both_kinds_speak_to_each_other(host: str) -> None:
+    shown = f"[{host}]" if ":" in host else host
+    async with (
+        opened(f"udpin:{shown}:0") as station,
+        opened(f"udpout:{shown}:{station.address[1]}") as vehicle,
+    ):
+        assert station.address[0] == host
+        await vehicle.send(HEARTBEAT, None)
+        peer: Any
+        far: Any
+        [(peer, data)] = await collect(station, 1)
+        assert data == HEARTBEAT
+        assert peer[:2] == vehicle.address
+        await station.send(frame(1), peer)
+        [(far, data)] = await collect(vehicle, 1)
+        assert data == frame(1)
+        assert far[:2] == station.address
+        await vehicle.send(frame(2), far)
+        assert await collect(station, 1) == [(peer, frame(2))]
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("host", LOOPBACKS)
+async def test_one_address_is_spoken_to_from_one_port_in_each_session(host: str) -> None:
+    """PX4 answers only the address and port that it heard first."""
+    shown = f"[{host}]" if ":" in host else host
+    async with opened(f"udpin:{shown}:0") as near, opened(f"udpin:{shown}:0") as far:
+        name = f"udpout:{shown}:{near.address[1]}"
+        async with opened(name) as link:
+            usual = link.address[1]
+            async with opened(name) as beside, opened(f"udpout:{shown}:{far.address[1]}") as elsewhere:
+                assert len({usual, beside.address[1], elsewhere.address[1]}) == 3
+                await beside.send(HEARTBEAT, None)
+                assert len(await collect(near, 1)) == 1
+        async with opened(name) as link:
+            assert link.address[1] == usual
+
+
+@pytest.mark.asyncio
+async def test_a_host_name_is_looked_up() -> None:
+    async with opened("udpin:localhost:0") as link, opened(f"udpout:localhost:{link.address[1]}") as far:
+        assert link.address[0] == "127.0.0.1"
+        await far.send(HEARTBEAT, None)
+        assert len(await collect(link, 1)) == 1
+
+
+@pytest.mark.asyncio
+async def test_a_host_is_taken_by_its_ipv4_address(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    answer_with(monkeypatch, (socket.AF_INET6, "::1", 0), (socket.AF_INET, "127.0.0.1", 0))
+    async with opened("udpin:some-vehicle:0") as link:
+        assert link.address[0] == "127.0.0.1"
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", ["udpin", "udpout", "tcp", "tcpin"])
+async def test_a_host_that_does_not_exist_is_a_link_error(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    async def getaddrinfo(*_: object, **__: object) -> None:
+        raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
+
+    monkeypatch.setattr(anyio, "getaddrinfo", getaddrinfo)
+    with pytest.raises(LinkError, match="host no-such-host not found: Name or service") as caught:
+        await create_link(f"{kind}:no-such-host:14550").open()
+    assert isinstance(caught.value.__cause__, socket.gaierror)
+
+
+@pytest.mark.asyncio
+async def test_udpin_speaks_to_every_vehicle_that_has_spoken() -> None:
+    async with opened("udpin:127.0.0.1:0") as link:
+        await link.send(HEARTBEAT, None)
+        with (
+            udp_socket(link.address) as one,
+            udp_socket(link.address) as two,
+            udp_socket(link.address) as odd,
+        ):
+            one.send(frame(1))
+            two.send(frame(2))
+            odd.send(b"GET / HTTP/1.1")
+            heard = dict(await collect(link, 3))
+            assert heard == {
+                one.getsockname(): frame(1),
+                two.getsockname(): frame(2),
+                odd.getsockname(): b"GET / HTTP/1.1",
+            }
+            await link.send(frame(3), None)
+            await link.send(frame(4), two.getsockname())
+            assert one.recv(1000) == frame(3)
+            assert two.recv(1000) == frame(3)
+            assert two.recv(1000) == frame(4)
+            for sock in (one, two, odd):
+                sock.setblocking(False)
+                with pytest.raises(BlockingIOError):
+                    sock.recv(1000)
+
+
+@pytest.mark.asyncio
+async def test_udpin_forgets_who_was_silent_for_longest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(udp, "PEERS", 3)
+    async with opened("udpin:127.0.0.1:0") as link:
+        with ExitStack() as stack:
+            far = [stack.enter_context(udp_socket(link.address)) for _ in range(4)]
+            for number in (0, 1, 2, 0, 3):
+                far[number].send(HEARTBEAT)
+                await collect(link, 1)
+            await link.send(frame(1), None)
+            for number in (0, 2, 3):
+                assert far[number].recv(1000) == frame(1)
+            await link.send(frame(2), far[1].getsockname())
+            assert far[1].recv(1000) == frame(2), "what is for it alone goes there all the same"
+            far[1].setblocking(False)
+            with pytest.raises(BlockingIOError):
+                far[1].recv(1000)
+
+
+TELEMETRY = wire.build_frame(30, bytes(range(1, 29)), system=1, component=1, sequence=0)
+
+
+async def got(sock: socket.socket) -> list[bytes]:
+    """What has come to a socket."""
+    sock.setblocking(False)
+    came = []
+    with suppress(BlockingIOError):
+        while True:
+            came.append(sock.recv(1000))
+    return came
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("junk", [b"\xfd\xfe and so on", HEARTBEAT[:-1] + b"\0", b"\xfd" * 300])
+async def test_udpin_learns_nobody_from_bytes_that_are_no_frame(junk: bytes) -> None:
+    async with opened("udpin:127.0.0.1:0") as link:
+        with udp_socket(link.address) as odd, udp_socket(link.address) as vehicle:
+            odd.send(junk)
+            vehicle.send(HEARTBEAT)
+            await collect(link, 2)
+            await link.send(frame(1), None)
+            assert await got(vehicle) == [frame(1)]
+            assert await got(odd) == []
+
+
+@pytest.mark.asyncio
+async def test_udpin_forgets_whoever_sends_no_valid_frame_for_a_minute(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    async with opened("udpin:127.0.0.1:0") as link:
+        with udp_socket(link.address) as one, udp_socket(link.address) as two:
+            for sock in (one, two):
+                sock.send(HEARTBEAT)
+            await collect(link, 2)
+            now = anyio.current_time()
+            monkeypatch.setattr(anyio, "current_time", lambda: now + udp.PEER_SILENCE - 1)
+            one.send(HEARTBEAT)
+            two.send(b"\xfd and so on")
+            await collect(link, 2)
+            await link.send(frame(1), None)
+            monkeypatch.setattr(anyio, "current_time", lambda: now + udp.PEER_SILENCE + 1)
+            await link.send(frame(2), None)
+            assert await got(one) == [frame(1), frame(2)]
+            assert await got(two) == [frame(1)]
+
+
+@pytest.mark.asyncio
+async def test_those_without_heartbeats_share_one_of_ours_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with opened("udpin:127.0.0.1:0") as link:
+        with ExitStack() as stack:
+            vehicle, *strangers = [stack.enter_context(udp_socket(link.address)) for _ in range(4)]
+            vehicle.send(HEARTBEAT)
+            for sock in strangers:
+                sock.send(TELEMETRY)
+            await collect(link, 4)
+            began = anyio.current_time()
+            for step in range(40):  # four a second, in ten seconds
+                at = began + step / 4
+                monkeypatch.setattr(anyio, "current_time", lambda at=at: at)
+                await link.send(HEARTBEAT, None)
+            assert len(await got(vehicle)) == 40
+            assert sorted([len(await got(sock)) for sock in strangers]) == [3, 3, 4]
+            await link.send(frame(9), None)
+            for sock in strangers:
+                assert await got(sock) == [frame(9)], "what is no heartbeat is for them too"
+            strangers[0].send(HEARTBEAT)
+            await collect(link, 1)
+            await link.send(HEARTBEAT, None)
+            assert await got(strangers[0]) == [HEARTBEAT]
+
+
+@pytest.mark.asyncio
+async def test_strangers_take_no_place_from_those_that_send_heartbeats(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(udp, "PEERS", 3)
+    async with opened("udpin:127.0.0.1:0") as link:
+        with ExitStack() as stack:
+            vehicle = stack.enter_context(udp_socket(link.address))
+            vehicle.send(HEARTBEAT)
+            await collect(link, 1)
+            for _ in range(10):
+                stack.enter_context(udp_socket(link.address)).send(TELEMETRY)
+            await collect(link, 10)
+            await link.send(frame(1), None)
+            assert await got(vehicle) == [frame(1)]
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
+async def test_a_busy_port_is_a_link_error_until_it_is_free(kind: str) -> None:
+    async with opened(f"{kind}:127.0.0.1:0") as first:
+        second = create_link(f"{kind}:127.0.0.1:{first.address[1]}")
+        files = open_files()
+        with pytest.raises(
+            LinkError, match=f"port {first.address[1]} is in use by another program"
+        ) as caught:
+            await second.open()
+        assert isinstance(caught.value.__cause__, OSError)
+        assert caught.value.__cause__.errno == errno.EADDRINUSE
+        assert caught.value.link == second.name
+        assert open_files() == files
+        await first.close()
+        await second.open()
+        await second.close()
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", ["udpin", "tcpin"])
+async def test_only_own_addresses_can_be_listened_on(kind: str) -> None:
+    with pytest.raises(LinkError, match=r"192\.0\.2\.1 is no address of this computer"):
+        await create_link(f"{kind}:192.0.2.1:0").open()
+
+
+@pytest.mark.asyncio
+async def test_udpout_hears_its_target_alone_and_keeps_its_port() -> None:
+    with udp_socket() as vehicle:
+        async with opened(f"udpout:127.0.0.1:{vehicle.getsockname()[1]}") as link:
+            with udp_socket(link.address) as stranger:
+                await link.send(frame(1), None)
+                assert vehicle.recvfrom(1000) == (frame(1), link.address)
+                stranger.send(frame(2))
+                vehicle.sendto(frame(3), link.address)
+                assert await collect(link, 1) == [(vehicle.getsockname(), frame(3))]
+                await link.send(frame(4), stranger.getsockname())
+                await link.send(frame(5), None)
+                assert vehicle.recvfrom(1000) == (frame(5), link.address)
+
+
+@pytest.mark.asyncio
+async def test_udpout_may_be_there_before_its_vehicle() -> None:
+    port = free_udp_port()
+    async with opened(f"udpout:127.0.0.1:{port}") as link, anyio.create_task_group() as tasks:
+        got: list[tuple[Peer, bytes]] = []
+
+        async def receive() -> None:
+            got.extend(await collect(link, 1))
+
+        tasks.start_soon(receive)
+        for _ in range(3):
+            await link.send(HEARTBEAT, None)  # the system's answer to each is "connection refused"
+            await anyio.wait_all_tasks_blocked()
+        tasks.cancel_scope.cancel()
+    assert got == []
+
+    async with opened(f"udpout:127.0.0.1:{port}") as link:
+        await link.send(frame(1), None)
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+            vehicle.bind(("127.0.0.1", port))
+            vehicle.settimeout(PATIENCE)
+            await link.send(frame(2), None)  # must not be swallowed by the refusal of the first
+            assert vehicle.recv(1000) == frame(2)
+            vehicle.sendto(frame(3), link.address)
+            assert [data for _, data in await collect(link, 1)] == [frame(3)]
+
+
+@pytest.mark.asyncio
+async def test_udpout_to_a_broadcast_address_hears_everyone() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
+        vehicle.bind(("0.0.0.0", 0))
+        vehicle.settimeout(PATIENCE)
+        async with opened(f"udpout:127.255.255.255:{vehicle.getsockname()[1]}") as link:
+            await link.send(frame(1), None)
+            assert vehicle.recv(1000) == frame(1)
+            vehicle.sendto(frame(2), ("127.0.0.1", link.address[1]))
+            [(peer, data)] = await collect(link, 1)
+            assert data == frame(2)
+            await link.send(frame(3), peer)
+            await link.send(frame(4), None)
+            assert [vehicle.recv(1000), vehicle.recv(1000)] == [frame(3), frame(4)]
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", ["udpin", "udpout"])
+async def test_a_burst_waits_for_a_late_reader(kind: str) -> None:
+    count = 2000
+    async with connected(kind) as (link, far):
+        got: list[bytes] = []
+        async with anyio.create_task_group() as tasks:
+
+            async def receive() -> None:
+                while True:
+                    got.extend(data for _, data in await link.receive())
+
+            tasks.start_soon(receive)
+            await anyio.wait_all_tasks_blocked()
+            for number in range(count):
+                far.send(frame(number))
+            time.sleep(0.1)  # noqa: ASYNC251 - the event loop itself is late
+            # Where the system grants less than was asked for, as much as fits must still be there.
+            whole = link.receive_buffer >= udp.RECEIVE_BUFFER
+            expected = count if whole else min(count, link.receive_buffer // 1280)
+            with anyio.fail_after(PATIENCE):
+                while len(got) < expected:
+                    await anyio.lowlevel.checkpoint()
+            tasks.cancel_scope.cancel()
+    assert got[:expected] == [frame(number) for number in range(expected)]
+
+
+@pytest.mark.asyncio
+async def test_the_receive_buffer_is_as_large_as_the_system_allows() -> None:
+    async with opened("udpin:127.0.0.1:0") as link:
+        assert link.receive_buffer >= 2 * min(
+            RMEM_MAX, udp.RECEIVE_BUFFER
+        )  # Linux doubles what it is asked for
+
+
+@pytest.mark.asyncio
+async def test_a_burst_is_given_out_in_portions(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(udp, "DATAGRAMS_PER_READ", 10)
+    async with connected("udpin") as (link, far):
+        for number in range(25):
+            far.send(frame(number))
+        portions = [await link.receive() for _ in range(3)]
+    assert [len(portion) for portion in portions] == [10, 10, 5]
+    assert [data for portion in portions for _, data in portion] == [frame(number) for number in range(25)]
+
+
+@pytest.mark.asyncio
+async def test_empty_datagrams_are_passed_over() -> None:
+    async with connected("udpin") as (link, far):
+        far.send(b"")
+        far.send(frame(1))
+        assert [data for _, data in await collect(link, 1)] == [frame(1)]
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("number", [errno.EAGAIN, errno.ENETUNREACH, errno.ENOBUFS, errno.EPERM])
+async def test_a_datagram_that_the_system_does_not_take_is_counted(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise OSError(number, os.strerror(number))
+
+    async with connected("udpin") as (link, far):
+        with monkeypatch.context() as patch:
+            patch.setattr(link, "_transmit", refuse)
+            await link.send(frame(1), None)
+        assert link.lost_sends == 1
+        await link.send(frame(2), None)
+        assert far.recv(1000) == frame(2)
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", ["udpin", "udpout"])
+async def test_a_lasting_fault_of_the_socket_is_a_link_error(kind: str) -> None:
+    async with connected(kind) as (link, _):
+        with pytest.raises(LinkError, match="cannot send: Message too long"):
+            await link.send(bytes(70_000), None)
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("name", ["udpout:[fe80::1]:14550", "tcp:255.255.255.255:5760"])
+async def test_an_address_that_cannot_be_reached_is_a_link_error(name: str) -> None:
+    files = open_files()
+    with pytest.raises(LinkError, match="cannot open: ") as caught:
+        await create_link(name).open()
+    assert isinstance(caught.value.__cause__, OSError)
+    assert open_files() == files
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", KINDS)
+async def test_waking_up_for_nothing_does_no_harm(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    wait_readable = anyio.wait_readable
+    left = [3]
+
+    async def eager(waitable: Any) -> None:
+        if left[0]:
+            left[0] -= 1
+            await anyio.lowlevel.checkpoint()
+        else:
+            await wait_readable(waitable)
+
+    async with connected(kind) as (link, far), anyio.create_task_group() as tasks:
+        got: list[tuple[Peer, bytes]] = []
+
+        async def receive() -> None:
+            got.extend(await link.receive())
+
+        monkeypatch.setattr(anyio, "wait_readable", eager)
+        tasks.start_soon(receive)
+        for _ in range(10):
+            await anyio.lowlevel.checkpoint()
+        assert not got
+        far.send(frame(1))
+    assert [data for _, data in got] == [frame(1)]
+
+
+# TCP
+
+
+@pytest.mark.asyncio
+async def test_tcp_refused_is_a_link_error_and_opens_once_somebody_listens() -> None:
+    with tcp_listener() as listener:
+        port = listener.getsockname()[1]
+    link = create_link(f"tcp:127.0.0.1:{port}")
+    files = open_files()
+    with pytest.raises(LinkError, match=f"connection refused by 127.0.0.1:{port}") as caught:
+        await link.open()
+    assert isinstance(caught.value.__cause__, ConnectionRefusedError)
+    assert open_files() == files
+    with socket.create_server(("127.0.0.1", port)):
+        await link.open()
+        await link.close()
+
+
+@pytest.mark.asyncio
+async def test_tcp_tries_every_address_of_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    with tcp_listener() as listener:
+        port = listener.getsockname()[1]
+        answer_with(monkeypatch, (socket.AF_INET, "127.0.0.2", port), (socket.AF_INET, "127.0.0.1", port))
+        async with opened(f"tcp:some-vehicle:{port}") as link:
+            far, address = listener.accept()
+            far.close()
+            assert address == link.address
+
+
+@contextmanager
+def deaf_listener() -> Iterator[int]:
+    """A port on which connecting takes for ever: its queue is full and nobody accepts."""
+    with tcp_listener(backlog=0) as listener, ExitStack() as stack:
+        for _ in range(4):
+            sock = stack.enter_context(socket.socket())
+            sock.setblocking(False)
+            sock.connect_ex(listener.getsockname())
+        yield listener.getsockname()[1]
+
+
+@pytest.mark.asyncio
+async def test_tcp_gives_up_connecting(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link, "OPEN_TIMEOUT", 0.05)
+    with deaf_listener() as port:
+        files = open_files()
+        with pytest.raises(LinkError, match=r"no answer from 127\.0\.0\.1"):
+            await create_link(f"tcp:127.0.0.1:{port}").open()
+        assert open_files() == files
+
+
+@pytest.mark.asyncio
+async def test_a_silent_address_leaves_time_for_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tcp, "OPEN_TIMEOUT", 0.1)
+    with deaf_listener() as deaf, tcp_listener() as listener:
+        port = listener.getsockname()[1]
+        answer_with(monkeypatch, (socket.AF_INET, "127.0.0.1", deaf), (socket.AF_INET, "127.0.0.1", port))
+        async with opened(f"tcp:some-vehicle:{port}"):
+            listener.accept()[0].close()
+
+
+@pytest.mark.asyncio
+async def test_tcp_sends_at_once_and_notices_silence() -> None:
+    async with connected("tcp") as (link, _):
+        sock = link._open_socket()
+        assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
+        assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT) == 1000 * tcp.SILENCE_TIMEOUT
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", ["udpin", "udpout", "tcp", "tcpin"])
+async def test_looking_up_a_name_takes_no_longer_than_opening(
+    kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def getaddrinfo(*_: object, **__: object) -> None:
+        await anyio.sleep_forever()
+
+    monkeypatch.setattr(anyio, "getaddrinfo", getaddrinfo)
+    monkeypatch.setattr(link, "OPEN_TIMEOUT", 0.05)
+    with pytest.raises(LinkError, match="no answer"):
+        await create_link(f"{kind}:some-vehicle:14550").open()
+
+
+@pytest.mark.asyncio
+async def test_closing_ends_an_open_that_is_under_way(monkeypatch: pytest.MonkeyPatch) -> None:
+    failures: list[str] = []
+
+    async def open_it(link: Link) -> None:
+        with pytest.raises(LinkError) as caught:
+            await link.open()
+        failures.append(str(caught.value))
+
+    with deaf_listener() as port:
+        files = open_files()
+        link = create_link(f"tcp:127.0.0.1:{port}")
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(open_it, link)
+            await anyio.wait_all_tasks_blocked()
+            assert open_files() == files + 1
+            await link.close()
+        assert open_files() == files
+
+    files = open_files()
+    looked_up = anyio.Event()
+
+    async def getaddrinfo(*_: object, **__: object) -> list[Any]:
+        await looked_up.wait()
+        return [(socket.AF_INET, socket.SOCK_STREAM, 6, "", ("127.0.0.1", 14550))]
+
+    monkeypatch.setattr(anyio, "getaddrinfo", getaddrinfo)
+    async with anyio.create_task_group() as tasks:
+        for kind in ("udpin", "udpout", "tcp", "tcpin"):
+            link = create_link(f"{kind}:some-vehicle:14550")
+            tasks.start_soon(open_it, link)
+            await anyio.wait_all_tasks_blocked()
+            await link.close()
+        looked_up.set()
+    assert open_files() == files
+    assert len(failures) == 5
+    assert all("closed" in failure for failure in failures)
+
+
+@pytest.mark.asyncio
+async def test_tcp_dropped_by_its_peer_can_be_opened_again() -> None:
+    with tcp_listener() as listener:
+        async with opened(f"tcp:127.0.0.1:{listener.getsockname()[1]}") as link:
+            peers = []
+            for leave in (socket.socket.close, reset):
+                far, _ = listener.accept()
+                far.send(frame(1))
+                [(peer, data)] = await collect(link, 1)
+                assert data == frame(1)
+                peers.append(peer)
+                leave(far)
+                with pytest.raises(LinkError, match=r"closed by 127\.0\.0\.1:|to 127\.0\.0\.1:\d+ lost"):
+                    await collect(link, 1)
+                with pytest.raises(LinkError, match="not open"):
+                    await link.send(frame(2), None)
+                await link.open()
+            listener.accept()[0].close()
+            assert peers[0] != peers[1]
+            await link.send(frame(3), peers[0])  # to a connection that is gone: nothing happens
+
+
+def reset(sock: socket.socket) -> None:
+    """Close a connection so that the other side sees an error instead of an end."""
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    sock.close()
+
+
+@pytest.mark.asyncio
+async def test_tcp_notices_a_dropped_connection_when_sending() -> None:
+    async with connected("tcp") as (link, far):
+        reset(far)
+        with pytest.raises(LinkError, match="lost: Connection reset by peer"):
+            await link.send(frame(1), None)
+
+
+@pytest.mark.asyncio
+async def test_tcp_does_not_wait_for_ever_for_a_peer_that_does_not_read(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(tcp, "SEND_TIMEOUT", 0.05)
+    problem = r"the other side has not read for 0\.05 s"
+    async with connected("tcp") as (link, _), anyio.create_task_group() as tasks:
+
+        async def receive() -> None:
+            with pytest.raises(LinkError, match=problem) as caught:
+                await link.receive()
+            assert isinstance(caught.value.__cause__, TimeoutError)
+
+        tasks.start_soon(receive)
+        await anyio.wait_all_tasks_blocked()
+        with pytest.raises(LinkError, match=problem):
+            await link.send(bytes(50_000_000), None)
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("kind", ["tcp", "tcpin"])
+async def test_closing_ends_a_send_that_waits_for_room(kind: str) -> None:
+    async with connected(kind) as (link, _), anyio.create_task_group() as tasks:
+
+        async def send() -> None:
+            with pytest.raises(LinkError, match="closed"):
+                await link.send(bytes(50_000_000), None)
+
+        tasks.start_soon(send)
+        await anyio.wait_all_tasks_blocked()
+        await link.close()
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("leave", [socket.socket.close, reset])
+async def test_tcpin_goes_on_when_one_of_its_clients_leaves(leave: Callable[[socket.socket], None]) -> None:
+    async with opened("tcpin:127.0.0.1:0") as link:
+        await link.send(HEARTBEAT, None)
+        with (
+            socket.create_connection(link.address, timeout=PATIENCE) as one,
+            socket.create_connection(link.address, timeout=PATIENCE) as two,
+        ):
+            one.send(frame(1))
+            two.send(frame(2))
+            peer_of = {data: peer for peer, data in await collect(link, 2)}
+            leave(one)
+            assert await collect(link, 1) == [(peer_of[frame(1)], b"")]
+            await link.send(frame(3), peer_of[frame(1)])
+            await link.send(frame(4), None)
+            assert two.recv(1000) == frame(4)
+            two.send(frame(5))
+            assert await collect(link, 1) == [(peer_of[frame(2)], frame(5))]
+            with socket.create_connection(link.address, timeout=PATIENCE) as three:
+                three.send(frame(6))
+                [(peer, data)] = await collect(link, 1)
+                assert data == frame(6)
+                assert peer not in peer_of.values()
+
+
+@pytest.mark.asyncio
+async def test_tcpin_ends_a_client_that_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with connected("tcpin") as (link, far):
+        with socket.create_connection(link.address, timeout=PATIENCE) as stuck:
+            stuck.send(frame(1))
+            [(peer, _)] = await collect(link, 1)
+            with monkeypatch.context() as patch:
+                patch.setattr(tcp, "SEND_TIMEOUT", 0.05)
+                await link.send(bytes(50_000_000), peer)
+            assert await collect(link, 1) == [(peer, b"")]
+        await link.send(frame(2), None)
+        assert far.recv(1000) == frame(2)
+
+
+@pytest.mark.asyncio
+async def test_tcpin_holds_a_bounded_number_of_clients(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tcp, "CLIENTS", 1)
+    async with connected("tcpin") as (link, far):
+        with socket.create_connection(link.address, timeout=PATIENCE) as second:
+            far.send(frame(1))
+            assert [data for _, data in await collect(link, 1)] == [frame(1)]
+            far.send(frame(2))
+            await collect(link, 1)
+            assert second.recv(1000) == b""
+        far.close()
+        assert [data for _, data in await collect(link, 1)] == [b""]
+        with socket.create_connection(link.address, timeout=PATIENCE) as third:
+            third.send(frame(3))
+            assert [data for _, data in await collect(link, 1)] == [frame(3)]
+
+
+@pytest.mark.asyncio
+async def test_tcpin_that_cannot_accept_any_more_is_a_link_error() -> None:
+    async with connected("tcpin") as (link, _):
+        with socket.create_connection(link.address, timeout=PATIENCE):
+            lowest_free = os.dup(0)
+            os.close(lowest_free)
+            soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+            resource.setrlimit(resource.RLIMIT_NOFILE, (lowest_free, hard))
+            try:
+                with pytest.raises(LinkError, match="cannot accept: Too many open files"):
+                    await link.receive()
+            finally:
+                resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+
+
+# Simulated vehicles
+
+
+def request_hash(system: int = 1) -> bytes:
+    request = wire.ParamRequestRead(system, 1, wire.HASH_CHECK)
+    return wire.encode(request, system=255, component=190, sequence=0)
+
+
+def request_by_index(index: int, system: int = 1) -> bytes:
+    return wire.encode(wire.ParamRequestRead(system, 1, "", index), system=255, component=190, sequence=0)
+
+
+async def answer(link: Link, request: bytes) -> tuple[wire.Frame, wire.ParamValue]:
+    """Ask, and wait for the first PARAM_VALUE."""
+    framer = wire.Framer(stream=link.is_stream)
+    with anyio.fail_after(PATIENCE):
+        await link.send(request, None)
+        while True:
+            for _, data in await link.receive():
+                for found in framer.receive(data):
+                    message = wire.decode(found)
+                    if isinstance(message, wire.ParamValue):
+                        return found, message
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("vehicle", ["px4", "ardupilot"])
+async def test_a_simulated_vehicle_answers_in_the_process(vehicle: str) -> None:
+    async with opened(f"sim:{vehicle}?system=7") as link:
+        sender, value = await answer(link, request_by_index(5, system=7))
+        assert (sender.system, value.param_index) == (7, 5)
+        assert isinstance(link.endpoint, PX4Vehicle if vehicle == "px4" else ArduPilotVehicle)
+
+
+@pytest.mark.asyncio
+async def test_a_simulated_vehicle_gives_its_whole_list() -> None:
+    names: set[str] = set()
+    framer = wire.Framer({22}, stream=False)
+    async with opened("sim:px4") as link:
+        request = wire.ParamRequestList(1, 1)
+        await link.send(wire.encode(request, system=255, component=190, sequence=0), None)
+        with anyio.fail_after(PATIENCE):
+            while len(names) < 904:
+                for _, data in await link.receive():
+                    names.update(wire.text_of(found.payload[8:24]) for found in framer.receive(data))
+    assert wire.HASH_CHECK in names
+
+
+@pytest.mark.asyncio
+async def test_the_faults_of_a_sim_link_are_those_of_its_name() -> None:
+    async with opened("sim:px4?delay=0.03&seed=4&param_error=1") as link:
+        assert isinstance(link.endpoint, Air)
+        started = anyio.current_time()
+        await answer(link, request_hash())
+        assert anyio.current_time() - started >= 0.06  # there and back
+    async with opened("sim:px4?loss=1&seed=4") as link:
+        for _ in range(5):
+            await link.send(request_hash(), None)
+        assert link.endpoint.uplink.lost == 5
+
+
+@pytest.mark.asyncio
+async def test_a_programs_own_endpoint_is_woken_by_what_is_sent() -> None:
+    class Echo(Post):
+        def next_deadline(self) -> float | None:
+            return None
+
+        def receive(self, data: bytes, now: float) -> None:
+            self.outbox.append(data)
+
+    link = SimLink(Echo(), "sim:echo")
+    await link.open()
+    async with anyio.create_task_group() as tasks:
+        got: list[tuple[Peer, bytes]] = []
+
+        async def receive() -> None:
+            got.extend(await link.receive())
+
+        tasks.start_soon(receive)
+        await anyio.wait_all_tasks_blocked()
+        await link.send(b"x", None)
+    assert [data for _, data in got] == [b"x"]
+    await link.close()
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(
+    ("vehicle_link", "station_link"),
+    [("udpout", "udpin"), ("udpin", "udpout"), ("tcp", "tcpin"), ("tcpin", "tcp")],
+)
+async def test_a_simulated_vehicle_on_a_real_link(vehicle_link: str, station_link: str) -> None:
+    async with anyio.create_task_group() as tasks:
+        vehicle = PX4Vehicle(stream=vehicle_link.startswith("tcp"))
+        if vehicle_link.endswith("in"):
+            served: Any = await tasks.start(
+                serve_endpoint, vehicle, create_link(f"{vehicle_link}:127.0.0.1:0")
+            )
+            address = served.address
+            async with opened(f"{station_link}:127.0.0.1:{address[1]}") as link:
+                _, value = await answer(link, request_hash())
+        else:
+            async with opened(f"{station_link}:127.0.0.1:0") as link:
+                far = create_link(f"{vehicle_link}:127.0.0.1:{link.address[1]}")
+                served = await tasks.start(serve_endpoint, vehicle, far)
+                assert any(data for _, data in await collect(link, 1))  # its heartbeat comes unasked
+                _, value = await answer(link, request_hash())
+                tasks.cancel_scope.cancel()
+        assert value.param_id == wire.HASH_CHECK
+        assert int.from_bytes(value.raw, "little") == vehicle.announced_hash()
+        tasks.cancel_scope.cancel()
+    assert served.address is None
+
+
+@pytest.mark.asyncio
+async def test_a_vehicle_that_is_always_late_still_listens() -> None:
+    class Overdue(Post):
+        def next_deadline(self) -> float | None:
+            return self.now
+
+    endpoint = Overdue()
+    async with anyio.create_task_group() as tasks:
+        served: Any = await tasks.start(serve_endpoint, endpoint, create_link("udpin:127.0.0.1:0"))
+        with udp_socket(served.address) as far:
+            far.send(frame(1))
+            with anyio.fail_after(PATIENCE):
+                while endpoint.inbox != [frame(1)]:
+                    await anyio.lowlevel.checkpoint()
+        tasks.cancel_scope.cancel()
+
+
+@pytest.mark.asyncio
+async def test_serving_fails_with_its_link() -> None:
+    async with opened("udpin:127.0.0.1:0") as first:
+        with pytest.raises(LinkError, match="in use"):
+            await serve_endpoint(Post(), create_link(f"udpin:127.0.0.1:{first.address[1]}"))

@@ -1,0 +1,522 @@
+"""Serial links over pseudo-terminals: whole sessions, unplugging, ports that refuse, stall or are taken."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import fcntl
+import grp
+import os
+import stat
+import struct
+import subprocess
+import sys
+import termios
+import threading
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import anyio
+import anyio.lowlevel
+import pytest
+import serialx
+
+from paramclient import ParamClient
+from paramclient.client import link_task
+from paramclient.errors import LinkError, UsageError
+from paramclient.links import Link, Peer, create_link, serial
+from paramclient.links.transport import UNREAD_LIMIT, Transport
+from paramclient.protocol import wire
+from tests.cable import PATIENCE, Cable
+from tests.shell import a_client, bits, generic, small_px4, until
+
+HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
+RATE = 40_000.0
+"""Bytes a second each way. 57600 baud are 5,760: these tests would take seconds."""
+
+TIOCGEXCL = 0x80045440  # Linux, asm-generic/ioctls.h; termios has no name for it
+
+
+@pytest.fixture
+def cable(tmp_path: Path) -> Iterator[Cable]:
+    with Cable(tmp_path) as cable:
+        yield cable
+
+
+@pytest.fixture(params=["descriptor", "transport"])
+def port(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """Both ways to move bytes; the second is that of Windows, which works here too."""
+    if request.param == "transport":
+        monkeypatch.setattr(serial, "_open_port", Transport.opened)
+    return str(request.param)
+
+
+@asynccontextmanager
+async def opened(cable: Cable) -> AsyncIterator[Any]:
+    link = create_link(cable.link)
+    await link.open()
+    try:
+        with anyio.fail_after(PATIENCE):
+            yield link
+    finally:
+        await link.close()
+
+
+async def received(link: Link, count: int) -> bytes:
+    """Receive until so many bytes have come."""
+    found = b""
+    while len(found) < count:
+        found += b"".join(data for _, data in await link.receive())
+    return found
+
+
+async def refusal(link: Link) -> LinkError:
+    with pytest.raises(LinkError) as caught:
+        await link.open()
+    assert "closed" in repr(link)
+    return caught.value
+
+
+# Whole sessions
+
+
+@pytest.mark.asyncio
+async def test_a_whole_session(cable: Cable, port: str) -> None:
+    vehicle = small_px4(stream=True)
+    async with asyncio.timeout(PATIENCE), a_client(cable.link) as client, anyio.create_task_group() as tasks:
+        tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
+        component = await client.component()
+        result = await component.fetch_all()
+        assert result.complete
+        assert bits(result.params) == bits(vehicle.params)
+        assert (await component.set("PARAM_01", 77)).status == "accepted"
+        assert (await component.get("PARAM_01")).value == 77
+        tasks.cancel_scope.cancel()
+
+
+@pytest.mark.asyncio
+async def test_the_cache_knows_the_vehicle_by_its_port(cable: Cable, tmp_path: Path) -> None:
+    """A vehicle that has no hardware id is known by the link's canonical name, however it is spelt."""
+    for spelling in (f"serial:{cable.device}:115200", f"serial://{cable.device},115200"):
+        vehicle = small_px4(stream=True)
+        async with (
+            asyncio.timeout(PATIENCE),
+            ParamClient(spelling, cache=tmp_path / "cache") as client,
+            anyio.create_task_group() as tasks,
+        ):
+            tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
+            result = await (await client.component()).fetch_all()
+            tasks.cancel_scope.cancel()
+    assert result.source == "cache"
+
+
+@pytest.mark.asyncio
+async def test_unplugged_in_the_middle_of_a_download(
+    cable: Cable, port: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    vehicle = generic(burst=1, period=0.03, stream=True)
+    async with asyncio.timeout(PATIENCE), a_client(cable.link) as client, anyio.create_task_group() as tasks:
+        tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
+        component = await client.component()
+        changes = component.changes()
+        fetch = asyncio.create_task(component.fetch_all())
+        await anext(changes)
+        cable.pull_out()
+        await until(lambda: " away, " in repr(client))
+        assert not fetch.done()
+        cable.plug_in()
+        tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
+        result = await fetch
+        assert result.complete
+        assert bits(result.params) == bits(vehicle.params)
+        assert (await component.set("PARAM_01", 77)).status == "accepted"
+        tasks.cancel_scope.cancel()
+    [warning] = [
+        record.getMessage() for record in caplog.records if record.name == "paramclient.client.link_task"
+    ]
+    assert warning.startswith(f"{cable.link}: lost {cable.device}: unplugged, or ")
+
+
+@pytest.mark.asyncio
+async def test_unplugged_for_good(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link_task, "LINK_PATIENCE", 0.2)
+    monkeypatch.setattr(link_task, "FIRST_BACKOFF", 0.05)
+    monkeypatch.setattr(link_task, "LONGEST_BACKOFF", 0.1)
+    vehicle = generic(stream=True)
+    async with asyncio.timeout(PATIENCE), a_client(cable.link) as client, anyio.create_task_group() as tasks:
+        tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
+        component = await client.component()
+        cable.pull_out()
+        with pytest.raises(
+            LinkError, match=f"there is no {cable.device}; 'paramclient ports' lists"
+        ) as caught:
+            await component.get("PARAM_01")
+        assert isinstance(caught.value.__cause__, FileNotFoundError)
+        cable.plug_in()
+        tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
+        await until(lambda: " open, " in repr(client))
+        assert (await component.get("PARAM_01")).value == 1
+        tasks.cancel_scope.cancel()
+
+
+# The link
+
+
+@pytest.mark.asyncio
+async def test_who_speaks_after_it_was_unplugged_is_another_one(cable: Cable, port: str) -> None:
+    """Half a frame of before is not continued, and what was for the old one is not sent to the new one."""
+    async with opened(cable) as link:
+        cable.send(b"\xfd")
+        [(before, _)] = await link.receive()
+        cable.pull_out()
+        with pytest.raises(LinkError, match=f"lost {cable.device}: unplugged"):
+            await link.receive()
+        with pytest.raises(LinkError, match="not open"):
+            await link.send(HEARTBEAT, None)
+        cable.plug_in()
+        await link.open()
+        cable.send(b"\xfe")
+        [(after, data)] = await link.receive()
+        assert (data, after != before) == (b"\xfe", True)
+        await link.send(b"old", before)
+        await link.send(b"new", after)
+        assert cable.recv(100) == b"new"
+
+
+@pytest.mark.asyncio
+async def test_unplugged_while_sending(cable: Cable, port: str) -> None:
+    async with opened(cable) as link:
+        cable.pull_out()
+        with pytest.raises(LinkError, match=f"lost {cable.device}: unplugged, or reset") as caught:  # noqa: PT012
+            while True:  # a transport is told of it later
+                await link.send(HEARTBEAT, None)
+        assert isinstance(caught.value.__cause__, OSError)
+        assert caught.value.link == link.name
+
+
+@pytest.mark.asyncio
+async def test_a_device_that_takes_nothing_is_lost_and_what_waits_for_it_dropped(
+    cable: Cable, port: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(serial, "STALL_TIMEOUT", 0.0)  # what is left is what a buffer takes at the rate
+    async with opened(cable) as link, anyio.create_task_group() as tasks:
+        got: list[tuple[Peer, bytes]] = []
+        failures: list[LinkError] = []
+
+        async def receive() -> None:
+            try:
+                while True:
+                    got.extend(await link.receive())
+            except LinkError as error:
+                failures.append(error)
+
+        tasks.start_soon(receive)
+        sent = 0
+        with pytest.raises(LinkError, match=f"{cable.device} has taken nothing for 0 s") as caught:  # noqa: PT012
+            while True:  # until the system's buffer is full
+                await link.send(bytes(1000), None)
+                sent += 1000
+                if sent == 5000:
+                    cable.send(b"still here")
+        assert 5000 < sent < 60_000  # what Linux holds for a pseudo-terminal, and nothing here
+        await until(lambda: failures)
+        assert str(failures[0]) == str(caught.value)
+        assert b"".join(data for _, data in got) == b"still here"
+        cable.drain()
+        await link.open()
+        await link.send(HEARTBEAT, None)
+        assert cable.recv(100_000) == HEARTBEAT
+
+
+@pytest.mark.asyncio
+async def test_a_slow_device_sets_the_pace(cable: Cable, port: str) -> None:
+    """More than the system's buffer holds: what is sent waits, and comes whole and in order."""
+    frames = [bytes([number]) * 1000 for number in range(60)]
+    async with opened(cable) as link:
+        heard = b""
+
+        async def send() -> None:
+            for frame in frames:
+                await link.send(frame, None)
+
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(send)
+            while len(heard) < 60_000:
+                await anyio.sleep(0.001)
+                heard += await anyio.to_thread.run_sync(cable.recv, 1500)
+        assert heard == b"".join(frames)
+
+
+@pytest.mark.asyncio
+async def test_a_transport_brings_no_more_than_is_read(cable: Cable) -> None:
+    port = await Transport.opened(str(cable.device), 115200)
+    try:
+        sent = 0
+        with anyio.fail_after(PATIENCE):
+            while port._unread < UNREAD_LIMIT:
+                sent += cable.offer(bytes(500))
+                await anyio.sleep(0.0001)
+            unread = port._unread
+            for _ in range(100):
+                sent += cable.offer(bytes(500))
+                await anyio.sleep(0.0001)
+            assert port._unread == unread
+            read = 0
+            while read < sent:
+                read += len(await port.read())
+    finally:
+        await port.close()
+
+
+@pytest.mark.asyncio
+async def test_how_a_port_is_set_up(cable: Cable) -> None:
+    """Raw bytes, 8N1, no flow control; DTR falls with the last program that closes it, as everywhere."""
+    async with opened(cable) as link:
+        iflag, oflag, cflag, lflag, _, ospeed, _ = termios.tcgetattr(link._port._file)
+    assert (iflag, oflag, lflag, ospeed) == (0, 0, 0, termios.B115200)
+    assert cflag & (termios.CSIZE | termios.CSTOPB | termios.PARENB | termios.CRTSCTS) == termios.CS8
+    assert cflag & termios.HUPCL
+    assert cflag & termios.CLOCAL
+
+
+# Ports that cannot be opened
+
+
+@pytest.mark.asyncio
+async def test_a_port_is_ours_alone_and_free_again_after(cable: Cable) -> None:
+    def is_exclusive() -> bool:
+        try:
+            file = os.open(cable.device, os.O_RDWR | os.O_NOCTTY)
+        except OSError as error:
+            return error.errno == errno.EBUSY
+        try:  # the privileged get in, and can look
+            (flag,) = struct.unpack("i", fcntl.ioctl(file, TIOCGEXCL, bytes(4)))
+        finally:
+            os.close(file)
+        return bool(flag)
+
+    async with opened(cable) as link:
+        assert is_exclusive()
+        error = await refusal(create_link(cable.link))
+        assert str(error) == f"{cable.link}: {cable.device} is in use by another program"
+        await link.send(HEARTBEAT, None)
+        assert cable.recv(100) == HEARTBEAT
+    assert not is_exclusive()
+    async with opened(cable):
+        pass
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(
+    ("code", "text"),
+    [
+        (errno.ENOENT, "there is no /dev/ttyACM0; 'paramclient ports' lists the ports that there are"),
+        (errno.ENODEV, "there is no /dev/ttyACM0; 'paramclient ports' lists the ports that there are"),
+        (errno.EBUSY, "/dev/ttyACM0 is in use by another program"),
+        (errno.EPERM, "no permission to open /dev/ttyACM0"),
+        (errno.ENOTTY, "/dev/ttyACM0 is no serial port"),
+        (errno.EINVAL, "/dev/ttyACM0 cannot be set to 57600 baud"),
+        (errno.EIO, "cannot open /dev/ttyACM0: Input/output error"),
+    ],
+)
+async def test_why_a_port_cannot_be_opened(code: int, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(serialx.Serial, "open", refuse)
+    monkeypatch.setattr(serial, "_who_may", lambda _: "")
+    error = await refusal(create_link("/dev/ttyACM0"))
+    assert str(error) == f"serial:/dev/ttyACM0:57600: {text}"
+    assert isinstance(error.__cause__, OSError)
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize("name", ["", "file", "missing"])
+async def test_what_is_no_port(tmp_path: Path, name: str) -> None:
+    (tmp_path / "file").touch()
+    path = tmp_path / name
+    expected = f"there is no {path};" if name == "missing" else f"{path} is no serial port"
+    assert expected in str(await refusal(create_link(f"serial:{path}")))
+
+
+@pytest.mark.asyncio
+@pytest.mark.parametrize(
+    ("mode", "is_member", "says_who"), [(0o660, False, True), (0o600, False, False), (0o660, True, False)]
+)
+async def test_without_permission_it_is_said_which_group_helps(
+    mode: int, is_member: bool, says_who: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(_: object) -> None:
+        raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
+
+    class Group:
+        gr_name = "dialout"
+
+    info = os.stat_result((stat.S_IFCHR | mode, 1, 1, 1, 0, 20, 0, 0, 0, 0))
+    monkeypatch.setattr(serialx.Serial, "open", refuse)
+    link = create_link("/dev/ttyUSB0")
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "stat", lambda _: info)
+        patch.setattr(grp, "getgrgid", {20: Group}.__getitem__)
+        patch.setattr(os, "getgroups", lambda: [20] if is_member else [100])
+        error = await refusal(link)
+    who = ", which is for the group dialout: sudo usermod -aG dialout $USER, then log in again"
+    expected = f"no permission to open /dev/ttyUSB0{who if says_who else ''}"
+    assert str(error) == f"serial:/dev/ttyUSB0:57600: {expected}"
+
+
+@pytest.mark.asyncio
+async def test_a_rate_that_the_system_does_not_have(
+    cable: Cable, port: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(*_: object) -> None:
+        raise serialx.UnsupportedSetting("Unsupported baudrate")
+
+    monkeypatch.setattr(serialx.Serial, "_reconfigure_port", refuse)
+    with pytest.raises(UsageError, match="no serial port of this system has 115200 baud"):
+        await create_link(cable.link).open()
+
+
+@pytest.mark.asyncio
+async def test_a_driver_that_does_not_tell_its_rate(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object) -> None:
+        raise RuntimeError("termios2 speed fields are zero")
+
+    monkeypatch.setattr(serialx.Serial, "_reconfigure_port", refuse)
+    error = await refusal(create_link(cable.link))
+    assert str(error) == f"{cable.link}: {cable.device} cannot be set to 115200 baud"
+
+
+class Stuck:
+    """A driver that takes its time with opening or closing a port: the next one, or the one that is given."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, call: str, port: object = None) -> None:
+        self.is_in_it = threading.Event()
+        self.may_go_on = threading.Event()
+        self.is_closed = threading.Event()
+        self._port = None if port is None else id(port)  # not the port: it would end with the patch
+        self._slow = call
+        self._real = {name: getattr(serialx.Serial, name) for name in ("open", "close")}
+        monkeypatch.setattr(serialx.Serial, "open", lambda port: self._call("open", port))
+        monkeypatch.setattr(serialx.Serial, "close", lambda port: self._call("close", port))
+
+    def _call(self, name: str, port: object) -> None:
+        if name == "open" and self._port is None:
+            self._port = id(port)
+        is_it = id(port) == self._port  # the collector closes others, of tests before
+        if is_it and name == self._slow:
+            self.is_in_it.set()
+            assert self.may_go_on.wait(PATIENCE)
+        self._real[name](port)
+        if is_it and name == "close":
+            self.is_closed.set()
+
+
+@pytest.mark.asyncio
+async def test_a_driver_that_does_not_open(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The loop goes on meanwhile, the call ends in time, and a port that comes late is closed again."""
+    monkeypatch.setattr(serial, "OPEN_TIMEOUT", 0.01)
+    monkeypatch.setattr(serial, "CLOSE_TIMEOUT", 0.01)
+    stuck = Stuck(monkeypatch, "open")
+    error = await refusal(create_link(cable.link))
+    assert str(error) == f"{cable.link}: {cable.device} did not open within 0.01 s"
+    assert stuck.is_in_it.is_set()
+    assert not stuck.is_closed.is_set()
+    stuck.may_go_on.set()
+    assert await anyio.to_thread.run_sync(stuck.is_closed.wait, PATIENCE)
+    monkeypatch.undo()
+    await until(lambda: "paramclient serial" not in {thread.name for thread in threading.enumerate()})
+    async with opened(cable):
+        pass
+
+
+@pytest.mark.asyncio
+async def test_closed_while_it_is_opened(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+    stuck = Stuck(monkeypatch, "open")
+    link = create_link(cable.link)
+    async with anyio.create_task_group() as tasks:
+
+        async def open_it() -> None:
+            assert str(await refusal(link)) == f"{cable.link}: closed"
+
+        tasks.start_soon(open_it)
+        await until(stuck.is_in_it.is_set)
+        await link.close()
+        stuck.may_go_on.set()
+    assert stuck.is_closed.is_set()
+
+
+@pytest.mark.asyncio
+async def test_a_driver_that_does_not_close(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serial, "CLOSE_TIMEOUT", 0.01)
+    async with opened(cable) as link:
+        stuck = Stuck(monkeypatch, "close", link._port._serial)
+        await link.close()
+        assert stuck.is_in_it.is_set()
+        stuck.may_go_on.set()
+        await until(lambda: "paramclient serial" not in {thread.name for thread in threading.enumerate()})
+
+
+@pytest.mark.asyncio
+async def test_closing_does_not_wait_for_what_is_not_taken(
+    cable: Cable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Whoever closes waits for no answer; Linux would wait 30 s for a device to take the rest."""
+    calls: list[str] = []
+    close = serialx.Serial.close
+    monkeypatch.setattr(termios, "tcflush", lambda _, queue: calls.append(f"flush {queue}"))
+
+    async with opened(cable) as link:
+        ours = id(link._port._serial)  # not the port: it would end with the patch, and call it
+
+        def closed(port: serialx.BaseSerial) -> None:
+            if id(port) == ours:
+                calls.append("close")
+            close(port)
+
+        calls.clear()
+        monkeypatch.setattr(serialx.Serial, "close", closed)
+        await link.close()
+        assert calls[:2] == [f"flush {termios.TCOFLUSH}", "close"]
+
+
+def test_a_transport_needs_asyncio() -> None:
+    program = (
+        "import asyncio\n"
+        "from paramclient.links.transport import Transport\n"
+        "opening = Transport.opened('COM5', 57600)\n"
+        "try:\n"
+        "    opening.send(None)\n"
+        "except ValueError as error:\n"
+        "    print(error)\n"
+    )
+    run = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
+    assert run.stdout == "COM5: on Windows serial ports need asyncio's own event loop\n"
+
+
+# The extra
+
+
+def test_without_the_extra_the_command_that_installs_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "serialx", None)
+    with pytest.raises(UsageError) as caught:
+        create_link("/dev/ttyACM0")
+    assert str(caught.value) == "serial:/dev/ttyACM0:57600 needs serialx: pip install 'paramclient[serial]'"
+
+
+def test_serialx_is_loaded_when_a_port_is_opened_and_not_before() -> None:
+    program = (
+        "import sys, anyio, paramclient.links as links\n"
+        "link = links.create_link('serial:/dev/null')\n"
+        "assert not {'serialx', 'asyncio'} & sys.modules.keys()\n"
+        "try:\n"
+        "    anyio.run(link.open)\n"
+        "except OSError as error:\n"
+        "    print(error)\n"
+        "assert 'serialx' in sys.modules\n"
+    )
+    run = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
+    assert run.stdout == "serial:/dev/null:57600: /dev/null is no serial port\n"

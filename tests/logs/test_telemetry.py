@@ -1,0 +1,506 @@
+"""Telemetry logs in the place of a link, and brought into a cache."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from pathlib import Path
+
+import anyio
+import pytest
+
+from paramclient import (
+    LinkError,
+    NoReply,
+    ParamCache,
+    ParamClient,
+    SyncState,
+    Trust,
+    UsageError,
+)
+from paramclient.cache import BY_US, StoredParam, TableUpdate
+from paramclient.cache.tables import HISTORY_LINES
+from paramclient.cli import run
+from paramclient.links import LinkKind, ReplayLink, create_link, parse_link
+from paramclient.links.replay import LONGEST_PAUSE
+from paramclient.links.tlog import FIRST_WITHIN
+from paramclient.logs.telemetry import ImportedTable, import_log
+from paramclient.model.identity import Identity
+from paramclient.model.values import Param
+from paramclient.protocol import wire
+from tests.recordings import DATA, from_vehicle, param_values, read
+from tests.shell import swiftly
+from tests.simulation import known
+from tests.telemetry import KEY, NOW, UID, Log
+
+
+def whole(**values: int) -> Log:
+    """A log in which a vehicle is identified and gives its table."""
+    return Log().beat().identify().list(**values).wait(1.0)
+
+
+def a_replay(path: Path | str, **options: object) -> ParamClient:
+    return ParamClient(f"replay:{path}", **options)  # type: ignore[arg-type]  # any
+
+
+# names
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "path", "options"),
+    [
+        ("replay:flight.tlog", "replay:flight.tlog", "flight.tlog", ()),
+        ("replay:///logs/a b.tlog", "replay:/logs/a b.tlog", "/logs/a b.tlog", ()),
+        ("REPLAY:/x.tlog?speed=2", "replay:/x.tlog?speed=2.0", "/x.tlog", (("speed", 2.0),)),
+        ("replay:/x.tlog?speed=inf", "replay:/x.tlog?speed=0.0", "/x.tlog", (("speed", 0.0),)),
+        ("replay:what?.tlog", "replay:what?.tlog", "what?.tlog", ()),
+    ],
+)
+def test_a_log_is_named_by_its_file(
+    text: str, name: str, path: str, options: tuple[tuple[str, float], ...]
+) -> None:
+    spec = parse_link(text)
+    assert (spec.kind, spec.name, spec.host, spec.options) == (LinkKind.REPLAY, name, path, options)
+    assert parse_link(name) == spec
+    assert isinstance(create_link(text), ReplayLink)
+
+
+@pytest.mark.parametrize("text", ["replay:", "replay:?speed=1", "replay:x?speed=-1", "replay:x?speed=fast"])
+def test_names_of_no_log(text: str) -> None:
+    with pytest.raises(UsageError, match="accepted forms"):
+        parse_link(text)
+
+
+@swiftly
+async def test_a_file_that_is_no_log(tmp_path: Path) -> None:
+    with pytest.raises(LinkError, match=r"cannot open .*nowhere\.tlog: No such file"):
+        async with a_replay(tmp_path / "nowhere.tlog"):
+            raise AssertionError("it was opened")
+    for content in (b"", b"FRAME_CLASS 1\n" * 50):
+        (tmp_path / "other.txt").write_bytes(content)
+        with pytest.raises(LinkError, match="is no telemetry log"):
+            async with a_replay(tmp_path / "other.txt"):
+                raise AssertionError("it was opened")
+    with pytest.raises(LinkError, match="Is a directory"):
+        async with a_replay(tmp_path):
+            raise AssertionError("it was opened")
+    os.mkfifo(tmp_path / "pipe")
+    for endless in ("/dev/zero", tmp_path / "pipe"):
+        with pytest.raises(LinkError, match="is no regular file"):
+            async with a_replay(endless):
+                raise AssertionError("it was opened")
+
+
+@pytest.mark.parametrize("before", [FIRST_WITHIN - 100, FIRST_WITHIN])
+@swiftly
+async def test_a_log_begins_within_its_first_bytes(before: int, tmp_path: Path) -> None:
+    """Whatever stands before its first frame; what has none there may be a disk image."""
+    path = tmp_path / "flight.tlog"
+    path.write_bytes(bytes(before) + whole(A=1).data)
+    if before < FIRST_WITHIN:
+        async with a_replay(path) as client:
+            assert (await (await client.component()).fetch_all()).complete
+        return
+    with path.open("r+b") as file:
+        file.truncate(1 << 40)
+    with pytest.raises(LinkError, match="is no telemetry log"):
+        async with a_replay(path):
+            raise AssertionError("it was opened")
+
+
+# as a link
+
+
+@pytest.mark.parametrize("speed", ["", "?speed=10", "?speed=0"])
+@pytest.mark.parametrize(
+    ("name", "crc"), [("px4_full_download", 0xCF579589), ("ardupilot_full_download", None)]
+)
+@swiftly
+async def test_a_table_comes_from_a_recording(name: str, crc: int | None, speed: str) -> None:
+    async with a_replay(f"{DATA / name}.tlog{speed}") as client:
+        assert client.cache is None
+        component = await client.component()
+        result = await component.fetch_all()
+        values = {each.param_id: each for each in param_values(from_vehicle(name))}
+        values.pop("_HASH_CHECK", None)
+        assert result.params.keys() == values.keys()
+        assert (result.missing, result.hash, result.source) == ((), crc, "stream")
+        assert component.sync_state is SyncState.SYNCED
+        assert {param.trust for param in result.params.values()} == {Trust.LIVE}
+        assert (await client.fetch_all()).complete
+        assert client.bytes_received == sum(len(each.data) for each in read(name))
+        assert client.bytes_sent == 0
+
+
+@pytest.mark.parametrize(("speed", "expected"), [("", 20.0), ("?speed=4", 5.0), ("?speed=0", 0.0)])
+@swiftly
+async def test_frames_come_at_the_times_of_the_log(speed: str, expected: float, tmp_path: Path) -> None:
+    path = whole(A=1).wait(19.0).beat().write(tmp_path / "flight.tlog")
+    began = anyio.current_time()
+    async with a_replay(f"{path}{speed}") as client:
+        await (await client.component()).fetch_all()
+        assert anyio.current_time() - began == pytest.approx(expected, abs=0.1)
+
+
+@swiftly
+async def test_long_pauses_and_clocks_that_go_back(tmp_path: Path) -> None:
+    path = Log().beat().wait(86400.0).beat().wait(-1e6).beat().write(tmp_path / "flight.tlog")
+    began = anyio.current_time()
+    async with a_replay(path) as client:
+        component = await client.component()
+        with pytest.raises(NoReply):
+            await component.fetch_all()
+        assert anyio.current_time() - began == pytest.approx(LONGEST_PAUSE, abs=0.1)
+
+
+@swiftly
+async def test_what_is_missing_is_named_when_the_log_ends(tmp_path: Path) -> None:
+    log = Log().beat().tell("A", 0, A=1, B=2, C=3).tell("C", 2)
+    async with a_replay(log.write(tmp_path / "flight.tlog")) as client:
+        component = await client.component()
+        for _ in range(2):  # also when it has ended
+            result = await component.fetch_all()
+            assert (result.missing, result.count) == ((1,), 3)
+        together = await client.fetch_all()
+        assert together.results[1, 1].missing == (1,)
+        await anyio.sleep(60.0)
+        # time stands still at its end: nobody is lost
+        assert component.state == "partial"
+        assert component.params["A"].trust is Trust.LIVE
+
+
+@swiftly
+async def test_the_last_word_counts(tmp_path: Path) -> None:
+    log = whole(A=1, B=2).wait(5.0).set("A", 7).wait(5.0)
+    async with a_replay(log.write(tmp_path / "flight.tlog")) as client:
+        component = await client.component()
+        changes, events = component.changes(), client.events()
+        assert (await component.fetch_all()).params["A"].value == 7
+        # both end with the log, also for those who come late
+        assert [(each.name, each.by) async for each in changes] == [("A", "station 255/190")]
+        assert [each async for each in events] == []
+        assert [each async for each in component.changes()] == []
+        assert [each async for each in client.events()] == []
+
+
+@swiftly
+async def test_a_log_cannot_be_asked(tmp_path: Path) -> None:
+    path = whole(A=1).write(tmp_path / "flight.tlog")
+    async with a_replay(path) as client:
+        component = await client.component()
+        calls: Sequence[Callable[[], Awaitable[object]]] = (
+            lambda: component.get("A"),
+            lambda: component.set("A", 2),
+            lambda: component.fetch_all(refresh=True),
+        )
+        for call in calls:
+            with pytest.raises(UsageError, match="where nothing is sent"):
+                await call()
+        began = anyio.current_time()
+        with pytest.raises(NoReply, match="component 9/9"):
+            await client.component(9, 9)
+        assert anyio.current_time() - began < 2.0
+    with pytest.raises(UsageError, match="paramclient import"):
+        a_replay(path, cache=tmp_path / "cache")
+
+
+@swiftly
+async def test_a_replay_can_be_closed_at_any_moment(tmp_path: Path) -> None:
+    path = Log().beat().wait(1000.0).beat().write(tmp_path / "flight.tlog")
+    link = create_link(f"replay:{path}")
+    await link.open()
+    assert len(await link.receive()) == 1
+    caught: list[LinkError] = []
+
+    async def wait() -> None:
+        try:
+            await link.receive()
+        except LinkError as error:
+            caught.append(error)
+
+    async with anyio.create_task_group() as tasks:
+        tasks.start_soon(wait)
+        await anyio.sleep(1.0)
+        await link.close()
+    assert str(caught[0]) == f"replay:{path}: not open"
+    await link.close()
+    await link.open()
+    assert len(await link.receive()) == 1
+    await link.close()
+
+
+# into a cache
+
+
+def imported(*paths: Path, cache: Path) -> list[ImportedTable]:
+    async def work() -> list[ImportedTable]:
+        with ParamCache(cache) as kept:
+            return [table for path in paths for table in await import_log(path, kept)]
+
+    return anyio.run(work)
+
+
+def kept_values(cache: Path) -> dict[str, object]:
+    with ParamCache(cache) as kept:
+        return {name: param.value for name, param in kept.component(KEY).params.items()}
+
+
+def lines(cache: Path) -> list[tuple[object, ...]]:
+    with ParamCache(cache) as kept:
+        return [
+            (each.name, each.old.value, each.new and each.new.value, each.by, each.at - NOW)
+            for each in kept.history(KEY)
+        ]
+
+
+def test_a_log_fills_a_cache_with_its_own_times(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    log = whole(A=1, B=2, C=3).wait(99.0).set("B", 5).wait(100.0).change("C", 9).wait(1.0).beat()
+    [table] = imported(log.write(tmp_path / "flight.tlog"), cache=cache)
+    assert table == ImportedTable(KEY, 1, 1, 0, 3, True, None)
+    assert kept_values(cache) == {"A": 1, "B": 5, "C": 9}
+    assert lines(cache) == [
+        ("B", 2, 5, "station 255/190", pytest.approx(100.0, abs=1e-3)),
+        ("C", 3, 9, "vehicle", pytest.approx(200.0, abs=1e-3)),
+    ]
+    with ParamCache(cache) as kept:
+        found = kept.component(KEY)
+        assert (found.complete, found.count, found.identity.firmware) == (True, 3, 7)
+        assert found.synced_at == pytest.approx(NOW, abs=1e-3)
+        assert {name: round(at - NOW) for name, at in found.heard_at.items()} == {"A": 0, "B": 100, "C": 200}
+        [vehicle] = kept.vehicles()
+        assert (round(vehicle.first_seen - NOW), round(vehicle.last_seen - NOW)) == (0, 200)
+
+
+def test_the_hash_that_a_log_carries_is_kept_with_its_table(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    [table] = imported(DATA / "px4_full_download.tlog", cache=cache)
+    assert table.hash == 0xCF579589
+    with ParamCache(cache) as kept:
+        found = kept.component(table.key)
+        assert (found.hash, found.complete, found.volatile_known) == (0xCF579589, True, True)
+        assert len(found.volatile) == 58
+
+
+def test_to_import_again_changes_nothing(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    log = whole(A=1, B=2).wait(9.0).set("B", 5).wait(9.0).change("A", 3).write(tmp_path / "flight.tlog")
+    imported(log, cache=cache)
+    before = (kept_values(cache), lines(cache))
+    with ParamCache(cache) as kept:
+        table = repr(kept.component(KEY))
+    imported(log, log, cache=cache)
+    assert (kept_values(cache), lines(cache)) == before
+    with ParamCache(cache) as kept:
+        assert repr(kept.component(KEY)) == table
+
+
+def test_to_import_again_changes_nothing_where_the_clock_was_set_back(tmp_path: Path) -> None:
+    """All that comes after that has one time, to the end of the log."""
+    cache = tmp_path / "cache"
+    log = Log().tell("A", A=1).wait(-60.0).change("A", 2).write(tmp_path / "flight.tlog")
+    [table] = imported(log, cache=cache)
+
+    def kept() -> str:
+        with ParamCache(cache) as kept:
+            return repr((kept.component(table.key).params["A"].value, kept.history(table.key)))
+
+    before = kept()
+    imported(log, cache=cache)
+    assert kept() == before
+
+
+def test_to_import_again_changes_nothing_where_a_name_went_and_came_back(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    log = whole(A=1, B=2).say(wire.AutopilotVersion(0, uid=0xDEADBEEF, flight_sw_version=8))  # an update
+    del log.values["B"]
+    log.list().wait(9.0).list(B=5).wait(9.0).change("A", 3).wait(1.0).beat()
+    imported(log.write(tmp_path / "flight.tlog"), cache=cache)
+    before = (kept_values(cache), lines(cache))
+    assert before[0] == {"A": 3, "B": 5}
+    assert [each[:3] for each in before[1]] == [("B", 2, None), ("A", 1, 3)]
+    imported(tmp_path / "flight.tlog", cache=cache)
+    assert (kept_values(cache), lines(cache)) == before
+
+
+@pytest.mark.parametrize("is_reversed", [False, True])
+def test_the_order_of_logs_does_not_matter(is_reversed: bool, tmp_path: Path) -> None:
+    first = whole(A=1, B=2).wait(9.0).change("A", 3).wait(1.0).beat()
+    second = Log(NOW + 1000.0).beat().identify()
+    second.list(A=4, B=2).wait(10.0).change("B", 8).wait(1.0).beat()
+    logs = [first.write(tmp_path / "1.tlog"), second.write(tmp_path / "2.tlog")]
+    cache = tmp_path / "cache"
+    imported(*(reversed(logs) if is_reversed else logs), cache=cache)
+    assert kept_values(cache) == {"A": 4, "B": 8}
+    assert [each[:3] for each in lines(cache)] == [("A", 1, 3), ("A", 3, 4), ("B", 2, 8)]
+    assert [round(float(str(each[4]))) for each in lines(cache)] == [10, 1000, 1010]
+    with ParamCache(cache) as kept:
+        assert kept.component(KEY).complete
+        [vehicle] = kept.vehicles()
+        assert round(vehicle.first_seen - NOW) == 0
+        assert round(vehicle.last_seen - NOW) == 1010
+
+
+def save(cache: Path, at: float, *params: Param, by: str = BY_US, firmware: int = 8) -> None:
+    identity = Identity(1, "udp", UID, firmware=firmware)
+    stored = [StoredParam(each, at, by=by) for each in params]
+    with ParamCache(cache) as kept:
+        kept.save(TableUpdate(identity=identity, component=1, autopilot=12, at=at, params=stored))
+
+
+def test_what_is_kept_of_a_later_time_stays(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    save(cache, NOW + 5000.0, known("A", 77))
+    imported(whole(A=1, B=2).write(tmp_path / "flight.tlog"), cache=cache)
+    assert kept_values(cache) == {"A": 77, "B": 2}
+    assert lines(cache) == [("A", 1, 77, "vehicle", 5000.0)]
+    with ParamCache(cache) as kept:
+        found = kept.component(KEY)
+        assert (found.identity.firmware, found.autopilot, found.complete) == (8, 12, False)
+        assert found.updated_at == NOW + 5000.0
+        assert kept.vehicles()[0].last_seen == NOW + 5000.0
+
+
+def test_a_log_that_spans_what_is_kept(tmp_path: Path) -> None:
+    """Before it, in the middle and behind it each observation finds its place."""
+    cache = tmp_path / "cache"
+    log = whole(A=1, B=2).wait(199.0).change("A", 9).wait(1.0).beat()
+    save(cache, NOW + 100.0, known("A", 5), known("B", 6, index=1))
+    imported(log.write(tmp_path / "flight.tlog"), cache=cache)
+    assert kept_values(cache) == {"A": 9, "B": 6}
+    assert sorted(each[:3] for each in lines(cache)) == [("A", 1, 5), ("A", 5, 9), ("B", 2, 6)]
+
+
+def test_a_change_that_was_heard_live_too_has_one_line(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    save(cache, NOW + 0.2, known("A", 1))
+    save(cache, NOW + 10.25, known("A", 3))
+    assert len(lines(cache)) == 1
+    log = whole(A=1).wait(9.0).change("A", 3).wait(1.0).beat()
+    imported(log.write(tmp_path / "flight.tlog"), cache=cache)
+    assert lines(cache) == [("A", 1, 3, BY_US, pytest.approx(10.25))]
+
+
+def test_a_name_that_a_later_table_lacks_stays_away(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    later = Log(NOW + 500.0).beat().identify().list(A=1).wait(1.0).beat()
+    imported(later.write(tmp_path / "later.tlog"), cache=cache)
+    imported(whole(A=1, OLD=2).write(tmp_path / "earlier.tlog"), cache=cache)
+    assert kept_values(cache) == {"A": 1}
+    assert lines(cache) == []
+
+
+def test_a_name_that_has_gone_since_stays_away(tmp_path: Path) -> None:
+    """Also from a table that is not whole: that it went is the later word."""
+    cache = tmp_path / "cache"
+    log = whole(A=1, OLD=2).write(tmp_path / "flight.tlog")
+    save(cache, NOW + 100.0, known("A", 1), known("OLD", 2))
+    who = Identity(1, "udp", UID)
+    gone = TableUpdate(identity=who, component=1, autopilot=12, at=NOW + 200.0, removed=("OLD",))
+    with ParamCache(cache) as kept:
+        kept.save(gone)
+    before = lines(cache)
+    assert before == [("OLD", 2, None, "vehicle", 200.0)]
+    imported(log, log, cache=cache)
+    assert kept_values(cache) == {"A": 1}
+    assert lines(cache) == before
+    imported(Log(NOW + 300.0).beat().identify().tell("OLD", OLD=5).write(tmp_path / "l.tlog"), cache=cache)
+    assert kept_values(cache) == {"A": 1, "OLD": 5}
+
+
+def test_vehicles_that_do_not_say_who_they_are_are_told_apart_by_the_log(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    one = Log().beat().list(A=1).write(tmp_path / "1.tlog")
+    two = Log().beat().tell("A", 0, A=2, B=3).write(tmp_path / "2.tlog")
+    tables = imported(one, two, cache=cache)
+    assert [table.key for table in tables] == [f"system:1@replay:{one}", f"system:1@replay:{two}"]
+    assert [table.complete for table in tables] == [True, False]
+
+
+def test_what_was_said_before_the_identity_has_its_own_time(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    log = Log().beat().list(A=1).wait(500.0).identify().beat()
+    save(cache, NOW + 100.0, known("A", 5))
+    imported(log.write(tmp_path / "flight.tlog"), cache=cache)
+    assert kept_values(cache) == {"A": 5}
+
+
+def test_history_keeps_its_newest_lines_by_their_time(tmp_path: Path) -> None:
+    cache = tmp_path / "cache"
+    names = [f"P{number}" for number in range(1000)]
+    for step in range(HISTORY_LINES // 1000 + 1):
+        save(cache, NOW + 1000.0 + step, *(known(name, step) for name in names))
+    assert len(lines(cache)) == HISTORY_LINES
+    log = whole(P0=7).wait(9.0).change("P0", 8).wait(1.0).beat()
+    imported(log.write(tmp_path / "flight.tlog"), cache=cache)
+    found = lines(cache)
+    assert len(found) == HISTORY_LINES
+    assert found == sorted(found, key=lambda each: float(str(each[4])))
+    assert found[0][4] == 1001.0
+
+
+# the command
+
+
+def test_the_command_reads_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = whole(A=1, B=2).wait(300.0).change("B", 4).write(tmp_path / "flight.tlog")
+    began = time.monotonic()
+    assert run(["fetch", f"replay:{path}", "--json"]) == 0
+    assert time.monotonic() - began < 60.0  # not the minutes of the log
+    fetched = json.loads(capsys.readouterr().out)
+    assert (fetched["count"], fetched["params"]["B"]["value"], fetched["bytes_sent"]) == (2, 4, 0)
+    assert run(["show", f"replay:{path}", "--json"]) == 0
+    [table] = json.loads(capsys.readouterr().out)["components"]
+    assert (table["uid"], table["params"]["B"]["value"]) == (UID, 4)
+    assert run(["get", f"replay:{path}", "A"]) == 2
+    assert "where nothing is sent" in capsys.readouterr().err
+    capsys.readouterr()
+    for names in ([], ["B"]):
+        assert run(["watch", f"replay:{path}?speed=100", *names]) == 0  # it ends with the log
+        told = capsys.readouterr().out.splitlines()
+        assert told == ["2023-11-14T22:18:21.000Z  B  2 -> 4  (vehicle)"], "with the time of the log"
+    assert run(["watch", f"replay:{path}?speed=100", "A"]) == 0
+    assert capsys.readouterr().out == ""
+    assert run(["show", f"replay:{path}.gone"]) == 4
+    assert "cannot open" in capsys.readouterr().err
+
+
+def test_the_command_imports_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    cache = tmp_path / "cache"
+    good = whole(A=1, B=2).write(tmp_path / "flight.tlog")
+    empty = Log().beat().write(tmp_path / "empty.tlog")
+    (tmp_path / "bad.tlog").write_bytes(b"nothing")
+    files = [str(tmp_path / "bad.tlog"), str(empty), str(good)]
+    assert run(["import", *files, "--cache", str(cache), "--json"]) == 4
+    told = capsys.readouterr()
+    [table] = json.loads(told.out)["tables"]
+    assert (table["file"], table["key"], table["params"], table["complete"]) == (str(good), KEY, 2, True)
+    assert "bad.tlog is no telemetry log" in told.err
+    assert "empty.tlog holds no parameters" in told.err
+    assert run(["import", str(good), "--cache", str(cache)]) == 0
+    assert "flight.tlog  1/1        generic         2  yes" in capsys.readouterr().out
+    assert run(["show", "1", "--cache", str(cache)]) == 0
+    assert run(["import"]) == 2
+
+
+def test_earlier_states_are_told_as_before_when_a_log_completes_the_history(tmp_path: Path) -> None:
+    """Lines of history get other numbers then, behind which names have appeared."""
+    cache = tmp_path / "cache"
+    later = Log(NOW + 1000.0).beat().identify().list(A=1, B=2).wait(10.0).change("A", 3)
+    later.wait(10.0).list(C=4).wait(10.0).change("B", 5).wait(1.0).beat()
+    imported(later.write(tmp_path / "later.tlog"), cache=cache)
+    moments = [NOW + 1005.0, NOW + 1015.0, NOW + 1025.0, NOW + 1035.0]
+
+    def told() -> list[dict[str, object]]:
+        with ParamCache(cache) as kept:
+            states = [kept.state_at(KEY, 1, at) for at in moments]
+        return [{name: param.value for name, param in state.items()} for state in states]
+
+    before = told()
+    assert before == [{"A": 1, "B": 2}, {"A": 3, "B": 2}, {"A": 3, "B": 2, "C": 4}, {"A": 3, "B": 5, "C": 4}]
+    earlier = whole(A=7, B=8).wait(9.0).change("A", 9).wait(1.0).beat()
+    imported(earlier.write(tmp_path / "earlier.tlog"), cache=cache)
+    assert [each[:3] for each in lines(cache)] == [("A", 7, 9), ("A", 1, 3), ("B", 2, 5)]
+    assert told() == before

@@ -1,0 +1,454 @@
+"""Descriptions of parameters: what they say of a value, and the files that they come from."""
+
+from __future__ import annotations
+
+import json
+import lzma
+import math
+import tracemalloc
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from paramclient import UsageError
+from paramclient.errors import MetadataError
+from paramclient.metadata import Metadata, ParamInfo, formats, read_content, read_metadata
+from paramclient.model.values import ParamType
+
+DATA = Path(__file__).parents[1] / "data"
+PX4, XML, JSON = DATA / "parameters.json", DATA / "apm.pdef.xml", DATA / "apm.pdef.json"
+
+MODE = ParamInfo("MODE", values={0: "Stabilize", 5: "Loiter", 6: "RTL", 9: "Land  now", 0.5: "Half"})
+MASK = ParamInfo("MASK", bits={0: "GPS", 1: "Baro", 3: "Optical flow", 7: "4"})
+SIGNED = ParamInfo("SIGNED", ParamType.INT32, bits={0: "GPS", 31: "Last"})
+GAIN = ParamInfo("GAIN", units="1/s", minimum=0.1, maximum=12)
+
+
+# what a value means
+
+
+def test_a_value_in_words() -> None:
+    assert MODE.text(5) == MODE.text(5.0) == "Loiter"
+    assert MODE.text(0.5) == "Half"
+    assert ParamInfo("A", values={0.1: "Low"}).text(0.10000000149011612) == "Low"  # 0.1 as a float32
+    assert [MODE.text(value) for value in (1, math.nan, math.inf, b"abcd", 5.5)] == [None] * 5
+
+
+def test_a_mask_in_words() -> None:
+    assert MASK.text(0b1011) == "GPS|Baro|Optical flow"
+    assert MASK.text(1.0) == "GPS"
+    assert MASK.text(0b10101) == "GPS|0x14"
+    assert MASK.text(1 << 7) == "0x80"  # its name would read as a number
+    assert [MASK.text(value) for value in (0, -1, 1.5)] == [None] * 3
+    assert SIGNED.text(-(2**31)) == "Last"
+    assert SIGNED.text(-(2**31) + 1) == "GPS|Last"
+
+
+@pytest.mark.parametrize("text", ["Loiter", "loiter", " LOITER ", "5", "0x5"])
+def test_the_name_of_a_value_is_read(text: str) -> None:
+    assert MODE.parse(text) == 5
+
+
+def test_names_are_read_whatever_their_spaces() -> None:
+    assert MODE.parse("land now") == 9
+    assert MODE.parse("half") == 0.5
+
+
+def test_numbers_are_read_exactly() -> None:
+    assert MODE.parse("-16777217") == -16777217
+    assert isinstance(MODE.parse("4"), int)
+    assert isinstance(MODE.parse("4.0"), float)
+    assert MODE.parse("1e-3") == 0.001
+    assert math.isnan(MODE.parse("nan"))
+    with pytest.raises(UsageError, match="beyond the range"):
+        MODE.parse("1e999")
+
+
+def test_a_number_is_never_a_name() -> None:
+    """ArduPilot has baud rates for names: 57 is called 57600."""
+    info = ParamInfo("SERIAL1_BAUD", values={57: "57600", 115: "111100"})
+    assert info.parse("57600") == 57600
+    assert info.parse("57") == 57
+    assert ParamInfo("A", bits={4: "1", 5: "GPS"}).parse("GPS|1") == 0b100001
+
+
+@pytest.mark.parametrize("text", ["GPS|Baro", "gps+baro", "GPS, Baro", "baro | 1", "0x1|0x2", "0b11"])
+def test_names_of_bits_are_joined(text: str) -> None:
+    if text == "0b11":
+        with pytest.raises(UsageError, match=r"MASK: '0b11' is no number, nor one of its bits: GPS \(0\)"):
+            MASK.parse(text)
+    else:
+        assert MASK.parse(text) == 3
+
+
+def test_a_name_may_hold_what_joins_names() -> None:
+    info = ParamInfo("A", bits={0: "Roll, pitch", 1: "Roll", 2: "Pitch", 3: "Yaw"})
+    assert info.parse("roll, pitch") == 1
+    assert info.parse("Roll, pitch|Yaw") == 0b1001
+    assert info.parse("Roll|Pitch") == 0b110
+    with pytest.raises(UsageError, match="can mean several things"):
+        info.parse("Yaw+Roll, pitch")
+
+
+def test_the_last_bit_of_a_signed_type_makes_it_negative() -> None:
+    assert SIGNED.parse("Last") == -(2**31)
+    assert SIGNED.parse("GPS|Last") == -(2**31) + 1
+
+
+def test_a_name_that_two_values_have_is_not_guessed() -> None:
+    info = ParamInfo("A", values={0: "Off", 2: "off"})
+    with pytest.raises(UsageError, match="A: 'Off' is the name of 0 and 2; give the number"):
+        info.parse("Off")
+
+
+def test_errors_say_what_could_have_been_meant() -> None:
+    with pytest.raises(
+        UsageError, match=r"MODE: 'Loitr' is no number, nor one of its values: Stabilize \(0\), Lo"
+    ):
+        MODE.parse("Loitr")
+    with pytest.raises(
+        UsageError, match=r"'GPS\|Barro' is no number, nor is 'Barro' one of its bits: GPS \(0\)"
+    ):
+        MASK.parse("GPS|Barro")
+    with pytest.raises(UsageError, match="and its values have no names"):
+        GAIN.parse("high")
+    named: dict[int | float, str] = {number: f"Mode {number}" for number in range(40)}
+    many = ParamInfo("MANY", values=named | {99: "Loiter"})
+    with pytest.raises(UsageError, match=r"nor one of its values; near it: Loiter$"):
+        many.parse("Loitr")
+    with pytest.raises(UsageError, match=r"nor one of its values, of which there are 41$"):
+        many.parse("xyzzy")
+
+
+@given(st.integers(0, 2**64 - 1), st.dictionaries(st.integers(0, 63), st.text(max_size=8), max_size=8))
+def test_a_mask_in_words_is_never_read_as_another_one(mask: int, bits: dict[int, str]) -> None:
+    info = ParamInfo("A", bits={bit: name for bit, name in bits.items() if name})
+    text = info.text(mask)
+    if text is not None:
+        try:
+            again = info.parse(text)
+        except UsageError:
+            return  # names that are the same, or hold what joins names
+        assert again == mask
+
+
+def test_the_range() -> None:
+    assert GAIN.problem(6.5) is None
+    assert GAIN.problem(0.10000000149011612) is None
+    assert GAIN.problem(12.0) is None
+    assert GAIN.problem(12.5) == "GAIN: 12.5 is above the maximum of 12 1/s"
+    assert GAIN.problem(-1) == "GAIN: -1 is below the minimum of 0.1 1/s"
+    assert GAIN.problem(math.nan) == "GAIN: nan is in no range"
+    assert GAIN.problem(math.inf) == "GAIN: inf is above the maximum of 12 1/s"
+    assert GAIN.problem(1e300) is not None
+    assert GAIN.problem(b"abcd") is None
+    assert MODE.problem(math.nan) is None
+    assert ParamInfo("A", maximum=16777216).problem(16777217) is not None
+    assert ParamInfo("A", maximum=3.1415926535).problem(3.1415927410125732) is None  # pi as a float32
+
+
+# the files
+
+
+def test_a_file_of_px4() -> None:
+    read = read_metadata(PX4)
+    assert len(read) == 5
+    assert repr(read) == f"<Metadata of 5 params from {PX4}>"
+    gain = read["TST_GAIN"]
+    assert gain == ParamInfo(
+        "TST_GAIN",
+        ParamType.REAL32,
+        "Gain of the test controller",
+        "How strongly the test controller reacts.\n\nToo much makes it swing.",
+        "1/s",
+        0.1,
+        12.0,
+        0.1,
+        2,
+        6.5,
+        category="Standard",
+        group="Test",
+    )
+    hash(gain)
+    mode = read["TST_MODE"]
+    assert dict(mode.values) == {-1: "Nothing", 0: "Hold", 1: "Return home"}
+    assert mode.reboot_required
+    assert mode.parse("return home") == 1
+    sensors = read["TST_SENSORS"]
+    assert dict(sensors.bits) == {0: "GPS", 1: "Baro", 31: "Flow"}
+    assert sensors.text(-(2**31) + 3) == "GPS|Baro|Flow"
+    count = read["TST_COUNT"]
+    assert count.is_read_only
+    assert count.is_volatile
+
+
+def test_a_group_is_found_by_the_names_in_it() -> None:
+    read = read_metadata(PX4)
+    third = read["TST_OUT3_FUNC"]
+    assert third.name == "TST_OUT3_FUNC"
+    assert third.short_description == "Function of output 3"
+    assert third.long_description == "What output 3 drives."
+    assert third.type is ParamType.UINT8
+    assert read["TST_OUT12_FUNC"].short_description == "Function of output 12"
+    assert "TST_OUT_FUNC" not in read
+    assert "TST_OUT3_FUNC2" not in read
+    assert read.get("NONE") is None
+    assert "TST_OUT{n}_FUNC" in list(read)
+
+
+def test_what_stands_under_its_own_name_counts_before_a_group() -> None:
+    read = Metadata.of([ParamInfo("A{n}"), ParamInfo("A2", units="m")])
+    assert read["A2"].units == "m"
+    assert read["A3"].units == ""
+
+
+@pytest.mark.parametrize("path", [XML, JSON], ids=["xml", "json"])
+def test_a_file_of_ardupilot(path: Path) -> None:
+    read = read_metadata(path)
+    assert list(read) == ["FLTMODE1", "TST_ALT", "TST_EXPO", "TST_LOG", "TST_OLD", "TST_RUNTIME"]
+    mode = read["FLTMODE1"]
+    assert mode.short_description == "First flight mode"
+    assert mode.long_description == 'The mode at the "lowest" position'
+    assert (mode.category, mode.group) == ("Standard", "ArduTest")
+    assert dict(mode.values) == {0: "Stabilize", 5: "Loiter", 6: "RTL"}
+    assert mode.parse("LOITER") == 5
+    height = read["TST_ALT"]
+    assert (height.minimum, height.maximum, height.increment, height.units) == (30, 3000.5, 1, "cm")
+    assert height.reboot_required
+    assert not height.is_read_only
+    expo = read["TST_EXPO"]
+    assert dict(expo.values) == {0: "Disabled", 0.1: "Very low, slow", 0.2: "Low"}
+    assert (expo.minimum, expo.maximum) == (None, None)
+    assert dict(read["TST_LOG"].bits) == {0: "IMU", 3: "GPS"}
+    assert dict(read["TST_OLD"].bits) == {0: "First", 1: "Second"}
+    assert read["TST_RUNTIME"].is_read_only
+    assert read["TST_RUNTIME"].is_volatile
+
+
+@pytest.mark.parametrize("path", [PX4, XML, JSON], ids=["px4", "xml", "json"])
+def test_the_form_is_told_by_the_content(path: Path, tmp_path: Path) -> None:
+    plain = read_metadata(path)
+    for name, content in {
+        "a.txt": path.read_bytes(),
+        "b": lzma.compress(path.read_bytes()),
+        "c.xml": b"\xef\xbb\xbf" + path.read_bytes(),
+    }.items():
+        other = tmp_path / name
+        other.write_bytes(content)
+        assert read_metadata(other).params == plain.params
+
+
+def test_what_two_vehicles_describe_differently_is_left_out() -> None:
+    row = '<param name="{0}:{1}" humanName="{2}"/>'
+    vehicles = ""
+    for name in ("Copter", "Plane"):
+        rows = row.format(name, "SAME", "s") + row.format(name, "OTHER", name)
+        vehicles += f'<parameters name="{name}">{rows}</parameters>'
+    read = read_content(f"<paramfile>{vehicles}</paramfile>".encode(), source="both")
+    assert list(read) == ["SAME"]
+
+
+def px4(*rows: dict[str, Any], **more: Any) -> bytes:
+    return json.dumps({"version": 1, "parameters": list(rows)} | more).encode()
+
+
+WRONG = {
+    "empty": (b"", "neither JSON nor XML"),
+    "text": (b"MC_ROLL_P 6.5", "neither JSON nor XML; expected PX4's parameters.json, ArduPilot's"),
+    "cut json": (b'{"parameters": [', "no JSON: EOF"),
+    "deep json": (b'{"a":' * 100_000, "no JSON: recursion limit"),
+    "list": (b" [1]", "neither JSON"),
+    "other json": (b'{"a": {"b": {}}}', 'has no "json", which marks'),
+    "general": (b'{"version": 1, "metadataTypes": []}', "the general metadata file"),
+    "no list": (b'{"version": 1, "parameters": {"A": 1}}', r"parameters: Input should be a valid list"),
+    "no version": (b'{"parameters": []}', "version: Field required"),
+    "no name": (px4({"type": "Float"}), r"parameters\[0\].name: Field required"),
+    "long name": (px4({"name": "A" * 17}), r"parameters\[0\].name: String should have at most 16"),
+    "text for a number": (px4({"name": "A"}, {"name": "B", "min": "0"}), r"parameters\[1\].min"),
+    "flag for a number": (px4({"name": "A", "max": True}), r"parameters\[0\].max"),
+    "number for a text": (
+        px4({"name": "A", "units": 7}),
+        r"parameters\[0\].units: Input should be a valid string",
+    ),
+    "number for a flag": (px4({"name": "A", "readOnly": 1}), r"parameters\[0\].readOnly"),
+    "high bit": (px4({"name": "A", "bitmask": [{"index": 64}]}), r"parameters\[0\].bitmask\[0\].index"),
+    "value": (px4({"name": "A", "values": [{}]}), r"parameters\[0\].values\[0\].value: Field required"),
+    "ardupilot list": (b'{"json": {}, "A": {"B": {"Values": [1]}}}', r"B.Values"),
+    "ardupilot number": (b'{"json": {}, "A": {"B": {"DisplayName": 1}}}', "B.DisplayName"),
+    "nothing in it": (b'{"json": {}}', "describes no parameters"),
+    "html": (b"<html><body/></html>", "begins with <html>, where the files of ArduPilot have <paramfile>"),
+    "cut xml": (b"<paramfile><vehicles>", "no XML: no element found"),
+    "encoding": (b'<?xml version="1.0" encoding="x-none"?><paramfile/>', "no XML: unknown encoding"),
+    "nameless": (b"<paramfile><param/></paramfile>", "a parameter without a name"),
+    "nested": (
+        b'<paramfile><param name="A"><param name="B"/></param></paramfile>',
+        "a parameter inside of A",
+    ),
+    "deep xml": (b"<paramfile>" + b"<a>" * 100, "more than 16 levels"),
+    "no xz": (b"\xfd7zXZ\0" + bytes(50), "cannot be unpacked"),
+    "cut xz": (lzma.compress(px4())[:-8], "cannot be unpacked: it is cut short"),
+}
+
+
+@pytest.mark.parametrize(("content", "said"), WRONG.values(), ids=WRONG)
+def test_what_is_wrong_with_a_file_is_said(content: bytes, said: str) -> None:
+    with pytest.raises(MetadataError, match=f"^the file[,:] .*{said}|^the file, {said}") as caught:
+        read_content(content, source="the file")
+    assert caught.value.source == "the file"
+    assert isinstance(caught.value, UsageError)
+
+
+ENTITIES = [
+    '<!DOCTYPE paramfile [<!ENTITY a "ha"><!ENTITY b "&a;&a;&a;">]><paramfile>&b;</paramfile>',
+    '<!DOCTYPE paramfile [<!ENTITY a SYSTEM "file:///etc/passwd">]><paramfile>&a;</paramfile>',
+    '<!DOCTYPE paramfile SYSTEM "http://127.0.0.1/a.dtd"><paramfile/>',
+]
+
+
+@pytest.mark.parametrize("text", ENTITIES, ids=["expansion", "file", "address"])
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_a_document_type_is_refused(text: str, encoding: str) -> None:
+    content = text.encode(encoding)
+    said = "document type" if encoding == "utf-8" else "neither JSON nor XML"
+    with pytest.raises(MetadataError, match=said):
+        read_content(content, source="the file")
+
+
+def test_an_entity_without_a_document_type_is_none() -> None:
+    with pytest.raises(MetadataError, match="no XML: undefined entity"):
+        read_content(b"<paramfile>&a;</paramfile>", source="the file")
+
+
+def test_a_file_that_unpacks_to_too_much_is_refused() -> None:
+    packed = lzma.compress(bytes(formats.LARGEST + 1), preset=1)
+    assert len(packed) < 10_000
+    with pytest.raises(MetadataError, match="too large"):
+        read_content(packed, source="the file")
+
+
+def test_a_file_that_needs_too_much_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    packed = lzma.compress(px4({"name": "A"}), preset=9)  # as PX4 packs
+    assert list(read_content(packed, source="the file")) == ["A"]
+    monkeypatch.setattr(formats, "MOST_MEMORY", 32 << 20)
+    with pytest.raises(MetadataError, match="cannot be unpacked: Memory usage limit exceeded"):
+        read_content(packed, source="the file")
+
+
+def test_files_that_are_too_large_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(formats, "LARGEST", 100)
+    monkeypatch.setattr(formats, "LARGEST_PACKED", 60)
+    with pytest.raises(MetadataError, match="too large"):
+        read_metadata(PX4)
+    with pytest.raises(MetadataError, match="too large"):
+        read_content(lzma.compress(px4()), source="the file")
+
+
+def test_more_parameters_than_a_vehicle_can_have_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    from paramclient.metadata import ardupilot
+
+    monkeypatch.setattr(ardupilot, "MOST_PARAMS", 5)
+    for path in (XML, JSON):
+        with pytest.raises(MetadataError, match="describes more than 5 parameters"):
+            read_metadata(path)
+
+
+def test_more_parameters_than_that_are_refused_of_px4_too() -> None:
+    with pytest.raises(MetadataError, match="parameters: List should have at most 65535 items"):
+        read_content(px4(*[{"name": "A"}] * 65_536), source="the file")
+
+
+def test_a_range_without_room_and_a_value_that_is_none_are_left_out() -> None:
+    rows = {"name": "A", "min": 2, "max": 1, "values": [{"value": math.nan, "description": "NaN"}]}
+    info = read_content(px4(rows), source="the file")["A"]
+    assert (info.minimum, info.maximum, dict(info.values)) == (None, None, {})
+    text = '<paramfile><param name="A"><field name="Range">2 1</field></param></paramfile>'
+    info = read_content(text.encode(), source="the file")["A"]
+    assert (info.minimum, info.maximum) == (None, None)
+
+
+def test_no_more_is_read_or_unpacked_than_may_be(tmp_path: Path) -> None:
+    packed = lzma.compress(bytes(8 * formats.LARGEST), preset=1)
+    with (tmp_path / "huge").open("wb") as file:
+        file.truncate(20 * formats.LARGEST)  # takes no room on the disk
+    tracemalloc.start()
+    try:
+        with pytest.raises(MetadataError, match="too large"):
+            read_content(packed, source="the file")
+        with pytest.raises(MetadataError, match="too large"):
+            read_metadata(tmp_path / "huge")
+        assert tracemalloc.get_traced_memory()[1] < 4 * formats.LARGEST
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_file_that_cannot_be_read(tmp_path: Path) -> None:
+    with pytest.raises(MetadataError, match=r"none\.json: cannot be read: No such file"):
+        read_metadata(tmp_path / "none.json")
+    with pytest.raises(MetadataError, match="cannot be read: Is a directory"):
+        read_metadata(tmp_path)
+
+
+STARTS = [
+    b"",
+    b"{",
+    b"<",
+    b"\xfd7zXZ\0",
+    b'<?xml version="1.0"?><paramfile>',
+    b'{"version":1,"parameters":[',
+    b'{"json":{}',
+]
+
+
+@given(st.sampled_from(STARTS), st.binary(max_size=200))
+def test_whatever_the_bytes_there_is_one_error(start: bytes, rest: bytes) -> None:
+    with suppress(MetadataError):
+        read_content(start + rest, source="the file")
+
+
+@given(st.data())
+def test_a_file_that_was_damaged_is_read_or_refused(data: st.DataObject) -> None:
+    content = bytearray(data.draw(st.sampled_from(SAMPLES)))
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(content) - 1))
+        if data.draw(st.booleans()):
+            content[at] = data.draw(st.integers(0, 255))
+        else:
+            del content[at : at + data.draw(st.integers(1, 50))]
+            if not content:
+                break
+    try:
+        read = read_content(bytes(content), source="the file")
+    except MetadataError:
+        return
+    for info in read.values():
+        for value in (0, 1, 2.5, math.nan):
+            info.text(value)
+            info.problem(value)
+
+
+SAMPLES = [
+    content for path in (PX4, XML, JSON) for content in (path.read_bytes(), lzma.compress(path.read_bytes()))
+]
+
+
+JSON_VALUES = st.recursive(
+    st.none() | st.booleans() | st.floats() | st.integers() | st.text(max_size=5),
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.dictionaries(
+            st.sampled_from(["name", "min", "values", "value", "Range", "Bitmask", "low"]), inner
+        )
+    ),
+    max_leaves=8,
+)
+
+
+@given(JSON_VALUES, st.sampled_from(["parameters", "metadataTypes", "A"]))
+def test_json_of_any_structure_is_read_or_refused(value: object, key: str) -> None:
+    content = json.dumps({"version": 1, "json": {}, key: value}).encode()
+    with suppress(MetadataError):
+        read_content(content, source="the file")

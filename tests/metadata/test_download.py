@@ -1,0 +1,615 @@
+"""Descriptions that a vehicle gives of itself: the question, the files, what is kept of them."""
+
+from __future__ import annotations
+
+import json
+import logging
+import lzma
+import os
+import stat
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import anyio
+import anyio.to_thread
+import pytest
+
+from paramclient import ClientClosed, FileTransferError, NoReply, ParamCache, UsageError
+from paramclient.errors import MetadataError
+from paramclient.metadata import Metadata, MetadataStore, download, metadata_cache, metadata_of
+from paramclient.model.identity import Identity
+from paramclient.model.values import crc32_px4
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.vehicle.metadata_location import Descriptions
+from paramclient.protocol.wire import CommandAck, CommandLong, ComponentMetadata, FileTransfer
+from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle
+from paramclient.sim.metadata import GENERAL_FILE, PARAMETER_FILE
+from tests.shell import (
+    FlakyLink,
+    Tap,
+    a_client,
+    generic,
+    outcome,
+    residue,
+    small_px4,
+    swift_loop,
+    swiftly,
+    tasks_beside,
+)
+
+IDENTITY = Identity(1, "link", "abcd", 12, 2, 0x01110000, "0123abcd", 1)
+
+
+@pytest.fixture(autouse=True)
+def _threads_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock of a `SwiftLoop` stands still while files are read in a thread."""
+    in_thread = download._in_thread
+
+    async def counted(*args: Any, **kwargs: Any) -> Any:
+        swift_loop().threads += 1
+        try:
+            return await in_thread(*args, **kwargs)
+        finally:
+            swift_loop().threads -= 1
+
+    monkeypatch.setattr(download, "_in_thread", counted)
+
+
+def describing(**options: Any) -> PX4Vehicle:
+    """A small vehicle that describes what it has."""
+    return small_px4(metadata=True, **options)
+
+
+def file_of(document: object) -> bytes:
+    return lzma.compress(json.dumps(document).encode())
+
+
+def publish(vehicle: PX4Vehicle, **entry: Any) -> None:
+    """Let a vehicle's general file say this of the descriptions of its parameters."""
+    kinds = [
+        {"type": 1, "uri": f"mftp://{PARAMETER_FILE}"} | entry,
+        {"type": 4, "uri": "https://x.invalid/e"},
+    ]
+    vehicle.files[GENERAL_FILE] = file_of({"version": 1, "metadataTypes": kinds})
+
+
+def reads_of(tap: Tap) -> int:
+    """How many messages about files the station has sent."""
+    return len(tap.messages(FileTransfer))
+
+
+async def files_in(folder: Path) -> list[Path]:
+    return await anyio.to_thread.run_sync(lambda: sorted(folder.iterdir()))
+
+
+# the whole way
+
+
+@swiftly
+async def test_a_vehicle_describes_its_parameters() -> None:
+    vehicle = PX4Vehicle(metadata=True)
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        read = await metadata_of(component)
+        assert read is not None
+        assert len(read) == 919
+        assert read["MC_ROLL_P"].units == "1/s"
+        assert read["COM_FLTMODE1"].parse("return") == 5
+        assert read["EKF2_GPS_CTRL"].text(7) == "Position|Altitude|Velocity"
+        volatile = {info.name for info in read.values() if info.is_volatile}
+        assert volatile == {name for name, entry in vehicle._by_name.items() if entry.volatile}
+        assert read.source == f"mftp://{PARAMETER_FILE} of 1/1"
+        assert not residue(component)
+        await anyio.sleep(1.0)
+        assert not vehicle.open_files
+
+
+@swiftly
+async def test_the_link_may_lose_much() -> None:
+    vehicle = describing(ftp_rate=10_000)
+    link = Air([vehicle], uplink=FaultyLink(loss=0.3, seed=5), downlink=FaultyLink(loss=0.3, seed=6))
+    async with a_client(link) as client:
+        read = await metadata_of(await client.component())
+        assert read is not None
+        assert "PARAM_03" in read
+
+
+@swiftly
+async def test_what_is_kept_is_not_fetched_again(tmp_path: Path) -> None:
+    cache = tmp_path / "cache.sqlite3"
+    for expected in (True, False):
+        tap = Tap(describing())
+        async with a_client(tap, cache=str(cache)) as client:
+            component = await client.component()
+            before = reads_of(tap)
+            read = await metadata_of(component)
+            assert read is not None
+            assert (reads_of(tap) > before) is expected
+            folder = tmp_path / "cache.metadata"
+            kept = await files_in(folder)
+            assert len(kept) == 3
+            assert {stat.S_IMODE(path.stat().st_mode) for path in kept} == {0o600}
+            assert stat.S_IMODE(folder.stat().st_mode) == 0o700
+            known = MetadataStore(folder).known(component.identity, 1)
+            assert known is not None
+            assert known.params == read.params
+
+
+@swiftly
+async def test_another_firmware_is_fetched_anew(tmp_path: Path) -> None:
+    kept = MetadataStore(tmp_path)
+    for units in ("m", "s"):
+        vehicle = describing()
+        vehicle.files[PARAMETER_FILE] = file_of(
+            {"version": 1, "parameters": [{"name": "PARAM_03", "units": units}]}
+        )
+        publish(vehicle, fileCrc=crc32_px4(vehicle.files[PARAMETER_FILE]))
+        async with a_client(vehicle) as client:
+            read = await metadata_of(await client.component(), store=kept)
+            assert read is not None
+            assert read["PARAM_03"].units == units
+
+
+@swiftly
+async def test_without_a_cache_nothing_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def forbidden(*_: object) -> None:
+        raise AssertionError
+
+    monkeypatch.setattr(MetadataStore, "put", forbidden)
+    async with a_client(describing()) as client:
+        assert await metadata_of(await client.component()) is not None
+    async with a_client(describing(), cache=str(tmp_path / "c")) as client:
+        assert await metadata_of(await client.component(), store=False) is not None
+
+
+@swiftly
+async def test_what_may_change_is_neither_checked_nor_kept(tmp_path: Path) -> None:
+    vehicle = describing()
+    publish(vehicle)  # without a checksum
+    kept = MetadataStore(tmp_path)
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        assert await metadata_of(component, store=kept) is not None
+        assert kept.known(component.identity, 1) is None
+        assert [path.suffix for path in await files_in(tmp_path)] == [".metadata"]  # the general file
+
+
+@swiftly
+async def test_the_checksum_may_be_that_of_what_is_packed(tmp_path: Path) -> None:
+    """PX4 announces that of its general file so."""
+    vehicle = describing()
+    unpacked = lzma.decompress(vehicle.files[PARAMETER_FILE])
+    publish(vehicle, fileCrc=crc32_px4(unpacked))
+    kept = MetadataStore(tmp_path)
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        read = await metadata_of(component, store=kept)
+        known = kept.known(component.identity, 1)
+    assert read is not None
+    assert known is not None
+    assert known.params == read.params
+
+
+# what goes wrong
+
+
+@pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle, generic])
+@swiftly
+async def test_most_vehicles_describe_nothing(make: Any) -> None:
+    async with a_client(make()) as client:
+        component = await client.component()
+        began = anyio.current_time()
+        assert await metadata_of(component) is None
+        assert anyio.current_time() - began < 1.5
+        assert not component._machine.descriptions.is_asking
+
+
+@swiftly
+async def test_a_general_file_without_parameters() -> None:
+    vehicle = describing()
+    vehicle.files[GENERAL_FILE] = file_of({"version": 1, "metadataTypes": [{"type": 4, "uri": "mftp://e"}]})
+    async with a_client(vehicle) as client:
+        assert await metadata_of(await client.component()) is None
+
+
+@swiftly
+async def test_nothing_is_fetched_from_the_internet() -> None:
+    vehicle = describing()
+    publish(vehicle, uri="https://example.invalid/parameters.json.xz")
+    async with a_client(vehicle) as client:
+        with pytest.raises(
+            MetadataError, match=r"1/1 .* at https://example\.invalid/.*, and nothing is"
+        ) as caught:
+            await metadata_of(await client.component())
+    assert caught.value.source == "https://example.invalid/parameters.json.xz"
+
+
+@swiftly
+async def test_what_is_on_board_goes_before_the_internet() -> None:
+    vehicle = describing()
+    publish(vehicle, uri="https://example.invalid/p", uriFallback=f"mftp://{PARAMETER_FILE}")
+    async with a_client(vehicle) as client:
+        assert await metadata_of(await client.component()) is not None
+
+
+@swiftly
+async def test_a_file_on_another_component() -> None:
+    vehicle, camera = describing(), PX4Vehicle(component=100, table={"CAM_MODE": 1})
+    camera.files["/p.json"] = json.dumps({"version": 1, "parameters": [{"name": "CAM_MODE"}]}).encode()
+    for number, expected in ((100, Metadata), (101, MetadataError)):
+        publish(vehicle, uri=f"mftp://[;comp={number}]/p.json")
+        async with a_client(Air([vehicle, camera])) as client:
+            await client.component(component=100)
+            result = await outcome(metadata_of(await client.component()))
+            assert isinstance(result, expected), result
+
+
+@pytest.mark.parametrize("wrong", ["checksum", "missing", "damaged", "long"])
+@swiftly
+async def test_files_that_are_not_as_announced(wrong: str, tmp_path: Path) -> None:
+    vehicle = describing()
+    content = vehicle.files[PARAMETER_FILE]
+    if wrong == "checksum":
+        publish(vehicle, fileCrc=crc32_px4(content) ^ 1)
+    elif wrong == "missing":
+        del vehicle.files[PARAMETER_FILE]
+    elif wrong == "damaged":
+        vehicle.files[PARAMETER_FILE] = content[:-20]
+        publish(vehicle, fileCrc=crc32_px4(content[:-20]))
+    else:
+        publish(vehicle, uri="mftp://" + "x" * 240)
+    kept = MetadataStore(tmp_path)
+    said = {
+        "checksum": (MetadataError, "does not have the checksum"),
+        "missing": (FileTransferError, "file not found"),
+        "damaged": (MetadataError, f"mftp://{PARAMETER_FILE} of 1/1: cannot be unpacked: it is cut short"),
+        "long": (MetadataError, r"1/1 says that its descriptions are at mftp://x*: .* 239 bytes"),
+    }[wrong]
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        with pytest.raises(said[0], match=said[1]):
+            await metadata_of(component, store=kept)
+        assert kept.known(component.identity, 1) is None
+        await anyio.sleep(1.0)
+        assert not vehicle.open_files
+
+
+@swiftly
+async def test_a_vehicle_that_does_not_answer() -> None:
+    tap = Tap(describing())
+    async with a_client(tap) as client:
+        component = await client.component()
+        await component.get("PARAM_03")
+        tap.is_deaf = True
+        result = await outcome(metadata_of(component))
+        assert isinstance(result, NoReply)
+        assert result.attempts >= 5
+        began = anyio.current_time()
+        result = await outcome(metadata_of(component, timeout=0.7))
+        assert isinstance(result, NoReply)
+        assert anyio.current_time() - began == pytest.approx(0.7, abs=0.01)
+        assert not component._machine.descriptions.is_asking
+        tap.is_mute = True
+        result = await outcome(metadata_of(component))
+        assert isinstance(result, NoReply)
+        assert "lost" in str(result)
+        result = await outcome(metadata_of(component))
+        assert isinstance(result, NoReply)
+        assert result.attempts == 0  # nothing was asked
+        tap.is_mute = tap.is_deaf = False
+        await anyio.sleep(1.5)
+        assert await metadata_of(component) is not None
+
+
+@swiftly
+async def test_a_client_that_is_closed_meanwhile() -> None:
+    tap = Tap(describing())
+    async with anyio.create_task_group() as tasks:
+        results: list[object] = []
+        async with a_client(tap) as client:
+            component = await client.component()
+            tap.is_deaf = True
+
+            async def ask() -> None:
+                results.append(await outcome(metadata_of(component)))
+
+            tasks.start_soon(ask)
+            await anyio.sleep(0.05)
+    assert [type(result) for result in results] == [ClientClosed]
+    assert not tasks_beside()
+    assert isinstance(await outcome(metadata_of(component)), ClientClosed)
+
+
+@swiftly
+async def test_cancellation_leaves_nothing_behind(tmp_path: Path) -> None:
+    """At whatever moment."""
+    for moment in (0.001, 0.012, 0.03, 0.05, 0.1, 0.2):
+        vehicle = describing(ftp_rate=20_000)
+        async with a_client(vehicle) as client:
+            component = await client.component()
+            with anyio.move_on_after(moment):
+                await metadata_of(component, store=MetadataStore(tmp_path / str(moment)))
+            assert not component._machine.descriptions.is_asking
+            await anyio.sleep(1.0)
+            assert not vehicle.open_files
+            assert await metadata_of(component) is not None
+
+
+@swiftly
+async def test_those_who_ask_at_the_same_time_share_the_answer() -> None:
+    tap = Tap(describing())
+    async with a_client(tap) as client:
+        component = await client.component()
+        async with anyio.create_task_group() as tasks:
+            for _ in range(3):
+                tasks.start_soon(metadata_of, component)
+        assert [message.params[0] for message in tap.messages(CommandLong)].count(397.0) == 1
+
+
+@swiftly
+async def test_a_link_that_drops_meanwhile() -> None:
+    tap = Tap(describing())
+    link = FlakyLink(tap)
+    async with a_client(link) as client:
+        component = await client.component()
+        await component.get("PARAM_03")
+        await anyio.sleep(2.0)
+        waited = [component._machine.is_waiting]
+        tap.is_deaf = True
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(metadata_of, component)
+            await anyio.sleep(0.01)
+            waited.append(component._machine.is_waiting)
+            await link.drop()
+            asked = len(tap.messages(CommandLong))
+            tap.is_deaf = False
+        assert len(tap.messages(CommandLong)) > asked
+        assert link.openings == 2
+        assert waited == [False, True]
+
+
+@swiftly
+async def test_what_is_too_long_for_a_description_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(download, "LARGEST_PACKED", 400)
+    vehicle = describing()
+    assert len(vehicle.files[GENERAL_FILE]) < 400 < len(vehicle.files[PARAMETER_FILE])
+    async with a_client(vehicle) as client:
+        with pytest.raises(FileTransferError, match="longer than 400 bytes"):
+            await metadata_of(await client.component())
+
+
+@swiftly
+async def test_nothing_is_noted_of_a_vehicle_that_another_one_has_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kept = MetadataStore(tmp_path)
+    read_parameters = download._read_parameters
+    async with a_client(describing()) as client:
+        component = await client.component()
+        await anyio.sleep(1.0)
+
+        def read(content: bytes, source: str) -> Metadata:
+            who = component._machine.who
+            who.identity = replace(who.identity, uid="another")
+            return read_parameters(content, source)
+
+        monkeypatch.setattr(download, "_read_parameters", read)
+        assert await metadata_of(component, store=kept) is not None
+        assert not kept.has_notes
+
+
+# the question
+
+
+class Asked:
+    """Descriptions of a component, with what is sent."""
+
+    def __init__(self) -> None:
+        self.sent: list[Any] = []
+        self.is_identifying = False
+        self.machine = Descriptions(
+            (1, 1), (255, 190), RoundTrip(), self.sent.append, is_identifying=lambda: self.is_identifying
+        )
+
+
+def test_the_question_and_its_answers() -> None:
+    asked = Asked()
+    ask = asked.machine.ask(0.0)
+    assert asked.sent == [CommandLong(1, 1, 512, (397.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))]
+    asked.machine.heard(ComponentMetadata("mftp://a", 7), 0.1)
+    assert ask.result == ComponentMetadata("mftp://a", 7)
+    asked.machine.heard(ComponentMetadata("mftp://b", 8), 0.2)  # unasked
+    assert asked.machine.next_deadline() == float("inf")
+    ask = asked.machine.ask(1.0)
+    asked.machine.heard(ComponentMetadata("", 0), 1.1)
+    assert ask.done
+    assert ask.result is None
+
+
+@pytest.mark.parametrize(
+    ("result", "is_answer"), [(0, False), (1, False), (2, True), (3, True), (4, True), (5, False)]
+)
+def test_refusals_are_answers(result: int, is_answer: bool) -> None:
+    asked = Asked()
+    ask = asked.machine.ask(0.0)
+    asked.machine.acknowledged(CommandAck(512, result, 255, 190), 0.1)
+    assert ask.done is is_answer
+
+
+def test_the_refusal_of_another_question_is_none() -> None:
+    asked = Asked()
+    ask = asked.machine.ask(0.0)
+    asked.machine.acknowledged(CommandAck(511, 3, 255, 190), 0.1)
+    asked.machine.acknowledged(CommandAck(512, 3, 254, 190), 0.1)  # another station's
+    asked.is_identifying = True
+    asked.machine.acknowledged(CommandAck(512, 3, 255, 190), 0.1)  # perhaps of AUTOPILOT_VERSION
+    assert not ask.done
+    asked.is_identifying = False
+    asked.machine.acknowledged(CommandAck(512, 3), 0.1)  # MAVLink 1 does not say whom it is for
+    assert ask.done
+
+
+def test_it_is_asked_again_until_there_is_no_hope() -> None:
+    asked = Asked()
+    ask = asked.machine.ask(0.0)
+    late = asked.machine.ask(0.5)
+    now = 0.0
+    while not ask.done:
+        now = asked.machine.next_deadline()
+        assert now < 100.0
+        asked.machine.tick(now)
+    assert isinstance(ask.error, NoReply)
+    assert isinstance(late.error, NoReply)
+    assert len(asked.sent) == ask.attempts >= 5
+    assert "COMPONENT_METADATA of 1/1" in str(ask.error)
+    asked.machine.tick(now + 1)
+    asked.machine.release(ask)
+
+
+def test_it_is_asked_again_when_the_link_is_back() -> None:
+    asked = Asked()
+    asked.machine.resume(0.0)
+    assert asked.sent == []
+    asked.machine.ask(0.0)
+    asked.machine.resume(0.5)
+    assert len(asked.sent) == 2
+    sent: list[Any] = []
+    machine = ComponentMachine(1, 1, own=(255, 190), link="link", send=sent.append, emit=lambda _: None)
+    machine.descriptions.ask(0.0)
+    machine.resume(0.5)
+    assert len(sent) == 2
+
+
+# what is kept
+
+
+def described(name: str = "A") -> bytes:
+    return file_of({"version": 1, "parameters": [{"name": name}]})
+
+
+def test_a_firmware_is_known_by_version_commit_and_board(tmp_path: Path) -> None:
+    kept = MetadataStore(tmp_path / "a" / "b")
+    assert kept.known(IDENTITY, 1) is None
+    content = described()
+    kept.put(content, crc32_px4(content))
+    kept.remember(IDENTITY, 1, crc32_px4(content))
+    for same in (IDENTITY, replace(IDENTITY, system=7, uid="ffff", link="other")):
+        known = kept.known(same, 1)
+        assert known is not None
+        assert list(known) == ["A"]
+    for other in (
+        replace(IDENTITY, firmware=1),
+        replace(IDENTITY, git_hash="ffff"),
+        replace(IDENTITY, board=2),
+        replace(IDENTITY, autopilot=3),
+    ):
+        assert kept.known(other, 1) is None
+    assert kept.known(IDENTITY, 2) is None
+    assert repr(kept) == f"<MetadataStore {tmp_path / 'a' / 'b'}>"
+
+
+def test_a_firmware_that_has_not_said_its_commit_is_not_known(tmp_path: Path) -> None:
+    kept = MetadataStore(tmp_path)
+    unknown = replace(IDENTITY, git_hash="")
+    kept.remember(unknown, 1, 7)
+    assert kept.known(unknown, 1) is None
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("damage", [b"", b"x", b"\xff" * 100])
+def test_what_was_damaged_is_thrown_away(
+    damage: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    kept = MetadataStore(tmp_path)
+    content = described()
+    crc = crc32_px4(content)
+    kept.put(content, crc)
+    kept.remember(IDENTITY, 1, crc)
+    (path,) = tmp_path.glob("*.metadata")
+    path.write_bytes(damage)
+    with caplog.at_level(logging.WARNING, "paramclient"):
+        assert kept.known(IDENTITY, 1) is None
+    assert "is damaged and was removed" in caplog.text
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("damage", [b"", b"zzzzzzzz\n", b"../../../x", b"0" * 100])
+def test_a_note_that_was_damaged_is_thrown_away(damage: bytes, tmp_path: Path) -> None:
+    kept = MetadataStore(tmp_path)
+    kept.remember(IDENTITY, 1, 7)
+    (path,) = tmp_path.iterdir()
+    path.write_bytes(damage)
+    assert kept.known(IDENTITY, 1) is None
+    assert not list(tmp_path.iterdir())
+
+
+def test_descriptions_that_cannot_be_read_are_forgotten(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    kept = MetadataStore(tmp_path)
+    kept.put(b"{}", crc32_px4(b"{}"))
+    kept.remember(IDENTITY, 1, crc32_px4(b"{}"))
+    with caplog.at_level(logging.WARNING, "paramclient"):
+        assert kept.known(IDENTITY, 1) is None
+        assert kept.known(IDENTITY, 1) is None
+    assert caplog.text.count("WARNING") == 1
+
+
+def test_only_so_much_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata_cache, "MOST_FILES", 4)
+    kept = MetadataStore(tmp_path)
+    contents = [described(f"P{number}") for number in range(6)]
+    for number, content in enumerate(contents):
+        kept.put(content, crc32_px4(content))
+        os.utime(tmp_path / f"{crc32_px4(content):08x}.metadata", (number, number))
+        if number == 3:
+            assert kept.get(crc32_px4(contents[0])) == contents[0]  # used, and so the newest
+    held = [kept.get(crc32_px4(content)) is not None for content in contents]
+    assert held == [True, False, False, True, True, True]
+
+
+def test_a_disk_that_fails_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    (tmp_path / "file").write_text("in the way")
+    kept = MetadataStore(tmp_path / "file")
+    content = described()
+    with caplog.at_level(logging.WARNING, "paramclient"):
+        kept.put(content, crc32_px4(content))
+        kept.remember(IDENTITY, 1, crc32_px4(content))
+        assert kept.get(crc32_px4(content)) is None
+        assert kept.known(IDENTITY, 1) is None
+    assert "cannot be written" in caplog.text
+
+
+def test_a_write_that_fails_leaves_nothing_half_done(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    kept = MetadataStore(tmp_path)
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(Path, "replace", fail)
+    with caplog.at_level(logging.WARNING, "paramclient"):
+        kept.put(b"abc", crc32_px4(b"abc"))
+    assert not list(tmp_path.iterdir())
+    assert "No space left" in caplog.text
+
+
+def test_it_lies_beside_the_cache(tmp_path: Path) -> None:
+    cache = ParamCache(tmp_path / "parameters.sqlite3")
+    assert MetadataStore.beside(cache.path).folder == tmp_path / "parameters.metadata"
+
+
+# the simulated vehicle
+
+
+def test_an_old_vehicle_cannot_describe_itself() -> None:
+    with pytest.raises(UsageError, match="MAVLink 1"):
+        PX4Vehicle(metadata=True, mavlink_version=1)
+
+
+def test_a_vehicle_that_describes_nothing_has_no_such_files() -> None:
+    assert not PX4Vehicle().files
+    assert set(PX4Vehicle(metadata=True).files) == {GENERAL_FILE, PARAMETER_FILE}

@@ -1,0 +1,246 @@
+"""Two sets of parameters held against each other, and against a third."""
+
+from __future__ import annotations
+
+import struct
+from dataclasses import replace
+
+import pytest
+from hypothesis import assume, given
+from hypothesis import strategies as st
+
+from paramclient.errors import UsageError
+from paramclient.model.comparison import Comparison, Moved, Standing, compare, defaults_of, same_value
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, decode, from_bits
+
+INT32, REAL32, REAL64 = ParamType.INT32, ParamType.REAL32, ParamType.REAL64
+NAN, OTHER_NAN = from_bits(0x7FC00000, REAL32), from_bits(0x7FC00001, REAL32)
+
+# near each other, so that draws of two are often about the same number
+NUMBERS = (
+    st.integers(-3, 3)
+    | st.sampled_from([2**24 - 1, 2**24, 2**24 + 1, 2**31 - 1, 2**31, 2**63, 2**64, 10**400, 300, 44])
+    | st.sampled_from([0.0, -0.0, 0.1, 1.0, 1.5, 16777216.0, 16777217.0, 1e300, float("inf"), NAN, OTHER_NAN])
+    | st.floats()
+    | st.floats(width=32)
+)
+VALUES = NUMBERS | st.sampled_from([b"\0\0\0\0", b"\1\0\0\0"])
+TYPES = st.none() | st.sampled_from([*ParamType, 77])
+WRITTEN = st.builds(WrittenParam, st.just("P"), VALUES, TYPES)
+SETS = st.dictionaries(
+    st.sampled_from("ABCDE"), st.builds(WrittenParam, st.just("P"), VALUES, TYPES, st.none() | NUMBERS)
+).map(lambda params: ParamSet({name: replace(param, name=name) for name, param in params.items()}))
+STANDING_MIRRORED = {Standing.ONLY_LEFT: Standing.ONLY_RIGHT, Standing.ONLY_RIGHT: Standing.ONLY_LEFT}
+MOVED_MIRRORED = {Moved.LEFT: Moved.RIGHT, Moved.RIGHT: Moved.LEFT}
+
+
+def written(value: Value, number: int | None = None) -> WrittenParam:
+    return WrittenParam("P", value, number)
+
+
+def of(**values: Value) -> ParamSet:
+    return ParamSet({name: WrittenParam(name, value) for name, value in values.items()})
+
+
+def float32(value: float) -> float:
+    rounded: float = struct.unpack("<f", struct.pack("<f", value))[0]
+    return rounded
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "same"),
+    [
+        (written(0.1), written(float32(0.1), REAL32), True),
+        (written(0.1), written(0.10000001), False),
+        (written(0.1), written(0.1 + 1e-12), True),
+        (written(0.1), written(0.1 + 1e-12, REAL64), False),
+        (written(0.1, REAL32), written(0.1 + 1e-12, REAL64), True),
+        (written(0.0), written(-0.0), True),
+        (written(0), written(-0.0, REAL32), True),
+        (written(0.0, REAL64), written(-0.0, REAL64), True),
+        (written(NAN, REAL32), written(NAN), True),
+        (written(NAN, REAL32), written(OTHER_NAN, REAL32), False),
+        (written(NAN, INT32), written(NAN, INT32), True),
+        (written(1, INT32), written(1.0, REAL32), True),
+        (written(1), written(1.0), True),
+        (written(1.0), written(1, INT32), True),
+        (written(1.5), written(1, INT32), False),
+        (written(1, ParamType.UINT8), written(1, INT32), True),
+        (written(255, ParamType.UINT8), written(-1, ParamType.INT8), False),
+        (written(2**24 + 1), written(2**24), False),
+        (written(2**24 + 1, INT32), written(2**24, INT32), False),
+        (written(2**24 + 1), written(float(2**24), REAL32), True),
+        (written(2**24 + 1), written(float(2**24)), True),
+        (written(2**24 + 1, INT32), written(float(2**24)), False),
+        (written(300), written(44, ParamType.UINT8), False),
+        (written(300, ParamType.UINT8), written(300, ParamType.UINT8), True),
+        (written(300, ParamType.UINT8), written(301, ParamType.UINT8), False),
+        (written(1e300), written(float("inf")), False),
+        (written(1e300), written(1e300), True),
+        (written(b"\1\0\0\0", 77), written(b"\1\0\0\0", 77), True),
+        (written(b"\1\0\0\0", 77), written(b"\1\0\0\0"), True),
+        (written(b"\1\0\0\0", 77), written(b"\1\0\0\0", 78), False),
+        (written(b"\1\0\0\0", 77), written(b"\2\0\0\0", 77), False),
+        (written(b"\1\0\0\0", INT32), written(1, INT32), False),
+    ],
+)
+def test_two_values_are_the_same_or_not(left: WrittenParam, right: WrittenParam, same: bool) -> None:
+    assert same_value(left, right) is same
+    assert same_value(right, left) is same
+
+
+@given(WRITTEN, WRITTEN)
+def test_sameness_knows_no_sides(left: WrittenParam, right: WrittenParam) -> None:
+    assert same_value(left, left)
+    assert same_value(left, right) == same_value(right, left)
+
+
+@given(VALUES, st.integers(0, 2**32 - 1), st.sampled_from([*ParamType, 77]), st.sampled_from(Encoding))
+def test_a_vehicle_holds_what_is_the_same(value: Value, raw: int, number: int, encoding: Encoding) -> None:
+    """`WrittenParam.is_held_by` says the same of a written value without a type, or with the vehicle's."""
+    held, bits = decode(raw.to_bytes(4, "little"), number, encoding)
+    assume(number != REAL32 or bits == bits_of(held, number))  # Python has no signalling NaN for these bits
+    agree(value, Param("P", held, number, 0, bits))
+    agree(held, Param("P", held, number, 0, bits))
+    try:
+        bits = bits_of(value, number)
+    except UsageError:
+        return
+    if not isinstance(value, bytes):
+        agree(value, Param("P", from_bits(bits, number), number, 0, bits))
+
+
+def agree(value: Value, param: Param) -> None:
+    for number in (None, param.type):
+        ours = WrittenParam("P", value, number)
+        assert same_value(ours, WrittenParam.of(param)) == ours.is_held_by(param)
+
+
+@given(SETS, SETS, st.none() | SETS)
+def test_a_comparison_is_whole_and_symmetrical(
+    left: ParamSet, right: ParamSet, base: ParamSet | None
+) -> None:
+    there, back = compare(left, right, base=base), compare(right, left, base=base)
+    assert [entry.name for entry in there.entries] == sorted(left.keys() | right.keys())
+    for ours, theirs in zip(there.entries, back.entries, strict=True):
+        assert (ours.left, ours.right, ours.base) == (theirs.right, theirs.left, theirs.base)
+        assert theirs.standing == STANDING_MIRRORED.get(ours.standing, ours.standing)
+        assert theirs.moved == (ours.moved and MOVED_MIRRORED.get(ours.moved, ours.moved))
+        assert (ours.types_differ, ours.is_rounding) == (theirs.types_differ, theirs.is_rounding)
+        assert (ours.moved is None) == (base is None or ours.name not in base)
+    assert there.is_same is back.is_same is (not there.differences)
+    assert sum(there.counts.values()) == len(there.entries)
+
+
+@given(SETS)
+def test_a_set_is_the_same_as_itself(params: ParamSet) -> None:
+    alone = compare(params, params, base=params)
+    assert alone.is_same
+    assert {entry.moved for entry in alone.entries} <= {Moved.NEITHER}
+
+
+def test_each_name_has_its_standing() -> None:
+    outcome = compare(of(B=1, A=1.5, D=4), of(C=3, A=1.25, D=4.0))
+    assert {entry.name: entry.standing for entry in outcome.entries} == {
+        "A": Standing.DIFFERENT,
+        "B": Standing.ONLY_LEFT,
+        "C": Standing.ONLY_RIGHT,
+        "D": Standing.SAME,
+    }
+    assert not outcome.is_same
+    assert [entry.name for entry in outcome.differences] == ["A", "B", "C"]
+    assert outcome.counts == dict.fromkeys(Standing, 1)
+    assert {entry.moved for entry in outcome.entries} == {None}
+    assert repr(outcome) == "<Comparison 3 of 4 params not the same>"
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "moved"),
+    [
+        (of(A=1), of(A=1), Moved.NEITHER),
+        (of(A=2), of(A=1), Moved.LEFT),
+        (of(A=1), of(A=2), Moved.RIGHT),
+        (of(A=2), of(A=2.0), Moved.BOTH),
+        (of(A=2), of(A=3), Moved.CONFLICT),
+        (of(A=2), of(), Moved.LEFT),
+        (of(A=1), of(), Moved.NEITHER),
+        (of(), of(A=2), Moved.RIGHT),
+    ],
+)
+def test_it_is_told_who_has_moved_away_from_the_base(left: ParamSet, right: ParamSet, moved: Moved) -> None:
+    outcome = compare(left, right, base=of(A=1, B=7))
+    (entry,) = outcome.entries
+    assert (entry.moved, entry.base) == (moved, WrittenParam("A", 1))
+    assert outcome.moves[moved] == 1
+
+
+def test_what_the_base_does_not_know_has_not_moved() -> None:
+    outcome = compare(of(A=1), of(A=2), base=of(B=1))
+    assert (outcome.entries[0].moved, sum(outcome.moves.values())) == (None, 0)
+
+
+def test_another_type_is_no_other_value() -> None:
+    outcome = compare(
+        ParamSet({"A": WrittenParam("A", 1, INT32), "B": WrittenParam("B", 1, INT32)}),
+        ParamSet({"A": WrittenParam("A", 1.0, REAL32), "B": WrittenParam("B", 1)}),
+    )
+    assert outcome.is_same
+    assert [entry.types_differ for entry in outcome.entries] == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("left", "right", "is_rounding"),
+    [
+        (2**24 + 1, 2**24, True),
+        (-(2**24) - 1, -(2**24), True),
+        (2**24 + 3, 2**24 + 5, False),  # both become 2**24 + 4
+        (2**24 + 1, 2**24 + 2, False),
+        (2**24, 2**24, False),
+        (1, 2, False),
+        (10**400, 10**401, False),
+    ],
+)
+def test_what_a_casting_vehicle_may_have_rounded_is_told(left: int, right: int, is_rounding: bool) -> None:
+    outcome = compare(of(A=left), of(A=right))
+    assert outcome.is_same is (left == right)
+    assert outcome.entries[0].is_rounding is is_rounding
+
+
+def names_of(outcome: Comparison) -> list[str]:
+    return [entry.name for entry in outcome.entries]
+
+
+def test_names_can_be_chosen_by_patterns() -> None:
+    left, right = of(MC_ROLL_P=1, MC_YAW_P=1, BAT_N=1), of(MC_ROLL_P=1, MC_PITCH_P=1)
+    assert names_of(compare(left, right, names=["MC_*_P"])) == ["MC_PITCH_P", "MC_ROLL_P", "MC_YAW_P"]
+    assert names_of(compare(left, right, names=["MC_ROLL_P", "BAT_?"])) == ["BAT_N", "MC_ROLL_P"]
+    assert compare(left, right, names="MC_ROLL_P").is_same
+
+
+def test_a_pattern_that_fits_nothing_is_a_mistake() -> None:
+    """A name that is misspelt would make any two vehicles the same."""
+    with pytest.raises(UsageError, match="called MC_PICTH_P or mc_\\*"):
+        compare(of(MC_PITCH_P=1), of(MC_PITCH_P=2), names=["MC_PICTH_P", "mc_*", "MC_*"])
+
+
+def test_defaults_make_a_base_as_far_as_they_are_known_and_agreed() -> None:
+    old = ParamSet(
+        {
+            "A": WrittenParam("A", 5, INT32, 1),
+            "B": WrittenParam("B", 2.0, REAL32, 2.0),
+            "C": WrittenParam("C", 3.0, REAL32),
+        }
+    )
+    new = ParamSet(
+        {
+            "A": WrittenParam("A", 5, INT32, 1),
+            "B": WrittenParam("B", 3.0, REAL32, 3.0),
+            "D": WrittenParam("D", 1.0, REAL32, 0.0),
+        }
+    )
+    base = defaults_of(old, new)
+    assert dict(base) == {"A": WrittenParam("A", 1, INT32), "D": WrittenParam("D", 0.0, REAL32)}
+    moved = {entry.name: entry.moved for entry in compare(old, new, base=base).entries}
+    assert moved == {"A": Moved.BOTH, "B": None, "C": None, "D": Moved.RIGHT}
+    assert len(defaults_of(of(A=1))) == 0

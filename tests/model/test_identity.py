@@ -1,0 +1,98 @@
+"""Identity: the fields of real vehicles, and the key under which tables are kept."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from paramclient.model.identity import SHARED_UIDS, Identity, autopilot_name
+from paramclient.protocol.wire import AutopilotVersion
+from tests import recordings
+
+
+def identity_in(recording: str, autopilot: int) -> Identity:
+    version = next(
+        message for _, message in recordings.from_vehicle(recording) if isinstance(message, AutopilotVersion)
+    )
+    return Identity.from_version(
+        system=1,
+        link="udpin:0.0.0.0:14550",
+        autopilot=autopilot,
+        vehicle_type=2,
+        uid=version.uid,
+        uid2=version.uid2,
+        firmware=version.flight_sw_version,
+        git_hash=version.git_hash,
+        board=version.board_version,
+        vendor_id=version.vendor_id,
+        product_id=version.product_id,
+        capabilities=version.capabilities,
+    )
+
+
+def test_px4_gives_its_commit_as_a_number_and_a_hardware_id_that_all_its_simulators_share() -> None:
+    identity = identity_in("px4_full_download", 12)
+    assert identity == Identity(
+        system=1,
+        link="udpin:0.0.0.0:14550",
+        uid="4954414c44494e4f",
+        autopilot=12,
+        vehicle_type=2,
+        firmware=0x01110040,
+        git_hash="a70a558393000000",
+        board=1,
+        capabilities=59647,
+    )
+    assert identity.key == "uid:4954414c44494e4f/1"
+
+
+def test_ardupilot_gives_its_commit_as_text_and_the_longer_hardware_id() -> None:
+    identity = identity_in("ardupilot_full_download", 3)
+    assert identity.git_hash == "fbb78585"
+    assert identity.uid == "336431323139633763346335343034616100"
+    assert identity.key == "uid:336431323139633763346335343034616100"
+
+
+def test_the_longer_hardware_id_counts_before_the_older_one() -> None:
+    both = Identity.from_version(
+        system=1, link="x", autopilot=3, vehicle_type=2, uid=7, uid2=b"\x01" + bytes(17)
+    )
+    older = Identity.from_version(system=1, link="x", autopilot=3, vehicle_type=2, uid=7, uid2=bytes(18))
+    none = Identity.from_version(system=1, link="x", autopilot=3, vehicle_type=2)
+    assert (both.uid, older.uid, none.uid) == ("01" + "00" * 17, "0000000000000007", None)
+    assert (older.key, none.key) == ("uid:0000000000000007", "system:1@x")
+    assert none.git_hash == ""
+
+
+def test_a_hardware_id_names_the_vehicle_wherever_it_is_and_without_one_link_and_system_do() -> None:
+    with_id = Identity(1, "udpin:a", uid="abcd")
+    assert replace(with_id, system=9, link="tcp:b").key == with_id.key
+    without = Identity(1, "udpin:a")
+    assert len({without.key, replace(without, system=2).key, replace(without, link="udpin:b").key}) == 3
+
+
+@pytest.mark.parametrize(
+    ("number", "name"),
+    [(0, "generic"), (3, "ardupilot"), (8, "no autopilot"), (12, "px4"), (77, "autopilot 77")],
+)
+def test_autopilots_have_a_name(number: int, name: str) -> None:
+    assert autopilot_name(number) == name
+
+
+def test_the_hardware_id_says_whether_it_is_the_same_vehicle() -> None:
+    mine = Identity(1, "udp", uid="0a", autopilot=3, vehicle_type=2)
+    assert mine.is_same_vehicle(replace(mine, system=9, link="tcp", vehicle_type=1))
+    assert not mine.is_same_vehicle(replace(mine, uid="0b"))
+    assert not mine.is_same_vehicle(replace(mine, uid=None))
+    assert mine.has_own_uid
+
+
+@pytest.mark.parametrize("uid", [None, *SHARED_UIDS])
+def test_where_it_says_nothing_the_kind_and_the_link_do(uid: str | None) -> None:
+    mine = Identity(1, "udp", uid=uid, autopilot=3, vehicle_type=2)
+    assert mine.is_same_vehicle(replace(mine, system=9))
+    for other in ({"link": "tcp"}, {"autopilot": 12}, {"vehicle_type": 1}):
+        assert not mine.is_same_vehicle(replace(mine, **other))
+    assert mine.is_same_vehicle(replace(mine, uid="0a")) is (uid is None)  # it may only now have said it
+    assert not mine.has_own_uid

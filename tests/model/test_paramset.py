@@ -1,0 +1,72 @@
+"""Parameters that no vehicle stands behind."""
+
+from __future__ import annotations
+
+import struct
+
+import pytest
+
+from paramclient.errors import UsageError
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, decode
+
+
+def held(value: Value, number: int, name: str = "P") -> Param:
+    return Param(name, value, number, 0, bits_of(value, number))
+
+
+@pytest.mark.parametrize(
+    ("written", "value", "number", "same"),
+    [
+        (0.1, struct.unpack("<f", struct.pack("<f", 0.1))[0], ParamType.REAL32, True),
+        (1, 1.0, ParamType.REAL32, True),
+        (1.0, 1, ParamType.INT32, True),
+        (1.5, 1, ParamType.INT32, False),
+        (-0.0, 0.0, ParamType.REAL32, True),
+        (float("nan"), float("nan"), ParamType.REAL32, True),
+        (300, 44, ParamType.UINT8, False),
+        (16777217, 16777217, ParamType.INT32, True),
+        (16777217, 16777216, ParamType.INT32, False),
+    ],
+)
+def test_a_written_value_is_compared_in_the_type_that_the_vehicle_gives_it(
+    written: Value, value: Value, number: int, same: bool
+) -> None:
+    assert WrittenParam("P", written).is_held_by(held(value, number)) is same
+
+
+def test_raw_bytes_are_held_by_raw_bytes_alone() -> None:
+    raw = Param("P", b"\x01\0\0\0", ParamType.UINT64, 0, 1)
+    number = Param("P", 1, ParamType.INT32, 0, 1)
+    assert WrittenParam("P", b"\x01\0\0\0").is_held_by(raw)
+    assert not WrittenParam("P", b"\x01\0\0\0").is_held_by(number)
+    assert not WrittenParam("P", 1).is_held_by(raw)  # nobody knows the other four bytes
+
+
+def test_a_number_that_its_type_cannot_hold_is_held_by_itself_alone() -> None:
+    """A vehicle that casts may report 300 for an INT8."""
+    odd, bits = decode(struct.pack("<f", 300), ParamType.INT8, Encoding.C_CAST)
+    param = Param("P", odd, ParamType.INT8, 0, bits)
+    assert WrittenParam.of(param).is_held_by(param)
+    assert not WrittenParam("P", bits & 0x7F).is_held_by(param)
+
+
+def test_raw_bytes_count_with_all_four_also_in_a_small_type() -> None:
+    """ArduPilot can send a float that its own integer type cannot hold."""
+    raw = struct.pack("<f", 1e20)
+    param = Param("P", raw, ParamType.INT8, 0, int.from_bytes(raw, "little"))
+    assert WrittenParam.of(param).is_held_by(param)
+    assert not WrittenParam("P", struct.pack("<f", 2e20)).is_held_by(param)
+
+
+def test_a_value_that_does_not_fit_the_type_says_so_when_its_bits_are_asked_for() -> None:
+    with pytest.raises(UsageError, match="300 does not fit UINT8"):
+        WrittenParam("P", 300).bits_as(ParamType.UINT8)
+
+
+def test_a_set_is_a_mapping_in_the_order_written() -> None:
+    params = ParamSet.of([held(2, ParamType.INT32, "B"), held(1.5, ParamType.REAL32, "A")], source="a test")
+    assert list(params) == ["B", "A"]
+    assert params["B"] == WrittenParam("B", 2, ParamType.INT32, line=7)
+    assert repr(params) == "<ParamSet 2 params from a test>"
+    assert str(params["A"]) == "A = 1.5"

@@ -1,0 +1,288 @@
+"""param.pck: the two real files, the rules of the format one by one, and bytes that are none."""
+
+from __future__ import annotations
+
+import csv
+import struct
+import tracemalloc
+from contextlib import suppress
+from pathlib import Path
+
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from paramclient.errors import PackError, UsageError
+from paramclient.model.values import ParamType
+from paramclient.protocol.ftp.param_pck import (
+    LARGEST_FILE,
+    Pack,
+    PackedParam,
+    decode,
+    decode_upload,
+    encode,
+    encode_upload,
+)
+from paramclient.sim import ardupilot_table
+from tests.recordings import DATA
+
+PLAIN = (DATA / "ardupilot_param.pck").read_bytes()
+WITH_DEFAULTS = (DATA / "ardupilot_param_withdefaults.pck").read_bytes()
+TABLE = Path(__file__).parents[3] / "paramclient" / "sim" / "tables" / "ardupilot.csv"
+KINDS = (ParamType.INT8, ParamType.INT16, ParamType.INT32, ParamType.REAL32)
+
+A = PackedParam("ACRO_OPTIONS", ParamType.INT8, 5)
+B = PackedParam("ACRO_RP_EXPO", ParamType.REAL32, 0x3E99999A, 0)
+
+
+def packed(
+    *entries: bytes, number: int | None = None, total: int | None = None, magic: int = 0x671B
+) -> bytes:
+    number = len(entries) if number is None else number
+    return struct.pack("<HHH", magic, number, number if total is None else total) + b"".join(entries)
+
+
+def entry(name: str, value: bytes = b"\x07", *, kind: int = 1, shared: int = 0) -> bytes:
+    own = name[shared:].encode("latin-1")
+    return bytes((kind, shared | len(own) - 1 << 4)) + own + value
+
+
+class TestTheRealFiles:
+    @pytest.mark.parametrize("data", [PLAIN, WITH_DEFAULTS], ids=["plain", "with defaults"])
+    def test_every_parameter_with_its_type_and_value(self, data: bytes) -> None:
+        pack = decode(data)
+        assert pack.total == len(pack.entries) == 1382
+        assert [(each.name, each.type, each.bits) for each in pack.entries] == [
+            (row.name, row.type, row.bits) for row in ardupilot_table()
+        ]
+
+    def test_the_defaults_of_what_differs_from_them(self) -> None:
+        assert not decode(PLAIN).with_defaults
+        assert all(each.default is None for each in decode(PLAIN).entries)
+        pack = decode(WITH_DEFAULTS)
+        assert pack.with_defaults
+        told = {each.name: each.default for each in pack.entries if each.default is not None}
+        assert len(told) == 42
+        # SIM_OH_RELAY_MSK is one of them: -1 as an INT16, and 65535 in the firmware's source
+        for row in csv.DictReader(TABLE.read_text(encoding="ascii").splitlines()):
+            if float(row["value"]) == float(row["default"]):
+                assert row["name"] not in told
+            elif ParamType[row["type"]].is_integer:
+                size = ParamType[row["type"]].size
+                assert told[row["name"]] == int(row["default"]) & (1 << 8 * size) - 1
+            else:
+                assert told[row["name"]] == struct.unpack("<I", struct.pack("<f", float(row["default"])))[0]
+
+    def test_encoding_gives_the_same_bytes(self) -> None:
+        assert encode(decode(PLAIN).entries) == PLAIN
+        assert encode(decode(WITH_DEFAULTS).entries) == PLAIN
+        assert encode(decode(WITH_DEFAULTS).entries, with_defaults=True) == WITH_DEFAULTS
+
+    @pytest.mark.parametrize("read_size", [7, 48, 110, 200, 238])
+    def test_at_other_read_sizes_no_value_lies_in_two_reads(self, read_size: int) -> None:
+        data = encode(decode(PLAIN).entries, read_size=read_size)
+        assert decode(data).entries == decode(PLAIN).entries
+        at, name_length = 6, {each.name: len(each.name) for each in decode(PLAIN).entries}
+        last = ""
+        for each in decode(PLAIN).entries:
+            while data[at] == 0:
+                at += 1
+            shared = data[at + 1] & 15
+            assert each.name[:shared] == last[:shared]
+            start = at + 2 + name_length[each.name] - shared
+            at, last = start + each.type.size, each.name
+            assert start // read_size == (at - 1) // read_size
+
+    @pytest.mark.parametrize("data", [PLAIN, WITH_DEFAULTS], ids=["plain", "with defaults"])
+    def test_cut_off_anywhere_it_is_none(self, data: bytes) -> None:
+        for length in [*range(40), *range(200, len(data), 61), len(data) - 1]:
+            with pytest.raises(PackError, match="cut off") as caught:
+                decode(data[:length])
+            assert caught.value.offset == length
+
+
+class TestTheFormat:
+    def test_names_share_their_beginning(self) -> None:
+        assert encode([A, B]) == packed(
+            entry("ACRO_OPTIONS", b"\x05"), entry("ACRO_RP_EXPO", b"\x9a\x99\x99\x3e", kind=4, shared=5)
+        )
+
+    def test_a_name_that_is_the_beginning_of_the_last_keeps_one_character(self) -> None:
+        long, short = PackedParam("ABC", ParamType.INT8, 1), PackedParam("AB", ParamType.INT8, 2)
+        data = encode([long, short])
+        assert data == packed(entry("ABC", b"\x01"), entry("AB", b"\x02", shared=1))
+        assert decode(data).entries == (long, short)
+
+    def test_names_of_sixteen_that_differ_in_the_last(self) -> None:
+        rows = tuple(PackedParam("ABCDEFGHIJKLMNO" + last, ParamType.INT16, 1) for last in "PQ")
+        data = encode(rows)
+        assert data[-5:] == bytes((2, 15)) + b"Q\x01\x00"
+        assert decode(data).entries == rows
+
+    def test_a_part_of_the_table_says_how_many_there_are(self) -> None:
+        assert decode(encode([A], total=1382)) == Pack((A,), 1382, False)
+
+    def test_no_entries_are_a_table_too(self) -> None:
+        assert decode(encode([])) == Pack((), 0, False)
+
+    def test_padding_may_stand_before_any_entry(self) -> None:
+        assert decode(packed(b"\0\0\0" + entry("A"), b"\0" * 50 + entry("B"))).total == 2
+
+    def test_defaults_are_given_when_asked_for(self) -> None:
+        assert decode(encode([A, B], with_defaults=True)) == Pack((A, B), 2, True)
+        assert decode(encode([A, B])) == Pack((A, B._replace(default=None)), 2, False)
+
+    @pytest.mark.parametrize(
+        ("data", "words"),
+        [
+            (b"", "cut off in its header"),
+            (b"\x1b\x67\x01\x00\x01", "cut off in its header"),
+            (packed(entry("A"), magic=0x671D), "does not begin with 0x671d"),
+            (packed(entry("A"), total=0), "1 entries of a table of 0"),
+            (packed(entry("A"), number=2), "cut off: 1 of 2 entries"),
+            (packed(entry("A"), b"\0\0\0\0", number=2), "cut off: 1 of 2 entries"),
+            (packed(entry("A"), entry("B"), number=1), "4 bytes are left over"),
+            (packed(entry("A"), b"\0", number=1), "1 bytes are left over"),
+            (packed(entry("A"), entry("A")), "A comes twice"),
+            (packed(entry("AB"), entry("AB", shared=1)), "AB comes twice"),
+            (packed(entry("A", kind=5)), "entry 0 begins with 0x05"),
+            (packed(entry("A", kind=0x10)), "entry 0 begins with 0x10"),
+            (packed(entry("A", b"\1\2", kind=0x11)), "entry 0 begins with 0x11"),
+            (packed(entry("A", b"\1\2", kind=0x21), magic=0x671C), "entry 0 begins with 0x21"),
+            (packed(entry("A", b"\1", kind=0x11), magic=0x671C), "cut off in entry 0"),
+            (packed(entry("AB", shared=1)), "shares 1 characters"),
+            (packed(entry("AB"), entry("ABCD", shared=3)), "shares 3 characters"),
+            (packed(entry("ABCDEFGHIJ"), entry("ABCDEFGHIJKLMNOPQ", shared=10)), "has the name"),
+            (packed(entry("A\0")), "has the name"),
+            (packed(entry("A\x7f")), "has the name"),
+            (packed(entry("\xc4")), "has the name"),
+        ],
+    )
+    def test_what_is_none(self, data: bytes, words: str) -> None:
+        with pytest.raises(PackError, match=words) as caught:
+            decode(data)
+        assert 0 <= caught.value.offset <= len(data)
+        assert str(caught.value).endswith(f"(byte {caught.value.offset})")
+
+    def test_what_is_longer_than_any_file_is_not_looked_at(self) -> None:
+        with pytest.raises(PackError, match="no packed parameter file has"):
+            decode(packed(bytes(LARGEST_FILE)))
+
+    @pytest.mark.parametrize(
+        ("rows", "words"),
+        [
+            ([A, A], "twice"),
+            ([PackedParam("", ParamType.INT8, 0)], "at least one character"),
+            ([PackedParam("ABCDEFGHIJKLMNOPQ", ParamType.INT8, 0)], "17 bytes"),
+            ([PackedParam("A", ParamType.UINT8, 0)], "has no UINT8"),
+            ([PackedParam("A", ParamType.INT8, 256)], "more bits"),
+            ([PackedParam("A", ParamType.INT8, -1)], "more bits"),
+            ([PackedParam("A", ParamType.INT8, 0, 256)], "more bits"),
+        ],
+    )
+    def test_what_cannot_stand_in_a_file(self, rows: list[PackedParam], words: str) -> None:
+        with pytest.raises(UsageError, match=words):
+            encode(rows, with_defaults=True)
+
+    @pytest.mark.parametrize("read_size", [0, 240])
+    def test_read_sizes_are_those_of_one_message(self, read_size: int) -> None:
+        with pytest.raises(UsageError, match="1 to 239"):
+            encode([A], read_size=read_size)
+
+    @pytest.mark.parametrize("total", [0, 65536])
+    def test_totals_that_cannot_be(self, total: int) -> None:
+        with pytest.raises(UsageError, match="of a table of"):
+            encode([A], total=total)
+
+
+class TestTheUpload:
+    def test_its_header_gives_the_length_of_the_file(self) -> None:
+        data = encode_upload([A, B])
+        assert data == b"\x1b\x67\x02\x00" + struct.pack("<H", len(data)) + encode([A, B])[6:]
+        assert decode_upload(data) == (A, B._replace(default=None))
+
+    def test_it_has_no_padding(self) -> None:
+        entries = [each for each in decode(PLAIN).entries if each.type is not ParamType.INT8]
+        data = encode_upload(entries)
+        assert len(data) < len(encode(entries))
+        assert decode_upload(data) == tuple(entries)
+
+    @pytest.mark.parametrize(
+        ("data", "words"),
+        [
+            (encode_upload([A])[:-1], "bytes of a file of"),
+            (encode([A]), "bytes of a file of"),
+            (encode([A], with_defaults=True), "does not begin with 0x671c"),
+            (b"\x1b", "cut off in its header"),
+        ],
+    )
+    def test_what_is_none(self, data: bytes, words: str) -> None:
+        with pytest.raises(PackError, match=words):
+            decode_upload(data)
+
+    def test_one_that_its_header_cannot_count(self) -> None:
+        rows = [PackedParam(f"{number:016d}"[::-1], ParamType.INT32, 0) for number in range(4000)]
+        with pytest.raises(UsageError, match="65535"):
+            encode_upload(rows)
+
+
+names = st.text(st.characters(min_codepoint=32, max_codepoint=126), min_size=1, max_size=16)
+
+
+@st.composite
+def entries(draw: st.DrawFn) -> PackedParam:
+    kind = draw(st.sampled_from(KINDS))
+    bits = st.integers(0, (1 << 8 * kind.size) - 1)
+    return PackedParam(draw(names), kind, draw(bits), draw(st.none() | bits))
+
+
+busy = settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])  # whatever else the machine does
+tables = st.lists(entries(), max_size=40, unique_by=lambda each: each.name)
+
+
+@busy
+@given(tables, st.integers(1, 239), st.booleans(), st.integers(0, 5))
+def test_what_is_encoded_is_decoded(
+    rows: list[PackedParam], read_size: int, with_defaults: bool, more: int
+) -> None:
+    data = encode(rows, total=len(rows) + more, with_defaults=with_defaults, read_size=read_size)
+    kept = rows if with_defaults else [each._replace(default=None) for each in rows]
+    assert decode(data) == Pack(tuple(kept), len(rows) + more, with_defaults)
+
+
+@busy
+@given(tables)
+def test_what_is_encoded_to_be_written_is_decoded(rows: list[PackedParam]) -> None:
+    assert decode_upload(encode_upload(rows)) == tuple(each._replace(default=None) for each in rows)
+
+
+@given(st.binary(max_size=200) | st.builds(lambda tail: PLAIN[:6] + tail, st.binary(max_size=200)))
+@example(b"\x1b\x67\xff\xff\xff\xff")
+def test_any_bytes_are_a_table_or_none(data: bytes) -> None:
+    for read in (decode, decode_upload):
+        with suppress(PackError):
+            read(data)
+
+
+@given(st.data())
+def test_a_real_file_with_damage_is_a_table_or_none(data: st.DataObject) -> None:
+    damaged = bytearray(WITH_DEFAULTS[: data.draw(st.integers(300, 3000))])
+    damaged[2:4] = struct.pack("<H", data.draw(st.integers(10, 200)))
+    for at in data.draw(st.lists(st.integers(0, len(damaged) - 1), max_size=4)):
+        damaged[at] = data.draw(st.integers(0, 255))
+    try:
+        pack = decode(bytes(damaged))
+    except PackError:
+        return
+    assert len({each.name for each in pack.entries}) == len(pack.entries)
+
+
+def test_a_file_that_claims_much_takes_no_more_memory_than_it_is_long() -> None:
+    claims = packed(entry("A"), bytes(1_000_000), number=65535)
+    tracemalloc.start()
+    try:
+        with pytest.raises(PackError, match="cut off"):
+            decode(claims)
+        assert tracemalloc.get_traced_memory()[1] < 100_000
+    finally:
+        tracemalloc.stop()

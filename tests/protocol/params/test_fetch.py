@@ -1,0 +1,859 @@
+"""Fetches: the vehicle's hash where it has one, the list where it must be, and what becomes of the table."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable
+
+import pytest
+
+from paramclient.errors import LinkError, NoReply
+from paramclient.model.values import ParamType, Trust, Value
+from paramclient.protocol import wire
+from paramclient.protocol.events import Fetched, ParamChanged
+from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.fetch_result import FRESH_HASH, FetchResult
+from paramclient.protocol.params.reads import Read
+from paramclient.protocol.wire import HASH_CHECK, ParamRequestList, ParamRequestRead, ParamSet
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam
+from paramclient.sim.param_table import Table
+from tests.simulation import Memory, Simulation, is_so, known, listing_ardupilot
+
+VOLATILE = ("CAL_MAG0_XOFF", "COM_FLIGHT_UUID")
+SMALL: list[SimParam] = [
+    *(SimParam(f"P{number:02d}", ParamType.INT32, number) for number in range(40)),
+    *(SimParam(name, ParamType.INT32, 7, volatile=True) for name in VOLATILE),
+]
+STRANGE = [SimParam(row.name, row.type, row.value, row.name in ("P03", "P04", "P05")) for row in SMALL]
+"""A firmware that leaves out of its hash what no other does."""
+
+
+def go_on(world: Simulation, *, seconds: float = 2.0) -> None:
+    """End the session, and begin the next one with what it has learnt."""
+    world.run(seconds)
+    memory = world.memory()
+    world.next_session()
+    world.meet().use_cached(now=world.now, **memory)
+    world.sent.clear()
+
+
+class Headless(PX4Vehicle):
+    """One whose hash at the head of the list is lost."""
+
+    def _on_list(self) -> None:
+        super()._on_list()
+        self._hash_next = False
+
+
+def deaf_to(vehicle: PX4Vehicle | GenericVehicle, names: Iterable[str]) -> None:
+    """Let some parameters never be sent, whoever asks."""
+    hidden = frozenset(names)
+    send_value = vehicle._send_value
+
+    def send(entry: object, **kwargs: object) -> None:
+        if entry.name not in hidden:  # type: ignore[attr-defined]  # an Entry of the simulator
+            send_value(entry, **kwargs)  # type: ignore[arg-type]  # the same
+
+    vehicle._send_value = send  # type: ignore[method-assign]  # a fault that the simulator has no switch for
+
+
+def names_read(world: Simulation) -> list[str]:
+    return [read.param_id or str(read.param_index) for read in world.sent_of(ParamRequestRead)]
+
+
+def values_of(result: FetchResult) -> dict[str, Value]:
+    return {name: param.value for name, param in result.params.items() if param.index is not None}
+
+
+# the first time
+
+
+def test_a_first_fetch_from_px4() -> None:
+    vehicle = PX4Vehicle()
+    world = Simulation(vehicle)
+    result = world.fetch()
+    assert (result.system, result.component, result.source) == (1, 1, "stream")
+    assert (result.count, result.received, result.missing, result.complete) == (903, 903, (), True)
+    assert result.hash == vehicle.announced_hash()
+    assert result.notes == ()
+    assert values_of(result) == vehicle.values
+    assert repr(result).startswith("<FetchResult 1/1 903 params from stream in 0.9")
+    machine = world.machine
+    assert machine.sync.synced
+    assert machine.state == "synced"
+    assert machine.table.complete
+    assert machine.table.volatile_known
+    assert len(machine.table.volatile) == 58
+    assert machine.fetches.last is result
+    assert [event.result for event in world.events if isinstance(event, Fetched)] == [result]
+    assert {param.trust for param in result.params.values()} == {Trust.LIVE}
+
+
+def test_a_first_fetch_from_ardupilot_asks_for_no_hash() -> None:
+    vehicle = listing_ardupilot()
+    world = Simulation(vehicle)
+    result = world.fetch()
+    assert result.hash is None
+    assert result.notes == ()
+    assert values_of(result) == vehicle.values
+    assert names_read(world) == []
+
+
+def test_a_first_fetch_of_something_generic() -> None:
+    kinds: dict[str, Value | tuple[ParamType | int, Value]] = {
+        kind.name: (kind, b"\x01\x02\x03\x04" if kind.size > 4 else 1) for kind in ParamType
+    }
+    vehicle = GenericVehicle(kinds)
+    result = Simulation(vehicle).fetch()
+    assert result.hash is None
+    assert list(result.params) == list(vehicle.params)
+    for name, param in vehicle.params.items():
+        if param.type.size <= 4:  # type: ignore[union-attr]  # all types here are defined
+            assert result.params[name].value == param.value
+
+
+def test_the_hash_that_is_lost_at_the_head_is_asked_for_meanwhile() -> None:
+    vehicle = Headless(table=SMALL)
+    world = Simulation(vehicle)
+    result = world.fetch()
+    assert result.hash == vehicle.announced_hash()
+    assert names_read(world) == [HASH_CHECK]
+    assert result.notes == ()
+    asked = {type(message): at for at, message in world.sent if not isinstance(message, wire.Heartbeat)}
+    assert asked[ParamRequestRead] - asked[ParamRequestList] < 0.02 < result.elapsed
+
+
+def test_a_vehicle_whose_hash_is_switched_off() -> None:
+    vehicle = PX4Vehicle(table=SMALL, hash_check=False)
+    world = Simulation(vehicle)
+    result = world.fetch()
+    assert result.complete
+    assert result.hash is None
+    assert result.elapsed < 3.0
+    assert values_of(result) == vehicle.values
+    go_on(world)
+    result = world.fetch()
+    assert result.source == "stream"
+    assert result.complete
+
+
+def test_a_hash_that_the_vehicle_keeps_silent_on_is_asked_for_once() -> None:
+    vehicle = PX4Vehicle(table=SMALL, hash_check=False)
+    world = Simulation(vehicle)
+    reads = world.meet().reads
+    asked: list[object] = []
+    ask = reads.ask
+
+    def spy(key: str | int, now: float, *, urgent: bool = True) -> Read:
+        asked.append(key)
+        return ask(key, now, urgent=urgent)
+
+    reads.ask = spy  # type: ignore[method-assign]  # only looks on
+    result = world.fetch()
+    assert result.hash is None
+    assert result.complete
+    assert asked == [HASH_CHECK]
+
+
+# the next time
+
+
+def test_a_hit_costs_one_request_and_the_volatile_values() -> None:
+    vehicle = PX4Vehicle()
+    world = Simulation(vehicle)
+    world.fetch()
+    go_on(world)
+    volatile = world.machine.table.volatile
+    result = world.fetch()
+    assert result.source == "cache"
+    assert (result.count, result.received, result.missing) == (903, 903, ())
+    assert result.hash == vehicle.announced_hash()
+    assert result.elapsed < 0.01
+    assert {result.params[name].trust for name in volatile} == {Trust.CACHED}
+    assert {param.trust for name, param in result.params.items() if name not in volatile} == {Trust.VERIFIED}
+    assert names_read(world)[0] == HASH_CHECK
+    refresh = world.machine.refresh
+    assert refresh is not None
+    world.until(lambda: refresh.done)
+    assert sorted(names_read(world)) == sorted([HASH_CHECK, *volatile])
+    assert world.sent_of(ParamRequestList) == []
+    assert world.sent_of(ParamSet) == []
+    assert {world.machine.table.params[name].trust for name in volatile} == {Trust.LIVE}
+    assert world.machine.refresh is None
+
+
+def test_volatile_values_are_read_afresh_after_a_hit() -> None:
+    vehicle = PX4Vehicle(table=SMALL)
+    world = Simulation(vehicle)
+    world.fetch()
+    go_on(world)
+    vehicle.set_param("CAL_MAG0_XOFF", 99)
+    world.run(0.0)
+    assert world.fetch().source == "cache"
+    world.run(1.0)
+    param = world.machine.table.params["CAL_MAG0_XOFF"]
+    assert (param.value, param.trust) == (99, Trust.LIVE)
+    assert world.machine.sync.synced
+
+
+def test_a_second_hit_while_the_first_one_is_refreshed() -> None:
+    world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
+    world.fetch()
+    go_on(world)
+    world.fetch()
+    first = world.machine.refresh
+    world.fetch()
+    second = world.machine.refresh
+    assert first is not None
+    assert second is not None
+    world.until(lambda: first.done and second.done)
+    assert world.machine.refresh is None
+
+
+def test_a_hit_without_anything_volatile_refreshes_nothing() -> None:
+    world = Simulation(PX4Vehicle(table={"A": 1, "B": 2}))
+    world.fetch()
+    go_on(world)
+    assert world.fetch().source == "cache"
+    assert world.machine.refresh is None
+
+
+def test_a_hash_that_was_asked_for_ahead_costs_nothing_more() -> None:
+    world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
+    world.fetch()
+    go_on(world)
+    world.machine.sync.ask(world.now)
+    world.run(0.3)
+    before = len(world.sent_of(ParamRequestRead))
+    fetch = world.machine.begin_fetch(world.now)
+    assert fetch.done
+    assert fetch.result is not None
+    assert (fetch.result.source, fetch.result.elapsed) == ("cache", 0.0)
+    assert before == 1
+    world.run(FRESH_HASH)
+    world.sent.clear()
+    world.fetch()
+    assert names_read(world)[0] == HASH_CHECK
+
+
+def test_a_change_since_leads_to_the_list() -> None:
+    vehicle = PX4Vehicle(table=SMALL)
+    world = Simulation(vehicle)
+    world.fetch()
+    go_on(world)
+    world.next_session()  # nobody hears of it
+    vehicle.set_param("P05", 500)
+    world.run(2.0)
+    memory = memory_of_cache(SMALL)
+    world.next_session()
+    world.meet().use_cached(now=world.now, **memory)
+    result = world.fetch()
+    assert result.source == "stream"
+    assert values_of(result) == vehicle.values
+    assert result.hash == vehicle.announced_hash()
+    assert names_read(world) == [HASH_CHECK]
+
+
+def memory_of_cache(rows: list[SimParam]) -> Memory:
+    world = Simulation(PX4Vehicle(table=rows))
+    world.fetch()
+    return world.memory()
+
+
+def test_a_change_that_is_heard_before_the_fetch_leads_to_no_list() -> None:
+    vehicle = PX4Vehicle(table=SMALL)
+    world = Simulation(vehicle)
+    world.fetch()
+    go_on(world)
+    vehicle.set_param("P05", 500)
+    world.run(0.5)
+    assert world.machine.table.hash == vehicle.announced_hash()
+    result = world.fetch()
+    assert result.source == "cache"
+    assert values_of(result) == vehicle.values
+
+
+def test_the_vehicle_may_keep_silent_on_the_hash_that_it_once_had() -> None:
+    vehicle = PX4Vehicle(table=SMALL, hash_check=False)
+    world = Simulation(vehicle)
+    world.meet().use_cached(now=world.now, **memory_of_cache(SMALL))
+    result = world.fetch()
+    assert result.source == "stream"
+    assert result.complete
+    assert values_of(result) == vehicle.values
+
+
+def test_what_the_vehicle_no_longer_has_leaves_the_table() -> None:
+    memory = memory_of_cache([*SMALL, SimParam("GONE", ParamType.INT32, 1)])
+    memory["params"] = {**memory["params"], "UNLISTED": known("UNLISTED", 1, index=None)}
+    world = Simulation(PX4Vehicle(table=SMALL))
+    world.meet().use_cached(now=world.now, **memory)
+    result = world.fetch()
+    assert "GONE" not in result.params
+    assert "UNLISTED" in result.params
+    changes = [event.change for event in world.events if isinstance(event, ParamChanged)]
+    assert [change.old.name for change in changes if change.new is None and change.old] == ["GONE"]
+
+
+def test_a_refresh_downloads_in_spite_of_the_hash() -> None:
+    world = Simulation(PX4Vehicle(table=SMALL))
+    world.fetch()
+    go_on(world)
+    assert world.fetch(refresh=True).source == "stream"
+    assert len(world.sent_of(ParamRequestList)) == 1
+
+
+# changes while it runs
+
+
+def test_a_change_that_the_stream_still_brings() -> None:
+    vehicle = PX4Vehicle()
+    world = Simulation(vehicle)
+    fetch = world.meet().begin_fetch(world.now)
+    world.run(0.3)
+    vehicle.set_param("SYS_AUTOSTART", 4999)
+    result = world.outcome(fetch)
+    assert result.params["SYS_AUTOSTART"].value == 4999
+    assert result.hash == vehicle.announced_hash()
+
+
+@pytest.mark.parametrize("change_what_is_to_come", [False, True])
+def test_a_change_behind_the_streams_back(change_what_is_to_come: bool) -> None:
+    vehicle = PX4Vehicle()
+    world = Simulation(vehicle)
+    before = vehicle.announced_hash()
+    fetch = world.meet().begin_fetch(world.now)
+    world.run(0.4)
+    vehicle._entry("BAT1_N_CELLS").store(9)  # has been sent, and nobody is told
+    if change_what_is_to_come:
+        vehicle._entry("SYS_AUTOSTART").store(4999)
+    vehicle._hash = None
+    result = world.outcome(fetch)
+    assert result.complete
+    if change_what_is_to_come:
+        assert result.hash is None
+        assert "moved during the download" in result.notes[0]
+    else:
+        assert result.hash == before != vehicle.announced_hash()
+
+
+def test_after_a_table_that_moved_our_own_write_does_not_confirm_it() -> None:
+    vehicle = PX4Vehicle(table=STRANGE)
+    world = Simulation(vehicle)
+    fetch = world.meet().begin_fetch(world.now)
+    world.until(lambda: fetch.download is not None and fetch.download.received > 5)
+    vehicle._entry("P00").store(77)  # nobody is told
+    vehicle._hash = None
+    result = world.outcome(fetch)
+    assert result.hash is None
+    world.set("P20", 1234)
+    world.run(2.0)
+    assert world.machine.table.hash is None
+    go_on(world)
+    assert world.fetch().source == "stream"
+    assert world.machine.table.params["P00"].value == 77
+
+
+def test_parameters_that_come_into_use_during_the_download() -> None:
+    late = [f"LATE_{number}" for number in range(5)]
+    rows = [SimParam(f"A{number:03d}", ParamType.INT32, number) for number in range(300)]
+    rows += [SimParam(name, ParamType.INT32, 1) for name in late]
+    rows += [SimParam(f"Z{number:03d}", ParamType.INT32, number) for number in range(300)]
+    vehicle = PX4Vehicle(table=rows, not_in_use=late)
+    world = Simulation(vehicle)
+    fetch = world.meet().begin_fetch(world.now)
+    world.run(0.4)
+    vehicle.use(*late)
+    result = world.outcome(fetch)
+    assert result.count == 605
+    assert result.complete
+    assert values_of(result) == vehicle.values
+    assert {name: result.params[name].index for name in late} == {
+        name: vehicle.param(name).index for name in late
+    }
+    assert result.hash == vehicle.announced_hash()
+
+
+def test_a_group_that_comes_during_the_download() -> None:
+    vehicle = listing_ardupilot()
+    world = Simulation(vehicle)
+    fetch = world.meet().begin_fetch(world.now)
+    world.run(0.3)
+    vehicle.set_param("EK2_ENABLE", 1)
+    world.run(0.1)
+    world.other_station(wire.ParamRequestRead(1, 1, "", 3))  # its answer shows the new count
+    result = world.outcome(fetch)
+    assert result.count in (1382, 1434)  # as the last ones that came have said
+    result = world.fetch()
+    assert result.count == 1434
+    assert result.complete
+    assert values_of(result) == vehicle.values
+
+
+def test_another_station_asks_for_the_list_meanwhile() -> None:
+    vehicle = PX4Vehicle()
+    world = Simulation(vehicle)
+    fetch = world.meet().begin_fetch(world.now)
+    world.run(0.4)
+    world.other_station(ParamRequestList(1, 1))
+    result = world.outcome(fetch)
+    assert result.complete
+    assert result.hash == vehicle.announced_hash()
+    assert result.elapsed < 2.5
+
+
+@pytest.mark.parametrize("make", [PX4Vehicle, listing_ardupilot])
+def test_a_list_that_others_begin_again_and_again_is_left_to_them(
+    make: Callable[..., PX4Vehicle | ArduPilotVehicle],
+) -> None:
+    vehicle = make()
+    world = Simulation(vehicle)
+    fetch = world.meet().begin_fetch(world.now)
+    for _ in range(10):
+        world.run(0.3)
+        world.other_station(ParamRequestList(1, 1))
+    result = world.outcome(fetch)
+    assert result.complete
+    assert sum(isinstance(message, ParamRequestList) for _, message in world.sent) == 1
+
+
+# hashes that cannot be computed
+
+
+def test_an_unproven_hash_is_confirmed_by_being_the_same_before_and_after() -> None:
+    vehicle = PX4Vehicle(table=STRANGE)
+    world = Simulation(vehicle)
+    result = world.fetch()
+    assert result.hash == vehicle.announced_hash()
+    assert "could not be proven" in result.notes[0]
+    assert not world.machine.table.volatile_known
+    go_on(world)
+    result = world.fetch()
+    assert result.source == "cache"
+    assert "could not be proven" in result.notes[0]
+
+
+def test_after_a_hit_with_an_unproven_hash_everything_is_read_afresh() -> None:
+    vehicle = PX4Vehicle(table=STRANGE)
+    world = Simulation(vehicle)
+    world.fetch()
+    go_on(world)
+    vehicle._entry("P03").store(77)  # no hash tells of it
+    result = world.fetch()
+    assert {param.trust for param in result.params.values()} == {Trust.CACHED}
+    refresh = world.machine.refresh
+    assert refresh is not None
+    world.until(lambda: refresh.done)
+    params = world.machine.table.params
+    assert {param.trust for param in params.values()} == {Trust.LIVE}
+    assert params["P03"].value == 77
+    world.run(0.1)
+    assert world.machine.table.hash == vehicle.announced_hash()
+    assert "P03" in world.machine.table.volatile
+    go_on(world)
+    assert world.fetch().source == "cache"
+
+
+ODD = [SimParam(row.name, row.type, row.value, row.volatile or row.name in ("P03", "P04")) for row in SMALL]
+"""A firmware that leaves out a little more than usual."""
+
+
+def test_what_changes_under_an_unchanged_hash_is_found_to_be_volatile() -> None:
+    vehicle = PX4Vehicle(table=ODD)
+    world = Simulation(vehicle)
+    world.fetch()
+    assert is_so(not world.machine.table.volatile_known)
+    go_on(world)
+    for name in ("P03", "P04"):
+        vehicle._entry(name).store(77)
+    assert world.fetch().source == "cache"
+    world.run(1.0)
+    table = world.machine.table
+    assert table.volatile_known
+    assert table.volatile == {*VOLATILE, "P03", "P04"}
+    world.set("P20", 500)
+    assert table.hash == vehicle.announced_hash()
+    go_on(world)
+    assert world.fetch().notes == ()
+
+
+def test_what_changes_with_the_hash_is_not_found_to_be_volatile() -> None:
+    vehicle = PX4Vehicle(table=ODD)
+    world = Simulation(air=Air.symmetric([vehicle], delay=0.05))
+    world.fetch()
+    go_on(world)
+    assert world.fetch().source == "cache"
+    vehicle._entry("P20").store(77)  # behind everybody's back, while all is read afresh
+    vehicle._hash = None
+    world.run(2.0)
+    assert not world.machine.table.volatile_known
+    assert "P20" not in world.machine.table.volatile
+    assert world.machine.table.params["P20"].value == 77
+
+
+def test_an_unproven_hash_without_one_before_stands_for_nothing() -> None:
+    world = Simulation(Headless(table=STRANGE))
+    result = world.fetch()
+    assert result.complete
+    assert result.hash is None
+    assert "No hash was heard before" in result.notes[0]
+
+
+def test_after_our_own_write_the_next_session_hits() -> None:
+    vehicle = PX4Vehicle(table=SMALL)
+    world = Simulation(vehicle)
+    world.fetch()
+    world.set("P05", 500)
+    assert world.machine.table.hash == vehicle.announced_hash()
+    world.run(0.5)
+    assert world.machine.sync.synced
+    go_on(world)
+    result = world.fetch()
+    assert result.source == "cache"
+    assert result.params["P05"].value == 500
+
+
+def test_after_our_own_write_an_unproven_hash_is_not_believed() -> None:
+    """It cannot be computed here, so it may stand for more than our write: for what was not heard as well."""
+    vehicle = PX4Vehicle(table=STRANGE)
+    world = Simulation(vehicle)
+    world.fetch()
+    world.set("P20", 500)
+    assert is_so(world.machine.is_settling)
+    world.run(0.5)
+    assert not world.machine.is_settling
+    assert world.machine.table.hash is None
+    assert world.machine.sync.synced
+    go_on(world)
+    assert world.fetch().source == "stream"
+
+
+def test_after_another_stations_change_an_unproven_hash_is_not_believed() -> None:
+    vehicle = PX4Vehicle(table=STRANGE)
+    world = Simulation(vehicle)
+    world.fetch()
+    vehicle.set_param("P21", 1)
+    world.run(1.0)
+    world.set("P20", 500)
+    world.run(1.0)
+    assert world.machine.table.hash is None
+
+
+def test_a_write_that_brings_parameters_into_use() -> None:
+    rows = [*SMALL, SimParam("A_SWITCH", ParamType.INT32, 0), SimParam("A_LATE", ParamType.INT32, 3)]
+    vehicle = PX4Vehicle(table=rows, late_use={"A_SWITCH": ["A_LATE"]})
+    world = Simulation(vehicle)
+    assert world.fetch().count == 43
+    world.set("A_SWITCH", 1)
+    world.run(1.0)
+    assert not world.machine.sync.synced
+    assert world.machine.state == "partial"
+    result = world.fetch()
+    assert result.count == 44
+    assert values_of(result) == vehicle.values
+    assert result.hash == vehicle.announced_hash()
+
+
+# what does not come
+
+
+def test_what_never_comes_is_named_and_the_table_is_not_complete() -> None:
+    vehicle = PX4Vehicle(table=SMALL)
+    deaf_to(vehicle, ["P03", "P17"])
+    world = Simulation(vehicle)
+    result = world.fetch()
+    assert not result.complete
+    missing = tuple(index for index, name in enumerate(vehicle.params) if name in ("P03", "P17"))
+    assert result.missing == missing
+    assert (result.count, result.received, result.hash) == (42, 40, None)
+    assert "2 missing" in repr(result)
+    assert not world.machine.table.complete
+    assert not world.machine.sync.synced
+    assert world.machine.state == "partial"
+
+
+def test_with_something_missing_no_hash_is_waited_for() -> None:
+    vehicle = PX4Vehicle()
+    world = Simulation(air=Air.symmetric([vehicle], delay=0.05))
+    fetch = world.meet().begin_fetch(world.now)
+    world.until(lambda: fetch.progress(world.now).received > 0)
+    vehicle.reboot(down=math.inf)
+    world.until(lambda: fetch.download is not None and fetch.download.done)
+    assert fetch.result is not None
+    assert fetch.result.missing
+
+
+def test_what_does_not_come_stays_as_the_cache_knows_it() -> None:
+    vehicle = PX4Vehicle(table=SMALL)
+    deaf_to(vehicle, ["P03"])
+    vehicle.set_param("P20", 1234)
+    world = Simulation(vehicle)
+    world.meet().use_cached(now=world.now, **memory_of_cache(SMALL))
+    result = world.fetch(refresh=True)
+    assert len(result.missing) == 1
+    assert result.params["P03"].trust is Trust.CACHED
+    assert result.params["P20"].value == 1234
+    assert world.machine.table.complete
+    assert world.machine.table.hash == vehicle.announced_hash()
+
+
+def test_an_incomplete_download_of_another_count_leaves_no_complete_table() -> None:
+    vehicle = PX4Vehicle(table=[*SMALL, SimParam("NEW", ParamType.INT32, 1)])
+    deaf_to(vehicle, ["NEW"])
+    world = Simulation(vehicle)
+    world.meet().use_cached(now=world.now, **memory_of_cache(SMALL))
+    result = world.fetch()
+    assert len(result.missing) == 1
+    assert not world.machine.table.complete
+    assert not world.machine.can_hit
+
+
+def test_a_component_without_parameters_gives_no_reply() -> None:
+    world = Simulation(GenericVehicle({}))
+    error = world.error_of(lambda: world.fetch())
+    assert isinstance(error, NoReply)
+    assert world.machine.fetch is None
+    assert world.machine.fetches.last is None
+
+
+@pytest.mark.parametrize("is_cached", [False, True])
+def test_a_vehicle_that_is_gone_gives_no_reply_in_bounded_time(is_cached: bool) -> None:
+    vehicle = PX4Vehicle(table=SMALL)
+    world = Simulation(vehicle)
+    world.meet()
+    if is_cached:
+        world.machine.use_cached(now=world.now, **memory_of_cache(SMALL))
+    vehicle.reboot(world.now, down=math.inf)
+    fetch = world.machine.begin_fetch(world.now)
+    assert is_so(not fetch.is_silent)
+    world.run(3.0)
+    assert fetch.is_silent
+    assert isinstance(world.error_of(lambda: world.outcome(fetch, 90.0)), NoReply)
+    assert len(world.machine.reads) == 0
+
+
+# those who wait
+
+
+def test_two_who_fetch_share_one() -> None:
+    world = Simulation(PX4Vehicle(table=SMALL))
+    machine = world.meet()
+    first = machine.begin_fetch(world.now)
+    second = machine.begin_fetch(world.now)
+    assert first is second
+    assert machine.state == "fetching"
+    machine.end_fetch(first, world.now)
+    assert machine.fetch is first
+    world.outcome(second)
+    assert len(world.sent_of(ParamRequestList)) == 1
+
+
+def test_the_last_one_who_waits_ends_it() -> None:
+    world = Simulation(air=Air.symmetric([PX4Vehicle()], loss=0.2, seed=1))
+    machine = world.meet()
+    fetch = machine.begin_fetch(world.now)
+    world.run(0.5)
+    machine.end_fetch(fetch, world.now)
+    assert machine.fetch is None
+    assert not fetch.done
+    assert len(machine.reads) == 0
+    assert machine.table.params
+    world.run(5.0)  # the stream goes on
+    assert not fetch.done
+    assert world.fetch().complete
+
+
+def test_cancelling_while_the_hash_is_asked_for() -> None:
+    world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
+    world.fetch()
+    go_on(world)
+    fetch = world.machine.begin_fetch(world.now)
+    assert HASH_CHECK in world.machine.reads
+    world.machine.end_fetch(fetch, world.now)
+    assert HASH_CHECK not in world.machine.reads
+    world.run(1.0)
+    assert not fetch.done
+
+
+def test_giving_one_back_twice_does_not_end_another() -> None:
+    world = Simulation(PX4Vehicle(table=SMALL))
+    machine = world.meet()
+    first = machine.begin_fetch(world.now)
+    machine.end_fetch(first, world.now)
+    second = machine.begin_fetch(world.now)
+    machine.end_fetch(first, world.now)
+    assert machine.fetch is second
+    assert world.outcome(second).complete
+
+
+def test_a_refresh_joins_a_download_and_turns_a_question_for_the_hash_into_one() -> None:
+    world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
+    world.fetch()
+    go_on(world)
+    fetch = world.machine.begin_fetch(world.now)
+    assert is_so(fetch.download is None)
+    assert world.machine.begin_fetch(world.now, refresh=True) is fetch
+    download = fetch.download
+    assert download is not None
+    assert world.machine.begin_fetch(world.now, refresh=True) is fetch
+    assert fetch.download is download
+    assert world.outcome(fetch).source == "stream"
+
+
+def test_what_has_come_so_far() -> None:
+    world = Simulation(PX4Vehicle())
+    fetch = world.meet().begin_fetch(world.now)
+    assert fetch.progress(world.now).received == 0
+    with pytest.raises(NoReply, match="parameters of 1/1"):
+        fetch.partial(world.now, "")
+    world.run(0.5)
+    progress = fetch.progress(world.now)
+    assert 300 < progress.received < 600
+    assert progress.total == 903
+    assert progress.rate == pytest.approx(1000, rel=0.3)
+    assert progress.seconds_left == pytest.approx(0.5, rel=0.5)
+    partial = fetch.partial(world.now, "Time is up.")
+    assert partial.notes == ("Time is up.",)
+    assert not partial.complete
+    assert partial.received == progress.received
+    assert partial.received + len(partial.missing) == 903
+    world.outcome(fetch)
+    assert fetch.progress(world.now).seconds_left == 0.0
+
+
+def test_progress_before_a_hit_and_before_a_count() -> None:
+    world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
+    machine = world.meet()
+    fetch = machine.begin_fetch(world.now)
+    progress = fetch.progress(world.now)
+    assert (progress.received, progress.total, progress.rate, progress.seconds_left) == (0, None, 0.0, None)
+    world.outcome(fetch)
+    machine.end_fetch(fetch, world.now)
+    go_on(world)
+    fetch = world.machine.begin_fetch(world.now)
+    assert fetch.progress(world.now).total == 42
+    with pytest.raises(NoReply):
+        fetch.partial(world.now, "")
+
+
+# the link
+
+
+def test_a_fetch_goes_on_when_the_link_is_back() -> None:
+    vehicle = PX4Vehicle()
+    world = Simulation(vehicle)
+    fetch = world.meet().begin_fetch(world.now)
+    world.run(0.3)
+    world.station.pause()
+    world.air.downlink._loss = 1.0
+    world.run(100.0)
+    world.air.downlink._loss = 0.0
+    assert not fetch.done
+    world.station.resume(world.now)
+    assert world.outcome(fetch).complete
+
+
+def test_a_question_for_the_hash_is_asked_again_when_the_link_is_back() -> None:
+    world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.1))
+    world.fetch()
+    go_on(world)
+    fetch = world.machine.begin_fetch(world.now)
+    world.air.uplink._loss = 1.0
+    world.exchange()
+    world.station.pause()
+    world.run(100.0)
+    world.air.uplink._loss = 0.0
+    world.station.resume(world.now)
+    assert world.outcome(fetch).source == "cache"
+    assert names_read(world)[:2] == [HASH_CHECK] * 2
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.05, 0.15, 0.5])
+def test_the_link_goes_for_good_at_any_moment(seconds: float) -> None:
+    world = Simulation(air=Air.symmetric([PX4Vehicle(table=SMALL)], delay=0.05))
+    world.fetch()
+    go_on(world)
+    error = LinkError("gone", link="x")
+    fetch = world.machine.begin_fetch(world.now)
+    world.run(seconds)
+    refresh = world.machine.refresh
+    world.station.fail_all(error, world.now)
+    assert fetch.error is error or fetch.result is not None
+    assert refresh is None or refresh.error is error or refresh.done
+    assert world.machine.fetch is None
+    assert len(world.machine.reads) == len(world.machine.writes) == 0
+    assert world.fetch().complete  # a later one is not spoilt by it
+
+
+def test_the_link_goes_for_good_while_everything_is_read_afresh() -> None:
+    world = Simulation(air=Air.symmetric([PX4Vehicle(table=STRANGE)], delay=0.05))
+    world.fetch()
+    go_on(world)
+    world.fetch()
+    refresh = world.machine.refresh
+    assert refresh is not None
+    error = LinkError("gone", link="x")
+    world.station.fail_all(error, world.now)
+    assert refresh.error is error
+    assert world.machine.refresh is None
+    assert len(world.machine.reads) == 0
+
+
+def test_a_write_while_everything_is_read_afresh_leaves_the_question_open() -> None:
+    vehicle = PX4Vehicle(table=ODD)
+    world = Simulation(air=Air.symmetric([vehicle], delay=0.05))
+    world.fetch()
+    go_on(world)
+    vehicle._entry("P03").store(77)
+    world.fetch()
+    refresh = world.machine.refresh
+    assert refresh is not None
+    world.until(lambda: refresh.done)
+    world.machine.write("P20", 5, world.now)
+    world.run(0.09)  # the hash comes before the write is done
+    assert not world.machine.table.volatile_known
+
+
+def test_changes_are_told_in_order() -> None:
+    world = Simulation(PX4Vehicle(table={"A": 1, "B": 2}))
+    world.fetch()
+    changes = [event.change for event in world.events if isinstance(event, ParamChanged)]
+    assert [change.name for change in changes] == ["A", "B"]
+    assert all(isinstance(change, Change) and change.old is None for change in changes)
+
+
+TABLES: list[Table] = [SMALL, {"ONLY": 1.5}]
+
+
+@pytest.mark.parametrize("table", TABLES)
+@pytest.mark.parametrize("loss", [0.0, 0.3])
+@pytest.mark.parametrize("seed", range(5))
+def test_small_tables_on_bad_links(table: Table, loss: float, seed: int) -> None:
+    vehicle = PX4Vehicle(table=table)
+    air = Air.symmetric([vehicle], loss=loss, delay=0.05, jitter=0.05, duplicate=0.1, reorder=0.1, seed=seed)
+    world = Simulation(air=air)
+    result = world.fetch()
+    assert result.complete
+    assert values_of(result) == vehicle.values
+    assert result.hash in (None, vehicle.announced_hash())
+
+
+# the file or the list
+
+
+def test_an_ardupilot_may_first_say_whether_it_serves_the_file() -> None:
+    world = Simulation(air=Air.symmetric([ArduPilotVehicle(live=())], delay=0.05))
+    world.until(lambda: (1, 1) in world.station.components)
+    assert not world.machine.who.settled
+    result = world.outcome(world.machine.begin_fetch(world.now))
+    assert result.source == "ftp"
+    assert not world.sent_of(ParamRequestList)
+
+
+def test_one_that_does_not_say_who_it_is_is_asked_for_its_file() -> None:
+    world = Simulation(air=Air.symmetric([ArduPilotVehicle(live=())], delay=0.05))
+    world.until(lambda: (1, 1) in world.station.components)
+    world.machine.who.version = lambda message, now: False  # type: ignore[method-assign]  # as if it was lost
+    result = world.outcome(world.machine.begin_fetch(world.now))
+    assert result.source == "ftp"
+    assert result.elapsed < 0.65

@@ -1,0 +1,450 @@
+"""Downloads that were not brought to their end, and what the next one makes of what is there."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from paramclient import Param, ParamCache, ParamClient, Trust
+from paramclient.errors import NoReply
+from paramclient.protocol.params.fetch_result import FetchResult
+from paramclient.protocol.wire import ParamRequestList, ParamRequestRead
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, Vehicle
+from tests.caches import start
+from tests.shell import bits, swiftly
+from tests.simulation import Simulation, listed, listing_ardupilot
+
+SIZE = 200
+TABLE = {f"P{number:03d}": number for number in range(SIZE)}
+MAKES: dict[str, Callable[[], PX4Vehicle | ArduPilotVehicle]] = {
+    "PX4": lambda: PX4Vehicle(table=TABLE, burst=1, period=0.01),
+    "ArduPilot": lambda: ArduPilotVehicle(ftp=False, table=TABLE, burst=1, period=0.01),
+}
+both = pytest.mark.parametrize("kind", MAKES)
+
+
+def cancelled(vehicle: Vehicle, received: int = SIZE // 2, *, delay: float = 0.01) -> Simulation:
+    """A session whose fetch was cancelled when so much had come; the vehicle has stopped its list."""
+    world = Simulation(air=Air.symmetric([vehicle], delay=delay))
+    machine = world.meet()
+    fetch = machine.begin_fetch(world.now)
+    world.until(lambda: len(machine.table.params) >= received)
+    machine.end_fetch(fetch, world.now)
+    vehicle._position = None
+    world.run(5.0)
+    world.sent.clear()
+    return world
+
+
+def next_session(world: Simulation) -> None:
+    """A new session that starts from what a cache has kept."""
+    memory = world.memory()
+    world.next_session()
+    world.meet().use_cached(now=world.now, **memory)
+    world.run(2.0)
+    world.sent.clear()
+
+
+def requests(world: Simulation) -> tuple[int, int]:
+    """Lists and reads by index that were sent."""
+    reads = [message for message in world.sent_of(ParamRequestRead) if message.param_index >= 0]
+    return len(world.sent_of(ParamRequestList)), len(reads)
+
+
+def is_right(result: FetchResult, vehicle: Vehicle) -> bool:
+    return result.complete and {name: p.value for name, p in result.params.items()} == vehicle.values
+
+
+# in the same session
+
+
+@both
+def test_the_next_fetch_goes_on_with_what_is_there(kind: str) -> None:
+    vehicle = MAKES[kind]()
+    world = cancelled(vehicle, 180)
+    there = len(world.machine.table.params)
+    fetch = world.machine.begin_fetch(world.now)
+    world.run(0.03)
+    assert fetch.progress(world.now).received >= there
+    result = world.outcome(fetch)
+    assert is_right(result, vehicle)
+    assert (result.source, result.resumed) == ("stream", there)
+    assert requests(world) == (0, SIZE - there + 1)
+    assert world.machine.sync.synced
+    assert world.machine.table.complete
+    assert result.notes == ()
+    assert (result.hash is not None) == (kind == "PX4")
+
+
+def test_with_little_there_the_list_is_measured_to_be_faster() -> None:
+    vehicle = ArduPilotVehicle(ftp=False, table=TABLE, burst=10, period=0.005)
+    world = cancelled(vehicle, 40)
+    there = len(world.machine.table.params)
+    result = world.fetch()
+    assert is_right(result, vehicle)
+    assert result.resumed == there
+    assert requests(world)[0] == 1
+    assert requests(world)[1] < 20
+
+
+@both
+def test_a_list_that_still_runs_brings_the_rest(kind: str) -> None:
+    vehicle = MAKES[kind]()
+    world = Simulation(air=Air.symmetric([vehicle], delay=0.01))
+    machine = world.meet()
+    fetch = machine.begin_fetch(world.now)
+    world.until(lambda: len(machine.table.params) >= SIZE // 4)
+    machine.end_fetch(fetch, world.now)
+    world.sent.clear()
+    assert is_right(world.fetch(), vehicle)
+    assert requests(world) == (0, 0)
+
+
+@both
+@pytest.mark.parametrize("left", range(0, 12, 3))
+def test_a_fetch_right_after_one_that_was_cancelled_near_its_end(kind: str, left: int) -> None:
+    vehicle = MAKES[kind]()
+    world = Simulation(vehicle)
+    machine = world.meet()
+    fetch = machine.begin_fetch(world.now)
+    world.until(lambda: len(machine.table.params) >= SIZE - 10)
+    machine.end_fetch(fetch, world.now)
+    world.run(left * 0.01)
+    assert is_right(world.fetch(), vehicle)
+
+
+def test_a_list_that_was_expected_and_has_broken_off_is_not_the_vehicles_end() -> None:
+    vehicle = MAKES["ArduPilot"]()
+    world = Simulation(vehicle)
+    machine = world.meet()
+    fetch = machine.begin_fetch(world.now)
+    world.until(lambda: len(machine.table.params) >= 150)
+    machine.end_fetch(fetch, world.now)
+    vehicle._position = None
+    result = world.fetch()
+    assert is_right(result, vehicle)
+
+
+@both
+def test_what_came_after_all_needs_only_to_be_asked_whether_it_is_still_so(kind: str) -> None:
+    vehicle = MAKES[kind]()
+    world = Simulation(vehicle)
+    machine = world.meet()
+    machine.end_fetch(machine.begin_fetch(world.now), world.now)
+    world.run(10.0)
+    world.sent.clear()
+    result = world.fetch()
+    assert is_right(result, vehicle)
+    assert result.resumed == SIZE
+    assert requests(world) == (0, 1)
+
+
+def test_a_refresh_does_not_go_on_with_anything() -> None:
+    world = cancelled(MAKES["PX4"]())
+    result = world.fetch(refresh=True)
+    assert result.complete
+    assert result.resumed == 0
+    assert requests(world) == (1, 0)
+
+
+def test_a_refresh_that_joins_begins_anew() -> None:
+    world = cancelled(MAKES["ArduPilot"](), 180)
+    fetch = world.machine.begin_fetch(world.now)
+    assert world.machine.begin_fetch(world.now, refresh=True) is fetch
+    result = world.outcome(fetch)
+    assert result.complete
+    assert result.resumed == 0
+    assert requests(world)[0] >= 1
+
+
+@both
+def test_what_is_dead_is_named_as_ever(kind: str) -> None:
+    vehicle = MAKES[kind]()
+    world = cancelled(vehicle, 180)
+    serve = vehicle._by_index
+    vehicle._by_index = lambda index: None if index == 190 else serve(index)  # type: ignore[method-assign]  # a fault that no option has
+    result = world.fetch()
+    assert result.missing == (190,)
+    assert not world.machine.table.complete
+    assert not world.machine.sync.synced
+
+
+@both
+def test_a_vehicle_that_is_gone_gives_no_reply_though_nothing_is_missing(kind: str) -> None:
+    vehicle = MAKES[kind]()
+    world = Simulation(vehicle)
+    machine = world.meet()
+    machine.end_fetch(machine.begin_fetch(world.now), world.now)
+    world.run(10.0)
+    world.air.uplink._loss = 1.0
+    with pytest.raises(NoReply):
+        world.fetch(limit=300.0)
+    assert not machine.sync.synced
+
+
+def test_when_the_count_has_moved_nothing_is_gone_on_with() -> None:
+    vehicle = ArduPilotVehicle(
+        ftp=False, table=TABLE, groups={"P001": {"GROUP_A": 1, "GROUP_B": 2}}, burst=1, period=0.01
+    )
+    vehicle.set_param("P001", 0)
+    world = cancelled(vehicle, 180)
+    vehicle.set_param("P001", 1)
+    vehicle.tick(world.now)
+    vehicle.data_to_send()  # of which nothing is heard
+    result = world.fetch()
+    assert is_right(result, vehicle)
+    assert result.resumed == 0
+    assert requests(world)[0] == 1
+    assert result.count == SIZE + 2
+
+
+def test_when_a_moved_count_was_heard_indices_of_before_are_worth_nothing() -> None:
+    vehicle = ArduPilotVehicle(
+        ftp=False, table=TABLE, groups={"P001": {"GROUP_A": 1, "GROUP_B": 2}}, burst=1, period=0.01
+    )
+    world = cancelled(vehicle, 180)
+    assert world.set("P001", 0).actual == 0
+    table = world.machine.table
+    assert (table.count, listed(table)) == (SIZE, [])
+    assert table.is_displaced
+    result = world.fetch()
+    assert is_right(result, vehicle)
+    assert result.resumed == 0
+    assert not world.machine.table.displaced
+    assert not {"GROUP_A", "GROUP_B"} & table.params.keys(), "what the vehicle no longer has has gone"
+
+
+def test_other_names_under_the_same_count_make_it_worthless() -> None:
+    vehicle = ArduPilotVehicle(ftp=False, table=TABLE, burst=1, period=0.01)
+    world = cancelled(vehicle, 180)
+    names = dict(TABLE)
+    del names["P010"]
+    other = ArduPilotVehicle(ftp=False, table={**names, "Q": 1}, burst=1, period=0.01)
+    memory = world.memory()
+    world = Simulation(other)
+    world.meet().use_cached(now=world.now, **memory)
+    result = world.fetch()
+    assert is_right(result, other)
+    assert result.resumed == 0
+
+
+# in the next session
+
+
+def test_with_a_hash_the_whole_is_proven_and_counts_as_verified() -> None:
+    table = {**TABLE, "COM_FLIGHT_UUID": 7}
+    vehicle = PX4Vehicle(table=table, burst=1, period=0.01)
+    vehicle._entry("COM_FLIGHT_UUID").volatile = True
+    world = cancelled(vehicle, 150)
+    vehicle.set_param("COM_FLIGHT_UUID", 8)
+    world.run(1.0)
+    next_session(world)
+    there = len(world.machine.table.params)
+    result = world.fetch()
+    assert result.complete
+    assert result.hash == vehicle.announced_hash()
+    assert result.resumed == there
+    assert requests(world) == (0, SIZE + 1 - there + 1)
+    assert world.machine.sync.synced
+    world.run(1.0)
+    trusts = {name: param.trust for name, param in world.machine.table.params.items()}
+    assert trusts["COM_FLIGHT_UUID"] is Trust.LIVE, "no hash covers it, so it was read afresh"
+    assert trusts["P000"] is Trust.VERIFIED
+    assert Trust.CACHED not in trusts.values()
+    assert world.machine.table.params["COM_FLIGHT_UUID"].value == 8
+
+
+def test_what_changed_since_leads_to_the_list() -> None:
+    vehicle = MAKES["PX4"]()
+    world = cancelled(vehicle, 150)
+    memory = world.memory()
+    vehicle.set_param("P003", 1234)
+    world.run(1.0)
+    world.next_session()
+    world.meet().use_cached(now=world.now, **memory)
+    result = world.fetch()
+    assert is_right(result, vehicle)
+    assert result.resumed == 0
+    assert requests(world)[0] == 1
+    assert any("could not be confirmed" in note for note in result.notes)
+    assert isinstance(vehicle, PX4Vehicle)
+    assert result.hash == vehicle.announced_hash()
+    assert {param.trust for param in result.params.values()} == {Trust.LIVE}
+
+
+def test_without_a_hash_earlier_values_stay_what_they_are() -> None:
+    vehicle = MAKES["ArduPilot"]()
+    world = cancelled(vehicle, 180)
+    next_session(world)
+    there = len(world.machine.table.params)
+    result = world.fetch()
+    assert result.complete
+    assert result.resumed == there
+    assert not result.is_confirmed
+    assert any(f"{there - 1} values are those of an earlier session" in note for note in result.notes)
+    assert requests(world) == (0, SIZE - there + 1)
+    assert not world.machine.sync.synced
+    assert world.machine.state == "cached"
+    assert sum(param.trust is Trust.CACHED for param in result.params.values()) == there - 1, (
+        "one was asked for"
+    )
+    again = world.fetch(refresh=True)
+    assert again.is_confirmed
+    assert world.machine.sync.synced
+
+
+@both
+def test_half_of_a_table_is_the_least_that_is_gone_on_with(kind: str) -> None:
+    vehicle = MAKES[kind]()
+    world = cancelled(vehicle, 90)
+    next_session(world)
+    result = world.fetch()
+    assert is_right(result, vehicle)
+    assert result.resumed == 0
+    assert requests(world)[0] == 1
+
+
+@both
+def test_another_count_by_now_leads_to_a_fresh_list(kind: str) -> None:
+    vehicle = MAKES[kind]()
+    world = cancelled(vehicle, 180)
+    memory = world.memory()
+    grown = {**TABLE, "AAA": 1}
+    grown_vehicle = (
+        PX4Vehicle(table=grown, burst=1, period=0.01)
+        if kind == "PX4"
+        else ArduPilotVehicle(ftp=False, table=grown, burst=1, period=0.01)
+    )
+    world = Simulation(grown_vehicle)
+    world.meet().use_cached(now=world.now, **memory)
+    result = world.fetch()
+    assert is_right(result, grown_vehicle)
+    assert result.resumed == 0
+    assert {param.trust for param in result.params.values()} == {Trust.LIVE}
+
+
+# from the cache on disk
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    return tmp_path / "cache.sqlite3"
+
+
+def on_disk(path: Path) -> Mapping[str, Param]:
+    """What another process has written. Its table in memory may be ahead, by much on a busy machine."""
+    with ParamCache(path) as cache:
+        return cache.component().params
+
+
+KILLED_SESSION = """
+import anyio, sys
+from paramclient import ParamClient
+from paramclient import sim
+
+async def main():
+    vehicle = sim.{made}
+    async with ParamClient(vehicle, cache=sys.argv[1]) as client:
+        component = await client.component()
+        changes = component.changes()
+        async with anyio.create_task_group() as tasks:
+            tasks.start_soon(component.fetch_all)
+            async for _ in changes:
+                print(len(component.params), flush=True)
+
+anyio.run(main)
+"""
+
+
+@pytest.mark.parametrize(
+    ("make", "made", "after"),
+    [
+        (PX4Vehicle, "PX4Vehicle(burst=1, period=0.004)", 520),
+        (listing_ardupilot, "ArduPilotVehicle(ftp=False, burst=1, period=0.004)", 1250),
+    ],
+)
+def test_after_a_killed_process_only_what_is_missing_is_fetched(
+    path: Path, make: Callable[..., Vehicle], made: str, after: int
+) -> None:
+    process = start(KILLED_SESSION.format(made=made), path)
+    assert process.stdout is not None
+    vehicle = make()
+    for line in process.stdout:
+        if int(line) >= after and len(on_disk(path)) > len(vehicle.params) / 2:
+            break
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate()
+    there = len(on_disk(path))
+
+    @swiftly
+    async def next_session() -> None:
+        async with ParamClient(vehicle, cache=path) as client:
+            component = await client.component()
+            result = await component.fetch_all()
+            assert result.complete
+            assert result.resumed == there
+            count = len(vehicle.params)
+            assert vehicle.requests["PARAM_REQUEST_LIST"] == 0
+            assert vehicle.requests["PARAM_REQUEST_READ"] < 1.5 * (count - there), "some are asked for twice"
+            assert bits(result.params) == bits(vehicle.params)
+            assert (result.hash == vehicle.announced_hash()) if isinstance(vehicle, PX4Vehicle) else True
+        with ParamCache(path) as cache:
+            kept = cache.component()
+            assert kept.complete
+            assert (kept.synced_at is not None) == isinstance(vehicle, PX4Vehicle)
+
+    next_session()
+
+
+async def left_unfinished(vehicle: Vehicle, path: Path) -> None:
+    """A session that ends in the middle of its download."""
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        assert not (await component.fetch_all(timeout=1.7)).complete
+
+
+async def fetched(vehicle: Vehicle, path: Path) -> FetchResult:
+    async with ParamClient(vehicle, cache=path) as client:
+        component = await client.component()
+        return await component.fetch_all()
+
+
+@swiftly
+async def test_another_firmware_does_not_go_on_with_the_old_ones_table(path: Path) -> None:
+    old = MAKES["ArduPilot"]()
+    await left_unfinished(old, path)
+    new = MAKES["ArduPilot"]()
+    new._version = replace(new._version, flight_sw_version=new._version.flight_sw_version + 1)
+    await left_unfinished(new, path)
+    again = MAKES["ArduPilot"]()
+    again._version = new._version
+    result = await fetched(again, path)
+    assert result.complete
+    same = MAKES["ArduPilot"]()
+    same._version = new._version
+    with ParamCache(path) as cache:
+        assert cache.component().identity.firmware == new._version.flight_sw_version
+
+
+@swiftly
+async def test_a_download_begun_under_another_count_is_no_mixture(path: Path) -> None:
+    """The first table is whole, the download of a grown one breaks off: old indices count for nothing."""
+    await fetched(MAKES["ArduPilot"](), path)
+    grown_table = {"AAA": 1, **TABLE}
+    grown = ArduPilotVehicle(ftp=False, table=grown_table, burst=1, period=0.01)
+    await left_unfinished(grown, path)
+    with ParamCache(path) as cache:
+        kept = cache.component()
+        assert not kept.complete
+        assert kept.count is None, "some indices are of before"
+    again = ArduPilotVehicle(ftp=False, table=grown_table, burst=1, period=0.01)
+    result = await fetched(again, path)
+    assert is_right(result, again)
+    assert result.resumed == 0
+    with ParamCache(path) as cache:
+        assert cache.component().count == SIZE + 1

@@ -1,0 +1,1101 @@
+"""Staying in step with a vehicle, losing it and finding it again: whole sessions in simulated time."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from itertools import pairwise
+
+import pytest
+
+from paramclient.errors import CacheError, NoReply, UsageError
+from paramclient.model.values import ParamType, Trust
+from paramclient.protocol import wire
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import (
+    ComponentFound,
+    ComponentLost,
+    ComponentRebooted,
+    Event,
+    Fetched,
+    ParamChanged,
+    TableResynced,
+)
+from paramclient.protocol.params.fetch import MOST_RESTARTS
+from paramclient.protocol.params.fetch_result import Policy
+from paramclient.protocol.params.reads import Read
+from paramclient.protocol.params.sync import GAPS_INTERVAL, WATCH_INTERVAL, SyncState, Upkeep
+from paramclient.protocol.params.sync_interval import RESERVE_SHARE
+from paramclient.protocol.params.writes import Write
+from paramclient.protocol.station import Station
+from paramclient.protocol.vehicle.presence import LOST_AFTER
+from paramclient.protocol.wire import (
+    HASH_CHECK,
+    CommandLong,
+    FileTransfer,
+    ParamRequestList,
+    ParamRequestRead,
+    ParamSet,
+)
+from paramclient.sim import Air, ArduPilotVehicle, Endpoint, GenericVehicle, PX4Vehicle, SimParam
+from tests.shell import Tap
+from tests.simulation import Memory, Simulation, is_so, listed
+
+INTERVAL = 30.0
+DUE = INTERVAL * (1.0 - RESERVE_SHARE)
+"""Seconds from one check to the next, less what the last ones took."""
+NAMES = [f"P{number:02d}" for number in range(40)]
+TABLE = [
+    *(SimParam(name, ParamType.INT32, number) for number, name in enumerate(NAMES)),
+    SimParam("CAL_MAG0_XOFF", ParamType.INT32, 7, volatile=True),
+    SimParam("COM_FLIGHT_UUID", ParamType.INT32, 7, volatile=True),
+]
+VOLATILE = 2
+PLAIN = {name: number for number, name in enumerate(NAMES)}
+
+
+class World(Simulation):
+    """A simulation whose station keeps its tables up, with one tapped vehicle after the other."""
+
+    def __init__(self, *vehicles: Endpoint, air: Air | None = None, upkeep: Upkeep | None = None) -> None:
+        self.taps = [Tap(vehicle) for vehicle in vehicles]
+        self.upkeep = Upkeep(INTERVAL) if upkeep is None else upkeep
+        super().__init__(*self.taps, air=air, station=self.a_station())
+
+    def a_station(self) -> Station:
+        return Station(link="sim:test", is_stream=False, upkeep=self.upkeep)
+
+    @property
+    def tap(self) -> Tap:
+        return self.taps[0]
+
+    def away(self, seconds: float) -> None:
+        """The vehicle is out of reach for a while, both ways."""
+        self.tap.is_mute = self.tap.is_deaf = True
+        self.run(seconds)
+        self.tap.is_mute = self.tap.is_deaf = False
+
+    def unheard(self, vehicle: PX4Vehicle | ArduPilotVehicle, **values: int) -> None:
+        """Values change on board, and what the vehicle tells of it is lost on the air."""
+        self.tap.is_mute = True
+        for name, value in values.items():
+            vehicle.set_param(name, value)
+        self.run(0.2)
+        self.tap.is_mute = False
+
+    def told(self, *kinds: type) -> list[Event]:
+        return [event for event in self.events if isinstance(event, kinds)]
+
+    def hashes(self, since: float = 0.0) -> list[float]:
+        """When the hash was asked for."""
+        return [
+            now
+            for now, message in self.sent
+            if now >= since and isinstance(message, ParamRequestRead) and message.param_id == HASH_CHECK
+        ]
+
+    def requests(self) -> int:
+        """Everything sent that has to do with parameters."""
+        return sum(len(self.sent_of(kind)) for kind in (ParamRequestRead, ParamRequestList, ParamSet))
+
+
+def fetched(
+    make: Callable[..., PX4Vehicle] = PX4Vehicle, *, upkeep: Upkeep | None = None, **options: object
+) -> tuple[World, PX4Vehicle]:
+    """A vehicle whose table was just fetched."""
+    vehicle = make(table=TABLE, **options)
+    world = World(vehicle, upkeep=upkeep)
+    assert world.fetch().complete
+    assert state(world) is SyncState.SYNCED
+    world.run(1.0)
+    world.events.clear()
+    world.sent.clear()
+    return world, vehicle
+
+
+def state(world: World) -> SyncState:
+    return world.machine.sync_state
+
+
+def resynced(world: World) -> list[tuple[str, ...]]:
+    return [event.changed for event in world.events if isinstance(event, TableResynced)]
+
+
+def trusts(machine: ComponentMachine) -> set[Trust]:
+    return {param.trust for param in machine.table.params.values()}
+
+
+# the watch
+
+
+def test_an_update_that_was_lost_is_found_within_one_interval() -> None:
+    world, vehicle = fetched()
+    world.unheard(vehicle, P07=700, P09=900)
+    assert world.machine.table.params["P07"].value == 7
+    assert state(world) is SyncState.SYNCED, "nobody can know yet"
+    world.run(INTERVAL)
+    assert world.machine.table.params["P07"].value == 700
+    assert resynced(world) == [("P07", "P09")]
+    (event,) = world.told(TableResynced)
+    assert isinstance(event, TableResynced)
+    assert event.hash == vehicle.announced_hash() == world.machine.table.hash
+    changes = [event.change.name for event in world.events if isinstance(event, ParamChanged)]
+    assert changes == ["P07", "P09"], "and nothing else"
+    assert state(world) is SyncState.SYNCED
+    assert trusts(world.machine) == {Trust.LIVE}
+
+
+def test_what_moved_is_told_before_it_is_said_that_all_agrees() -> None:
+    world, vehicle = fetched()
+    world.unheard(vehicle, P07=700)
+    states: list[SyncState] = []
+    world.until(lambda: states.append(world.machine.sync_state) or bool(resynced(world)))  # type: ignore[func-returns-value]  # collects on the way
+    assert dict.fromkeys(states) == dict.fromkeys([SyncState.SYNCED, SyncState.RESYNCING, SyncState.SYNCED])
+    assert [type(event) for event in world.events] == [ParamChanged, TableResynced, Fetched]
+
+
+def test_as_long_as_nothing_moves_an_interval_costs_one_question_and_the_volatile_values() -> None:
+    world, _ = fetched()
+    last = world.machine.fetches.last
+    assert last is not None
+    world.run(10 * INTERVAL)
+    times = world.hashes()
+    assert len(times) == 10
+    assert world.requests() == 10 * (1 + VOLATILE)
+    apart = [after - before for before, after in pairwise(times)]
+    assert apart == pytest.approx([DUE - last.elapsed] * 9), "a fetch would end within the interval"
+    assert world.events == []
+
+
+def test_without_a_watch_nothing_is_asked() -> None:
+    world, vehicle = fetched(upkeep=Upkeep())
+    world.unheard(vehicle, P07=700)
+    world.away(4.0)
+    world.run(500.0)
+    assert world.requests() == 0
+    assert state(world) is SyncState.SYNCED, "no sign has come"
+
+
+def test_a_table_that_was_never_fetched_is_not_kept_up() -> None:
+    world = World(PX4Vehicle(table=TABLE))
+    world.get("P07")
+    world.away(3.0)
+    world.run(200.0)
+    assert world.hashes() == []
+    assert state(world) is SyncState.UNSYNCED
+
+
+def test_nothing_is_asked_while_the_link_is_busy() -> None:
+    world = World(PX4Vehicle(table=TABLE), GenericVehicle(table=PLAIN, system=2))
+    world.fetch()
+    fetched_at = world.now  # the fetch itself asks for the hash beside the list
+    other = world.station.components[2, 1]
+    world.run(DUE - 1.0)
+    world.taps[1].is_deaf = True
+    fetch = other.begin_fetch(world.now)
+    assert world.hashes(fetched_at) == []
+    world.until(lambda: fetch.done, 200.0)
+    assert world.now > INTERVAL + 5.0
+    assert world.hashes(fetched_at) == [], "although it was due long ago"
+    world.run(0.2)
+    assert len(world.hashes(fetched_at)) == 1
+
+
+def test_nothing_is_asked_in_high_latency_mode() -> None:
+    world, vehicle = fetched()
+    vehicle.high_latency = True
+    world.run(10 * INTERVAL)
+    assert state(world) is SyncState.SYNCED, "nor is it lost"
+    assert world.requests() == 0
+    assert not world.sent_of(CommandLong)
+    vehicle.high_latency = False
+    world.run(INTERVAL + 1.0)
+    assert len(world.hashes()) >= 1
+
+
+def test_nothing_is_asked_in_low_bandwidth_mode() -> None:
+    world, vehicle = fetched(burst=1, period=0.125)
+    world.unheard(vehicle, P07=700)
+    world.away(4.0)
+    world.run(10 * INTERVAL)
+    assert world.requests() == 0
+
+
+def test_a_radio_of_57600_baud_is_no_low_bandwidth_mode() -> None:
+    world, _ = fetched(burst=1, period=0.025)
+    world.run(INTERVAL + 1.0)
+    assert world.requests() == 1 + VOLATILE
+
+
+@pytest.mark.parametrize("upkeep", [Upkeep(INTERVAL), Upkeep(INTERVAL, without_hash=True)])
+def test_a_vehicle_without_a_hash(upkeep: Upkeep) -> None:
+    vehicle = ArduPilotVehicle(ftp=False, table=PLAIN)
+    world = World(vehicle, upkeep=upkeep)
+    world.fetch()
+    world.run(1.0)
+    world.sent.clear()
+    world.events.clear()
+    world.run(2 * INTERVAL)
+    lists = len(world.sent_of(ParamRequestList))
+    assert world.requests() == lists, "no hash, no reads"
+    if not upkeep.without_hash:
+        assert lists == 0
+        return
+    assert lists == 2
+    assert resynced(world) == [], "nothing had moved"
+    assert state(world) is SyncState.SYNCED
+    world.unheard(vehicle, P07=700)
+    world.run(INTERVAL)
+    assert resynced(world) == [("P07",)]
+    assert world.machine.table.params["P07"].value == 700
+
+
+def test_gaps_bring_about_no_lists() -> None:
+    world = World(ArduPilotVehicle(ftp=False, table=PLAIN), upkeep=Upkeep(INTERVAL, without_hash=True))
+    world.fetch()
+    world.sent.clear()
+    for _ in range(5):
+        world.away(3.0)
+        world.run(2.0)
+    assert world.requests() == 0
+    world.run(INTERVAL)
+    assert len(world.sent_of(ParamRequestList)) == 1
+
+
+def test_a_standard_vehicle_counts_as_one_without_a_hash() -> None:
+    world = World(GenericVehicle(table=PLAIN))
+    world.fetch()
+    world.sent.clear()
+    world.run(5 * INTERVAL)
+    assert world.requests() == 0
+
+
+def test_a_resync_that_fails_is_tried_again() -> None:
+    vehicle = PX4Vehicle(table=TABLE)
+    tap = Tap(vehicle)
+    world = World(air=Air.symmetric([tap], delay=0.1))
+    world.fetch()
+    tap.is_mute = True
+    vehicle.set_param("P07", 700)
+    world.run(0.2)
+    tap.is_mute = False
+    world.until(lambda: world.machine.fetch is not None)
+    tap.is_deaf = True
+    world.until(lambda: world.machine.fetch is None)
+    assert resynced(world) == []
+    assert state(world) is SyncState.UNSYNCED
+    tap.is_deaf = False
+    world.run(INTERVAL + 1.0)
+    assert resynced(world) == [("P07",)]
+
+
+def test_of_one_that_was_lost_during_its_fetch_nothing_is_asked() -> None:
+    world = World(ArduPilotVehicle(ftp=False, table=PLAIN), upkeep=Upkeep(INTERVAL, without_hash=True))
+    world.fetch()
+    fetch = world.machine.begin_fetch(world.now, refresh=True)
+    world.until(lambda: fetch.progress(world.now).received > 0)
+    world.tap.is_mute = True
+    assert world.outcome(fetch).missing
+    assert state(world) is SyncState.LOST
+    world.sent.clear()
+    world.run(3 * INTERVAL)
+    assert world.requests() == 0
+
+
+def test_a_table_that_came_as_a_file_is_kept_up_by_its_hash_alone() -> None:
+    unknown = [SimParam(row.name, row.type, row.value, volatile=row.name in NAMES[::9]) for row in TABLE]
+    vehicle = PX4Vehicle(ftp=True, table=unknown)
+    world = World(air=Air.symmetric([vehicle], delay=0.05), upkeep=Upkeep(INTERVAL))
+    result = world.fetch()
+    assert result.source == "ftp"
+    assert result.hash == vehicle.announced_hash(), "it was the same before and after"
+    world.run(1.0)
+    world.sent.clear()
+    world.run(3 * INTERVAL)
+    assert len(world.hashes()) == 3
+    assert world.sent_of(ParamRequestList) == []
+    assert world.sent_of(FileTransfer) == []
+
+
+def test_a_missing_value_of_our_own_set_is_settled_by_a_read() -> None:
+    world, vehicle = fetched()
+    world.tap.is_mute = True
+    write = world.machine.write("P07", 700, world.now)
+    world.run(0.05)
+    world.tap.is_mute = False
+    assert world.outcome(write).actual == 700
+    world.run(1.0)
+    assert world.machine.table.hash == vehicle.announced_hash()
+    assert state(world) is SyncState.SYNCED
+
+
+def test_another_count_leads_to_a_check_at_once() -> None:
+    world, vehicle = fetched(not_in_use=["P30"])
+    vehicle.use("P30")
+    vehicle.set_param("P07", 700)
+    world.run(1.0)
+    assert world.machine.table.params["P30"].index == 32
+    assert resynced(world) == [("P07", "P30")] or resynced(world) == [("P30",)]
+    assert state(world) is SyncState.SYNCED
+
+
+# gaps
+
+
+def test_after_a_gap_in_the_heartbeats_it_is_asked() -> None:
+    world, vehicle = fetched()
+    vehicle.set_param("P07", 700)
+    world.away(3.0)
+    assert world.hashes() == []
+    world.run(1.5)
+    assert len(world.hashes()) == 1
+    assert resynced(world) == [("P07",)]
+    assert world.told(ComponentLost) == []
+
+
+def test_a_gap_counts_whatever_is_heard_first_after_it() -> None:
+    world, _ = fetched()
+    world.away(3.5)
+    world.station.receive(
+        wire.encode(wire.SystemTime(0, int(1000 * world.now)), system=1, component=1, sequence=0),
+        "the only peer",
+        world.now,
+    )
+    world.run(2.0)
+    assert len(world.hashes()) == 1
+
+
+def test_what_a_heartbeat_leaves_between_two_of_them_is_no_gap() -> None:
+    world, _ = fetched()
+    world.away(1.9)
+    world.run(1.0)
+    assert world.hashes() == []
+
+
+def checks(world: World) -> list[float]:
+    """When it begins to ask for the hash, from now on; not how often it asks then."""
+    sync, times = world.machine.sync, list[float]()
+    ask = sync.ask
+
+    def noted(now: float) -> None:
+        times.append(now)
+        ask(now)
+
+    sync.ask = noted  # type: ignore[method-assign]  # listens in
+    return times
+
+
+def test_gaps_are_many_on_a_bad_link_and_checks_are_not() -> None:
+    vehicle = PX4Vehicle(table=TABLE)
+    world = World(air=Air.symmetric([vehicle], loss=0.4, seed=3))
+    world.fetch()
+    times = checks(world)
+    world.run(1800.0)
+    apart = [after - before for before, after in pairwise(times)]
+    assert len(times) > 1800.0 / INTERVAL, "there were gaps"
+    assert min(apart) > GAPS_INTERVAL - 1e-6
+    assert max(apart) <= INTERVAL + 5.0
+    assert state(world) is SyncState.SYNCED
+    assert len(world.told(TableResynced)) == len(world.told(ComponentLost))
+
+
+def test_gaps_lead_to_one_check_in_five_seconds() -> None:
+    world, _ = fetched()
+    times = checks(world)
+    for _ in range(20):
+        world.away(2.6)
+        world.run(1.9)
+    assert len(times) >= 15
+    assert min(after - before for before, after in pairwise(times)) > GAPS_INTERVAL - 1e-6
+
+
+class Rare(Tap):
+    """Lets only every tenth heartbeat through, and no SYSTEM_TIME."""
+
+    def data_to_send(self) -> list[bytes]:
+        data = super().data_to_send()
+        kept = []
+        for each in data:
+            (frame,) = wire.Framer(stream=False).receive(each)
+            if frame.message_id == 0:
+                self.beats = getattr(self, "beats", -1) + 1
+            if frame.message_id not in (0, 2) or (frame.message_id == 0 and self.beats % 10 == 0):
+                kept.append(each)
+        return kept
+
+
+def test_one_that_beats_every_ten_seconds_is_not_flapping() -> None:
+    world = World(air=Air([Rare(PX4Vehicle(table=TABLE))]))
+    world.run(0.5)
+    world.fetch()
+    world.run(300.0)
+    assert len(world.told(ComponentLost)) <= 1, "before it was known how rarely it beats"
+    assert len(world.hashes()) <= 300.0 / DUE + 2, "and what lies between its heartbeats is no gap"
+
+
+class Heartless(Tap):
+    """Lets no sign of life through."""
+
+    def data_to_send(self) -> list[bytes]:
+        return [each for each in super().data_to_send() if each[7] not in (0, 2)]
+
+
+def test_one_that_never_sends_heartbeats_is_never_lost() -> None:
+    heartless = Heartless(GenericVehicle(table=PLAIN))
+    world = World(air=Air([heartless]))
+    world.station.receive(
+        wire.encode(wire.ParamValue("P00", bytes(4), 6, 40, 0), system=1, component=1, sequence=0),
+        "the only peer",
+        world.now,
+    )
+    world.run(60.0)
+    assert world.told(ComponentLost) == []
+    assert world.get("P07").value == 7
+    assert world.machine.state != "lost"
+
+
+def test_what_lies_between_the_answers_of_one_without_heartbeats_is_no_gap() -> None:
+    world = World(air=Air([Heartless(PX4Vehicle(table=TABLE))]))
+    world.station.receive(
+        wire.encode(wire.ParamValue("P00", bytes(4), 6, 42, 65535), system=1, component=1, sequence=0),
+        "the only peer",
+        world.now,
+    )
+    world.fetch()
+    assert state(world) is SyncState.SYNCED
+    world.sent.clear()
+    for _ in range(3):
+        world.run(7.0)
+        world.station.receive(
+            wire.encode(wire.ParamValue("P00", bytes(4), 6, 42, 0), system=1, component=1, sequence=0),
+            "the only peer",
+            world.now,
+        )
+    world.run(7.0)
+    assert world.requests() == 0, "that it says something after a while is no gap either"
+    world.run(9 * INTERVAL)
+    assert len(world.hashes()) <= 20, "each answer after a silence begs the question whose it is"
+    assert state(world) is SyncState.SYNCED
+
+
+def test_one_that_beats_rarely_is_found_again_in_high_latency_mode() -> None:
+    world = World(air=Air([]))
+
+    def hear(message: wire.Message, at: float) -> None:
+        world.run(at - world.now)
+        world.station.receive(
+            wire.encode(message, system=1, component=1, sequence=0), "the only peer", world.now
+        )
+        world.exchange()
+
+    for at in (0.0, 10.0):
+        hear(wire.Heartbeat(2, wire.MAV_AUTOPILOT_PX4), at)
+    hear(wire.HighLatency2(2, wire.MAV_AUTOPILOT_PX4), 20.0)
+    hear(wire.HighLatency2(2, wire.MAV_AUTOPILOT_PX4), 42.0)
+    machine = world.machine
+    assert world.told(ComponentLost, ComponentFound)[-2:] == [
+        ComponentLost(machine, 20.0),
+        ComponentFound(machine, 22.0),
+    ]
+
+
+# lost and found
+
+
+def test_after_five_seconds_without_a_word_it_is_lost() -> None:
+    world, _ = fetched()
+    machine = world.machine
+    last = machine.presence.heard_at
+    world.tap.is_mute = True
+    world.until(lambda: machine.presence.is_lost)
+    assert world.now == last + LOST_AFTER
+    (lost,) = world.told(ComponentLost)
+    assert lost == ComponentLost(machine, LOST_AFTER)
+    assert machine.state == "lost"
+    assert state(world) is SyncState.LOST
+    assert [param.value for param in listed(machine.table)][2:4] == [0, 1]
+    assert trusts(machine) == {Trust.CACHED}
+    world.run(100.0)
+    assert world.told(ComponentLost) == [lost], "once"
+    world.sent.clear()
+    world.run(100.0)
+    assert world.requests() == 0
+    assert not world.sent_of(CommandLong)
+
+
+def test_what_is_pending_ends_with_the_loss_and_what_is_new_at_once() -> None:
+    world, _ = fetched()
+    machine = world.machine
+    world.tap.is_mute = True
+    world.run(4.0)
+    read = machine.read("P01", world.now)
+    writes = [machine.write("P02", value, world.now) for value in (1, 2, 3)]
+    queued = machine.write("P03", 9, world.now)
+    world.until(lambda: machine.presence.is_lost)
+    operations: list[Read | Write] = [read, *writes, queued]
+    for operation in operations:
+        assert operation.done
+        assert isinstance(operation.error, NoReply)
+        assert "1/1" in str(operation.error)
+        assert "lost" in str(operation.error)
+        assert operation.error.attempts == operation.attempts
+    assert read.attempts > 1
+    assert [write.attempts > 0 for write in writes] == [True, False, False]
+    world.sent.clear()
+    for call in (
+        lambda: machine.read("P01", world.now),
+        lambda: machine.write("P02", 2, world.now),
+        lambda: machine.begin_fetch(world.now),
+    ):
+        error = world.error_of(call)
+        assert isinstance(error, NoReply)
+        assert "1/1" in str(error)
+        assert error.attempts == 0
+        assert error.waited == pytest.approx(LOST_AFTER)
+    world.run(60.0)
+    assert world.requests() == 0, "neither now nor because writes have ended"
+    assert len(machine.reads) == len(machine.writes) == 0
+
+
+def test_a_read_that_a_fetch_shares_with_a_caller_ends_for_the_caller_alone() -> None:
+    world, _ = fetched()
+    machine = world.machine
+    world.tap.is_deaf = True
+    fetch = machine.begin_fetch(world.now)
+    read = machine.read(HASH_CHECK, world.now)
+    world.tap.is_mute = True
+    world.until(lambda: machine.presence.is_lost)
+    assert isinstance(read.error, NoReply)
+    world.tap.is_deaf = world.tap.is_mute = False
+    assert world.outcome(fetch).complete
+
+
+def test_back_with_the_same_table() -> None:
+    world, vehicle = fetched()
+    machine = world.machine
+    world.away(9.0)
+    world.sent.clear()
+    began = world.now
+    world.until(lambda: not machine.presence.is_lost)
+    (found,) = world.told(ComponentFound)
+    assert isinstance(found, ComponentFound)
+    assert 9.0 <= found.silence <= 10.1
+    assert state(world) is SyncState.CHECKING
+    assert machine.state == "cached"
+    world.run(1.0)
+    assert world.now < began + 2.5
+    commands = [now for now, message in world.sent if isinstance(message, CommandLong)]
+    assert commands, "who it is"
+    assert commands[0] <= world.hashes()[0], "comes before what it has"
+    assert resynced(world) == [()]
+    assert state(world) is SyncState.SYNCED
+    volatile = vehicle.params.keys() - set(NAMES)
+    assert {machine.table.params[name].trust for name in NAMES} == {Trust.VERIFIED}
+    assert {machine.table.params[name].trust for name in volatile} == {Trust.LIVE}, "read afresh"
+    assert not world.sent_of(ParamRequestList)
+
+
+def test_back_with_another_table() -> None:
+    world, vehicle = fetched()
+    world.tap.is_mute = world.tap.is_deaf = True
+    vehicle.set_param("P07", 700)
+    world.away(9.0)
+    world.run(3.0)
+    assert resynced(world) == [("P07",)]
+    assert state(world) is SyncState.SYNCED
+    assert trusts(world.machine) == {Trust.LIVE}
+
+
+def test_back_with_another_count_is_made_good_too() -> None:
+    world, vehicle = fetched(not_in_use=["P30"])
+    world.tap.is_mute = world.tap.is_deaf = True
+    world.machine.receive(
+        wire.ParamValue("P00", bytes(4), ParamType.INT32, 44, 65535), world.now
+    )  # a count that is soon of the past
+    assert not world.machine.table.complete
+    world.away(60.0)
+    world.run(3.0)
+    assert state(world) is SyncState.SYNCED
+    assert vehicle.values.items() <= {n: p.value for n, p in world.machine.table.params.items()}.items()
+
+
+def test_a_table_that_is_not_whole_any_more_is_checked_after_a_reboot_too() -> None:
+    vehicle, other = PX4Vehicle(table=TABLE), GenericVehicle(table=PLAIN, system=2)
+    world = World(vehicle, other)
+    world.fetch()
+    fetched_at = world.now
+    world.run(3.0)
+    world.taps[1].is_deaf = True
+    world.station.components[2, 1].read("P01", world.now)  # the link is busy, so a check has to wait
+    world.machine.receive(wire.ParamValue("P00", bytes(4), ParamType.INT32, 44, 65535), world.now)
+    vehicle.reboot(world.now, down=1.5)
+    world.run(2.1)
+    assert len(world.told(ComponentRebooted)) == 1
+    assert world.hashes(fetched_at) == []
+    world.taps[1].is_deaf = False
+    world.run(3.0)
+    assert state(world) is SyncState.SYNCED
+
+
+def test_back_without_a_hash_its_values_are_cached_until_they_are_fetched() -> None:
+    vehicle = ArduPilotVehicle(ftp=False, table=PLAIN)
+    world = World(vehicle)
+    world.fetch()
+    world.away(9.0)
+    world.sent.clear()
+    world.run(60.0)
+    machine = world.machine
+    assert state(world) is SyncState.UNSYNCED
+    assert trusts(machine) == {Trust.CACHED}
+    assert world.requests() == 0
+    world.get("P07")
+    assert machine.table.params["P07"].trust is Trust.LIVE
+    world.events.clear()
+    world.fetch()
+    assert state(world) is SyncState.SYNCED
+    assert trusts(machine) == {Trust.LIVE}
+    assert resynced(world) == [()]
+
+
+def test_without_a_watch_it_is_checked_on_return_all_the_same() -> None:
+    world, _ = fetched(upkeep=Upkeep())
+    world.away(9.0)
+    world.run(2.0)
+    assert state(world) is SyncState.SYNCED
+    assert len(world.hashes()) == 1
+    world.run(500.0)
+    assert len(world.hashes()) == 1
+
+
+class Berth(Tap):
+    """An address that one vehicle takes after the other."""
+
+    def moor(self, vehicle: Endpoint) -> None:
+        self._endpoint = vehicle
+
+
+@pytest.mark.parametrize("is_alike", [True, False], ids=["same table", "another table"])
+def test_another_vehicle_has_taken_the_place(is_alike: bool) -> None:
+    berth = Berth(PX4Vehicle(table=TABLE, uid=1))
+    camera = Berth(GenericVehicle(table=PLAIN, component=100))
+    world = World(air=Air([berth, camera]))
+    world.fetch()
+    eye = world.station.components[1, 100]
+    fetch = eye.begin_fetch(world.now)
+    world.outcome(fetch)
+    eye.end_fetch(fetch, world.now)
+    world.run(1.0)
+    berth.is_mute = berth.is_deaf = camera.is_mute = camera.is_deaf = True
+    world.run(9.0)
+    world.events.clear()
+    rows = TABLE if is_alike else [SimParam("P07", ParamType.INT32, 1), SimParam("B", ParamType.INT32, 2)]
+    berth.moor(PX4Vehicle(table=rows, uid=2, boot_time=0.0))
+    camera.moor(GenericVehicle(table={"P07": 1}, component=100))
+    berth.is_mute = berth.is_deaf = camera.is_mute = camera.is_deaf = False
+    machine = world.machine
+    while not (machine.identity.uid or "").endswith("2"):
+        assert state(world) is not SyncState.SYNCED
+        assert trusts(machine) <= {Trust.CACHED}
+        world.now += 0.01
+        world.air.tick(world.now)
+        world.exchange()
+    world.run(60.0)
+    assert machine.table.params == {}
+    assert eye.table.params == {}
+    assert resynced(world) == []
+    assert state(world) is SyncState.UNSYNCED
+    result = world.fetch()
+    assert result.params.keys() == {row.name for row in rows}
+
+
+def test_a_hash_that_was_asked_for_before_the_loss_confirms_nothing_after_it() -> None:
+    berth = Berth(PX4Vehicle(table=TABLE, uid=1))
+    world = World(air=Air.symmetric([berth], delay=0.1))
+    world.fetch()
+    berth.is_mute = True
+    world.run(3.9)
+    world.machine.sync.ask(world.now)
+    world.run(1.2)
+    assert world.machine.presence.is_lost
+    berth.moor(PX4Vehicle(table=TABLE, uid=2))
+    berth.is_mute = False
+    world.events.clear()
+    world.run(3.0)
+    assert world.machine.identity.uid == "0000000000000002"
+    assert resynced(world) == [], "the other one has the same hash"
+
+
+def test_while_it_is_away_the_fetch_under_way_waits_for_it() -> None:
+    world, vehicle = fetched(burst=1, period=0.05)
+    fetch = world.machine.begin_fetch(world.now, refresh=True)
+    world.run(1.0)
+    assert not fetch.done
+    vehicle.reboot(world.now, down=8.0)
+    world.until(lambda: world.machine.presence.is_lost)
+    assert not fetch.done
+    vehicle.set_param("P07", 700)
+    result = world.outcome(fetch)
+    assert result.complete
+    assert result.params["P07"].value == 700
+    assert len(world.told(ComponentRebooted)) == 1
+    assert state(world) is SyncState.SYNCED
+    assert trusts(world.machine) == {Trust.LIVE}
+
+
+@pytest.mark.parametrize("has_hash", [True, False])
+def test_a_fade_in_the_middle_of_a_fetch(has_hash: bool) -> None:
+    """What came before it may have moved in it: only a hash can tell that it has not."""
+    vehicle: PX4Vehicle | ArduPilotVehicle = (
+        PX4Vehicle(table=TABLE, burst=1, period=0.05)
+        if has_hash
+        else ArduPilotVehicle(ftp=False, table=PLAIN, burst=1, period=0.05)
+    )
+    world = World(vehicle)
+    world.meet()
+    fetch = world.machine.begin_fetch(world.now)
+    world.run(1.0)
+    world.away(7.0)
+    assert world.machine.presence.is_lost
+    assert world.outcome(fetch).complete
+    world.run(1.0)
+    machine = world.machine
+    if has_hash:
+        assert state(world) is SyncState.SYNCED
+        assert Trust.CACHED not in trusts(machine)
+    else:
+        assert Trust.CACHED in trusts(machine)
+        assert state(world) is SyncState.UNSYNCED
+        world.fetch()
+        assert is_so(state(world) is SyncState.SYNCED)
+
+
+# the link itself
+
+
+def test_a_link_that_was_away_for_long_is_checked_like_a_loss() -> None:
+    world, vehicle = fetched()
+    vehicle.set_param("P07", 700)
+    world.station.pause()
+    world.away(9.0)
+    world.station.resume(world.now)
+    assert world.machine.who.is_doubted, "it may be another vehicle by now"
+    assert state(world) is SyncState.CHECKING
+    assert trusts(world.machine) == {Trust.CACHED}
+    world.run(3.0)
+    assert resynced(world) == [("P07",)]
+    assert world.told(ComponentLost, ComponentFound)[-2:] == []
+
+
+def test_a_link_that_was_away_for_a_moment_is_a_gap() -> None:
+    world, vehicle = fetched()
+    vehicle.set_param("P07", 700)
+    world.station.pause()
+    world.away(3.5)
+    world.station.resume(world.now)
+    assert state(world) is SyncState.SYNCED
+    assert trusts(world.machine) == {Trust.LIVE}
+    world.run(1.0)
+    assert resynced(world) == [("P07",)]
+
+
+def test_lost_before_the_link_was_away_and_found_after_it() -> None:
+    world, _ = fetched()
+    world.away(6.0)
+    assert world.machine.presence.is_lost
+    world.station.pause()
+    world.away(10.0)
+    world.station.resume(world.now)
+    world.sent.clear()
+    world.until(lambda: not world.machine.presence.is_lost)
+    (found,) = world.told(ComponentFound)
+    assert isinstance(found, ComponentFound)
+    assert found.silence > 15.0
+    world.run(2.0)
+    assert world.sent_of(CommandLong), "it may be another vehicle by now"
+    assert resynced(world) == [()]
+
+
+# writes wait for it
+
+
+def test_a_write_waits_until_it_is_known_whom_it_reaches() -> None:
+    berth = Berth(PX4Vehicle(table=TABLE, uid=1))
+    world = World(air=Air.symmetric([berth], delay=0.2))
+    world.fetch()
+    berth.is_mute = berth.is_deaf = True
+    world.run(9.0)
+    stranger = PX4Vehicle(table=TABLE, uid=2)
+    berth.moor(stranger)
+    berth.is_mute = berth.is_deaf = False
+    world.until(lambda: not world.machine.presence.is_lost)
+    write = world.machine.write("P07", 700, world.now)
+    world.run(3.0)
+    assert isinstance(write.error, NoReply)
+    assert "another vehicle" in str(write.error)
+    assert stranger.requests["PARAM_SET"] == 0
+    assert world.set("P07", 701).actual == 701
+
+
+def test_a_write_under_way_is_held_while_it_is_open_who_gets_it() -> None:
+    berth = Berth(PX4Vehicle(table=TABLE, uid=1))
+    world = World(air=Air([berth]))
+    world.fetch()
+    berth.is_deaf = True
+    write = world.machine.write("P07", 700, world.now)
+    world.run(0.5)
+    assert write.attempts > 0
+    stranger = PX4Vehicle(table=TABLE, uid=2)
+    world.station.pause()
+    world.run(9.0)
+    berth.moor(stranger)
+    berth.is_deaf = False
+    world.station.resume(world.now)
+    world.run(5.0)
+    assert isinstance(write.error, NoReply)
+    assert stranger.requests["PARAM_SET"] == 0
+    assert stranger.param("P07").value == 7
+
+
+def test_a_write_under_way_goes_on_when_it_is_the_same_vehicle() -> None:
+    world, vehicle = fetched()
+    world.tap.is_deaf = True
+    write = world.machine.write("P07", 700, world.now)
+    world.run(0.3)
+    world.tap.is_deaf = False
+    vehicle.reboot(world.now, down=1.0)
+    world.station.pause()
+    world.run(9.0)
+    world.station.resume(world.now)
+    assert world.outcome(write).actual == 700
+    assert vehicle.param("P07").value == 700
+
+
+def test_writes_to_a_camera_wait_for_its_vehicle() -> None:
+    berth = Berth(PX4Vehicle(table=TABLE, uid=1))
+    camera = GenericVehicle(table=PLAIN, component=100)
+    world = World(air=Air.symmetric([berth, camera], delay=0.2))
+    world.fetch()
+    eye = world.station.components[1, 100]
+    world.until(lambda: eye.who.settled)
+    world.outcome(eye.read("P07", world.now))
+    berth.is_mute = berth.is_deaf = True
+    world.run(9.0)
+    berth.moor(PX4Vehicle(table=TABLE, uid=2))
+    berth.is_mute = berth.is_deaf = False
+    world.until(lambda: not world.machine.presence.is_lost)
+    write = eye.write("P07", 700, world.now)
+    world.run(0.05)
+    assert write.attempts == 0
+    world.run(3.0)
+    assert isinstance(write.error, NoReply)
+    assert camera.requests["PARAM_SET"] == 0
+
+
+# reboots
+
+
+def test_a_reboot_is_told_and_the_table_checked() -> None:
+    world, vehicle = fetched()
+    vehicle.reboot(world.now, down=2.0)
+    world.run(3.0)
+    assert world.told(ComponentRebooted) == [ComponentRebooted(world.machine)]
+    assert world.told(ComponentLost) == []
+    world.run(2.0)
+    assert resynced(world) == [()]
+    assert state(world) is SyncState.SYNCED
+    assert world.sent_of(CommandLong), "it may be another one"
+
+
+def test_a_reboot_that_takes_its_time_is_a_loss_and_a_reboot() -> None:
+    world, vehicle = fetched(boot_time=3.0)
+    vehicle.reboot(world.now, down=7.0)
+    world.run(20.0)
+    kinds = [type(event) for event in world.events if not isinstance(event, ParamChanged)]
+    assert kinds == [ComponentLost, ComponentFound, ComponentRebooted, TableResynced]
+
+
+def test_a_reboot_at_the_last_question_of_a_fetch_begins_it_anew() -> None:
+    vehicle = PX4Vehicle(
+        table=[SimParam(row.name, row.type, row.value, row.name in ("P03", "P04", "P05")) for row in TABLE]
+    )
+    world = World(air=Air.symmetric([vehicle], delay=0.1))
+    world.meet()
+    world.run(9.0)
+    fetch = world.machine.begin_fetch(world.now)
+    world.until(lambda: fetch.download is not None and fetch.download.done)
+    assert not fetch.done, "which of its values are volatile cannot be found out, so the hash is awaited"
+    vehicle.set_param("P07", 700)
+    vehicle.reboot(world.now, down=0.5)
+    assert world.outcome(fetch).params["P07"].value == 700
+
+
+def test_a_vehicle_that_never_stops_starting_again_ends_a_fetch() -> None:
+    vehicle = PX4Vehicle(table=TABLE, burst=1, period=0.2)
+    world = World(vehicle)
+    world.meet()
+    world.run(3.0)
+    fetch = world.machine.begin_fetch(world.now)
+    reboots = 0
+    while not fetch.done:
+        reboots += 1
+        vehicle.reboot(world.now, down=1.5)
+        world.run(5.0)
+        assert reboots < 20
+    assert reboots == MOST_RESTARTS + 1 == 9
+    assert isinstance(fetch.error, NoReply)
+    assert "started again" in str(fetch.error)
+    assert world.machine.fetch is None
+
+
+# policies
+
+
+def offline(memory: Memory, vehicle: Endpoint, policy: Policy) -> World:
+    world = World(vehicle, upkeep=Upkeep(INTERVAL, policy=policy))
+    world.meet().use_cached(now=world.now, **memory)
+    return world
+
+
+def the_memory() -> tuple[Memory, PX4Vehicle]:
+    world, _ = fetched()
+    return world.memory(), PX4Vehicle(table=TABLE)
+
+
+def test_cache_only_sends_nothing() -> None:
+    memory, vehicle = the_memory()
+    world = offline(memory, vehicle, Policy.CACHE_ONLY)
+    result = world.fetch()
+    assert (result.source, result.complete, result.hash, result.received) == ("cache", True, None, 42)
+    assert ["cache-only" in note for note in result.notes] == [True]
+    machine = world.machine
+    assert state(world) is SyncState.UNSYNCED
+    assert machine.state == "cached"
+    assert trusts(machine) == {Trust.CACHED}
+    assert world.told(Fetched) == []
+    vehicle.set_param("P07", 1)  # two changes in a short while, of which one may be an old one
+    world.run(0.5)
+    vehicle.set_param("P07", 2)
+    world.run(5.0)
+    assert machine.table.params["P07"].value == 2, "it listens"
+    world.away(4.0)
+    world.run(1.0)
+    world.away(9.0)
+    world.run(2.0)
+    vehicle.reboot(world.now, down=2.0)
+    world.run(5 * INTERVAL)
+    assert world.fetch().source == "cache"
+    assert world.requests() == 0
+    assert world.sent_of(CommandLong)
+
+
+def test_cache_only_without_a_cache() -> None:
+    world = World(PX4Vehicle(table=TABLE), upkeep=Upkeep(policy=Policy.CACHE_ONLY))
+    assert isinstance(world.error_of(world.fetch), CacheError)
+    assert world.machine.fetch is None
+    assert world.requests() == 0
+
+
+def test_cache_only_gives_what_there_is_of_a_component_that_is_lost() -> None:
+    memory, vehicle = the_memory()
+    world = offline(memory, vehicle, Policy.CACHE_ONLY)
+    world.away(9.0)
+    fetch = world.machine.begin_fetch(world.now)
+    assert fetch.result is not None
+    assert len(fetch.result.params) == 42
+
+
+def test_hash_only_asks_for_the_hash_and_nothing_more() -> None:
+    memory, vehicle = the_memory()
+    world = offline(memory, vehicle, Policy.HASH_ONLY)
+    result = world.fetch()
+    assert (result.source, result.complete, result.hash) == ("cache", True, vehicle.announced_hash())
+    assert ["hash-only" in note for note in result.notes] == [True]
+    machine = world.machine
+    assert state(world) is SyncState.SYNCED
+    assert {machine.table.params[name].trust for name in NAMES} == {Trust.VERIFIED}
+    assert machine.table.params["COM_FLIGHT_UUID"].trust is Trust.CACHED
+    assert machine.refresh is None
+    world.away(4.0)
+    world.run(5 * INTERVAL)
+    assert world.requests() == len(world.hashes()) == 1
+
+
+def test_hash_only_says_when_the_hash_is_another_one() -> None:
+    memory, vehicle = the_memory()
+    world = offline(memory, vehicle, Policy.HASH_ONLY)
+    assert world.fetch().hash is not None
+    world.unheard(vehicle, P07=700)
+    world.run(1.0)
+    result = world.fetch()
+    assert (result.source, result.hash, result.params["P07"].value) == ("cache", None, 7)
+    assert "did not confirm" in result.notes[0]
+    machine = world.machine
+    assert state(world) is SyncState.UNSYNCED, "it is known not to agree"
+    assert trusts(machine) == {Trust.CACHED}
+    world.run(5 * INTERVAL)
+    assert world.requests() == len(world.hashes()) == 2
+    world.away(9.0)
+    world.run(5.0)
+    assert state(world) is SyncState.UNSYNCED
+    assert world.requests() == len(world.hashes()) == 3, "on return the hash is asked for once"
+
+
+def test_hash_only_on_return() -> None:
+    memory, vehicle = the_memory()
+    world = offline(memory, vehicle, Policy.HASH_ONLY)
+    world.fetch()
+    world.away(9.0)
+    world.run(5.0)
+    assert state(world) is SyncState.SYNCED
+    assert resynced(world) == [()]
+    assert world.requests() == len(world.hashes()) == 2
+
+
+@pytest.mark.parametrize("policy", [Policy.CACHE_ONLY, Policy.HASH_ONLY])
+def test_no_list_goes_to_all_components_at_once(policy: Policy) -> None:
+    vehicles = [GenericVehicle(table=PLAIN, component=number) for number in (1, 2)]
+    world = World(*vehicles, upkeep=Upkeep(INTERVAL, policy=policy))
+    world.run(10.0)
+    world.station.begin_fetches(list(world.station.components.values()), world.now)
+    assert world.sent_of(ParamRequestList) == []
+    with pytest.raises(UsageError, match=policy):
+        world.station.check_refresh(True)
+    world.station.check_refresh(False)
+
+
+def test_what_a_users_choice_means() -> None:
+    assert Upkeep.chosen(None, "auto") == Upkeep(WATCH_INTERVAL)
+    assert Upkeep.chosen(5, Policy.AUTO) == Upkeep(5, without_hash=True)
+    assert Upkeep.chosen(0, "hash-only") == Upkeep(math.inf, without_hash=True, policy=Policy.HASH_ONLY)
+    wrong: Sequence[tuple[float | None, str]] = [(0.5, "auto"), (-1, "auto"), (math.nan, "auto"), (None, "x")]
+    for interval, policy in wrong:
+        with pytest.raises(UsageError):
+            Upkeep.chosen(interval, policy)
+
+
+def test_a_table_that_moved_while_it_came_is_fetched_again() -> None:
+    """The hash of its beginning proves the table; what moved after that is fetched then."""
+    names = ["A_LATE", "SWITCH", *list(PLAIN)[:12]]
+    rows = [SimParam(name, ParamType.INT32, number) for number, name in enumerate(names)]
+    vehicle = PX4Vehicle(table=rows, late_use={"SWITCH": ["A_LATE"]})
+    world = World(air=Air.symmetric([vehicle], delay=0.3), upkeep=Upkeep(INTERVAL))
+    vehicle.when_listed(3, lambda: vehicle.set_param("SWITCH", 9))
+    world.until(lambda: (1, 1) in world.station.components)
+    fetch = world.machine.begin_fetch(world.now, refresh=True)
+    assert "A_LATE" not in world.outcome(fetch).params
+    assert fetch.result is not None
+    assert fetch.result.hash is not None
+    world.run(GAPS_INTERVAL + 5.0)
+    assert state(world) is SyncState.SYNCED
+    assert "A_LATE" in world.machine.table.params
+
+
+def test_nothing_is_begun_for_a_component_that_is_lost() -> None:
+    vehicle = ArduPilotVehicle(ftp=False, table=PLAIN)
+    world = World(vehicle, upkeep=Upkeep(5.0, without_hash=True))
+    world.fetch()
+    fetch = world.machine.begin_fetch(world.now, refresh=True)
+    vehicle.reboot(world.now, down=math.inf)
+    world.run(60.0)
+    assert fetch.done
+    assert state(world) is SyncState.LOST

@@ -1,0 +1,856 @@
+"""Writes, one message at a time: the type first, exactly that type, and proof by value."""
+
+from __future__ import annotations
+
+import math
+import struct
+from functools import partial
+
+import pytest
+
+from paramclient.errors import (
+    LinkError,
+    NoReply,
+    ParamErrorCode,
+    Refused,
+    TypeMismatch,
+    UnknownParameter,
+    UsageError,
+    ValueNotApplied,
+)
+from paramclient.model.values import Encoding, ParamType, Trust, Value, decode
+from paramclient.protocol.params.reads import Reads
+from paramclient.protocol.params.table import Table
+from paramclient.protocol.params.writes import Write, Writes
+from paramclient.protocol.requests.round_trip import FEWEST_TRIES, INITIAL_TIMEOUT, RoundTrip
+from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamSet, ParamValue
+from tests.simulation import is_so, known, param_value
+
+INT32 = ParamType.INT32
+NAN = struct.unpack("<f", b"\x01\x00\xc0\x7f")[0]
+
+
+class Desk:
+    """Writes to component 1/1, with the table and the reads that they need."""
+
+    def __init__(self, encoding: Encoding = Encoding.BYTEWISE) -> None:
+        self.now = 0.0
+        self.encoding = encoding
+        self.is_certain = True
+        self.sent: list[Message] = []
+        self.table = Table(encoding)
+        self.round_trip = RoundTrip()
+        self.reads = Reads((1, 1), self.round_trip, self.sent.append, self.table.params.__contains__)
+        self.reads.is_idle = False
+        self.writes = Writes(
+            (1, 1),
+            self.round_trip,
+            self.sent.append,
+            self.reads,
+            self.table.params,
+            encoding=lambda: self.table.encoding,
+            is_certain=lambda: self.is_certain,
+        )
+
+    def set(self, name: str, value: Value, asker: str | None = None) -> Write:
+        return self.writes.set(name, value, self.now, asker)
+
+    def hear(self, name: str, value: Value, kind: int = ParamType.REAL32, *, at: float | None = None) -> None:
+        self.now = self.now if at is None else at
+        self.take_in(param_value(name, value, kind=kind, encoding=self.table.encoding))
+
+    def take_in(self, message: ParamValue) -> None:
+        self.table.hear(message, "vehicle")
+        self.writes.heard(message, self.now)
+        self.reads.heard(message, self.now)
+
+    def knows(self, name: str, value: Value, kind: int = ParamType.REAL32) -> None:
+        """Let a value have been heard before."""
+        self.hear(name, value, kind)
+
+    def pass_time(self, seconds: float = math.inf) -> None:
+        """Go from deadline to deadline, so long or until nothing is left to do."""
+        end = self.now + seconds
+        for _ in range(10_000):
+            deadline = min(self.reads.next_deadline(), self.writes.next_deadline())
+            if deadline > end or deadline == math.inf:
+                self.now = end if end < math.inf else self.now
+                return
+            self.now = max(deadline, self.now)
+            self.reads.tick(self.now)
+            self.writes.tick(self.now)
+        raise AssertionError("it does not come to an end")
+
+    def take(self) -> list[str]:
+        """What was sent, in short: `set NAME value TYPE`, `read NAME`, `read index`."""
+        sent, self.sent[:] = list(self.sent), []
+        return [self._short(message) for message in sent]
+
+    def _short(self, message: Message) -> str:
+        if isinstance(message, ParamSet):
+            assert (message.target_system, message.target_component) == (1, 1)
+            value, _ = decode(message.raw, message.param_type, self.table.encoding)
+            return f"set {message.param_id} {value!r} {ParamType(message.param_type).name}"
+        assert isinstance(message, ParamRequestRead)
+        return f"read {message.param_id or message.param_index}"
+
+
+# how it goes
+
+
+def test_a_write_to_a_known_parameter() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", 2.5)
+    assert desk.take() == ["set A 2.5 REAL32"]
+    desk.hear("A", 2.5, at=0.2)
+    assert write.result is not None
+    result = write.result
+    assert (result.name, result.status, result.requested, result.actual) == ("A", "accepted", 2.5, 2.5)
+    assert (result.adjusted, result.attempts, result.param) == (False, 1, desk.table.params["A"])
+    assert str(result) == "A = 2.5"
+    assert write.ended_at == 0.2
+    assert desk.round_trip.smoothed == pytest.approx(0.2)
+    assert len(desk.writes) == len(desk.reads) == 0
+    assert desk.writes.next_deadline() == math.inf
+
+
+def test_the_type_is_learnt_first() -> None:
+    desk = Desk()
+    write = desk.set("A", 5)
+    assert desk.take() == ["read A"]
+    assert desk.writes.author("A") is None
+    desk.hear("A", 3, ParamType.INT16)
+    assert desk.take() == ["set A 5 INT16"]
+    assert desk.writes.author("A") == "us"
+    desk.hear("A", 5, ParamType.INT16)
+    assert write.result is not None
+    assert write.result.param.type is ParamType.INT16
+
+
+def test_writes_to_one_name_have_each_the_author_who_asked_for_it() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    writes = [desk.set("A", 2.0, "first"), desk.set("A", 3.0), desk.set("A", 4.0, "third")]
+    told = []
+    for value in (2.0, 3.0, 4.0):
+        told.append(desk.writes.author("A"))
+        desk.hear("A", value)
+    assert told == ["us for first", "us", "us for third"]
+    assert all(write.done and write.error is None for write in writes)
+    assert desk.writes.author("A") is None
+
+
+def test_a_cached_type_is_not_enough_but_a_verified_one_is() -> None:
+    desk = Desk()
+    desk.table.fill({"A": known("A", 1), "B": known("B", 1)})
+    desk.table.confirm(5, frozenset("A"), proven=True)
+    desk.table.verify()
+    desk.set("A", 5)
+    desk.set("B", 5)
+    assert desk.take() == ["read A", "set B 5 INT32"]
+    assert desk.table.params["B"].trust is Trust.VERIFIED
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_what_has_to_wait_says_so_until_it_is_begun(is_known: bool) -> None:
+    """Whoever may be written again, for however short a time it was not, looks at that."""
+    desk = Desk()
+    if is_known:
+        desk.knows("A", 1.0)
+        desk.is_certain = False
+        desk.set("A", 2.5)
+    else:  # it becomes uncertain while the type is asked for
+        desk.set("A", 2.5)
+        assert desk.take() == ["read A"]
+        desk.is_certain = False
+        desk.hear("A", 1.0, at=0.1)
+    assert desk.take() == []
+    assert desk.writes.is_held
+    desk.is_certain = True
+    desk.writes.proceed(0.2)
+    assert desk.take() == ["set A 2.5 REAL32"]
+    assert not desk.writes.is_held
+
+
+def test_a_value_that_comes_while_nothing_may_be_sent_again_leaves_the_time_outs_as_they_are() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", 2.5)
+    desk.is_certain = False
+    desk.writes.resume(3.0)
+    desk.hear("A", 2.5, at=4.0)
+    assert write.done
+    assert desk.round_trip.smoothed is None
+
+
+def test_nothing_is_sent_before_the_encoding_is_certain() -> None:
+    desk = Desk()
+    desk.knows("A", 1, INT32)
+    desk.is_certain = False
+    first, second = desk.set("A", 2), desk.set("B", 3)
+    desk.pass_time(10.0)
+    assert desk.take() == []
+    desk.is_certain = True
+    desk.table.use_encoding(Encoding.C_CAST)
+    desk.writes.proceed(desk.now)
+    assert desk.take() == ["set A 2 INT32", "read B"]
+    desk.writes.proceed(desk.now)
+    assert desk.take() == []
+    desk.hear("A", 2, INT32)
+    assert first.done
+    assert not second.done
+
+
+@pytest.mark.parametrize(
+    ("kind", "value"),
+    [
+        (ParamType.REAL32, 0.1),
+        (ParamType.REAL32, math.inf),
+        (ParamType.REAL32, NAN),
+        (ParamType.INT32, -5_000_000),
+        (ParamType.UINT8, 255),
+        (ParamType.INT32, 7.0),
+        (ParamType.INT32, b"\x01\x00\xa0\x7f"),
+        (ParamType.INT64, b"\x01\x02\x03\x04"),
+    ],
+)
+def test_values_that_are_taken_as_they_are(kind: ParamType, value: Value) -> None:
+    desk = Desk()
+    desk.take_in(ParamValue("A", bytes(4), kind, 10, 65535))
+    write = desk.set("A", value)
+    [message] = desk.sent
+    assert isinstance(message, ParamSet)
+    assert message.param_type == kind
+    if isinstance(value, bytes):
+        assert message.raw == value
+    desk.take_in(ParamValue("A", message.raw, kind, 10, 65535))
+    assert write.result is not None
+    assert write.result.status == "accepted"
+
+
+def test_minus_zero_will_do_for_zero_and_one_nan_not_for_another() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", -0.0)
+    desk.hear("A", 0.0)
+    assert write.done
+    write = desk.set("A", NAN)
+    desk.hear("A", math.nan)
+    assert not write.done
+    desk.hear("A", NAN)
+    assert write.result is not None
+    assert write.result.status == "accepted"
+
+
+def test_writing_what_is_there_already() -> None:
+    desk = Desk()
+    desk.knows("A", 2.5)
+    write = desk.set("A", 2.5)
+    assert not write.done
+    desk.hear("A", 2.5)
+    assert write.done
+
+
+def test_ardupilot_cuts_off_the_fraction() -> None:
+    desk = Desk(Encoding.C_CAST)
+    desk.knows("A", 0, INT32)
+    write = desk.set("A", 1234.7)
+    [message] = desk.sent
+    assert isinstance(message, ParamSet)
+    assert struct.unpack("<f", message.raw)[0] == pytest.approx(1234.7)
+    desk.hear("A", 1234, INT32)
+    assert write.result is not None
+    assert (write.result.status, write.result.requested, write.result.actual) == ("adjusted", 1234.7, 1234)
+    assert str(write.result) == "A = 1234 (adjusted from 1234.7)"
+
+
+# other values on the way
+
+
+def test_an_old_value_passing_by_proves_nothing() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    desk.round_trip.answered(0.0, 0.1, 1)
+    write = desk.set("A", 2.0)
+    desk.hear("A", 1.0, at=0.01)
+    assert not write.done
+    desk.hear("A", 2.0, at=0.05)
+    assert write.result is not None
+    assert write.result.attempts == 1
+    assert desk.take() == ["set A 2.0 REAL32"]
+
+
+def test_a_stale_answer_to_an_earlier_read_proves_nothing() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    read = desk.reads.ask("A", desk.now)
+    write = desk.set("A", 2.0)
+    desk.hear("A", 1.0, at=0.1)  # sent before the write had come
+    assert read.done
+    assert not write.done
+    desk.hear("A", 2.0, at=0.15)
+    assert write.done
+
+
+def test_a_lost_write_is_seen_by_a_read_and_sent_again() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", 2.0)
+    desk.hear("A", 1.0, at=0.1)  # something asked for by others
+    desk.pass_time(0.6)
+    assert desk.take() == ["set A 2.0 REAL32", "read A"]
+    desk.hear("A", 1.0)
+    assert desk.take() == ["set A 2.0 REAL32"]
+    desk.hear("A", 2.0)
+    assert write.result is not None
+    assert (write.result.status, write.result.attempts) == ("accepted", 2)
+
+
+def test_a_write_without_an_answer_is_sent_again_after_the_time_out() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    desk.set("A", 2.0)
+    desk.pass_time(2.2 * INITIAL_TIMEOUT)
+    # after the third the vehicle may be silent on just this write
+    assert desk.take() == ["set A 2.0 REAL32"] * 3 + ["read A"]
+
+
+def test_the_read_that_decides_may_bring_the_wanted_value() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", 2.0)
+    desk.pass_time(2.5 * INITIAL_TIMEOUT)
+    desk.hear("A", 2.0)
+    assert write.result is not None
+    assert write.result.status == "accepted"
+    assert len(desk.reads) == 0
+
+
+def test_the_answer_to_that_read_does_not_tell_how_long_the_write_took() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", 2.0)
+    desk.hear("A", 1.0, at=0.1)
+    desk.pass_time(4.0)
+    assert desk.take().count("read A") == 4
+    desk.hear("A", 2.0)
+    assert write.done
+    assert desk.round_trip.smoothed is None
+
+
+def test_a_value_that_the_vehicle_makes_of_it_twice_is_its_adjustment() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", 900.0)
+    for seconds in (0.6, 0.3):
+        desk.hear("A", 100.0)
+        desk.pass_time(seconds)
+        desk.hear("A", 100.0)
+    assert desk.take() == ["set A 900.0 REAL32", "read A"] * 2
+    assert write.result is not None
+    assert (write.result.status, write.result.actual, write.result.attempts) == ("adjusted", 100.0, 2)
+
+
+def test_another_stations_value_is_not_taken_for_an_adjustment() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", 3.0)  # is lost
+    desk.hear("A", 2.0, at=0.1)  # another station has set it
+    desk.pass_time(0.6)
+    desk.hear("A", 2.0)
+    assert not write.done
+    assert desk.take() == ["set A 3.0 REAL32", "read A", "set A 3.0 REAL32"]
+    desk.hear("A", 3.0)
+    assert write.result is not None
+    assert write.result.status == "accepted"
+
+
+def test_what_a_read_alone_shows_is_no_adjustment() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", 3.0)
+    for _ in range(3):  # every write is lost, and so was the word of another station's
+        desk.pass_time(2.5)
+        desk.hear("A", 2.0)
+    assert not write.done
+    assert desk.take().count("set A 3.0 REAL32") > 3
+
+
+def test_the_write_before_it_is_not_taken_for_an_adjustment() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    first, second = desk.set("A", 2.0), desk.set("A", 3.0)
+    desk.writes.cancel(first, desk.now)
+    desk.hear("A", 2.0)  # the answer to the first; the second is lost
+    desk.pass_time(0.9)
+    desk.hear("A", 2.0)
+    desk.hear("A", 3.0)
+    assert second.result is not None
+    assert second.result.status == "accepted"
+
+
+# how it fails
+
+
+def silent(desk: Desk, write: Write, *, answering_reads: Value | None = None) -> Exception:
+    """Let a vehicle be silent on writes to A; it may answer reads of it."""
+    for _ in range(1000):
+        if write.done:
+            break
+        desk.pass_time(0.01)
+        if answering_reads is not None and "read A" in desk.take():
+            desk.hear("A", answering_reads)
+    assert write.error is not None
+    assert len(desk.writes) == len(desk.reads) == 0
+    return write.error
+
+
+def test_without_any_answer_there_is_no_reply() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", 2.0)
+    desk.pass_time()
+    assert isinstance(write.error, NoReply)
+    assert write.error.awaited == "PARAM_SET A to 1/1"
+    assert write.error.attempts == write.attempts == 3
+    assert write.error.waited == pytest.approx(desk.now)
+
+
+def test_without_any_answer_to_the_first_read_there_is_no_reply() -> None:
+    desk = Desk()
+    write = desk.set("A", 2.0)
+    desk.pass_time()
+    assert isinstance(write.error, NoReply)
+    assert not any(isinstance(message, ParamSet) for message in desk.sent)
+
+
+def test_silence_on_the_write_alone_says_that_it_is_not_applied() -> None:
+    desk = Desk(Encoding.C_CAST)
+    desk.knows("A", 1.0)
+    for _ in range(60):
+        desk.round_trip.answered(0.0, 0.02, 1)
+    write = desk.set("A", math.nan)
+    error = silent(desk, write, answering_reads=1.0)
+    assert isinstance(error, ValueNotApplied)
+    assert math.isnan(float(error.requested))
+    assert error.actual == 1.0
+    assert write.attempts >= FEWEST_TRIES
+    assert desk.now < 5.0
+    assert "keeps A at 1.0" in str(error)
+
+
+def test_a_vehicle_that_answers_every_write_with_the_old_value_does_not_apply_it() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    for _ in range(60):
+        desk.round_trip.answered(0.0, 0.02, 1)
+    write = desk.set("A", 2.0)
+    while not write.done:
+        if desk.take():
+            desk.hear("A", 1.0)
+        desk.pass_time(0.01)
+    assert isinstance(write.error, ValueNotApplied)
+    assert write.error.actual == 1.0
+
+
+@pytest.mark.parametrize("tries", range(5, 9))
+def test_giving_up_may_take_other_writes_with_it(tries: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(RoundTrip, "tries", tries)
+    desk = Desk()
+    desk.knows("A", 1.0)
+    desk.knows("B", 1.0)
+    writes = [desk.set("A", 2.0), desk.set("B", 2.0)]
+    writes[0].on_done.append(lambda: desk.writes.cancel(writes[1], desk.now))
+    writes[1].on_done.append(lambda: desk.writes.cancel(writes[0], desk.now))
+    while len(desk.writes):
+        desk.pass_time(0.01)
+        for each in desk.take():
+            if each.startswith("read "):
+                desk.hear(each.removeprefix("read "), 1.0)
+    assert sorted(isinstance(write.error, ValueNotApplied) for write in writes) == [False, True]
+    assert max(write.attempts for write in writes) == tries
+
+
+def test_the_vehicle_may_fall_silent_while_its_value_is_read() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", 2.0)
+    desk.hear("A", 1.0)
+    desk.pass_time()
+    assert isinstance(write.error, NoReply)
+
+
+@pytest.mark.parametrize(
+    ("code", "kind"),
+    [
+        (ParamErrorCode.READ_ONLY, Refused),
+        (ParamErrorCode.VALUE_OUT_OF_RANGE, Refused),
+        (99, Refused),
+        (ParamErrorCode.TYPE_MISMATCH, TypeMismatch),
+        (ParamErrorCode.DOES_NOT_EXIST, UnknownParameter),
+    ],
+)
+@pytest.mark.parametrize("old_value", ["before", "after", "never"])
+def test_a_refusal_with_a_reason(code: int, kind: type[Exception], old_value: str) -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.set("A", 2.0)
+    if old_value == "before":
+        desk.hear("A", 1.0)
+    assert desk.writes.refused(ParamError(255, 190, "A", -1, code), 0.1)
+    if old_value == "after":
+        desk.hear("A", 1.0)
+    assert type(write.error) is kind
+    assert desk.take() == ["set A 2.0 REAL32"]
+    if isinstance(write.error, Refused):
+        assert write.error.code == code
+    desk.pass_time()
+    assert desk.take() == []
+
+
+def test_a_refusal_that_is_not_for_a_write() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    assert not desk.writes.refused(ParamError(255, 190, "A", -1, 1), 0.0)
+    write, learning = desk.set("A", 2.0), desk.set("B", 2.0)
+    assert not desk.writes.refused(ParamError(255, 190, "", 3, 1), 0.0)
+    assert not desk.writes.refused(ParamError(255, 190, "B", -1, 1), 0.0)
+    assert not desk.writes.refused(ParamError(255, 190, "C", -1, 1), 0.0)
+    assert not write.done
+    desk.reads.refused(ParamError(255, 190, "B", -1, 1), 0.0)
+    assert isinstance(learning.error, UnknownParameter)
+
+
+@pytest.mark.parametrize("after_the_value", [False, True])
+def test_ardupilots_text_is_a_refusal(after_the_value: bool) -> None:
+    desk = Desk(Encoding.C_CAST)
+    desk.knows("A", 1.0)
+    write = desk.set("A", 2.0)
+    desk.writes.denied("B", 0.0)
+    if after_the_value:
+        desk.hear("A", 1.0)
+    desk.writes.denied("A", 0.1)
+    if not after_the_value:
+        desk.hear("A", 1.0)
+    assert isinstance(write.error, Refused)
+    assert write.error.code == ParamErrorCode.READ_ONLY
+    assert write.error.reason == "read only"
+    desk.writes.denied("A", 0.2)
+
+
+def test_a_value_that_does_not_fit_is_found_out_with_the_type() -> None:
+    desk = Desk()
+    write = desk.set("A", 300)
+    desk.hear("A", 3, ParamType.UINT8)
+    assert isinstance(write.error, UsageError)
+    assert desk.take() == ["read A"]
+    assert len(desk.writes) == 0
+
+
+def test_another_type_than_the_known_one_is_written_in_that_type() -> None:
+    desk = Desk()
+    desk.knows("A", 1, INT32)
+    write = desk.set("A", 5)
+    desk.hear("A", 1.0, ParamType.REAL32)
+    assert desk.take() == ["set A 5 INT32", "set A 5.0 REAL32"]
+    desk.hear("A", 5.0, ParamType.REAL32)
+    assert write.result is not None
+    assert write.result.status == "accepted"
+
+
+def test_a_type_that_changes_twice_is_a_mismatch() -> None:
+    desk = Desk()
+    desk.knows("A", 1, INT32)
+    write = desk.set("A", 5)
+    desk.hear("A", 1.0, ParamType.REAL32)
+    desk.hear("A", 1, ParamType.INT16)
+    assert isinstance(write.error, TypeMismatch)
+    assert "REAL32" in str(write.error)
+    assert "INT16" in str(write.error)
+
+
+def test_another_type_that_the_value_does_not_fit_is_a_mismatch() -> None:
+    desk = Desk()
+    desk.knows("A", 1, INT32)
+    write = desk.set("A", 300)
+    desk.hear("A", 1, ParamType.UINT8)
+    assert isinstance(write.error, TypeMismatch)
+    assert "300" in str(write.error)
+
+
+# several
+
+
+def test_writes_to_one_name_go_in_order_and_others_beside_them() -> None:
+    desk = Desk()
+    for name in "AB":
+        desk.knows(name, 0.0)
+    done: list[str] = []
+    for name, value in (("A", 1.0), ("A", 2.0), ("B", 3.0)):
+        desk.set(name, value).on_done.append(partial(done.append, f"{name}{value}"))
+    assert desk.take() == ["set A 1.0 REAL32", "set B 3.0 REAL32"]
+    assert len(desk.writes) == 2
+    desk.hear("B", 3.0)
+    desk.hear("A", 1.0)
+    assert desk.take() == ["set A 2.0 REAL32"]
+    desk.hear("A", 2.0)
+    assert done == ["B3.0", "A1.0", "A2.0"]
+
+
+def test_a_failure_lets_the_next_one_go() -> None:
+    desk = Desk()
+    desk.knows("A", 0.0)
+    first, second = desk.set("A", 1.0), desk.set("A", 2.0)
+    desk.writes.refused(ParamError(255, 190, "A", -1, 5), 0.0)
+    assert first.done
+    assert desk.take() == ["set A 1.0 REAL32", "set A 2.0 REAL32"]
+    desk.hear("A", 2.0)
+    assert second.result is not None
+
+
+def test_cancelling_the_first() -> None:
+    desk = Desk()
+    desk.knows("A", 0.0)
+    first, second = desk.set("A", 1.0), desk.set("A", 2.0)
+    desk.writes.cancel(first, desk.now)
+    assert desk.take() == ["set A 1.0 REAL32", "set A 2.0 REAL32"]
+    desk.hear("A", 2.0)
+    assert second.done
+    assert not first.done
+
+
+def test_cancelling_one_that_waits() -> None:
+    desk = Desk()
+    desk.knows("A", 0.0)
+    first, second, third = (desk.set("A", value) for value in (1.0, 2.0, 3.0))
+    desk.writes.cancel(second, desk.now)
+    desk.hear("A", 1.0)
+    assert first.done
+    assert desk.take() == ["set A 1.0 REAL32", "set A 3.0 REAL32"]
+    desk.writes.cancel(third, desk.now)
+    desk.writes.cancel(third, desk.now)
+    assert len(desk.writes) == 0
+
+
+def test_a_cancelled_write_is_not_sent_when_the_type_comes() -> None:
+    desk = Desk()
+    read = desk.reads.ask("A", desk.now)  # somebody else wants the value
+    write = desk.set("A", 1.0)
+    desk.writes.cancel(write, desk.now)
+    desk.hear("A", 0.0)
+    assert read.done
+    assert desk.take() == ["read A"]
+    assert len(desk.reads) == len(desk.writes) == 0
+
+
+def test_cancelling_gives_the_read_back() -> None:
+    desk = Desk()
+    desk.writes.cancel(desk.set("A", 1.0), desk.now)
+    assert len(desk.reads) == 0
+
+
+# the link goes and comes
+
+
+def test_when_the_link_is_back_writes_are_sent_again() -> None:
+    desk = Desk()
+    for name in "AB":
+        desk.knows(name, 0.0)
+    write = desk.set("A", 1.0)
+    desk.set("B", 1.0)
+    desk.hear("B", 0.0)
+    desk.pass_time(0.9)  # B is being read
+    desk.set("C", 1.0)
+    desk.take()
+    desk.writes.resume(50.0)
+    assert desk.take() == ["set A 1.0 REAL32"]
+    assert write.attempts == 1
+
+
+def test_what_no_longer_fits_when_the_link_is_back_fails_without_harm() -> None:
+    desk = Desk(Encoding.C_CAST)
+    desk.knows("A", 0, INT32)
+    desk.knows("B", 0, INT32)
+    first, second = desk.set("A", 1.5), desk.set("B", 1)
+    desk.table.use_encoding(Encoding.BYTEWISE)
+    desk.writes.resume(1.0)
+    assert isinstance(first.error, UsageError)
+    assert not second.done
+
+
+def test_a_write_that_no_longer_fits_when_it_is_repeated_fails() -> None:
+    desk = Desk(Encoding.C_CAST)
+    desk.knows("A", 0, INT32)
+    write = desk.set("A", 1.5)
+    desk.pass_time(1.5 * INITIAL_TIMEOUT)
+    desk.table.use_encoding(Encoding.BYTEWISE)
+    desk.pass_time()
+    assert isinstance(write.error, UsageError)
+    assert len(desk.reads) == 0
+
+
+def test_a_write_that_no_longer_fits_leaves_no_read_behind() -> None:
+    desk = Desk(Encoding.C_CAST)
+    desk.knows("A", 0, INT32)
+    write = desk.set("A", 1.5)
+    while write.attempts < 4:
+        desk.pass_time(0.01)
+        if "read A" in desk.take():
+            desk.hear("A", 0, INT32)
+    desk.table.use_encoding(Encoding.BYTEWISE)
+    desk.pass_time()
+    assert isinstance(write.error, UsageError)
+    assert len(desk.reads) == 0
+
+
+def test_when_the_link_is_gone_all_fail() -> None:
+    desk = Desk()
+    desk.knows("A", 0.0)
+    error = LinkError("gone", link="x")
+    writes = [desk.set("A", 1.0), desk.set("A", 2.0), desk.set("B", 1.0)]
+    again: list[Write] = []
+    writes[0].on_done.append(lambda: desk.writes.cancel(writes[1], desk.now))
+    writes[0].on_done.append(lambda: again.append(desk.set("A", 9.0)))
+    desk.writes.fail_all(error, 1.0)
+    assert [write.error for write in writes] == [error] * 3
+    assert [write.done for write in again] == [False]
+    assert len(desk.writes) == 1
+    assert len(desk.reads) == 0
+
+
+def test_a_write_that_ends_may_take_others_with_it_while_time_passes() -> None:
+    desk = Desk()
+    for name in "AB":
+        desk.knows(name, 0.0)
+    first, second = desk.set("A", 1.0), desk.set("B", 1.0)
+    first.on_done.append(lambda: desk.writes.cancel(second, desk.now))
+    second.on_done.append(lambda: desk.writes.cancel(first, desk.now))
+    desk.pass_time()
+    assert sorted([first.done, second.done]) == [False, True]
+    assert len(desk.writes) == len(desk.reads) == 0
+
+
+# watched after the acknowledgement
+
+
+def test_a_watched_value_is_read_once_more_and_then_the_write_ends() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.writes.set("A", 80.0, desk.now, settle=1.2)
+    desk.take()
+    desk.hear("A", 80.0, at=0.1)
+    assert not is_so(write.done)
+    assert desk.writes.author("A") is None  # what changes now is not ours
+    desk.pass_time(1.1)
+    assert desk.take() == []
+    desk.pass_time(0.2)
+    assert desk.take() == ["read A"]
+    desk.hear("A", 80.0)
+    assert write.result is not None
+    assert (write.result.status, write.result.actual, write.result.attempts) == ("accepted", 80.0, 1)
+    assert len(desk.writes) == len(desk.reads) == 0
+
+
+def test_what_the_vehicle_makes_of_a_watched_value_is_an_adjustment() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.writes.set("A", 80.0, desk.now, settle=1.2)
+    desk.hear("A", 80.0, at=0.1)
+    desk.hear("A", 45.0, at=0.9)
+    assert not write.done
+    desk.pass_time(0.5)
+    desk.hear("A", 45.0)
+    assert write.result is not None
+    assert write.result.adjusted
+    assert (write.result.requested, write.result.actual, write.result.param.value) == (80.0, 45.0, 45.0)
+
+
+def test_a_watched_adjustment_stays_one() -> None:
+    desk = Desk(Encoding.C_CAST)
+    desk.knows("A", 1, INT32)
+    write = desk.writes.set("A", 5.7, desk.now, settle=1.0)
+    desk.hear("A", 5, INT32)
+    desk.pass_time(1.1)
+    desk.hear("A", 5, INT32)
+    assert write.result is not None
+    assert write.result.adjusted
+    assert write.result.actual == 5
+
+
+def test_the_next_write_to_a_name_waits_for_the_watch_and_others_do_not() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    desk.knows("B", 1.0)
+    first = desk.writes.set("A", 2.0, desk.now, settle=1.0)
+    second = desk.set("A", 3.0)
+    other = desk.set("B", 3.0)
+    desk.hear("A", 2.0)
+    desk.hear("B", 3.0)
+    assert [first.done, second.done, other.done] == [False, False, True]
+    desk.take()
+    desk.pass_time(1.1)
+    desk.hear("A", 2.0)
+    assert first.done
+    assert desk.take() == ["read A", "set A 3.0 REAL32"]
+
+
+def test_a_watch_survives_an_absence_of_the_link() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    write = desk.writes.set("A", 2.0, desk.now, settle=1.0)
+    desk.hear("A", 2.0)
+    desk.take()
+    desk.writes.resume(desk.now)
+    assert desk.take() == []  # it is acknowledged: nothing is sent again
+    desk.pass_time(1.1)
+    desk.hear("A", 2.0)
+    assert write.result is not None
+
+
+def test_a_watch_that_cannot_be_ended_says_that_the_value_was_acknowledged() -> None:
+    desk = Desk()
+    desk.knows("A", 1.0)
+    left: list[str] = []
+    desk.writes.left_open = lambda name, by, now: left.append(name)
+    lost = desk.writes.set("A", 2.0, desk.now, settle=1.0)
+    desk.hear("A", 2.0)
+    desk.writes.lose(desk.now)
+    assert isinstance(lost.error, NoReply)
+    assert "acknowledged" in str(lost.error)
+    cancelled = desk.writes.set("A", 3.0, desk.now, settle=1.0)
+    desk.hear("A", 3.0)
+    desk.writes.cancel(cancelled, desk.now)
+    assert len(desk.writes) == 0
+    unanswered = desk.writes.set("A", 4.0, desk.now, settle=1.0)
+    desk.hear("A", 4.0)
+    desk.pass_time()
+    assert isinstance(unanswered.error, NoReply)
+    assert "acknowledged" in str(unanswered.error)
+    assert left == []  # nobody has to guess who changes the value now
+
+
+# NaN and infinity
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, struct.pack("<f", math.inf)])
+def test_what_the_vehicle_cannot_store_is_not_sent(value: Value) -> None:
+    desk = Desk()
+    desk.writes.against_non_finite = "it stops"
+    write = desk.set("A", value)  # the type is not known yet
+    desk.hear("A", 1.0)
+    assert isinstance(write.error, UsageError)
+    assert "it stops" in str(write.error)
+    assert desk.take() == ["read A"]
+    assert len(desk.writes) == 0
+    forced = desk.writes.set("A", value, desk.now, force=True)
+    assert [each[:5] for each in desk.take()] == ["set A"]
+    assert not forced.done
+
+
+def test_the_bits_of_an_infinity_are_an_integer_as_any_other() -> None:
+    desk = Desk()
+    desk.writes.against_non_finite = "it stops"
+    desk.knows("A", 1, INT32)
+    desk.set("A", struct.pack("<f", math.inf))
+    assert desk.take() == ["set A 2139095040 INT32"]

@@ -1,0 +1,239 @@
+"""How fast a component may be asked."""
+
+from __future__ import annotations
+
+import pytest
+
+from paramclient.protocol.requests.pacing import (
+    BATCHED_RATE,
+    FIRST_RATE,
+    LARGEST_RATE,
+    LIST_READS,
+    QUEUEING,
+    SMALLEST_BURST,
+    SMALLEST_RATE,
+    UPSTREAM_SHARE,
+    Pace,
+    Share,
+)
+from paramclient.protocol.requests.round_trip import RoundTrip
+
+
+def burst(pace: Pace, now: float) -> int:
+    """How many requests go out at once."""
+    sent = 0
+    while pace.may_send(now):
+        pace.sent(now)
+        sent += 1
+    return sent
+
+
+def serve(pace: Pace, seconds: float, delay: float, *, rate: float = 1e9, since: float = 0.0) -> float:
+    """Ask as fast as allowed; answers come after `delay`, at `rate` at the most. Gives the end."""
+    now = since
+    answers: list[tuple[float, float]] = []
+    free_at = since
+    while now < since + seconds:
+        for at, asked_at in [answer for answer in answers if answer[0] <= now]:
+            answers.remove((at, asked_at))
+            pace.answered(now - asked_at, now)
+        while pace.may_send(now):
+            pace.sent(now)
+            free_at = max(free_at, now) + 1 / rate
+            answers.append((free_at + delay, now))
+        now += 0.001
+    return now
+
+
+def test_it_begins_with_what_the_slowest_autopilot_serves() -> None:
+    pace = Pace(RoundTrip())
+    assert burst(pace, 5.0) == SMALLEST_BURST
+    assert pace.next_at() == pytest.approx(5.0 + 1 / FIRST_RATE)
+    assert not pace.may_send(5.01)
+    assert pace.may_send(pace.next_at())
+
+
+def test_what_next_at_promises_holds_to_the_last_bit() -> None:
+    pace = Pace(RoundTrip())
+    now = 1234.567
+    for _ in range(10_000):
+        burst(pace, now)
+        now = pace.next_at()
+        assert pace.may_send(now)
+
+
+def test_a_reserve_is_kept() -> None:
+    pace = Pace(RoundTrip())
+    for _ in range(int(SMALLEST_BURST) - 2):
+        pace.sent(0.0)
+    assert pace.may_send(0.0, reserve=1.0)
+    assert not pace.may_send(0.0, reserve=1.5)
+    assert pace.next_at(1.5) == pytest.approx(0.5 / FIRST_RATE)
+
+
+def test_it_speeds_up_as_long_as_answers_keep_up() -> None:
+    pace = Pace(RoundTrip())
+    serve(pace, 3.0, 0.02)
+    assert pace.rate == LARGEST_RATE
+
+
+def test_it_stays_near_what_is_served() -> None:
+    pace = Pace(RoundTrip())
+    end = serve(pace, 3.0, 0.02, rate=120.0)
+    assert FIRST_RATE <= pace.rate < 400.0
+    # and a request waits for the others that are before it, not for ever
+    assert pace.next_at() < end + 1.0
+
+
+@pytest.mark.parametrize("silent", [0, 64])
+def test_one_that_serves_batches_is_never_asked_faster_than_it_serves(silent: int) -> None:
+    round_trip = RoundTrip()
+    for number in range(100):
+        if number < silent:
+            round_trip.timed_out(1)
+        else:
+            round_trip.answered(0.0, 0.02, 1)
+    pace = Pace(round_trip)
+    pace.is_batched = True
+    serve(pace, 3.0, 0.02)
+    assert pace.rate == pytest.approx(BATCHED_RATE / (1.0 - round_trip.seen_loss) ** 0.5)
+    assert pace.prospect == pace.rate
+    assert (pace.rate > BATCHED_RATE) is (silent > 0)
+
+
+def test_answers_that_queue_up_slow_it_down() -> None:
+    pace = Pace(RoundTrip())
+    serve(pace, 1.0, 0.02)
+    fast = pace.rate
+    serve(pace, 3.0, 0.02 + 3 * QUEUEING, since=1.0)
+    assert pace.rate < fast
+
+
+@pytest.mark.parametrize(("late", "is_believed"), [(1.0, True), (1.5, False)])
+def test_a_little_too_few_answers_count_when_they_are_late_as_well(late: float, is_believed: bool) -> None:
+    pace = Pace(RoundTrip())
+    pace.answered(0.1, 0.0)  # the quickest one
+    now = 0.0
+    for _ in range(8):
+        burst(pace, now)
+        now += 0.028  # 36 a second: 7 of 10 asked for
+        pace.answered(0.1 * late, now)
+    assert (pace.rate > FIRST_RATE) is is_believed
+
+
+def test_without_requests_that_wait_nothing_is_concluded() -> None:
+    pace = Pace(RoundTrip())
+    for turn in range(100):
+        now = turn * 0.1
+        assert pace.may_send(now)
+        pace.sent(now)
+        pace.answered(0.02, now + 0.02)
+    assert pace.rate == FIRST_RATE
+
+
+def test_an_answer_to_what_was_asked_for_twice_tells_no_delay() -> None:
+    pace = Pace(RoundTrip())
+    now = 0.0
+    for _ in range(200):
+        burst(pace, now)
+        pace.answered(None, now)
+        now += 0.02
+    assert pace.rate >= FIRST_RATE
+
+
+def test_it_leaves_most_of_the_link_to_others() -> None:
+    pace = Pace(RoundTrip())
+    pace.stream_seen(0.1)
+    assert pace.rate == pytest.approx(37 * 10 * UPSTREAM_SHARE / 16)
+    pace.stream_seen(0.0)  # no stream was seen
+    assert pace.rate == pytest.approx(37 * 10 * UPSTREAM_SHARE / 16)
+    pace.stream_seen(0.01)
+    assert pace.rate == FIRST_RATE
+    pace.stream_seen(0.001)
+    assert pace.rate == pytest.approx(LIST_READS / 0.001)
+
+
+@pytest.mark.parametrize("gap", [0.125, 0.2, 1.0, 60.0])
+def test_something_may_always_be_asked_even_on_the_slowest_link(gap: float) -> None:
+    pace = Pace(RoundTrip())
+    burst(pace, 0.0)
+    pace.stream_seen(gap)
+    assert pace.rate >= SMALLEST_RATE
+    now = 0.0
+    for _ in range(5):
+        now = max(pace.next_at(), now)
+        assert pace.may_send(now)
+        pace.sent(now)
+    assert now < 5 / SMALLEST_RATE + 1.0
+
+
+def test_what_the_component_drops_does_not_pass_for_a_bad_link() -> None:
+    trip = RoundTrip()
+    pace = Pace(trip)
+    pace.stream_seen(0.0001)  # the list lost nothing
+    for _ in range(200):
+        trip.timed_out(1)
+        trip.timed_out(1)
+        trip.answered(0.0, 0.02, 1)
+    now = 0.0
+    answers: list[float] = []
+    while now < 2.0:  # it answers one of three, at once
+        while pace.may_send(now):
+            pace.sent(now)
+            pace.sent(now)
+            pace.sent(now)
+            answers.append(now + 0.02)
+        while answers and answers[0] <= now:
+            pace.answered(now - answers.pop(0) + 0.02, now)
+        now += 0.01
+    assert pace.rate <= FIRST_RATE
+
+
+def test_answers_that_were_not_counted_slow_nothing_down() -> None:
+    pace = Pace(RoundTrip())
+    now = serve(pace, 0.5, 0.02)
+    before = pace.rate
+    while now < 3.0:  # a list answers, and what is asked for meanwhile is not counted
+        while pace.may_send(now):
+            pace.sent(now)
+        now += 0.01
+    pace.rest()
+    serve(pace, 0.5, 0.02, since=now)
+    assert pace.rate >= before
+
+
+def test_components_share_what_reads_may_take_of_the_link() -> None:
+    share = Share()
+    one, two = Pace(RoundTrip(), share), Pace(RoundTrip(), share)
+    one.stream_seen(0.1)
+    total = 37 * 10 * UPSTREAM_SHARE / 16
+    assert one.rate == two.rate == pytest.approx(total)
+    one.sent(0.0)
+    two.sent(0.0)
+    assert one.rate == two.rate == pytest.approx(total / 2)
+    two.idle()
+    assert one.rate == pytest.approx(total)
+
+
+def test_lists_that_run_beside_each_other_show_the_link_by_what_came_of_them() -> None:
+    share = Share()
+    one, two = Pace(RoundTrip(), share), Pace(RoundTrip(), share)
+    one.stream_seen(0.1, 0.5)
+    assert one.rate == pytest.approx(37 * 10 * UPSTREAM_SHARE / 16), (
+        "alone: what was lost was lost on the way"
+    )
+    two.stream_seen(0.1, 0.5)
+    assert one.rate == pytest.approx(37 * 10 * UPSTREAM_SHARE / 16)
+    two.stream_seen(0.1, 0.0)
+    assert one.rate == pytest.approx(37 * 15 * UPSTREAM_SHARE / 16)
+    one.stream_ended()
+    two.stream_ended()
+    assert one.rate == pytest.approx(37 * 15 * UPSTREAM_SHARE / 16), "that still holds"
+    one.stream_seen(0.2)
+    assert one.rate < 37 * 10 * UPSTREAM_SHARE / 16, "until one of them comes anew"
+
+
+def test_a_stream_of_bursts_shows_a_faster_link() -> None:
+    pace = Pace(RoundTrip())
+    pace.stream_seen(0.1, 0.0, 3.0)
+    assert pace.rate == pytest.approx(3 * 37 * 10 * UPSTREAM_SHARE / 16)

@@ -1,0 +1,193 @@
+"""The round trip, and how many tries an answer is worth."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from paramclient.protocol.requests.round_trip import (
+    FEWEST_SILENCES,
+    FEWEST_TRIES,
+    INITIAL_TIMEOUT,
+    LONGEST_SILENCE,
+    LONGEST_TIMEOUT,
+    MOST_SILENCES,
+    MOST_TRIES,
+    SERVING_TIME,
+    SHORTEST_TIMEOUT,
+    RoundTrip,
+)
+
+
+def measured(sample: float, times: int = 1) -> RoundTrip:
+    trip = RoundTrip()
+    for _ in range(times):
+        trip.answered(10.0, 10.0 + sample, 1)
+    return trip
+
+
+def test_before_anything_was_measured() -> None:
+    trip = RoundTrip()
+    assert trip.timeout == INITIAL_TIMEOUT
+    assert trip.smoothed is None
+    assert trip.loss == pytest.approx(0.1)
+    assert trip.seen_loss == 0.0
+
+
+def test_the_first_samples_give_two_round_trips() -> None:
+    trip = measured(0.5)
+    assert trip.smoothed == 0.5
+    assert trip.timeout == pytest.approx(1.0)
+
+
+def test_samples_are_smoothed() -> None:
+    trip = measured(0.5)
+    trip.answered(20.0, 21.3, 1)
+    assert trip.smoothed == pytest.approx(0.6)
+    assert trip.variation == pytest.approx(0.25 + (0.8 - 0.25) / 4)
+
+
+def test_a_steady_link_is_not_asked_sooner_than_a_vehicle_answers() -> None:
+    assert measured(0.001, 100).timeout == SHORTEST_TIMEOUT
+    steady = measured(0.3, 100)
+    assert 0.3 < steady.timeout < 0.35
+
+
+def test_what_was_asked_for_twice_is_no_sample() -> None:
+    trip = measured(0.2)
+    trip.answered(0.0, 3.0, 2)
+    assert trip.smoothed == pytest.approx(0.2)
+
+
+def test_silences_in_a_row_back_off_and_a_sample_ends_that() -> None:
+    trip = measured(0.1, 50)
+    before = trip.timeout
+    for _ in range(FEWEST_SILENCES - 1):
+        trip.timed_out(1)
+    assert trip.timeout == before
+    trip.timed_out(1)
+    assert trip.timeout == 2 * before
+    for _ in range(20 * FEWEST_SILENCES):
+        trip.timed_out(3)
+    assert trip.timeout == LONGEST_TIMEOUT
+    trip.answered(0.0, 0.1, 1)
+    assert trip.timeout == pytest.approx(before)
+
+
+def test_an_answer_that_fits_the_last_request_ends_the_silences() -> None:
+    trip = measured(0.1, 50)
+    for _ in range(4):
+        for _ in range(FEWEST_SILENCES - 1):
+            trip.timed_out(1)
+        trip.answered(0.0, 0.09, 2)
+    assert trip.timeout < 0.2
+    for _ in range(MOST_SILENCES):
+        trip.timed_out(1)
+        trip.answered(0.0, 0.01, 2)  # too soon to be the answer to the last request
+    assert trip.timeout > 0.2
+    for _ in range(4):
+        trip.answered(0.0, 0.09, 2)
+    assert trip.timeout < 0.2
+
+
+def test_the_worse_the_link_the_more_silences_are_no_surprise() -> None:
+    good, bad = measured(0.1, 50), measured(0.1, 50)
+    for _ in range(100):
+        for _ in range(2):
+            bad.timed_out(1)
+        bad.answered(0.0, 0.1, 1)
+    before = bad.timeout
+    for _ in range(FEWEST_SILENCES):
+        good.timed_out(3)
+        bad.timed_out(3)
+    assert good.timeout > 1.9 * 0.12
+    assert bad.timeout == before
+    for _ in range(MOST_SILENCES):
+        bad.timed_out(3)
+    assert bad.timeout > 1.9 * before
+
+
+def test_before_reads_are_known_they_get_longer_than_what_is_answered_at_once() -> None:
+    trip = measured(0.02, 2)
+    assert trip.prompt_timeout == SHORTEST_TIMEOUT
+    assert trip.timeout == pytest.approx(0.02 + SERVING_TIME)
+    known = measured(0.02, 50)
+    assert known.timeout == known.prompt_timeout
+
+
+def test_how_many_requests_at_once_a_risk_is_worth() -> None:
+    trip = measured(0.1, 50)
+    assert trip.copies(0.05, 3) == 1
+    for _ in range(200):
+        trip.timed_out(1)
+        trip.answered(0.0, 0.1, 1)
+    assert trip.copies(0.3, 9) == 2
+    assert trip.copies(0.05, 3) == 3
+
+
+def test_a_slow_link_gets_what_it_needs() -> None:
+    trip = measured(9.0, 100)
+    for _ in range(100):
+        trip.timed_out(3)
+    assert 9.0 < trip.timeout < 10.0
+
+
+def test_the_share_that_is_lost() -> None:
+    trip = RoundTrip()
+    for _ in range(200):
+        trip.answered(0.0, 0.1, 1)
+        trip.timed_out(1)
+    assert trip.loss == pytest.approx(0.5, abs=0.02)
+    assert trip.seen_loss == pytest.approx(0.5, abs=0.02)
+    for _ in range(200):
+        trip.timed_out(3)  # may have no answer at all
+        trip.answered(0.0, 0.1, 3)
+    assert trip.loss == pytest.approx(0.5, abs=0.02)
+
+
+def test_the_number_of_tries_follows_the_loss() -> None:
+    clean = measured(0.1, 200)
+    assert clean.tries == FEWEST_TRIES
+    lossy = measured(0.1)
+    for number in range(200):
+        lossy.answered(0.0, 0.1, 1)
+        if number % 2:
+            lossy.timed_out(1)
+    assert FEWEST_TRIES < lossy.tries < MOST_TRIES
+    dead = RoundTrip()
+    for _ in range(200):
+        dead.timed_out(1)
+    assert dead.tries == MOST_TRIES
+
+
+def test_enough_is_enough() -> None:
+    trip = measured(0.1, 200)
+    assert not trip.is_hopeless(FEWEST_TRIES - 1, 1e9)
+    assert trip.is_hopeless(FEWEST_TRIES, 0.0)
+    for _ in range(50):
+        trip.timed_out(1)
+    assert trip.tries > FEWEST_TRIES
+    assert not trip.is_hopeless(FEWEST_TRIES, 1e9)  # nobody keeps its `heard_at`
+
+
+def test_a_component_that_is_gone_is_not_asked_for_ever() -> None:
+    trip = RoundTrip()
+    for _ in range(50):
+        trip.timed_out(1)
+    trip.heard_at = 100.0
+    assert not trip.is_hopeless(FEWEST_TRIES, 99.0 + LONGEST_SILENCE)
+    assert trip.is_hopeless(FEWEST_TRIES, 100.0 + LONGEST_SILENCE)
+    assert not trip.is_hopeless(FEWEST_TRIES - 1, 100.0 + LONGEST_SILENCE)
+
+
+def test_an_answer_to_what_was_sent_at_no_known_time_tells_nothing_of_the_round_trip() -> None:
+    """One such number would make every time-out none."""
+    for known in (False, True):
+        trip = RoundTrip()
+        if known:
+            trip.answered(1.0, 1.2, 1)
+        before = trip.timeout
+        for sent_at in (-math.inf, math.inf):
+            trip.answered(sent_at, 5.0, 1)
+            assert trip.timeout == before

@@ -1,0 +1,903 @@
+"""One component: its messages in, its requests out, and what is known in between."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+
+from paramclient.errors import (
+    LinkError,
+    NoReply,
+    ParamErrorCode,
+    Refused,
+    UnknownParameter,
+    UsageError,
+)
+from paramclient.model.values import Encoding, Param, ParamType, Trust, Value, px4_hash
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import ComponentIdentified, Event, Fetched, ParamChanged, ParamsMoved
+from paramclient.protocol.params import table as table_room
+from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.change_origin import DOUBT, FOREIGN_SET_MEMORY, MOST_FOREIGN_SETS
+from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.params.value_check import DISTRUST_TIME
+from paramclient.protocol.station import Station
+from paramclient.protocol.wire import (
+    CAPABILITY_PARAM_ENCODE_BYTEWISE,
+    HASH_CHECK,
+    MAV_AUTOPILOT_ARDUPILOTMEGA,
+    MAV_AUTOPILOT_PX4,
+    NO_INDEX,
+    AutopilotVersion,
+    CommandLong,
+    Heartbeat,
+    Message,
+    ParamError,
+    ParamRequestList,
+    ParamRequestRead,
+    ParamSet,
+    ParamValue,
+    StatusText,
+)
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, Vehicle
+from tests.simulation import Simulation, is_so, known, listed, param_value
+
+OWN = (255, 190)
+PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
+ARDUPILOT = Heartbeat(2, MAV_AUTOPILOT_ARDUPILOTMEGA)
+SOMETHING = Heartbeat(2, 0)
+
+
+class Desk:
+    """The component 1/1 with all that it sends and tells."""
+
+    def __init__(self, heartbeat: Heartbeat | None = PX4, *, encoding: Encoding | None = None) -> None:
+        self.now = 0.0
+        self.sent: list[Message] = []
+        self.events: list[Event] = []
+        self.machine = ComponentMachine(
+            1, 1, own=OWN, link="x", send=self.sent.append, emit=self.events.append, encoding=encoding
+        )
+        self.machine.reads.is_idle = False
+        if heartbeat is not None:
+            self.receive(heartbeat)
+            self.receive(AutopilotVersion(0, uid=7))
+        self.take()
+
+    def receive(self, message: Message, *, at: float | None = None) -> None:
+        self.now = self.now if at is None else at
+        self.machine.receive(message, self.now)
+
+    def hear(
+        self,
+        name: str,
+        value: Value = 0.0,
+        kind: int = ParamType.REAL32,
+        *,
+        index: int = NO_INDEX,
+        count: int = 3,
+    ) -> None:
+        encoding = self.machine.table.encoding
+        self.receive(param_value(name, value, index=index, count=count, kind=kind, encoding=encoding))
+
+    def hash(self, value: int, *, count: int = 3) -> None:
+        self.receive(ParamValue(HASH_CHECK, value.to_bytes(4, "little"), ParamType.UINT32, count, NO_INDEX))
+
+    def send_list(self, *names: str, count: int = 3) -> None:
+        for index, name in enumerate(names):
+            self.hear(name, float(index), index=index, count=count)
+
+    def cached(self, *params: Param, **more: object) -> None:
+        arguments: dict[str, object] = {
+            "count": len(params),
+            "confirmed": None,
+            "complete": True,
+            "volatile": frozenset(),
+            "volatile_known": False,
+        }
+        self.machine.use_cached({each.name: each for each in params}, self.now, **{**arguments, **more})  # type: ignore[arg-type]  # as it says
+
+    def pass_time(self, seconds: float = math.inf) -> None:
+        end = self.now + seconds
+        for _ in range(10_000):
+            deadline = self.machine.next_deadline()
+            if deadline > end or deadline == math.inf:
+                self.now = end if end < math.inf else self.now
+                return
+            self.now = max(deadline, self.now)
+            self.machine.tick(self.now)
+        raise AssertionError("it does not come to an end")
+
+    def take(self) -> list[Message]:
+        sent, self.sent[:] = list(self.sent), []
+        return sent
+
+    def reads(self) -> list[str]:
+        return [
+            each.param_id or str(each.param_index)
+            for each in self.take()
+            if isinstance(each, ParamRequestRead)
+        ]
+
+    @property
+    def changes(self) -> list[Change]:
+        return [event.change for event in self.events if isinstance(event, ParamChanged)]
+
+
+def fetched(desk: Desk, *, announce: bool = True) -> None:
+    """Let a table of three be fetched, under its hash."""
+    fetch = desk.machine.begin_fetch(desk.now)
+    if announce:
+        desk.hash(px4_hash([known(name, float(at), index=at) for at, name in enumerate("ABC")]))
+    desk.send_list("A", "B", "C")
+    desk.machine.end_fetch(fetch, desk.now)
+    desk.take()
+
+
+# values
+
+
+def test_a_value_goes_into_the_table_and_is_told() -> None:
+    desk = Desk()
+    desk.hear("A", 1.5, index=2)
+    assert desk.machine.table.params["A"].value == 1.5
+    assert desk.machine.table.count == 3
+    assert [(change.name, change.by) for change in desk.changes] == [("A", "vehicle")]
+    desk.hear("A", 1.5, index=2)
+    assert len(desk.changes) == 1
+
+
+def test_where_nobody_wants_to_know_each_change_it_is_told_once_that_there_are_some() -> None:
+    desk = Desk()
+    desk.events.clear()
+    desk.machine.tells_changes = False
+    desk.send_list("A", "B")
+    desk.cached(known("C", 1, index=2))
+    assert desk.events == [ParamsMoved(desk.machine)]
+    desk.machine.has_moved = False
+    desk.hear("A", 7.0)
+    assert desk.events == [ParamsMoved(desk.machine)] * 2
+    desk.machine.tells_changes = True
+    desk.hear("A", 8.0)
+    assert [change.new.value for change in desk.changes if change.new] == [8.0]
+
+
+def test_a_value_without_a_name_is_none() -> None:
+    desk = Desk()
+    desk.hear("")
+    assert desk.machine.table.params == {}
+
+
+def test_a_table_that_is_full_takes_no_more_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(table_room, "MOST_NAMES", 1)
+    desk = Desk()
+    desk.hear("A")
+    write = desk.machine.write("B", 1.0, desk.now)
+    desk.hear("B", 5.0)
+    assert not write.done
+    desk.pass_time()
+    assert isinstance(write.error, NoReply | UnknownParameter)
+
+
+@pytest.mark.parametrize("index", [NO_INDEX, 32767])
+def test_a_hash_is_no_parameter(index: int) -> None:
+    desk = Desk()
+    desk.receive(ParamValue(HASH_CHECK, b"\x01\x02\x03\x04", ParamType.UINT32, 3, index), at=2.0)
+    assert desk.machine.table.params == {}
+    announced = desk.machine.sync.announced
+    assert announced is not None
+    assert (announced.hash, announced.count, announced.at) == (0x04030201, 3, 2.0)
+
+
+def test_values_are_read_again_when_the_encoding_becomes_known() -> None:
+    desk = Desk(None)
+    desk.receive(param_value("A", 1234.0, kind=ParamType.INT32, encoding=Encoding.C_CAST))
+    assert desk.machine.table.params["A"].value == 0x449A4000
+    desk.receive(ARDUPILOT)
+    assert desk.machine.table.params["A"].value == 1234
+    assert desk.changes[-1].new == desk.machine.table.params["A"]
+
+
+def test_what_the_user_says_about_the_encoding_holds() -> None:
+    desk = Desk(ARDUPILOT, encoding=Encoding.BYTEWISE)
+    desk.hear("A", 5, ParamType.INT32)
+    assert desk.machine.table.params["A"].value == 5
+    assert desk.machine.who.encoding_reason == "chosen by the user"
+
+
+def test_ardupilot_answers_in_the_spelling_that_was_asked_for() -> None:
+    desk = Desk(ARDUPILOT)
+    read = desk.machine.read("wpnav_speed", desk.now)
+    assert desk.reads() == ["WPNAV_SPEED"]
+    desk.hear("Wpnav_Speed", 500.0)
+    assert read.done
+    assert list(desk.machine.table.params) == ["WPNAV_SPEED"]
+    write = desk.machine.write("wpnav_speed", 400.0, desk.now)
+    assert [each.param_id for each in desk.take() if isinstance(each, ParamSet)] == ["WPNAV_SPEED"]
+    desk.hear("wpnav_speed", 400.0)
+    assert write.done
+
+
+def types_of(desk: Desk) -> dict[str, ParamType | int]:
+    return {name: param.type for name, param in desk.machine.table.params.items()}
+
+
+def test_ardupilots_answer_to_a_set_does_not_change_an_integers_type() -> None:
+    """It says REAL32 if the set changes nothing and the value was never stored."""
+    desk = Desk(ARDUPILOT)
+    desk.hear("A", 3, ParamType.INT8, index=0)
+    desk.hear("B", 7, ParamType.INT32, index=1)
+    write = desk.machine.write("A", 3, desk.now)
+    desk.take()
+    before = len(desk.changes)
+    desk.hear("A", 3.0)
+    assert write.result is not None
+    assert (write.result.param.value, write.result.param.type) == (3, ParamType.INT8)
+    desk.hear("B", 7.0)  # another station's set
+    assert types_of(desk) == {"A": ParamType.INT8, "B": ParamType.INT32}
+    assert len(desk.changes) == before
+    desk.hear("B", 8.0)
+    assert [change.new for change in desk.changes[before:]] == [known("B", 8, index=1).with_trust(Trust.LIVE)]
+
+
+def test_a_type_of_the_cache_gives_way() -> None:
+    """A write reads first, so it never depends on that."""
+    desk = Desk(ARDUPILOT)
+    desk.cached(known("A", 3, index=0, kind=ParamType.INT8))
+    write = desk.machine.write("A", 3, desk.now)
+    assert desk.reads() == ["A"]
+    desk.hear("A", 3.0)
+    assert types_of(desk) == {"A": ParamType.REAL32}
+    desk.hear("A", 3.0)
+    assert write.done
+
+
+@pytest.mark.parametrize("value", [3.5, 128.0, -129.0, math.nan, math.inf])
+def test_a_value_that_the_known_type_cannot_have_brings_its_own(value: float) -> None:
+    desk = Desk(ARDUPILOT)
+    desk.hear("A", 3, ParamType.INT8, index=0)
+    desk.hear("A", value)
+    assert types_of(desk) == {"A": ParamType.REAL32}
+
+
+def test_a_list_says_what_type_it_is() -> None:
+    desk = Desk(ARDUPILOT)
+    desk.hear("A", 3, ParamType.INT8, index=0)
+    desk.hear("A", 3.0, index=0)
+    assert types_of(desk) == {"A": ParamType.REAL32}
+
+
+def test_other_autopilots_mean_the_type_that_they_say() -> None:
+    desk = Desk(SOMETHING)
+    desk.hear("A", 3, ParamType.INT8, index=0)
+    desk.hear("A", 3.0)
+    assert types_of(desk) == {"A": ParamType.REAL32}
+
+
+def test_other_autopilots_mind_the_case() -> None:
+    desk = Desk()
+    desk.machine.read("a", desk.now)
+    assert desk.reads() == ["a"]
+
+
+def test_a_count_that_moves_takes_the_table_out_of_step() -> None:
+    desk = Desk()
+    fetched(desk)
+    assert is_so(desk.machine.sync.synced)
+    desk.hear("A", 0.0, index=0, count=NO_INDEX)
+    assert is_so(desk.machine.sync.synced)
+    desk.hear("A", 0.0, index=0, count=4)
+    assert not desk.machine.sync.synced
+    assert not desk.machine.can_hit
+    assert desk.machine.table.count == 4
+
+
+def test_what_changes_twice_in_a_short_while_is_asked_for_once_more() -> None:
+    desk = Desk(ARDUPILOT)
+    desk.hear("A", 1.0)
+    desk.now += 2 * DOUBT
+    desk.hear("A", 2.0)
+    desk.now += DISTRUST_TIME
+    desk.hear("A", 1.0)  # an answer from before the change, it may be
+    desk.hear("B", 1.0)
+    assert desk.reads() == []
+    desk.pass_time(DOUBT / 2 + 0.05)
+    assert desk.reads() == ["A"]
+    desk.hear("A", 2.0)
+    desk.pass_time(DOUBT / 2 + 0.05)
+    assert desk.reads() == ["A"]
+    desk.hear("A", 2.0)
+    desk.pass_time(3 * DOUBT)
+    assert desk.reads() == []
+    assert len(desk.machine.reads) == 0
+
+
+def test_what_changes_slowly_is_believed() -> None:
+    desk = Desk()
+    for number in range(5):
+        desk.now += DOUBT + 0.1
+        desk.hear("A", float(number))
+    desk.pass_time(3 * DOUBT)
+    assert desk.reads() == []
+
+
+def test_what_we_change_twice_ourselves_is_believed() -> None:
+    desk = Desk(SOMETHING)
+    desk.hear("A", 0.0)
+    for value in (1.0, 2.0, 3.0):
+        desk.machine.write("A", value, desk.now)
+        desk.hear("A", value)
+    desk.pass_time(3 * DOUBT)
+    assert desk.reads() == []
+
+
+def test_memory_of_changes_is_short() -> None:
+    desk = Desk()
+    for number in range(1000):
+        desk.now += 0.1
+        desk.hear(f"N{number}")
+        if number % 10 == 0:
+            desk.receive(PX4)
+    assert len(desk.machine._authors._changed_at) <= (DOUBT + 1.0) / 0.1 + 2
+
+
+# who did it
+
+
+def test_a_change_by_our_own_write() -> None:
+    desk = Desk()
+    desk.hear("A", 1.0)
+    desk.machine.write("A", 2.0, desk.now)
+    desk.hear("A", 2.0)
+    assert [change.by for change in desk.changes] == ["vehicle", "us"]
+
+
+def test_a_change_by_another_station() -> None:
+    desk = Desk(ARDUPILOT)
+    desk.hear("A", 1.0)
+    desk.machine.foreign_set("a", struct.pack("<f", 2.0), "station 254/190", desk.now)
+    desk.hear("A", 2.0)
+    desk.hear("B", 2.0)
+    assert [change.by for change in desk.changes] == ["vehicle", "station 254/190", "vehicle"]
+    desk.now += FOREIGN_SET_MEMORY + 0.1
+    desk.hear("A", 3.0)
+    assert desk.changes[-1].by == "vehicle"
+
+
+@pytest.mark.parametrize(
+    ("heard", "by"),
+    [
+        pytest.param(3.0, "station 254/190", id="its value"),
+        pytest.param(2.0, "us", id="our value"),
+        pytest.param(2.5, "us", id="an adjustment"),
+    ],
+)
+def test_a_change_while_our_write_and_another_stations_are_under_way(heard: float, by: str) -> None:
+    desk = Desk()
+    desk.hear("A", 1.0)
+    desk.machine.write("A", 2.0, desk.now)
+    desk.machine.foreign_set("A", struct.pack("<f", 3.0), "station 254/190", desk.now)
+    desk.hear("A", heard)
+    assert [change.by for change in desk.changes] == ["vehicle", by]
+
+
+def test_an_old_set_of_another_station_is_not_the_author_of_what_comes_of_our_write() -> None:
+    desk = Desk()
+    desk.hear("A", 1.0)
+    desk.machine.foreign_set("A", struct.pack("<f", 3.0), "station 254/190", desk.now)
+    desk.now += FOREIGN_SET_MEMORY + 0.1
+    desk.machine.write("A", 2.0, desk.now)
+    desk.hear("A", 3.0)
+    assert desk.changes[-1].by == "us"
+
+
+def test_the_memory_of_other_stations_is_bounded() -> None:
+    desk = Desk()
+    for number in range(3 * MOST_FOREIGN_SETS):
+        desk.machine.foreign_set(f"N{number}", bytes(4), "station 2/2", desk.now)
+    assert len(desk.machine._authors.foreign_sets) == MOST_FOREIGN_SETS
+    desk.hear("N0")
+    desk.hear(f"N{3 * MOST_FOREIGN_SETS - 1}")
+    assert [change.by for change in desk.changes] == ["vehicle", "station 2/2"]
+
+
+# refusals
+
+
+@pytest.mark.parametrize("target", [OWN, (0, 0)])
+def test_a_refusal_for_us(target: tuple[int, int]) -> None:
+    desk = Desk()
+    read = desk.machine.read("A", desk.now)
+    desk.receive(ParamError(*target, "A", -1, 1))
+    assert isinstance(read.error, UnknownParameter)
+
+
+@pytest.mark.parametrize("target", [(254, 190), (255, 191), (255, 0), (0, 190)])
+def test_a_refusal_for_somebody_else(target: tuple[int, int]) -> None:
+    desk = Desk()
+    desk.hear("A", 1.0)
+    read, write = desk.machine.read("B", desk.now), desk.machine.write("A", 2.0, desk.now)
+    desk.receive(ParamError(*target, "A", -1, 5))
+    desk.receive(ParamError(*target, "B", -1, 1))
+    assert not read.done
+    assert not write.done
+
+
+def test_a_refusal_of_a_write_is_not_one_of_a_read() -> None:
+    desk = Desk()
+    desk.hear("A", 1.0)
+    write, read = desk.machine.write("A", 2.0, desk.now), desk.machine.read("A", desk.now)
+    desk.receive(ParamError(*OWN, "A", -1, ParamErrorCode.READ_ONLY))
+    assert isinstance(write.error, Refused)
+    assert not read.done
+
+
+@pytest.mark.parametrize(
+    ("text", "is_refusal"),
+    [
+        ("Param write denied (A)", True),
+        ("ArduCopter: Param write denied (A)", True),
+        ("Param write denied (B)", False),
+        ("Param write allowed (A)", False),
+    ],
+)
+def test_ardupilots_text(text: str, is_refusal: bool) -> None:
+    desk = Desk(ARDUPILOT)
+    desk.hear("A", 1.0)
+    write = desk.machine.write("A", 2.0, desk.now)
+    desk.receive(StatusText(4, text))
+    assert write.done is is_refusal
+
+
+def test_a_silent_index_beyond_the_count_is_unknown() -> None:
+    world = Simulation(PX4Vehicle(table={"A": 1, "B": 2}))
+    world.fetch()
+    assert isinstance(world.error_of(lambda: world.get(5)), UnknownParameter)
+
+
+# writes and what they need
+
+
+def test_a_value_that_does_not_fit_is_refused_before_anything_is_sent() -> None:
+    desk = Desk()
+    desk.hear("A", 3, ParamType.UINT8)
+    for value in (300, 1.5, math.nan):
+        with pytest.raises(UsageError):
+            desk.machine.write("A", value, desk.now)
+    assert desk.take() == []
+    assert len(desk.machine.writes) == 0
+
+
+def test_before_it_is_certain_how_values_are_written_nothing_is_judged_or_sent() -> None:
+    desk = Desk(None)
+    desk.receive(param_value("A", 5.0, kind=ParamType.INT32, encoding=Encoding.C_CAST))
+    write = desk.machine.write("A", 1234.7, desk.now)
+    assert not any(isinstance(each, ParamSet) for each in desk.take())
+    desk.receive(ARDUPILOT)
+    [message] = [each for each in desk.take() if isinstance(each, ParamSet)]
+    assert message.raw == param_value("A", 1234.7).raw
+    desk.hear("A", 1234, ParamType.INT32)
+    assert write.result is not None
+    assert write.result.status == "adjusted"
+
+
+def test_a_component_that_never_says_who_it_is_is_written_to_by_the_standard() -> None:
+    desk = Desk(None)
+    desk.receive(SOMETHING)
+    desk.hear("A", 5, ParamType.INT32)
+    desk.machine.write("A", 6, desk.now)
+    assert not any(isinstance(each, ParamSet) for each in desk.take())
+    desk.pass_time(6.0)
+    assert desk.machine.who.settled
+    assert any(isinstance(each, ParamSet) for each in desk.take())
+
+
+# hashes
+
+
+def test_after_our_write_the_hash_is_asked_for_once_things_have_settled() -> None:
+    desk = Desk()
+    fetched(desk)
+    desk.machine.write("A", 7.0, desk.now)
+    desk.hear("A", 7.0, index=0)
+    assert is_so(desk.machine.is_settling)
+    desk.pass_time(0.05)
+    assert HASH_CHECK not in desk.reads()
+    desk.pass_time(0.02)
+    assert desk.reads() == [HASH_CHECK]
+    assert is_so(desk.machine.is_settling)
+    expected = desk.machine.table.hash
+    assert expected is not None
+    desk.hash(expected)
+    assert not desk.machine.is_settling
+    assert desk.machine.sync.synced
+
+
+def test_another_hash_than_expected_takes_the_table_out_of_step() -> None:
+    desk = Desk()
+    fetched(desk)
+    desk.machine.write("A", 7.0, desk.now)
+    desk.hear("A", 7.0, index=0)
+    desk.pass_time(0.1)
+    desk.hash(0x12345678)
+    assert not desk.machine.sync.synced
+    assert desk.machine.table.hash != 0x12345678
+
+
+def test_the_right_hash_with_another_count_confirms_nothing() -> None:
+    desk = Desk()
+    fetched(desk)
+    desk.machine.sync.ask(desk.now)
+    expected = desk.machine.table.hash
+    assert expected is not None
+    desk.hash(expected, count=4)
+    assert not desk.machine.sync.synced
+
+
+def test_the_right_hash_with_another_count_is_no_hit() -> None:
+    desk = Desk()
+    fetched(desk)
+    desk.now += 10.0
+    fetch = desk.machine.begin_fetch(desk.now)
+    assert desk.reads() == [HASH_CHECK]
+    expected = desk.machine.table.hash
+    assert expected is not None
+    desk.hash(expected, count=4)
+    assert not fetch.done
+    assert ParamRequestList(1, 1) in desk.take()
+
+
+def test_during_further_writes_a_hash_means_nothing() -> None:
+    desk = Desk()
+    fetched(desk)
+    desk.machine.sync.ask(desk.now)
+    desk.machine.write("A", 7.0, desk.now)
+    desk.hash(0x12345678)
+    assert desk.machine.sync.synced
+
+
+def test_a_vehicle_without_a_hash_is_not_asked_for_it() -> None:
+    for heartbeat in (ARDUPILOT, SOMETHING):
+        desk = Desk(heartbeat)
+        desk.hear("A", 1.0)
+        desk.machine.write("A", 2.0, desk.now)
+        desk.hear("A", 2.0)
+        desk.pass_time(1.0)
+        assert HASH_CHECK not in desk.reads()
+
+
+def test_a_hash_that_the_vehicle_does_not_have_is_not_asked_for_again() -> None:
+    desk = Desk()
+    desk.hear("A", 1.0)
+    desk.machine.sync.ask(desk.now)
+    desk.receive(ParamError(*OWN, HASH_CHECK, -1, 1))
+    desk.machine.write("A", 2.0, desk.now)
+    desk.hear("A", 2.0)
+    desk.take()
+    desk.pass_time(1.0)
+    assert desk.reads() == []
+    desk.hash(5)  # it has one after all
+    desk.machine.write("A", 3.0, desk.now)
+    desk.hear("A", 3.0)
+    desk.pass_time(1.0)
+    assert HASH_CHECK in desk.reads()
+
+
+@pytest.mark.parametrize("how", ["silence", "link"])
+def test_a_hash_that_was_not_heard_may_still_be_there(how: str) -> None:
+    desk = Desk()
+    desk.machine.sync.ask(desk.now)
+    if how == "silence":
+        desk.pass_time()
+    else:
+        desk.machine.fail_all(LinkError("gone", link="x"), desk.now)
+    assert desk.machine.sync.expects_hash
+
+
+def test_a_change_makes_an_announced_hash_old() -> None:
+    desk = Desk()
+    desk.hash(5)
+    desk.hear("A", 1.0)
+    assert desk.machine.sync.announced is not None
+    assert desk.machine.sync.announced.at == -math.inf
+    desk.hear("A", 2.0)
+    assert desk.machine.sync.announced.hash == 5
+
+
+# the cache
+
+
+def test_what_the_cache_knows_is_confirmed_by_a_hash_that_came_before() -> None:
+    desk = Desk()
+    params = [known("A", 1, index=0), known("B", 2, index=1)]
+    desk.hash(px4_hash(params), count=2)
+    desk.cached(*params, confirmed=px4_hash(params), volatile_known=True)
+    assert {param.trust for param in desk.machine.table.params.values()} == {Trust.VERIFIED}
+    assert [change.name for change in desk.changes] == ["A", "B"]
+    assert desk.machine.state == "cached"
+    assert desk.machine.can_hit
+
+
+@pytest.mark.parametrize("announced", [None, 1])
+def test_without_such_a_hash_it_stays_cached(announced: int | None) -> None:
+    desk = Desk()
+    params = [known("A", 1, index=0), known("B", 2, index=1)]
+    if announced is not None:
+        desk.hash(announced, count=2)
+    desk.cached(*params, confirmed=px4_hash(params), volatile_known=True)
+    assert {param.trust for param in desk.machine.table.params.values()} == {Trust.CACHED}
+
+
+def test_what_was_heard_before_the_cache_was_read_stays() -> None:
+    desk = Desk()
+    desk.hear("A", 9, ParamType.INT32, index=0, count=2)
+    params = [known("A", 1, index=0), known("B", 2, index=1)]
+    desk.cached(*params, confirmed=px4_hash(params), volatile_known=True)
+    table = desk.machine.table
+    assert (table.params["A"].value, table.params["B"].value) == (9, 2)
+    assert table.hash == px4_hash(listed(table)) != px4_hash(params)
+
+
+def test_a_hash_that_cannot_be_computed_is_lost_when_something_has_moved() -> None:
+    desk = Desk()
+    desk.hear("A", 9, ParamType.INT32, index=0, count=2)
+    desk.cached(known("A", 1, index=0), known("B", 2, index=1), confirmed=77)
+    assert desk.machine.table.hash is None
+    other = Desk()
+    other.hear("A", 1, ParamType.INT32, index=0, count=2)
+    other.cached(known("A", 1, index=0), known("B", 2, index=1), confirmed=77)
+    assert other.machine.table.hash == 77
+
+
+def test_a_table_of_another_count_is_only_a_start() -> None:
+    desk = Desk()
+    desk.hear("A", 9, ParamType.INT32, index=0, count=5)
+    desk.cached(known("B", 2, index=1), confirmed=77)
+    assert "B" in desk.machine.table.params
+    assert not desk.machine.table.complete
+    assert desk.machine.table.hash is None
+    assert desk.machine.state == "partial"
+
+
+def test_a_complete_table_needs_no_cache() -> None:
+    desk = Desk()
+    fetched(desk)
+    desk.cached(known("OLD", 2, index=1))
+    assert "OLD" not in desk.machine.table.params
+
+
+# its state
+
+
+def test_the_states_of_a_table() -> None:
+    desk = Desk()
+    assert desk.machine.state == "new"
+    assert repr(desk.machine) == "<ComponentMachine 1/1 px4 new>"
+    desk.hear("X")
+    assert desk.machine.state == "partial"
+    fetch = desk.machine.begin_fetch(desk.now)
+    assert desk.machine.state == "fetching"
+    desk.hash(5)
+    desk.send_list("A", "B", "C")
+    desk.hash(5)
+    assert fetch.done
+    assert desk.machine.state == "synced"
+    assert any(isinstance(event, Fetched) for event in desk.events)
+    assert repr(Desk(None).machine) == "<ComponentMachine 1/1 unknown new>"
+
+
+def test_a_table_whose_count_never_rests_is_not_in_step() -> None:
+    desk = Desk(SOMETHING)
+    fetch = desk.machine.begin_fetch(desk.now)
+    for number in range(30):
+        desk.hear("A", 1.0, index=0, count=2 + number % 2)
+    desk.hear("B", 1.0, index=1, count=2)
+    assert fetch.result is not None
+    assert fetch.result.complete
+    assert "kept changing" in fetch.result.notes[0]
+    assert not desk.machine.sync.synced
+    assert not desk.machine.table.complete
+
+
+# identity
+
+
+def test_it_is_told_when_it_is_settled_who_it_is() -> None:
+    desk = Desk(None)
+    desk.receive(PX4)
+    assert desk.events == []
+    desk.receive(AutopilotVersion(CAPABILITY_PARAM_ENCODE_BYTEWISE, uid=7))
+    assert desk.events == [ComponentIdentified(desk.machine)]
+    desk.receive(PX4)
+    assert len(desk.events) == 1
+    assert desk.machine.identity.uid == "0000000000000007"
+
+
+def test_it_is_told_again_when_a_late_answer_gives_another_name() -> None:
+    desk = Desk(None)
+    for _ in range(10):
+        desk.receive(PX4)
+        desk.pass_time(1.0)
+    assert desk.events == [ComponentIdentified(desk.machine)]
+    desk.receive(AutopilotVersion(0, uid=7))
+    assert desk.events == 2 * [ComponentIdentified(desk.machine)]
+    assert desk.machine.identity.key == "uid:0000000000000007"
+
+
+def test_another_vehicle_in_the_same_place() -> None:
+    desk = Desk()
+    fetched(desk)
+    desk.machine.table.volatile = frozenset("C")
+    desk.events.clear()
+    write = desk.machine.write("A", 5.0, desk.now)
+    desk.now += 60.0
+    desk.receive(PX4)
+    assert any(isinstance(each, CommandLong) for each in desk.take())
+    desk.receive(AutopilotVersion(0, uid=8))
+    table = desk.machine.table
+    assert table.params == {}
+    assert (table.count, table.complete, table.hash, table.volatile) == (None, False, None, frozenset())
+    assert not table.volatile_known
+    assert desk.machine.sync.announced is None
+    assert not desk.machine.sync.synced
+    assert isinstance(write.error, NoReply)
+    assert "another vehicle" in str(write.error)
+    assert [change.name for change in desk.changes] == ["A", "B", "C"]
+    assert all(change.new is None for change in desk.changes)
+    assert desk.events[-1] == ComponentIdentified(desk.machine)
+
+
+def test_another_vehicle_during_a_fetch_begins_it_anew() -> None:
+    desk = Desk()
+    fetch = desk.machine.begin_fetch(desk.now)
+    desk.hear("A", index=0)
+    desk.take()
+    desk.now += 6.0
+    desk.receive(PX4)
+    desk.receive(AutopilotVersion(0, uid=8))
+    assert any(isinstance(each, ParamRequestList) for each in desk.take())
+    desk.hash(5)
+    desk.send_list("X", "Y", "Z")
+    desk.hash(5)
+    assert fetch.result is not None
+    assert list(fetch.result.params) == ["X", "Y", "Z"]
+
+
+def test_two_vehicles_one_after_the_other() -> None:
+    first, second = PX4Vehicle(uid=1, table={"A": 1, "B": 2}), PX4Vehicle(uid=2, table={"A": 3, "C": 4})
+    second.reboot(0.0, down=math.inf)
+    world = Simulation(first, second)
+    world.fetch()
+    first.reboot(world.now, down=math.inf)
+    world.run(10.0)
+    second.reboot(world.now, down=0.0)
+    world.until(lambda: world.machine.identity.uid == f"{2:016x}")
+    assert world.machine.table.params == {}
+    result = world.fetch()
+    assert {name: param.value for name, param in result.params.items()} == {"A": 3, "C": 4}
+
+
+@pytest.mark.parametrize("make", [PX4Vehicle, GenericVehicle])
+def test_a_vehicle_that_takes_the_place_of_another_at_once_is_told_apart_by_its_table(
+    make: Callable[..., Vehicle],
+) -> None:
+    first, second = make(uid=1, table={"A": 1, "B": 2}), make(uid=2, table={"A": 3, "C": 4})
+    second.reboot(0.0, down=math.inf)
+    world = Simulation(first, second)
+    world.fetch()
+    world.run(2.0)
+    first.reboot(world.now, down=math.inf)
+    second.reboot(world.now, down=0.0)
+    result = world.fetch()
+    world.until(lambda: world.machine.identity.uid == f"{2:016x}")
+    if result.params.keys() != {"A", "C"}:  # the answer came after the end
+        result = world.fetch()
+    assert {name: param.value for name, param in result.params.items()} == {"A": 3, "C": 4}
+
+
+# the link
+
+
+def test_when_the_link_is_gone_everything_ends_and_nothing_is_left() -> None:
+    desk = Desk()
+    fetched(desk)
+    desk.hear("V", 1.0)
+    error = LinkError("gone", link="x")
+    read, write = desk.machine.read("Q", desk.now), desk.machine.write("A", 5.0, desk.now)
+    fetch = desk.machine.begin_fetch(desk.now, refresh=True)
+    desk.machine.sync.ask(desk.now)
+    desk.hear("A", 9.0, index=0)
+    desk.hear("B", 9.0, index=1)
+    desk.hear("B", 8.0, index=1)  # in doubt
+    desk.machine.fail_all(error, desk.now)
+    assert read.error is error
+    assert write.error is error
+    assert fetch.error is error
+    assert len(desk.machine.reads) == len(desk.machine.writes) == 0
+    assert desk.machine.fetch is None
+    assert desk.machine.next_deadline() == desk.machine.presence.lost_at(), "that is all there is left to see"
+
+
+def test_a_refresh_of_volatile_values_fails_with_the_link() -> None:
+    world = Simulation(air=Air.symmetric([PX4Vehicle()], delay=0.2))
+    world.fetch()
+    memory = world.memory()
+    world.next_session()
+    world.meet().use_cached(now=world.now, **memory)
+    world.fetch()
+    refresh = world.machine.refresh
+    assert refresh is not None
+    error = LinkError("gone", link="x")
+    world.station.fail_all(error, world.now)
+    assert refresh.error is error
+    assert world.machine.refresh is None
+
+
+def test_a_pause_does_not_count_as_the_vehicles_silence() -> None:
+    desk = Desk()
+    desk.hear("A", 1.0)
+    read = desk.machine.read("A", desk.now)
+    desk.pass_time(4.0)
+    assert not read.done
+    desk.now += 100.0
+    desk.machine.resume(desk.now)
+    desk.pass_time(4.0)  # several time-outs
+    assert not read.done
+
+
+def test_a_dead_vehicle_is_given_up_by_all_that_waits() -> None:
+    desk = Desk()
+    desk.hear("A", 1.0)
+    read, write = desk.machine.read("B", desk.now), desk.machine.write("A", 2.0, desk.now)
+    desk.pass_time(60.0)
+    assert isinstance(read.error, NoReply)
+    assert isinstance(write.error, NoReply)
+
+
+def test_messages_that_mean_nothing_here() -> None:
+    desk = Desk()
+    desk.receive(ParamRequestList(1, 1))
+    assert desk.take() == []
+
+
+# with ArduPilot: answers that were made before a change
+
+
+def test_an_answer_made_before_a_write_does_not_stay_in_the_table() -> None:
+    vehicle = ArduPilotVehicle(table={"A": 1.0, "B": 2.0}, live=())
+    world = Simulation(air=Air.symmetric([vehicle], delay=0.01))
+    world.fetch()
+    world.run(3.0)
+    machine = world.machine
+    for moment in range(12):
+        machine.read("A", world.now)
+        world.run(0.01 * moment)
+        world.outcome(machine.write("A", 10.0 + moment, world.now))
+        world.run(5.0)
+        assert machine.table.params["A"].value == 10.0 + moment
+
+
+def test_hit_results_do_not_change_afterwards() -> None:
+    world = Simulation(PX4Vehicle(table={"A": 1}))
+    result = world.fetch()
+    world.set("A", 5)
+    assert result.params["A"].value == 1
+    assert replace(result, elapsed=0.0).params is result.params
+
+
+def test_upkeep_goes_on_when_a_vehicle_is_found_whose_count_had_moved() -> None:
+    vehicle = ArduPilotVehicle(table={"A": 1, "B_ENABLE": 0}, groups={"B_ENABLE": {"B_X": 5}}, live=())
+    station = Station(link="sim:test", is_stream=False, upkeep=Upkeep(30.0, without_hash=True))
+    world = Simulation(vehicle, station=station)
+    world.fetch()
+    world.run(10.0)  # so that its clock tells that it has started again
+    world.machine.table.move(1)
+    vehicle._entry("B_ENABLE").store(1)
+    vehicle.reboot(world.now, down=8.0)
+    world.run(60.0)
+    assert world.machine.sync.synced
+    assert world.machine.table.params["B_X"].value == 5

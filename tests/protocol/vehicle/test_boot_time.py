@@ -1,0 +1,458 @@
+"""The time since boot: requests for it, samples of it from telemetry, and what follows a restart."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import pytest
+
+from paramclient.model.values import ParamType
+from paramclient.protocol import wire
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import ComponentRebooted, Event
+from paramclient.protocol.params.boot_values import MEASURING_TIME, YOUNG
+from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.station import Station
+from paramclient.protocol.vehicle.boot_time_requests import (
+    BASELINE_DELAY,
+    QUICK_TIME,
+    REQUEST_PACE,
+    SLOW_PACE,
+    ClockRequests,
+)
+from paramclient.protocol.vehicle.boot_time_sampling import SAMPLE_TIME, ClockSampling
+from paramclient.protocol.vehicle.presence import Presence
+from paramclient.protocol.wire import (
+    MAV_AUTOPILOT_ARDUPILOTMEGA,
+    MAV_AUTOPILOT_PX4,
+    MAV_CMD_REQUEST_MESSAGE,
+    SYSTEM_TIME_ID,
+    AutopilotVersion,
+    CommandAck,
+    CommandLong,
+    Heartbeat,
+    Message,
+    ParamRequestRead,
+    ParamValue,
+    StatusText,
+    SystemTime,
+)
+
+OWN = (255, 190)
+COPTER = Heartbeat(2, MAV_AUTOPILOT_ARDUPILOTMEGA, system_status=3)
+PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4, system_status=3)
+ATTITUDE_ID = 30
+CLOCK_REQUEST = CommandLong(1, 1, MAV_CMD_REQUEST_MESSAGE, (float(SYSTEM_TIME_ID), *[0.0] * 6))
+
+
+# requests
+
+
+class Requests:
+    """A `ClockRequests` in a time of its own.
+
+    Attributes:
+        sent: when each request went out.
+        is_requesting: whether another message is requested.
+    """
+
+    def __init__(self, *, may_send: bool = True) -> None:
+        self.now = 0.0
+        self.sent: list[float] = []
+        self.is_requesting = False
+        self.presence = Presence()
+
+        def send(message: Message) -> None:
+            assert message == CLOCK_REQUEST
+            self.sent.append(self.now)
+
+        self.requests = ClockRequests(
+            (1, 1), self.presence, send, is_requesting=lambda: self.is_requesting, may_send=may_send
+        )
+
+    def run(self, until: float) -> list[float]:
+        """Give the requests that are sent until then."""
+        self.sent.clear()
+        while self.requests.next_deadline() <= until:
+            self.now = max(self.now, self.requests.next_deadline())
+            self.requests.tick(self.now)
+        self.now = until
+        return self.sent.copy()
+
+    def tell(self, boot_ms: int) -> None:
+        self.presence.system_time(SystemTime(0, boot_ms), self.now)
+
+
+def test_a_component_without_a_clock_is_asked_for_a_baseline() -> None:
+    desk = Requests()
+    desk.requests.want_baseline(desk.now)
+    assert desk.run(BASELINE_DELAY + 0.1) == [BASELINE_DELAY]
+    desk.tell(5_000)
+    assert desk.run(60.0) == []
+
+
+def test_nobody_waits_for_a_baseline() -> None:
+    desk = Requests()
+    desk.requests.want_baseline(desk.now)
+    times = [BASELINE_DELAY + SLOW_PACE * turn for turn in range(int(QUICK_TIME / SLOW_PACE))]
+    assert desk.run(60.0) == times
+
+
+def test_a_component_that_tells_its_clock_is_not_asked_for_a_baseline() -> None:
+    desk = Requests()
+    desk.requests.want_baseline(desk.now)
+    desk.run(1.0)
+    desk.tell(5_000)
+    assert desk.run(60.0) == []
+
+
+def test_a_clock_that_does_not_come_is_given_up() -> None:
+    desk = Requests()
+    desk.requests.want(desk.now)
+    assert desk.run(60.0) == [REQUEST_PACE * turn for turn in range(int(QUICK_TIME / REQUEST_PACE))]
+
+
+def test_a_clock_of_before_is_not_the_one_that_is_wanted() -> None:
+    desk = Requests()
+    desk.tell(5_000)
+    desk.run(10.0)
+    desk.requests.want(desk.now)
+    assert desk.run(10.1) == [10.0]
+    desk.tell(300)
+    assert desk.run(60.0) == []
+
+
+def test_after_the_command_to_restart_it_is_asked_until_it_is_back() -> None:
+    desk = Requests()
+    desk.requests.follow(desk.now)
+    sent = desk.run(20.0)
+    assert sent[0] == REQUEST_PACE
+    assert sent[:20] == [REQUEST_PACE * (turn + 1) for turn in range(20)]
+    assert sent[-1] - sent[-2] == SLOW_PACE
+    desk.tell(100_000)  # it is still there: that is not the end
+    assert desk.run(22.5) != []
+    desk.requests.want(desk.now)  # joins what is going on
+    desk.requests.stop_following()
+    assert desk.run(60.0) == []
+
+
+def test_another_message_that_is_requested_goes_first() -> None:
+    desk = Requests()
+    desk.is_requesting = True
+    desk.requests.want(desk.now)
+    assert desk.run(1.0) == []
+    desk.is_requesting = False
+    assert desk.run(1.1) == [1.0]
+
+
+def test_nothing_is_asked_where_nothing_is_sent() -> None:
+    desk = Requests(may_send=False)
+    desk.requests.want(desk.now)
+    desk.requests.follow(desk.now)
+    assert desk.run(60.0) == []
+
+
+# the component
+
+
+class Desk:
+    """The component 1/1 of a kind, with upkeep.
+
+    Attributes:
+        sent: what goes out to it, with the time.
+    """
+
+    def __init__(
+        self, heartbeat: Heartbeat = COPTER, *, interval: float = 30.0, uptime: int = 60_000
+    ) -> None:
+        self.now = 0.0
+        self.sent: list[tuple[float, Message]] = []
+        self.events: list[Event] = []
+        self.machine = ComponentMachine(
+            1,
+            1,
+            own=OWN,
+            link="x",
+            send=lambda message: self.sent.append((self.now, message)),
+            emit=self.events.append,
+            upkeep=Upkeep(interval),
+        )
+        self.machine.reads.is_idle = False
+        self.hear(heartbeat, sequence=100)
+        self.hear(AutopilotVersion(0, uid=7))
+        self.hear(SystemTime(0, uptime))
+        self.sent.clear()
+
+    def hear(self, message: Message, *, sequence: int | None = None) -> None:
+        self.machine.receive(message, self.now, sequence=sequence)
+
+    def value(self, name: str, value: float = 1.0) -> None:
+        raw = struct.pack("<f", value)
+        self.hear(ParamValue(name, raw, ParamType.REAL32, 4, wire.NO_INDEX))
+
+    def run(self, until: float) -> None:
+        while self.machine.next_deadline() <= until:
+            self.now = max(self.now, self.machine.next_deadline())
+            self.machine.tick(self.now)
+        self.now = until
+
+    def run_heard(self, until: float) -> None:
+        """Let time pass in which it sends a STATUSTEXT a second, so that it is not lost."""
+        while self.now < until:
+            self.run(min(self.now + 1.0, until))
+            self.hear(StatusText(6, "alive"))
+
+    def take(self) -> list[tuple[float, Message]]:
+        sent, self.sent = self.sent, []
+        return sent
+
+    @property
+    def reboots(self) -> int:
+        return sum(isinstance(event, ComponentRebooted) for event in self.events)
+
+    def clock_requests(self) -> list[float]:
+        return [now for now, message in self.take() if message == CLOCK_REQUEST]
+
+    def names_read(self) -> set[str]:
+        return {message.param_id for _, message in self.take() if isinstance(message, ParamRequestRead)}
+
+
+def test_numbers_that_begin_anew_have_the_clock_requested() -> None:
+    desk = Desk()
+    desk.run_heard(100.0)
+    desk.take()
+    desk.hear(COPTER, sequence=0)
+    desk.run(100.3)
+    assert desk.clock_requests() == [100.0, 100.25]
+    assert desk.reboots == 0
+    desk.hear(SystemTime(0, 160_300))  # it has not started again
+    desk.run(104.0)
+    assert desk.clock_requests() == []
+    assert desk.reboots == 0
+    desk.hear(COPTER, sequence=200)
+    desk.hear(COPTER, sequence=2)
+    desk.run(104.5)
+    desk.hear(SystemTime(0, 2_400))
+    assert desk.reboots == 1
+
+
+def test_another_state_has_the_clock_requested() -> None:
+    """As ArduCopter says ACTIVE for two seconds after a start, and PX4 UNINIT."""
+    desk = Desk()
+    desk.run_heard(100.0)
+    desk.take()
+    desk.hear(COPTER, sequence=101)
+    desk.run(100.5)
+    assert desk.clock_requests() == []
+    desk.hear(Heartbeat(2, MAV_AUTOPILOT_ARDUPILOTMEGA, system_status=4), sequence=102)
+    desk.run(100.6)
+    assert desk.clock_requests() == [100.5]
+
+
+def test_telemetry_that_begins_anew_is_a_restart() -> None:
+    desk = Desk(PX4)
+    desk.machine.boot_clock(ATTITUDE_ID, 60_100, 0.1)
+    desk.machine.boot_clock(ATTITUDE_ID, 316, 2.0)
+    desk.machine.boot_clock(ATTITUDE_ID, 340, 2.03)
+    assert desk.reboots == 1
+
+
+ACCEPTED = CommandAck(wire.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN, wire.MAV_RESULT_ACCEPTED, *OWN)
+
+
+def test_an_accepted_restart_shows_in_the_numbers_of_the_frames() -> None:
+    """ArduCopter: heard 1.2 s after it has accepted, and sends its clock 1.4 s later."""
+    desk = Desk()
+    desk.run_heard(100.0)
+    restart = desk.machine.begin_restart(desk.now)
+    desk.run(100.01)
+    desk.hear(ACCEPTED, sequence=31)
+    desk.run(101.2)
+    desk.hear(COPTER, sequence=0)
+    assert desk.reboots == 1
+    desk.hear(AutopilotVersion(0, uid=7), sequence=1)
+    desk.run(101.21)
+    assert restart.done
+    assert restart.error is None
+    desk.machine.end_restart(restart, desk.now)
+    desk.take()
+    desk.run(102.6)
+    assert desk.clock_requests() != []  # a baseline for the next one
+    desk.hear(SystemTime(0, 2_400))
+    desk.run(104.0)
+    assert desk.reboots == 1
+
+
+@pytest.mark.parametrize(("after", "sequence"), [(0.2, 0), (1.2, 35), (1.2, 240)])
+def test_numbers_that_prove_nothing(after: float, sequence: int) -> None:
+    """Before it can have gone off, or in the middle: that waits for the clock."""
+    desk = Desk()
+    desk.run_heard(100.0)
+    restart = desk.machine.begin_restart(desk.now)
+    desk.hear(ACCEPTED, sequence=31)
+    desk.run(100.0 + after)
+    desk.hear(COPTER, sequence=sequence)
+    assert desk.reboots == 0
+    desk.hear(SystemTime(0, 200))
+    assert desk.reboots == 1
+    desk.machine.end_restart(restart, desk.now)
+
+
+def test_numbers_prove_nothing_while_a_clock_goes_on() -> None:
+    desk = Desk()
+    desk.run_heard(100.0)
+    restart = desk.machine.begin_restart(desk.now)
+    desk.hear(ACCEPTED, sequence=31)
+    desk.run(100.5)
+    desk.machine.boot_clock(ATTITUDE_ID, 160_500, desk.now)
+    desk.run(100.6)
+    desk.hear(COPTER, sequence=0)
+    assert desk.reboots == 0
+    desk.machine.end_restart(restart, desk.now)
+    assert desk.machine.clock_requests.next_deadline() == math.inf
+
+
+# values that are measured at each start
+
+
+def test_what_is_measured_at_a_start_is_read_again() -> None:
+    desk = Desk()
+    measured = {"INS_GYR1_CALTEMP", "BARO1_GND_PRESS", "ARSPD_OFFSET", "RC1_DZ"}
+    for name in (*sorted(measured), "ATC_RAT_RLL_P", "INS_TCAL1_TMIN"):
+        desk.value(name)
+    desk.run_heard(100.0)
+    desk.hear(SystemTime(0, 2_000))
+    assert desk.reboots == 1
+    desk.hear(AutopilotVersion(0, uid=7))
+    desk.take()
+    desk.run(100.0 + MEASURING_TIME - 0.1)
+    assert desk.names_read() == set()
+    desk.run(100.0 + MEASURING_TIME)
+    assert desk.names_read() == measured
+    for name in measured:
+        desk.value(name, 2.0)
+    desk.run(120.0)
+    assert desk.names_read() == set()
+    assert desk.machine.table.params["BARO1_GND_PRESS"].value == 2.0
+
+
+def test_measuring_counts_from_the_first_clock() -> None:
+    """A restart that shows in the heartbeat is noticed before the main loop runs."""
+    desk = Desk()
+    desk.value("BARO1_GND_PRESS")
+    desk.run_heard(100.0)
+    desk.hear(Heartbeat(2, MAV_AUTOPILOT_ARDUPILOTMEGA, system_status=wire.MAV_STATE_BOOT))
+    assert desk.reboots == 1
+    desk.hear(AutopilotVersion(0, uid=7))
+    desk.run(102.0)
+    desk.hear(SystemTime(0, 2_000))
+    desk.take()
+    desk.run(102.0 + MEASURING_TIME - 0.1)
+    assert desk.names_read() == set()
+    desk.run(102.0 + MEASURING_TIME)
+    assert desk.names_read() == {"BARO1_GND_PRESS"}
+
+
+@pytest.mark.parametrize(("uptime", "is_young"), [(YOUNG - 1.0, True), (YOUNG + 1.0, False)])
+def test_a_vehicle_that_is_met_soon_after_its_start(uptime: float, is_young: bool) -> None:
+    desk = Desk(uptime=int(1000 * uptime))
+    desk.value("BARO1_GND_PRESS")
+    desk.run(MEASURING_TIME + 0.1)
+    assert desk.names_read() == ({"BARO1_GND_PRESS"} if is_young else set())
+
+
+@pytest.mark.parametrize("desk", [Desk(interval=math.inf), Desk(PX4)], ids=["no upkeep", "a hash"])
+def test_nothing_is_read_by_itself_where_that_is_not_wanted_or_needed(desk: Desk) -> None:
+    desk.value("BARO1_GND_PRESS")
+    desk.run_heard(100.0)
+    desk.hear(SystemTime(0, 2_000))
+    desk.hear(AutopilotVersion(0, uid=7))
+    desk.take()
+    desk.run(110.0)
+    assert "BARO1_GND_PRESS" not in desk.names_read()
+
+
+# telemetry
+
+
+def test_windows_open_and_close() -> None:
+    chosen: list[bool] = []
+    sampling = ClockSampling(chosen.append)
+    first, second = (1, 1), (2, 1)
+    sampling.open(first, 10.0)
+    sampling.open(second, 10.0)
+    assert chosen == [True]
+    sampling.sampled(first, 10.0 + SAMPLE_TIME / 2)
+    assert sampling.is_open(first)
+    sampling.sampled(first, 10.0 + SAMPLE_TIME)
+    assert not sampling.is_open(first)
+    assert sampling.is_open(second)
+    sampling.close(second)
+    sampling.close(second)
+    assert chosen == [True, False]
+
+
+def attitude(boot_ms: int, system: int = 1, component: int = 1) -> bytes:
+    payload = boot_ms.to_bytes(4, "little") + bytes(24)
+    return wire.build_frame(ATTITUDE_ID, payload, system=system, component=component, sequence=0)
+
+
+def beat(system: int = 1, component: int = 1, *, heartbeat: Heartbeat = PX4) -> bytes:
+    return wire.encode(heartbeat, system=system, component=component, sequence=0)
+
+
+@pytest.mark.parametrize("is_stream", [False, True])
+def test_a_station_reads_clocks_after_a_heartbeat(is_stream: bool) -> None:
+    station = Station(link="x", is_stream=is_stream)
+    presence = None
+    for second in range(5):
+        station.receive(beat(), "peer", float(second))
+        presence = station.components[1, 1].presence
+        assert not station.receive(attitude(90_000 + 1000 * second), "peer", second + 0.5), "telemetry"
+        assert presence.clock_at == second + 0.5
+        station.receive(attitude(90_400 + 1000 * second), "peer", second + 0.9)
+        assert presence.clock_at == second + 0.5, "the window is closed"
+    station.receive(beat(), "peer", 5.0)
+    station.receive(attitude(500), "peer", 5.1)
+    assert sum(isinstance(event, ComponentRebooted) for event in station.events()) == 1
+
+
+def test_clocks_of_other_components_are_their_own() -> None:
+    station = Station(link="x", is_stream=False)
+    gimbal = Heartbeat(26, wire.MAV_AUTOPILOT_INVALID)
+    for second in range(20):
+        now = float(second)
+        station.receive(beat() + beat(1, 154, heartbeat=gimbal), "peer", now)
+        station.receive(attitude(90_000 + 1000 * second) + attitude(1 + 1000 * second, 1, 154), "peer", now)
+        station.receive(attitude(1, 7, 7), "peer", now)
+    assert not any(isinstance(event, ComponentRebooted) for event in station.events())
+
+
+def test_clocks_are_read_all_the_time_while_a_restart_is_awaited() -> None:
+    station = Station(link="x", is_stream=False)
+    station.receive(beat(), "peer", 0.0)
+    station.receive(wire.encode(AutopilotVersion(0, uid=7), system=1, component=1, sequence=1), "peer", 0.0)
+    station.receive(attitude(90_000), "peer", 0.5)
+    machine = station.components[1, 1]
+    restart = machine.begin_restart(0.9)
+    for tenth in range(10, 20):
+        station.receive(attitude(90_000 + 100 * tenth), "peer", tenth / 10)
+        assert machine.presence.clock_at == tenth / 10
+    machine.end_restart(restart, 2.0)
+    station.receive(attitude(92_000), "peer", 2.0)
+    station.receive(attitude(92_100), "peer", 2.1)
+    assert machine.presence.clock_at == 2.0
+
+
+def test_a_station_passes_on_the_numbers_of_frames() -> None:
+    station = Station(link="x", is_stream=False)
+    station.receive(wire.encode(COPTER, system=1, component=1, sequence=100), "peer", 0.0)
+    station.receive(wire.encode(AutopilotVersion(0, uid=7), system=1, component=1, sequence=101), "peer", 0.0)
+    station.receive(wire.encode(SystemTime(0, 5_000), system=1, component=1, sequence=102), "peer", 0.0)
+    station.data_to_send()
+    station.receive(wire.encode(COPTER, system=1, component=1, sequence=0), "peer", 1.0)
+    station.tick(1.0)
+    framer = wire.Framer(wire.UNDERSTOOD, stream=False)
+    sent = [wire.decode(frame) for data, _ in station.data_to_send() for frame in framer.receive(data)]
+    assert CLOCK_REQUEST in sent

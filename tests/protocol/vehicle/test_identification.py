@@ -1,0 +1,316 @@
+"""Who a component is, and how it writes values: by what evidence."""
+
+from __future__ import annotations
+
+import math
+from itertools import pairwise
+
+import pytest
+
+from paramclient.model.values import Encoding
+from paramclient.protocol.requests.round_trip import FIRST_TIMEOUT, RoundTrip
+from paramclient.protocol.vehicle.identification import (
+    DOUBT_PACE,
+    DOUBT_PATIENCE,
+    TRIES,
+    Identification,
+    judge_encoding,
+)
+from paramclient.protocol.wire import (
+    AUTOPILOT_VERSION_ID,
+    CAPABILITY_PARAM_ENCODE_BYTEWISE,
+    CAPABILITY_PARAM_ENCODE_C_CAST,
+    MAV_AUTOPILOT_ARDUPILOTMEGA,
+    MAV_AUTOPILOT_GENERIC,
+    MAV_AUTOPILOT_INVALID,
+    MAV_AUTOPILOT_PX4,
+    MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES,
+    MAV_CMD_REQUEST_MESSAGE,
+    MAV_RESULT_ACCEPTED,
+    MAV_RESULT_UNSUPPORTED,
+    MAV_TYPE_GCS,
+    AutopilotVersion,
+    CommandAck,
+    CommandLong,
+    Heartbeat,
+    Message,
+)
+from tests.simulation import is_so
+
+PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
+ARDUPILOT = Heartbeat(2, MAV_AUTOPILOT_ARDUPILOTMEGA)
+CAMERA = Heartbeat(30, MAV_AUTOPILOT_INVALID)
+GCS = Heartbeat(MAV_TYPE_GCS, MAV_AUTOPILOT_INVALID)
+ARDUPILOT_BITS = 64495
+"""What ArduPilot 4.6 sets: neither of the encoding bits."""
+
+
+class Desk:
+    """The identification of component 1/1 and what it sends."""
+
+    def __init__(self, chosen: Encoding | None = None) -> None:
+        self.sent: list[Message] = []
+        self.trip = RoundTrip()
+        self.who = Identification((1, 1), "udpin:x", self.trip, self.sent.append, chosen)
+
+    def beat(self, heartbeat: Heartbeat, now: float = 0.0) -> None:
+        self.who.heartbeat(heartbeat)
+        self.who.heard(now)
+
+    def commands(self) -> list[int]:
+        sent, self.sent[:] = list(self.sent), []
+        for message in sent:
+            assert isinstance(message, CommandLong)
+            assert (message.target_system, message.target_component) == (1, 1)
+        return [message.command for message in sent if isinstance(message, CommandLong)]
+
+    def let_it_be(self) -> None:
+        """Let every request go unanswered."""
+        while (deadline := self.who.next_deadline()) < math.inf:
+            self.who.tick(deadline)
+
+
+# the chain of evidence
+
+
+@pytest.mark.parametrize(
+    ("chosen", "capabilities", "autopilot", "expected", "reason"),
+    [
+        (Encoding.C_CAST, CAPABILITY_PARAM_ENCODE_BYTEWISE, 12, Encoding.C_CAST, "user"),
+        (Encoding.BYTEWISE, None, 3, Encoding.BYTEWISE, "user"),
+        (None, CAPABILITY_PARAM_ENCODE_BYTEWISE, 3, Encoding.BYTEWISE, "PARAM_ENCODE_BYTEWISE"),
+        (None, CAPABILITY_PARAM_ENCODE_C_CAST, 12, Encoding.C_CAST, "PARAM_ENCODE_C_CAST"),
+        (None, ARDUPILOT_BITS, 3, Encoding.C_CAST, "ArduPilot"),
+        (None, None, 3, Encoding.C_CAST, "ArduPilot"),
+        (None, 2, 12, Encoding.BYTEWISE, "PX4"),
+        (None, 2, 0, Encoding.BYTEWISE, "standard"),
+        (None, None, None, Encoding.BYTEWISE, "standard"),
+        (None, None, 8, Encoding.BYTEWISE, "standard"),
+    ],
+)
+def test_the_first_evidence_there_is_decides(
+    chosen: Encoding | None, capabilities: int | None, autopilot: int | None, expected: Encoding, reason: str
+) -> None:
+    encoding, why = judge_encoding(chosen, capabilities, autopilot)
+    assert encoding is expected
+    assert reason in why
+
+
+def test_evidence_as_it_comes_in() -> None:
+    desk = Desk()
+    assert is_so(desk.who.encoding is Encoding.BYTEWISE)
+    desk.beat(ARDUPILOT)
+    assert is_so(desk.who.encoding is Encoding.C_CAST)
+    assert "ArduPilot" in desk.who.encoding_reason
+    desk.who.version(AutopilotVersion(CAPABILITY_PARAM_ENCODE_BYTEWISE, uid=1), 0.1)
+    assert desk.who.encoding is Encoding.BYTEWISE
+    assert "capability" in desk.who.encoding_reason
+
+
+def test_when_the_encoding_is_certain() -> None:
+    desk = Desk()
+    assert not desk.who.encoding_is_certain
+    desk.beat(Heartbeat(2, MAV_AUTOPILOT_GENERIC))
+    assert not desk.who.encoding_is_certain
+    for heartbeat in (ARDUPILOT, PX4, GCS):
+        other = Desk()
+        other.beat(heartbeat)
+        assert other.who.encoding_is_certain
+    assert Desk(Encoding.C_CAST).who.encoding_is_certain
+    desk.let_it_be()
+    assert desk.who.encoding_is_certain
+
+
+# what kind it is
+
+
+@pytest.mark.parametrize(
+    ("heartbeat", "has_parameters", "is_autopilot"),
+    [(PX4, True, True), (Heartbeat(2, 0), True, True), (CAMERA, True, False), (GCS, False, False)],
+)
+def test_what_its_heartbeat_says(heartbeat: Heartbeat, has_parameters: bool, is_autopilot: bool) -> None:
+    desk = Desk()
+    desk.beat(heartbeat)
+    assert desk.who.has_parameters is has_parameters
+    assert desk.who.is_autopilot is is_autopilot
+    assert len(desk.commands()) == has_parameters
+    assert (desk.who.autopilot, desk.who.vehicle_type) == (heartbeat.autopilot, heartbeat.type)
+
+
+def test_before_a_heartbeat_it_is_no_autopilot() -> None:
+    desk = Desk()
+    assert desk.who.autopilot is None
+    assert not desk.who.is_autopilot
+    assert desk.who.has_parameters
+
+
+# asking
+
+
+def test_it_is_asked_for_its_version_once() -> None:
+    desk = Desk()
+    desk.beat(PX4, 1.0)
+    [message] = desk.sent
+    assert isinstance(message, CommandLong)
+    assert message.command == MAV_CMD_REQUEST_MESSAGE
+    assert message.params[0] == AUTOPILOT_VERSION_ID
+    desk.beat(PX4, 1.1)
+    assert len(desk.sent) == 1
+    assert is_so(not desk.who.settled)
+    desk.who.acknowledged(CommandAck(MAV_CMD_REQUEST_MESSAGE, MAV_RESULT_ACCEPTED), 1.2)
+    assert desk.who.next_deadline() > 1.2
+    assert desk.who.version(AutopilotVersion(CAPABILITY_PARAM_ENCODE_BYTEWISE, uid=7), 1.2) is False
+    assert desk.who.settled
+    assert desk.who.next_deadline() == math.inf
+    assert desk.trip.smoothed == pytest.approx(0.2)
+    identity = desk.who.identity
+    assert (identity.system, identity.link, identity.uid) == (1, "udpin:x", "0000000000000007")
+    assert (identity.autopilot, identity.vehicle_type) == (MAV_AUTOPILOT_PX4, 2)
+
+
+def test_both_ways_to_ask_are_tried_in_turn_and_then_it_is_let_be() -> None:
+    desk = Desk()
+    desk.beat(CAMERA)
+    assert desk.who.next_deadline() == FIRST_TIMEOUT
+    desk.let_it_be()
+    both = [MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES]
+    assert desk.commands() == [MAV_CMD_REQUEST_MESSAGE, *both * (TRIES - 1)]
+    assert desk.who.settled
+    assert desk.who.identity.uid is None
+    assert desk.who.identity.key == "system:1@udpin:x"
+    desk.beat(CAMERA, 10.0)
+    assert desk.commands() == []
+
+
+def test_a_refusal_leads_to_the_other_way_at_once() -> None:
+    desk = Desk()
+    desk.beat(PX4)
+    desk.who.acknowledged(CommandAck(MAV_CMD_REQUEST_MESSAGE, MAV_RESULT_UNSUPPORTED), 0.1)
+    assert desk.who.next_deadline() == 0.1
+    desk.who.tick(0.1)
+    assert desk.commands() == [MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES]
+
+
+def test_refusals_of_other_things_and_refusals_that_come_late_mean_nothing() -> None:
+    desk = Desk()
+    desk.beat(PX4)
+    before = desk.who.next_deadline()
+    desk.who.acknowledged(CommandAck(400, MAV_RESULT_UNSUPPORTED), 0.1)
+    assert desk.who.next_deadline() == before
+    desk.who.version(AutopilotVersion(0, uid=7), 0.2)
+    desk.who.acknowledged(CommandAck(MAV_CMD_REQUEST_MESSAGE, MAV_RESULT_UNSUPPORTED), 0.3)
+    assert desk.who.next_deadline() == math.inf
+    desk.who.tick(5.0)
+    assert len(desk.commands()) == 1
+
+
+def test_a_version_that_others_have_asked_for_is_taken() -> None:
+    desk = Desk()
+    desk.who.version(AutopilotVersion(0, uid=7), 0.2)
+    assert desk.who.settled
+    assert desk.trip.smoothed is None
+
+
+def test_a_version_that_comes_before_the_heartbeat_learns_the_autopilot_from_it() -> None:
+    desk = Desk()
+    desk.who.version(AutopilotVersion(0, uid=7), 0.2)
+    desk.beat(ARDUPILOT, 0.3)
+    assert desk.who.identity.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
+    assert desk.who.identity.vehicle_type == 2
+    assert desk.who.identity.uid == "0000000000000007"
+
+
+# another vehicle
+
+
+def settled(uid: int) -> Desk:
+    desk = Desk()
+    desk.beat(PX4)
+    desk.who.version(AutopilotVersion(CAPABILITY_PARAM_ENCODE_BYTEWISE, uid=uid), 0.1)
+    desk.commands()
+    return desk
+
+
+def test_a_version_that_tells_no_encoding_waits_for_a_heartbeat() -> None:
+    """ArduPilot's version before its heartbeat: the standard's encoding would write a wrong value."""
+    for heartbeat, encoding in ((ARDUPILOT, Encoding.C_CAST), (None, Encoding.BYTEWISE)):
+        desk = Desk()
+        desk.who.heard(10.0)
+        desk.who.version(AutopilotVersion(ARDUPILOT_BITS), 10.1)
+        assert is_so(not desk.who.may_be_written)
+        if heartbeat is None:  # one that never sends any keeps to the standard
+            desk.who.tick(13.0)
+            assert is_so(not desk.who.may_be_written)
+            assert desk.who.next_deadline() == 13.1
+            desk.who.tick(13.1)
+        else:
+            desk.who.heartbeat(heartbeat)
+        assert is_so(desk.who.may_be_written)
+        assert desk.who.encoding is encoding
+        assert desk.who.next_deadline() == math.inf
+
+
+def test_a_version_that_tells_the_encoding_waits_for_no_heartbeat() -> None:
+    desk = Desk()
+    desk.who.heard(10.0)
+    desk.who.version(AutopilotVersion(CAPABILITY_PARAM_ENCODE_BYTEWISE), 10.1)
+    assert desk.who.may_be_written
+
+
+def test_where_it_is_doubted_it_is_asked_again_who_it_is() -> None:
+    desk = settled(7)
+    desk.beat(PX4, 20.0)
+    assert desk.commands() == []
+    assert is_so(desk.who.may_be_written)
+    desk.who.doubt(30.0)
+    assert not desk.who.may_be_written
+    assert desk.commands() == [MAV_CMD_REQUEST_MESSAGE]
+    assert desk.who.settled
+    assert desk.who.version(AutopilotVersion(0, uid=7), 30.1) is False
+    assert is_so(desk.who.may_be_written)
+    assert desk.who.version(AutopilotVersion(0, uid=8), 30.2) is True
+    assert desk.who.identity.uid == "0000000000000008"
+
+
+def test_a_vehicle_that_gave_no_id_before_is_not_another_one() -> None:
+    desk = Desk()
+    desk.beat(PX4)
+    desk.let_it_be()
+    assert desk.who.version(AutopilotVersion(0, uid=8), 30.0) is False
+    assert desk.who.identity.key == "uid:0000000000000008"
+
+
+def test_ids_that_name_no_single_vehicle_do_not_tell_them_apart() -> None:
+    desk = settled(5283920058631409231)  # every simulated PX4 has it
+    assert desk.who.version(AutopilotVersion(0, uid=5283920058631409231), 30.0) is False
+    assert desk.who.version(AutopilotVersion(0, uid=9), 31.0) is True
+
+
+def test_an_answer_that_never_comes_again_leaves_what_is_known() -> None:
+    desk = settled(7)
+    desk.who.doubt(30.0)
+    desk.let_it_be()
+    assert not desk.who.is_doubted
+    assert desk.who.identity.uid == "0000000000000007"
+    assert desk.who.settled
+
+
+def test_one_that_was_away_is_asked_for_five_seconds_and_not_more_than_once_a_second_in_the_end() -> None:
+    desk = settled(7)
+    for _ in range(50):
+        desk.trip.answered(0.0, 0.02, 1)  # a quick link, on which five tries take half a second
+    desk.who.doubt(30.0)
+    times = [30.0]
+    while (deadline := desk.who.next_deadline()) < math.inf:
+        assert is_so(desk.who.is_doubted)
+        assert not desk.who.may_be_written
+        times.append(deadline)
+        desk.who.tick(deadline)
+    usual = desk.trip.tries
+    assert times[-1] >= 30.0 + DOUBT_PATIENCE
+    assert all(after - before >= DOUBT_PACE for before, after in pairwise(times[usual - 1 : -1]))
+    assert len(times) <= usual + DOUBT_PATIENCE / DOUBT_PACE + 2
+    assert desk.who.is_unconfirmed, "it has not said that it is the same"
+    assert not desk.who.may_be_written
+    desk.who.version(AutopilotVersion(0, uid=7), 60.0)
+    assert not is_so(desk.who.was_away)

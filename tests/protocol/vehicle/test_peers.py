@@ -1,0 +1,878 @@
+"""Two vehicles under one address, and two paths to one: what is taken, where requests go, what is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable
+
+import pytest
+
+from paramclient.errors import ContestedAddress, NoReply
+from paramclient.protocol import station as station_room
+from paramclient.protocol import wire
+from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import ComponentContested, ComponentReplaced, ComponentUncontested, Event
+from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.station import Station
+from paramclient.protocol.vehicle import peers as room
+from paramclient.protocol.vehicle.presence import LOST_AFTER
+from paramclient.protocol.wire import (
+    MAV_AUTOPILOT_ARDUPILOTMEGA,
+    MAV_AUTOPILOT_GENERIC,
+    MAV_AUTOPILOT_PX4,
+    MAV_CMD_REQUEST_MESSAGE,
+    MAV_TYPE_GCS,
+    AutopilotVersion,
+    CommandAck,
+    CommandLong,
+    Framer,
+    Heartbeat,
+    Message,
+    ParamRequestRead,
+    ParamSet,
+    ParamValue,
+    SystemTime,
+)
+from paramclient.sim import ArduPilotVehicle, Endpoint, PX4Vehicle
+from tests.simulation import param_value
+
+STEP = 0.05
+PX4 = Heartbeat(2, MAV_AUTOPILOT_PX4)
+ARDUPILOT = Heartbeat(2, MAV_AUTOPILOT_ARDUPILOTMEGA)
+
+
+class Speaker:
+    """One that sends heartbeats from a peer, and answers what it is asked, under the address 1/1.
+
+    Args:
+        heartbeats: what it sends, in turn.
+        every: seconds from one to the next.
+        uid: its hardware id; None where it does not answer AUTOPILOT_VERSION, 0 where it has none.
+        booted_at: when it has started; None where it tells no time.
+        value: of the parameter P.
+        obeys: whether it answers a PARAM_SET.
+        start, end: when it speaks.
+    """
+
+    def __init__(
+        self,
+        *heartbeats: Heartbeat,
+        every: float = 1.0,
+        uid: int | None = 1,
+        booted_at: float | None = -100.0,
+        value: float = 1.0,
+        obeys: bool = True,
+        start: float = 0.0,
+        end: float = 1e9,
+        system: int = 1,
+    ) -> None:
+        self.heard: list[Message] = []
+        self.uid, self.booted_at, self.value = uid, booted_at, value
+        self.start, self.end = start, end
+        self._heartbeats = heartbeats or (PX4,)
+        self._every = every
+        self._obeys = obeys
+        self._system = system
+        self._beats = 0
+        self._framer = Framer(wire.UNDERSTOOD, stream=False)
+        self._out: list[bytes] = []
+
+    def say(self, message: Message) -> None:
+        self._out.append(wire.encode(message, system=self._system, component=1, sequence=0))
+
+    def tick(self, now: float) -> None:
+        while self._beats * self._every <= now - self.start + 1e-9:
+            if now < self.end:
+                self.say(self._heartbeats[self._beats % len(self._heartbeats)])
+            self._beats += 1
+
+    def receive(self, data: bytes, now: float) -> None:
+        if not self.start <= now + 1e-9 < self.end:
+            return
+        for frame in self._framer.receive(data):
+            message = wire.decode(frame)
+            assert message is not None
+            self.heard.append(message)
+            if isinstance(message, CommandLong) and message.command == MAV_CMD_REQUEST_MESSAGE:
+                if message.params[0] == wire.AUTOPILOT_VERSION_ID and self.uid is not None:
+                    self.say(AutopilotVersion(0, uid=self.uid))
+                if message.params[0] == wire.SYSTEM_TIME_ID and self.booted_at is not None:
+                    self.say(SystemTime(0, int(1000 * (now - self.booted_at))))
+            elif isinstance(message, ParamSet) and self._obeys:
+                self.say(ParamValue(message.param_id, message.raw, message.param_type, 1, 0))
+            elif isinstance(message, ParamRequestRead):
+                self.say(param_value("P", self.value, index=0, count=1))
+
+    def data_to_send(self) -> list[bytes]:
+        out, self._out = self._out, []
+        return out
+
+
+class Net:
+    """Speakers at peers of one link, in a time that passes in steps."""
+
+    def __init__(self, *, station: Station | None = None, **speakers: Speaker) -> None:
+        self.station = Station(link="udpin:test", is_stream=False) if station is None else station
+        self.peers: dict[Hashable, Speaker] = {}
+        self.peers.update(speakers)
+        self.events: list[Event] = []
+        self.now = 0.0
+
+    @property
+    def machine(self) -> ComponentMachine:
+        return self.station.components[1, 1]
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / STEP)):
+            self.now += STEP
+            for peer, speaker in self.peers.items():
+                speaker.tick(self.now)
+                for data in speaker.data_to_send():
+                    self.station.receive(data, peer, self.now)
+            self.station.tick(self.now)
+            for data, peer in self.station.data_to_send():
+                for each, speaker in self.peers.items():
+                    if peer in (None, each):
+                        speaker.receive(data, self.now)
+            self.events += self.station.events()
+
+    def kinds(self) -> list[str]:
+        told = [each for each in self.events if isinstance(each, ComponentContested | ComponentUncontested)]
+        return [type(each).__name__.removeprefix("Component") for each in told]
+
+
+def silent_after(at: float, **how: object) -> Speaker:
+    return Speaker(end=at, **how)  # type: ignore[arg-type]
+
+
+# Two vehicles
+
+
+def test_two_autopilots_under_one_address_are_contested_at_once() -> None:
+    net = Net(a=Speaker(PX4, uid=1), b=Speaker(ARDUPILOT, uid=2, start=0.5, value=7.0))
+    net.run(2.5)
+    assert net.kinds() == ["Contested"]
+    contest = net.machine.peers.contest
+    assert contest is not None
+    assert contest.claimants[0] == "PX4 quadrotor with the id 0000000000000001 from a"
+    assert contest.claimants[1].startswith("ArduPilot quadrotor")
+    assert contest.difference == "the autopilot or vehicle type"
+    assert net.station.is_doubted(net.machine)
+    assert net.machine.state == "contested"
+    for call in (
+        lambda: net.machine.write("P", 1.0, net.now),
+        lambda: net.machine.read("P", net.now),
+        lambda: net.machine.begin_fetch(net.now),
+        lambda: net.machine.begin_restart(net.now),
+        lambda: net.machine.search(["P"], net.now),
+        lambda: net.machine.check_present("a file", net.now),
+    ):
+        with pytest.raises(ContestedAddress, match="is contested"):
+            call()
+
+
+def test_values_of_the_second_vehicle_never_reach_the_table() -> None:
+    other = Speaker(ARDUPILOT, uid=2, start=0.3)
+    net = Net(a=Speaker(PX4, uid=1), b=other)
+    net.run(0.2)
+    for step in range(60):
+        other.say(param_value(f"B{step}", 3.0, index=step, count=60))
+        net.run(STEP)
+    assert [*net.machine.table.params] == []
+    assert net.station.foreign >= 60
+
+
+def test_whoever_waits_gets_the_error() -> None:
+    net = Net(a=Speaker(PX4, uid=1, obeys=False), b=Speaker(ARDUPILOT, uid=2, start=2.0))
+    net.run(1.5)
+    write = net.machine.write("P", 2.0, net.now, settle=5.0)
+    read = net.machine.read("P", net.now)
+    fetch = net.machine.begin_fetch(net.now)
+    net.run(2.0)
+    assert net.kinds() == ["Contested"]
+    assert isinstance(write.error, ContestedAddress)
+    assert read.done
+    assert isinstance(fetch.error, ContestedAddress)
+    assert fetch.error.system == 1
+
+
+@pytest.mark.parametrize("other", [{"uid": 2}, {"uid": None}, {"booted_at": -40.0}, {"uid": 0}])
+def test_two_of_one_kind_are_told_apart_by_id_and_clock(other: dict[str, object]) -> None:
+    net = Net(a=Speaker(PX4), b=Speaker(PX4, start=0.5, **other))  # type: ignore[arg-type]
+    net.run(room.JUDGING_TIME + 2.0)
+    assert net.kinds() == ["Contested"]
+    net.run(20.0)
+    assert net.kinds() == ["Contested"], "told once"
+
+
+def test_the_id_that_every_simulated_px4_has_shows_nothing() -> None:
+    uid = 0x4954414C44494E4F
+    net = Net(a=Speaker(uid=uid), b=Speaker(uid=uid, booted_at=-50.0, start=0.4))
+    net.run(3.0)
+    assert net.kinds() == ["Contested"]
+    net = Net(a=Speaker(uid=uid), b=Speaker(uid=uid, start=0.4))
+    net.run(10.0)
+    assert net.kinds() == []
+    net = Net(a=Speaker(uid=uid, booted_at=None), b=Speaker(uid=uid, booted_at=None, start=0.4))
+    net.run(10.0)
+    assert net.kinds() == ["Contested"]
+
+
+def test_heartbeats_at_20_hz_divert_no_request() -> None:
+    """The forger sends the vehicle's heartbeats and confirms each set; the vehicle is not asked by it."""
+    forger = Speaker(PX4, every=0.05, uid=None, booted_at=None, start=1.0)
+    vehicle = Speaker(PX4, obeys=False)
+    net = Net(vehicle=vehicle, forger=forger)
+    net.run(0.9)
+    net.machine.read("P", net.now)
+    net.run(0.6)
+    write = net.machine.write("P", 5.0, net.now)
+    net.run(2.0)
+    assert not any(isinstance(each, ParamSet) for each in forger.heard)
+    assert any(isinstance(each, ParamSet) for each in vehicle.heard)
+    forger.say(param_value("P", 5.0, index=0, count=1))
+    forger.say(CommandAck(400, 0, 255, 190))
+    net.run(0.2)
+    assert write.result is None, "its answer does not count"
+    net.run(room.JUDGING_TIME)
+    assert net.kinds() == ["Contested"]
+    asked = [each for each in forger.heard if isinstance(each, CommandLong)]
+    assert len(asked) <= 3 * room.ASKS_MAX
+    assert net.machine.table.params["P"].value == 1.0
+
+
+def test_requests_go_to_the_peer_that_gives_the_hardware_id() -> None:
+    """Also where the forger was heard first."""
+    vehicle = Speaker(PX4, start=0.4)
+    net = Net(forger=Speaker(PX4, uid=None, booted_at=None, every=0.05), vehicle=vehicle)
+    net.run(1.0)
+    assert net.machine.peers.home == "vehicle"
+    assert net.machine.who.identity.uid == f"{1:016x}"
+    net.run(room.JUDGING_TIME + 2.0)
+    assert net.kinds() == ["Contested"]
+
+
+def test_it_ends_when_one_was_silent_for_the_heartbeat_timeout() -> None:
+    net = Net(a=Speaker(PX4, uid=1), b=silent_after(4.0, uid=2, start=0.5))
+    net.run(0.4)
+    net.machine.read("P", net.now)
+    net.run(3.5)
+    assert net.kinds() == ["Contested"]
+    net.run(LOST_AFTER - 1.0)
+    assert net.kinds() == ["Contested"]
+    net.run(2.0)
+    assert net.kinds() == ["Contested", "Uncontested"]
+    assert net.machine.peers.home == "a"
+    assert net.machine.table.params["P"].trust == "cached", "until the vehicle has confirmed it"
+    net.run(1.0)
+    assert not net.station.is_doubted(net.machine)
+    net.machine.write("P", 1.0, net.now)
+
+
+def test_the_other_one_may_be_left() -> None:
+    net = Net(a=silent_after(4.0, uid=1), b=Speaker(ARDUPILOT, uid=2, start=0.5, value=7.0))
+    net.run(0.4)
+    net.machine.read("P", net.now)
+    net.run(0.1)
+    net.run(3.5)
+    assert net.kinds() == ["Contested"]
+    net.run(LOST_AFTER - 1.5)
+    assert net.kinds() == ["Contested"], "it spoke last at 3 s"
+    net.run(3.0)
+    assert net.kinds() == ["Contested", "Uncontested"]
+    assert net.machine.peers.home == "b"
+    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert net.machine.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
+    assert dict(net.machine.table.params) == {}, "nothing of the other one's"
+    read = net.machine.read("P", net.now)
+    net.run(0.2)
+    assert read.result is not None
+    assert net.machine.table.params["P"].value == 7.0
+
+
+# Several vehicles through one peer
+
+
+@pytest.mark.parametrize("every", [0.5, 1.0, 2.0])
+def test_heartbeats_of_two_autopilots_through_one_peer_are_contested(every: float) -> None:
+    both = Speaker(PX4, ARDUPILOT, every=every)
+    net = Net(both=both)
+    net.run(0.3)
+    both.say(param_value("P", 1.0, index=0, count=1))
+    net.run(every)
+    assert net.station.is_doubted(net.machine), "nothing is kept from the first change on"
+    net.run(2 * every)
+    assert net.kinds() == ["Contested"]
+    both._heartbeats = (PX4,)
+    net.run(LOST_AFTER + 2 * every + 1.0)
+    assert net.kinds() == ["Contested", "Uncontested"]
+    assert dict(net.machine.table.params) == {}
+
+
+def test_hardware_ids_that_alternate_through_one_peer_are_contested() -> None:
+    """Two of one kind behind one radio: each request is answered by both."""
+
+    class Two(Speaker):
+        def receive(self, data: bytes, now: float) -> None:
+            for self.uid in (1, 2):
+                super().receive(data, now)
+
+    net = Net(two=Two())
+    net.run(2.0)
+    assert net.kinds() == ["Contested"]
+    net.run(10.0)
+    assert net.kinds() == ["Contested"], "it is seen on for as long as both answer"
+
+
+def test_a_change_without_return_is_another_vehicle_as_before() -> None:
+    one = Speaker(PX4)
+    net = Net(one=one)
+    net.run(3.0)
+    one._heartbeats, one.uid = (ARDUPILOT,), 2
+    net.run(0.1)
+    one.say(AutopilotVersion(0, uid=2))
+    net.run(1.0)
+    assert net.station.is_doubted(net.machine)
+    net.run(LOST_AFTER + 1.0)
+    assert net.kinds() == []
+    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert not net.station.is_doubted(net.machine)
+
+
+# Two paths to one vehicle
+
+
+def test_two_paths_to_one_vehicle_stay_as_they_were() -> None:
+    first, second = Speaker(), Speaker(start=0.4, value=2.0, end=20.0)
+    net = Net(a=first, b=second)
+    net.run(3.0)
+    assert net.kinds() == []
+    second.say(param_value("Q", 3.0, index=1, count=2))
+    net.run(0.1)
+    assert net.machine.table.params["Q"].value == 3.0, "what comes over the second path counts"
+    first.end = net.now
+    net.run(room.PATH_SILENCE + 1.5)
+    assert net.machine.peers.home == "b"
+    read = net.machine.read("P", net.now)
+    net.run(0.1)
+    assert read.result is not None
+    first.end = 1e9
+    net.run(10.0)
+    assert net.kinds() == []
+
+
+def test_a_path_that_could_not_answer_at_first_is_proven_later(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A second radio that hears nothing for some seconds: it is asked on, and the contest ends."""
+    second = Speaker(start=0.4)
+    net = Net(a=Speaker(), b=second)
+    with monkeypatch.context() as deaf:
+        deaf.setattr(second, "receive", lambda data, now: None)
+        net.run(room.JUDGING_TIME + 3.0)
+        assert net.kinds() == ["Contested"]
+    net.run(room.LATER_PAUSE + 1.0)
+    assert net.kinds() == ["Contested", "Uncontested"]
+    assert net.machine.peers.contest is None
+    net.run(20.0)
+    assert net.kinds() == ["Contested", "Uncontested"]
+
+
+def test_one_that_never_shows_who_it_is_stays_contested_and_is_asked_rarely() -> None:
+    stranger = Speaker(uid=None, booted_at=None, every=0.5)
+    net = Net(a=Speaker(), b=stranger)
+    net.run(room.JUDGING_TIME + 1.0)
+    stranger.heard.clear()
+    net.run(60.0)
+    assert net.kinds() == ["Contested"]
+    asked = [message for message in stranger.heard if isinstance(message, wire.CommandLong)]
+    assert len(asked) <= 3 * (60.0 / room.LATER_PAUSE + 1)
+
+
+def test_a_vehicle_without_id_and_clock_may_have_two_paths() -> None:
+    """Nothing tells the two apart, and nothing ever will."""
+    camera = Heartbeat(30, MAV_AUTOPILOT_GENERIC)
+    net = Net(
+        a=Speaker(camera, uid=None, booted_at=None),
+        b=Speaker(camera, uid=None, booted_at=None, start=0.4),
+    )
+    net.run(room.JUDGING_TIME + 5.0)
+    assert net.kinds() == []
+
+
+def test_a_vehicle_that_starts_again_behind_two_paths_is_no_contest() -> None:
+    first, second = Speaker(), Speaker(start=0.4)
+    net = Net(a=first, b=second)
+    net.run(5.0)
+    for at, speaker in ((5.5, first), (7.0, second)):  # the second path tells of it later
+        net.run(at - net.now)
+        speaker.booted_at = 5.3
+        speaker.say(SystemTime(0, int(1000 * (net.now - 5.3))))
+    net.run(20.0)
+    assert net.kinds() == []
+
+
+def test_ground_stations_with_one_address_are_no_contest() -> None:
+    gcs = Heartbeat(MAV_TYPE_GCS, 8)
+    net = Net(
+        a=Speaker(gcs, uid=None, booted_at=None, system=254),
+        b=Speaker(gcs, uid=None, booted_at=None, start=0.3, system=254),
+    )
+    net.run(20.0)
+    assert net.kinds() == []
+
+
+def test_a_vehicle_in_place_of_a_ground_station_is_heard() -> None:
+    net = Net(a=Speaker(Heartbeat(MAV_TYPE_GCS, 8), uid=None, booted_at=None))
+    net.run(2.0)
+    net.peers["b"] = Speaker()
+    net.peers["a"].end = net.now
+    net.run(4.0)
+    assert net.machine.who.identity.uid == f"{1:016x}"
+    assert net.kinds() == []
+
+
+def test_components_of_one_system_may_come_from_several_peers() -> None:
+    net = Net(a=Speaker())
+    net.run(2.0)
+    camera = wire.encode(Heartbeat(30, 8), system=1, component=100, sequence=0)
+    net.station.receive(camera, "camera", net.now)
+    net.station.data_to_send()
+    net.station.components[1, 100].read("C", net.now)
+    net.machine.read("P", net.now)
+    targets = {peer for _, peer in net.station.data_to_send()}
+    assert targets == {"a", "camera"}
+
+
+def test_a_heartbeat_from_a_forged_address_brings_that_seven_requests_and_no_more() -> None:
+    station = Station(link="udpin:test", is_stream=False, upkeep=Upkeep.chosen(None, "auto"))
+    station.receive(wire.encode(PX4, system=9, component=1, sequence=0), "victim", 0.0)
+    framer, sent = Framer(wire.UNDERSTOOD, stream=False), []
+    for step in range(1200):
+        station.tick(step * STEP)
+        for data, peer in station.data_to_send():
+            if peer == "victim":
+                sent += [wire.decode(frame) for frame in framer.receive(data)]
+    assert len(sent) <= 7
+
+
+# A peer in place of another
+
+
+def test_a_vehicle_that_comes_back_from_another_port_takes_its_address() -> None:
+    net = Net(a=silent_after(3.0), b=Speaker(start=3.6, booted_at=3.3))
+    net.run(3.0 + room.RESTART_SILENCE + 0.5)
+    assert net.machine.peers.home == "b"
+    net.run(10.0)
+    assert net.kinds() == []
+    assert net.machine.presence.started_at == pytest.approx(3.3, abs=0.1)
+
+
+def test_one_whose_port_changes_on_the_way_is_heard_at_once() -> None:
+    """As behind a mobile network's address translation: the vehicle goes on."""
+    net = Net(a=silent_after(3.0), b=Speaker(start=3.1))
+    net.run(3.5)
+    net.peers["b"].say(param_value("P", 4.0, index=0, count=1))
+    net.run(0.1)
+    assert net.machine.table.params["P"].value == 4.0
+    net.run(room.PATH_SILENCE)
+    assert net.machine.peers.home == "b"
+
+
+def test_another_vehicle_in_place_of_one_that_is_gone_is_identified_anew() -> None:
+    net = Net(a=silent_after(3.0, uid=1), b=Speaker(ARDUPILOT, uid=2, start=3.5))
+    net.run(2.5)
+    net.machine.read("P", net.now)
+    net.run(0.2)
+    assert "P" in net.machine.table.params
+    net.run(4.0)
+    assert net.kinds() == []
+    assert net.machine.peers.home == "b"
+    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert dict(net.machine.table.params) == {}
+
+
+def test_further_peers_are_so_many_and_no_more() -> None:
+    net = Net(a=Speaker())
+    net.run(1.0)
+    for number in range(100):
+        data = wire.encode(PX4, system=1, component=1, sequence=0)
+        net.station.receive(data, f"forger {number}", net.now)
+    assert len(net.machine.peers._others) == room.CLAIMS_MAX
+    net.run(LOST_AFTER + 2.0)
+    assert net.machine.peers.next_deadline() == float("inf"), "nothing is looked at any more"
+
+
+def test_where_nothing_is_sent_the_clock_shows_a_second_path() -> None:
+    def listening(**other: object) -> Net:
+        station = Station(link="udpin:test", is_stream=False, upkeep=Upkeep(listens_only=True))
+        net = Net(a=Speaker(), b=Speaker(start=0.4, **other), station=station)  # type: ignore[arg-type]
+        for _ in range(20):
+            for speaker in net.peers.values():
+                if net.now >= speaker.start and speaker.booted_at is not None:
+                    speaker.say(SystemTime(0, int(1000 * (net.now - speaker.booted_at))))
+            net.run(0.5)
+        return net
+
+    assert listening().kinds() == []
+    assert listening(booted_at=-50.0).kinds() == ["Contested"]
+
+
+def test_split_peers_are_never_contested() -> None:
+    station = Station(link="tcpin:test", is_stream=False, split_peers=True)
+    net = Net(a=Speaker(PX4), b=Speaker(ARDUPILOT, uid=2, start=0.4, value=7.0), station=station)
+    net.run(8.0)
+    assert net.kinds() == []
+    assert len(station.components) == 2
+    assert len({*station.components, (1, 1)}) == 3, "the ids alone are no key"
+    for machine in station.components.values():
+        machine.read("P", net.now)
+    net.run(0.2)
+    values = {
+        machine.peer_in_words: machine.table.params["P"].value for machine in station.components.values()
+    }
+    assert values == {"a": 1.0, "b": 7.0}
+    assert [each.peer_in_words for each in station.at_peer("b")] == ["b"]
+    assert {repr(address) for address in station.components} == {"1/1 at a", "1/1 at b"}
+
+
+def test_a_split_component_that_is_forgotten_leaves_the_other_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(station_room, "MOST_COMPONENTS", 2)
+    station = Station(link="tcpin:test", is_stream=False, split_peers=True)
+    net = Net(a=Speaker(), b=silent_after(2.0), station=station)
+    net.run(9.0)
+    net.peers["c"] = Speaker(uid=3, start=9.0)
+    net.run(5.0)
+    assert sorted(each.peer_in_words for each in station.components.values()) == ["a", "c"]
+
+
+@pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle])
+def test_simulated_vehicles_behind_two_paths(make: Callable[[], Endpoint]) -> None:
+    """Each message comes twice, as from a router with two ways to one vehicle."""
+    vehicle = make()
+    station = Station(link="udpin:test", is_stream=False)
+    now = 0.0
+    events: list[Event] = []
+    while now < 12.0:
+        now += STEP
+        vehicle.tick(now)
+        for data in vehicle.data_to_send():
+            for peer in ("a", "b"):
+                station.receive(data, peer, now)
+        station.tick(now)
+        for data, _ in station.data_to_send():
+            vehicle.receive(data, now)
+        events += station.events()
+    assert not any(isinstance(each, ComponentContested) for each in events)
+
+
+# One that is not the vehicle of before
+
+
+def hold(net: Net, *names: str) -> None:
+    """Have the vehicle at the first peer give these, of a table of two."""
+    speaker = next(iter(net.peers.values()))
+    for name in names:
+        speaker.say(param_value(name, 1.0, index=ord(name) - ord("P"), count=2))
+    net.run(STEP)
+
+
+def test_one_that_gives_its_id_first_takes_nothing_over() -> None:
+    """Two of one kind: the id of the first and one of its values were lost, and the table is gone on with."""
+    net = Net(a=Speaker(uid=None), b=Speaker(uid=9, start=0.6, value=9.0))
+    net.run(0.4)
+    fetch = net.machine.begin_fetch(net.now)
+    hold(net, "P")
+    assert [*net.machine.table.params] == ["P"]
+    net.run(1.0)
+    assert net.machine.peers.home == "b"
+    assert net.machine.who.identity.uid == f"{9:016x}"
+    assert dict(net.machine.table.params) == {}
+    assert any(isinstance(each, ComponentReplaced) for each in net.events)
+    net.peers["b"].say(param_value("Q", 9.0, index=1, count=2))
+    net.run(STEP)
+    assert not fetch.done, "P is wanted of this one as well"
+    assert not net.machine.table.complete
+
+
+def test_an_id_that_comes_over_a_second_path_first_changes_nothing() -> None:
+    net = Net(a=Speaker(uid=None), b=Speaker(start=0.2, uid=1))
+    net.run(0.2)
+    hold(net, "P")
+    net.run(room.FIRST_GRACE - STEP)
+    net.peers["a"].say(AutopilotVersion(0, uid=1))
+    net.run(1.0)
+    assert net.machine.peers.home == "a"
+    assert [*net.machine.table.params] == ["P"]
+    assert net.kinds() == []
+
+
+def test_nothing_is_taken_from_one_that_does_not_show_to_be_the_vehicle_that_is_silent() -> None:
+    net = Net(a=silent_after(3.0), b=Speaker(uid=None, booted_at=None, start=3.5, value=99.0))
+    net.run(2.0)
+    hold(net, "P", "Q")
+    net.run(1.8)
+    for _ in range(40):
+        net.peers["b"].say(param_value("P", 99.0, index=0, count=2))
+        net.run(STEP)
+        assert net.machine.table.params["P"].value == 1.0
+    net.peers["b"].end = net.now
+    net.peers["a"].end = 1e9
+    net.run(10.0)
+    assert net.machine.table.params["P"].value == 1.0
+    assert net.machine.peers.home == "a"
+    assert not net.station.is_doubted(net.machine)
+
+
+def test_one_that_stays_and_gives_no_id_is_another_vehicle() -> None:
+    net = Net(a=silent_after(3.0), b=Speaker(uid=None, booted_at=None, start=3.5, value=99.0))
+    net.run(2.0)
+    hold(net, "P", "Q")
+    net.run(1.2)
+    write = net.machine.write("P", 5.0, net.now)
+    net.run(3.5 + room.JUDGING_TIME + 1.0 - net.now)
+    assert isinstance(write.error, NoReply)
+    assert not any(isinstance(each, ParamSet) for each in net.peers["b"].heard)
+    assert net.machine.peers.home == "b"
+    assert not net.machine.who.identity.uid
+    assert dict(net.machine.table.params) == {}
+    write = net.machine.write("P", 6.0, net.now)
+    net.run(8.0)
+    assert write.result is not None, "it is written to as the vehicle that it is"
+    assert not net.station.is_doubted(net.machine)
+    net.peers["a"].end = 1e9
+    net.peers["b"].end = net.now
+    net.run(10.0)
+    assert net.machine.who.identity.uid == f"{1:016x}"
+    assert {param.value for param in net.machine.table.params.values()} <= {1.0}, "nothing of the other one"
+
+
+def test_a_write_does_not_go_to_the_peers_that_are_left_where_a_connection_ends() -> None:
+    station = Station(link="tcpin:test", is_stream=True)
+    net = Net(a=Speaker(obeys=False), station=station)
+    net.run(2.0)
+    hold(net, "P", "Q")
+    write = net.machine.write("P", 5.0, net.now)
+    net.run(0.1)
+    net.peers["b"] = other = Speaker(uid=2, start=net.now)
+    other._beats = 2  # it is connected, and will be silent for 2 s
+    station.receive(b"", "a", net.now)
+    net.peers["a"].end = net.now
+    net.run(1.9)
+    assert {type(each) for each in other.heard} == {Heartbeat}
+    net.run(0.5)
+    assert net.machine.peers.home == "b", "what has ended needs no further silence"
+    net.run(8.0)
+    assert isinstance(write.error, NoReply)
+    assert not any(isinstance(each, ParamSet) for each in net.peers["b"].heard)
+    assert net.machine.who.identity.uid == f"{2:016x}"
+
+
+def test_a_vehicle_that_connects_anew_goes_on() -> None:
+    station = Station(link="tcpin:test", is_stream=True)
+    net = Net(a=Speaker(), station=station)
+    net.run(2.0)
+    hold(net, "P", "Q")
+    station.receive(b"", "a", net.now)
+    net.peers["a"].end = net.now
+    net.run(1.0)
+    assert not station.data_to_send() or all(peer is None for _, peer in station.data_to_send())
+    net.peers["b"] = Speaker(start=net.now)
+    net.run(1.0)
+    assert net.machine.peers.home == "b"
+    assert [*net.machine.table.params] == ["P", "Q"]
+    write = net.machine.write("P", 5.0, net.now)
+    net.run(0.5)
+    assert write.result is not None
+    assert not any(isinstance(each, ComponentReplaced) for each in net.events)
+
+
+def test_one_that_says_no_more_who_it_is_is_not_written_to() -> None:
+    """At a serial port nothing but the id tells whether it is the vehicle that was there before."""
+    speaker = Speaker(end=3.0)
+    net = Net(port=speaker)
+    net.run(2.0)
+    hold(net, "P", "Q")
+    net.run(9.0)
+    speaker.end, speaker.uid = 1e9, None
+    net.run(2.0)
+    write = net.machine.write("P", 5.0, net.now)
+    net.run(6.0)
+    assert isinstance(write.error, NoReply)
+    assert "has not said since it was away which vehicle it is" in str(write.error)
+    again = net.machine.write("P", 5.0, net.now)
+    net.run(0.5)
+    assert not again.done
+    speaker.uid = 1
+    net.run(2.0)
+    assert again.result is not None
+    assert len([each for each in speaker.heard if isinstance(each, ParamSet)]) == 1
+
+
+def test_another_kind_through_one_peer_is_asked_who_it_is() -> None:
+    """As where another vehicle was plugged in within the heartbeat timeout."""
+    port = Speaker(PX4, end=3.0)
+    net = Net(port=port)
+    net.run(2.5)
+    hold(net, "P", "Q")
+    net.run(2.0)
+    port._heartbeats, port.uid, port.end = (ARDUPILOT,), 2, 1e9
+    net.run(2.0)
+    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert dict(net.machine.table.params) == {}
+
+
+def test_another_kind_that_gives_no_id_is_not_written_to() -> None:
+    port = Speaker(PX4)
+    net = Net(port=port)
+    net.run(2.5)
+    hold(net, "P", "Q")
+    port._heartbeats, port.uid = (ARDUPILOT,), None
+    net.run(1.5)
+    write = net.machine.write("P", 5.0, net.now)
+    net.run(8.0)
+    assert isinstance(write.error, NoReply)
+    assert net.station.is_doubted(net.machine)
+    port._heartbeats, port.uid = (PX4,), 1
+    net.run(room.LATER_PAUSE + 3.0)
+    assert not net.station.is_doubted(net.machine)
+    assert any(isinstance(each, ComponentReplaced) for each in net.events), "what came meanwhile is not its"
+
+
+@pytest.mark.parametrize("first", [None, 0])
+def test_one_that_gives_an_id_after_one_without_is_another(first: int | None) -> None:
+    port = Speaker(uid=first, end=6.0)
+    net = Net(port=port)
+    net.run(5.0)
+    hold(net, "P", "Q")
+    write = net.machine.write("P", 5.0, net.now)
+    port._obeys = False
+    net.run(8.0)
+    assert write.done
+    port.end, port.uid, port._obeys = 1e9, 2, True
+    net.run(3.0)
+    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert {param.value for param in net.machine.table.params.values()} <= {port.value}
+    assert any(isinstance(each, ComponentReplaced) for each in net.events)
+
+
+def test_a_vehicle_that_could_not_answer_for_a_while_is_confirmed_later() -> None:
+    port = Speaker(end=3.0)
+    net = Net(port=port)
+    net.run(9.0)
+    port.end, port.uid = 1e9, None  # its radio hears nothing
+    net.run(20.0)
+    assert net.station.is_doubted(net.machine)
+    port.uid = 1
+    net.run(6.0)
+    assert not net.station.is_doubted(net.machine)
+
+
+def test_two_of_one_kind_behind_one_radio_are_told_apart_by_their_clocks() -> None:
+    radio = Speaker()
+    net = Net(radio=radio)
+    net.run(5.0)
+    for step in range(20):
+        radio.say(SystemTime(0, int(1000 * (net.now + (100.0 if step % 2 else 900.0)))))
+        net.run(0.5)
+    assert net.kinds() == ["Contested"]
+    assert net.machine.peers.contest is not None
+    assert "two times since boot" in net.machine.peers.contest.claimants[0]
+    net.run(30.0)
+    assert net.kinds() == ["Contested", "Uncontested"]
+
+
+def test_what_comes_late_after_a_restart_is_no_second_vehicle() -> None:
+    radio = Speaker()
+    net = Net(radio=radio)
+    net.run(5.0)
+    for booted_at in (-100.0, 5.0, -100.0, 5.0, 5.0, 5.0):
+        radio.say(SystemTime(0, int(1000 * (net.now - booted_at))))
+        net.run(0.1)
+    net.run(20.0)
+    assert net.kinds() == []
+
+
+def test_a_slow_clock_is_no_other_vehicle() -> None:
+    """That of a simulation on a busy computer: 5 % slow, and a second path is found after some minutes."""
+    first, second = Speaker(), Speaker(start=301.0)
+    net = Net(a=first, b=second)
+    for _ in range(400):
+        for speaker in (first, second):
+            speaker.booted_at = -100.0 + 0.05 * net.now
+            if net.now >= speaker.start:
+                speaker.say(SystemTime(0, int(1000 * (net.now - speaker.booted_at))))
+        net.run(1.0)
+    assert net.kinds() == []
+
+
+def test_a_satellite_path_contests_nothing() -> None:
+    net = Net(a=Speaker())
+    for _ in range(30):
+        data = wire.encode(wire.HighLatency2(PX4.type, PX4.autopilot), system=1, component=1, sequence=0)
+        net.station.receive(data, "satellite", net.now)
+        net.run(1.0)
+    assert net.kinds() == []
+    assert net.machine.peers.home == "a"
+
+
+def test_a_restart_at_a_new_port_may_take_its_time_to_answer() -> None:
+    after = Speaker(uid=None, booted_at=None, start=4.0)
+    net = Net(a=silent_after(3.0), b=after)
+    net.run(2.0)
+    hold(net, "P", "Q")
+    net.machine.begin_restart(net.now)
+    net.run(10.0)
+    after.uid, after.booted_at = 1, 3.5
+    net.run(6.0)
+    assert net.machine.peers.home == "b"
+    assert not any(isinstance(each, ComponentReplaced) for each in net.events)
+    assert [*net.machine.table.params] == ["P", "Q"]
+
+
+def camera(net: Net, peer: str, value: float) -> ComponentMachine:
+    """One of the same system, which has told a value."""
+    for message in (Heartbeat(30, 8), param_value("CAM", value, index=0, count=1)):
+        net.station.receive(wire.encode(message, system=1, component=100, sequence=0), peer, net.now)
+    net.run(STEP)
+    return net.station.components[1, 100]
+
+
+def test_the_other_components_go_with_the_autopilot_that_loses_a_contest() -> None:
+    net = Net(a=silent_after(5.0, uid=1), b=Speaker(uid=2, start=1.0))
+    net.run(0.5)
+    other = camera(net, "a", 7.0)
+    assert [*other.table.params] == ["CAM"]
+    net.run(15.0)
+    assert net.kinds() == ["Contested", "Uncontested"]
+    assert net.machine.who.identity.uid == f"{2:016x}"
+    assert dict(other.table.params) == {}
+
+
+def test_a_component_at_the_peer_of_a_rival_is_neither_kept_nor_written_to() -> None:
+    net = Net(a=Speaker(uid=1), b=silent_after(12.0, uid=2, start=2.0))
+    net.run(2.2)
+    other = camera(net, "b", 9.0)
+    assert net.station.is_doubted(other)
+    assert not other.may_be_written
+    net.run(room.JUDGING_TIME)
+    assert net.machine.peers.contest is not None
+    with pytest.raises(ContestedAddress):
+        other.write("CAM", 1.0, net.now)
+    camera(net, "b", 9.0)
+    assert net.station.is_doubted(other)
+    net.run(15.0)
+    assert net.machine.who.identity.uid == f"{1:016x}"
+    assert dict(other.table.params) == {}, "it was heard from the rival's peer"
+
+
+def test_the_components_of_an_autopilot_that_does_not_say_who_it_is_are_not_written_to() -> None:
+    port = Speaker(end=3.0)
+    net = Net(port=port)
+    net.run(2.0)
+    other = camera(net, "port", 9.0)
+    net.run(9.0)
+    port.end, port.uid = 1e9, None
+    net.run(10.0)
+    camera(net, "port", 9.0)
+    write = other.write("CAM", 5.0, net.now)
+    net.run(15.0)
+    assert isinstance(write.error, NoReply)
+    assert not any(isinstance(each, ParamSet) for each in port.heard)

@@ -1,0 +1,271 @@
+"""Whether a component is there: its heartbeats, its silence, its reboots."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import pytest
+
+from paramclient.protocol.vehicle.presence import (
+    CLOCKS_MAX,
+    DETOUR,
+    FIRST_FRAMES,
+    LONGEST_PATIENCE,
+    LOST_AFTER,
+    LOST_AFTER_HIGH_LATENCY,
+    OUT_OF_ORDER,
+    WRAP,
+    Presence,
+)
+from paramclient.protocol.wire import (
+    MAV_AUTOPILOT_PX4,
+    MAV_STATE_ACTIVE,
+    MAV_STATE_BOOT,
+    Heartbeat,
+    SystemTime,
+)
+from tests.simulation import is_so
+
+ACTIVE = Heartbeat(2, MAV_AUTOPILOT_PX4, system_status=MAV_STATE_ACTIVE)
+BOOT = Heartbeat(2, MAV_AUTOPILOT_PX4, system_status=MAV_STATE_BOOT)
+
+
+def beating(*times: float) -> Presence:
+    presence = Presence()
+    for now in times:
+        presence.heard(now)
+        assert not presence.heartbeat(ACTIVE, now)
+    return presence
+
+
+# silence
+
+
+def test_the_first_word_has_no_silence_before_it() -> None:
+    presence = Presence()
+    assert presence.heard(7.0) == math.inf
+    assert presence.heard(9.5) == 2.5
+
+
+def test_what_never_sent_a_heartbeat_is_never_lost() -> None:
+    presence = Presence()
+    presence.heard(1.0)
+    assert not presence.has_beaten
+    assert presence.patience == math.inf
+    assert presence.lost_at() == math.inf
+    assert not presence.was_away(LOST_AFTER - 0.1)
+    assert presence.was_away(LOST_AFTER), "another vehicle may speak now all the same"
+
+
+def test_five_seconds_after_the_last_word_it_is_lost() -> None:
+    presence = beating(1.0)
+    assert presence.lost_at() == 1.0 + LOST_AFTER
+    presence.heard(3.5)
+    assert presence.lost_at() == 3.5 + LOST_AFTER, "whatever the word was"
+    presence.is_lost = True
+    assert presence.lost_at() == math.inf
+
+
+@pytest.mark.parametrize("interval", [0.1, 0.6, 1.0, 1.6])
+def test_usual_heartbeats_change_nothing(interval: float) -> None:
+    presence = beating(0.0, interval, 2 * interval, 3 * interval)
+    assert presence.patience == LOST_AFTER
+    assert 2.5 <= presence.gap <= 4.0
+
+
+def test_one_that_beats_rarely_is_given_three_of_its_own_intervals() -> None:
+    presence = beating(0.0, 10.0)
+    assert presence.patience == 30.0
+    assert presence.gap == 25.0, "no gap after each of its heartbeats"
+
+
+def test_heartbeats_that_came_twice_tell_of_no_quicker_rhythm() -> None:
+    presence = beating(0.0, 0.01, 10.0, 10.01, 20.0, 20.01)
+    assert presence.patience == pytest.approx(29.97)
+
+
+def test_lost_heartbeats_do_not_make_it_one_that_beats_rarely() -> None:
+    presence = beating(0.0, 9.0, 10.0, 14.0)
+    assert presence.patience == LOST_AFTER
+    assert presence.gap == 2.5
+
+
+def test_patience_has_an_end() -> None:
+    assert beating(0.0, 1e6).patience == LONGEST_PATIENCE
+
+
+def test_high_latency_needs_more_patience_until_the_next_heartbeat() -> None:
+    presence = beating(0.0, 1.0)
+    presence.heard(2.0)
+    presence.high_latency()
+    assert is_so(presence.is_high_latency)
+    assert presence.lost_at() == 2.0 + LOST_AFTER_HIGH_LATENCY
+    presence.heard(30.0)
+    presence.heartbeat(ACTIVE, 30.0)
+    assert not presence.is_high_latency
+    assert presence.lost_at() == 30.0 + LOST_AFTER
+
+
+def test_one_that_is_first_heard_in_high_latency_can_be_lost_too() -> None:
+    presence = Presence()
+    presence.heard(2.0)
+    presence.high_latency()
+    assert presence.lost_at() == 2.0 + LOST_AFTER_HIGH_LATENCY
+
+
+# reboots
+
+
+def reboots(clock: Sequence[tuple[float, int]]) -> list[float]:
+    """When a SYSTEM_TIME shows a reboot: each comes at a time in seconds, and says so many milliseconds."""
+    presence = Presence()
+    return [now for now, boot_ms in clock if presence.system_time(SystemTime(0, boot_ms), now)]
+
+
+def test_a_clock_that_begins_anew_is_a_reboot() -> None:
+    assert reboots([(0.0, 500_000), (1.0, 501_000), (6.0, 1_200), (7.0, 2_200)]) == [6.0]
+    assert reboots([(0.0, 50_000), (60.0, 40_000)]) == [60.0], "it was away for a minute"
+    assert reboots([(0.0, 3 * WRAP // 4), (9.0, 3_000)]) == [9.0], "after weeks"
+
+
+def test_each_reboot_counts_once() -> None:
+    clock = [(0.0, 50_000), (5.0, 1_000), (6.0, 2_000), (6.0, 2_000), (20.0, 500), (21.0, 1_500)]
+    assert reboots(clock) == [5.0, 20.0]
+
+
+def test_what_comes_in_the_wrong_order_or_twice_is_no_reboot() -> None:
+    assert reboots([(0.0, 50_000), (0.1, 49_000), (0.2, 51_000), (0.2, 51_000), (1.0, 50_000)]) == []
+    soon = int(1000 * OUT_OF_ORDER) + 100
+    assert reboots([(0.0, soon), (0.1, 200), (1.0, soon + 1_000)]) == [], "soon after it was switched on"
+    assert reboots([(0.0, soon), (0.1, 150)]) == [0.1]
+
+
+def test_a_second_way_that_takes_longer_is_no_reboot() -> None:
+    lag = int(1000 * (DETOUR - 1))
+    clock = [(float(second), 100_000 + 1000 * second - (lag if second % 2 else 0)) for second in range(60)]
+    assert reboots(clock) == []
+    assert reboots([*clock, (65.0, 1_000), (66.0, 2_000)]) == [65.0]
+
+
+def test_a_simulated_clock_may_run_faster() -> None:
+    clock = [(float(second), 20_000 * second) for second in range(10)]
+    assert reboots(clock) == []
+    assert reboots([*clock, (12.0, 4_000)]) == [12.0]
+
+
+def test_a_clock_that_is_full_begins_at_zero() -> None:
+    assert reboots([(0.0, WRAP - 500), (1.0, 500), (2.0, 1_500)]) == []
+    assert reboots([(0.0, WRAP - 500), (1.0, 500), (9.0, 8_500), (14.0, 1_000)]) == [14.0]
+
+
+def states(*beats: tuple[float, Heartbeat]) -> list[float]:
+    presence = Presence()
+    return [now for now, beat in beats if presence.heartbeat(beat, now)]
+
+
+def test_a_heartbeat_that_says_it_boots_is_a_reboot() -> None:
+    assert states((0.0, ACTIVE), (5.0, BOOT), (6.0, BOOT), (7.0, ACTIVE)) == [5.0]
+    assert states((0.0, ACTIVE), (5.0, BOOT), (7.0, ACTIVE), (20.0, BOOT)) == [5.0, 20.0]
+
+
+def test_one_that_is_met_while_it_boots_has_not_started_again() -> None:
+    assert states((0.0, BOOT), (1.0, BOOT), (2.0, ACTIVE)) == []
+
+
+def test_a_late_copy_of_a_booting_heartbeat_is_no_second_reboot() -> None:
+    assert states((0.0, ACTIVE), (5.0, BOOT), (6.0, ACTIVE), (6.5, BOOT), (7.0, ACTIVE)) == [5.0]
+
+
+def test_clock_and_heartbeat_tell_of_one_reboot_only() -> None:
+    presence = beating(0.0, 1.0)
+    assert not presence.system_time(SystemTime(0, 90_000), 1.0)
+    assert presence.heartbeat(BOOT, 6.0)
+    assert not presence.system_time(SystemTime(0, 500), 6.0)
+    assert not presence.system_time(SystemTime(0, 1_500), 7.0)
+
+
+# clocks in telemetry
+
+ATTITUDE_ID, GLOBAL_POSITION_ID = 30, 33
+
+
+def telemetry_reboots(clock: Sequence[tuple[float, int, int]]) -> list[float]:
+    """When telemetry shows a reboot, by messages with a time in seconds, an id and milliseconds."""
+    presence = Presence()
+    return [now for now, number, boot_ms in clock if presence.boot_clock(number, boot_ms, now)]
+
+
+def test_a_clock_in_telemetry_that_begins_anew_is_a_reboot() -> None:
+    clock = [(0.0, ATTITUDE_ID, 60_000), (0.1, GLOBAL_POSITION_ID, 60_080), (1.9, GLOBAL_POSITION_ID, 316)]
+    assert telemetry_reboots([*clock, (2.0, ATTITUDE_ID, 400), (2.1, GLOBAL_POSITION_ID, 500)]) == [1.9]
+
+
+def test_clocks_of_different_messages_are_not_compared() -> None:
+    """One that is filled with another clock, with a constant or with nothing shows no reboot."""
+    clock = [
+        (second, number, boot_ms)
+        for second in range(20)
+        for number, boot_ms in (
+            (ATTITUDE_ID, 90_000 + 1000 * second),
+            (GLOBAL_POSITION_ID, 1000 * second + 1),
+            (132, 700),
+            (143, 0 if second % 2 else 90_000),
+        )
+    ]
+    assert telemetry_reboots(clock) == []
+
+
+def test_late_frames_of_the_run_before_are_no_second_reboot() -> None:
+    """They come over a slower way, after those of the new run."""
+    clock = [(0.0, 60_000), (2.0, 400), (2.1, 61_000), (2.2, 600), (4.0, 61_500), (4.1, 2_500), (9.0, 7_400)]
+    assert telemetry_reboots([(now, ATTITUDE_ID, boot_ms) for now, boot_ms in clock]) == [2.0]
+
+
+def test_a_second_reboot_soon_after_the_first_one_counts() -> None:
+    clock = [(0.0, 60_000), (2.0, 400), (6.0, 4_400), (8.0, 300), (12.0, 4_300), (14.0, 200)]
+    assert telemetry_reboots([(now, ATTITUDE_ID, boot_ms) for now, boot_ms in clock]) == [2.0, 8.0, 14.0]
+
+
+def test_clocks_of_telemetry_may_wrap_and_come_over_two_ways() -> None:
+    wrapping = [(now, ATTITUDE_ID, (WRAP - 3_000 + int(1000 * now)) % WRAP or 1) for now in range(10)]
+    assert telemetry_reboots(wrapping) == []
+    lag = int(1000 * (DETOUR - 1))
+    ways = [(0.5 * turn, ATTITUDE_ID, 100_000 + 500 * turn - (lag if turn % 2 else 0)) for turn in range(40)]
+    assert telemetry_reboots(ways) == []
+
+
+def test_the_clock_is_told_by_any_message() -> None:
+    presence = Presence()
+    assert presence.started_at is None
+    presence.boot_clock(ATTITUDE_ID, 4_000, 10.0)
+    assert is_so(presence.started_at == 6.0)
+    assert presence.clock_at == 10.0
+    presence.forget_clock(11.0)
+    assert is_so(presence.started_at is None)
+    assert not presence.boot_clock(ATTITUDE_ID, 500, 11.5)
+
+
+def test_message_ids_with_clocks_are_bounded() -> None:
+    presence = Presence()
+    for number in range(1_000):
+        presence.boot_clock(number, 5_000, 1.0)
+    assert len(presence._clocks) == CLOCKS_MAX
+
+
+# sequence numbers
+
+
+def test_a_numbering_that_begins_is_noticed() -> None:
+    presence = Presence()
+    assert not presence.numbering_begins(0), "the first frame that is heard"
+    presence.numbering_begins(200)
+    assert presence.numbering_begins(1)
+    assert not presence.numbering_begins(2)
+
+
+@pytest.mark.parametrize(("before", "sequence"), [(254, 0), (250, 1), (0, 1), (100, FIRST_FRAMES), (40, 200)])
+def test_the_usual_step_over_255_begins_no_numbering(before: int, sequence: int) -> None:
+    presence = Presence()
+    presence.numbering_begins(before)
+    assert not presence.numbering_begins(sequence)

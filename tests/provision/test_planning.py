@@ -1,0 +1,474 @@
+"""What a set-up would do: which values, in which order, and what is left alone for which reason."""
+
+from __future__ import annotations
+
+import fnmatch
+import math
+from dataclasses import dataclass
+
+import pytest
+
+from paramclient.errors import UsageError
+from paramclient.metadata import Metadata, ParamInfo
+from paramclient.model.identity import Identity
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, from_bits
+from paramclient.provision import CATEGORIES, MISSING, WRONG, Plan, PlanStatus, overlay, plan
+from paramclient.provision.cautions import OUT_OF_RANGE, READ_ONLY, Caution, cautions_for
+from paramclient.provision.planning import MOST_SUGGESTED
+from paramclient.sim.param_table import SimParam, ardupilot_table, ek2_group, px4_table
+
+SECTIONS = ("left_out", "frame", "resets", "reveals", "last", "system_id", "reboot")
+
+
+@dataclass(frozen=True)
+class Info:
+    minimum: float | None = None
+    maximum: float | None = None
+    is_read_only: bool = False
+    reboot_required: bool = False
+
+
+def held(**values: Value | tuple[ParamType | int, Value]) -> dict[str, Param]:
+    """A vehicle's table: an int is an INT32, a float a REAL32, other types are said."""
+    table: dict[str, Param] = {}
+    for name, entry in values.items():
+        default = ParamType.REAL32 if isinstance(entry, float) else ParamType.INT32
+        kind, value = entry if isinstance(entry, tuple) else (default, entry)
+        bits = bits_of(value, kind)
+        table[name] = Param(name, from_bits(bits, kind), kind, len(table), bits)
+    return table
+
+
+def written(**values: Value) -> ParamSet:
+    return ParamSet({name: WrittenParam(name, value) for name, value in values.items()}, source="a file")
+
+
+def copy_of(table: tuple[SimParam, ...]) -> dict[str, Param]:
+    return {
+        row.name: Param(row.name, from_bits(row.bits, row.type), row.type, index, row.bits)
+        for index, row in enumerate(table)
+    }
+
+
+def order(made: Plan) -> list[list[str]]:
+    return [[step.name for step in stage.steps] for stage in made.stages]
+
+
+def only_row(made: Plan) -> tuple[PlanStatus, str, str]:
+    (row,) = made.rows.values()
+    return row.status, row.category, row.reason
+
+
+def test_every_wanted_parameter_ends_in_one_of_the_states() -> None:
+    made = plan(
+        held(ROLL_P=4.0, PITCH_P=4.0, STAT_RUNTIME=5, COUNT=(ParamType.INT8, 1), OTHER=1),
+        written(ROLL_P=4, PITCH_P=6.5, STAT_RUNTIME=6, COUNT=300, PICTH_P=1),
+        autopilot="ardupilot",
+    )
+    assert {name: row.status for name, row in made.rows.items()} == {
+        "ROLL_P": PlanStatus.UNCHANGED,
+        "PITCH_P": PlanStatus.SET,
+        "STAT_RUNTIME": PlanStatus.SKIPPED,
+        "COUNT": PlanStatus.INVALID,
+        "PICTH_P": PlanStatus.SKIPPED,
+    }
+    (step,) = made.steps
+    assert (step.name, step.value, step.type, step.before) == ("PITCH_P", 6.5, ParamType.REAL32, 4.0)
+    assert made.extra == ("OTHER",)
+    assert not made.is_met
+    assert repr(made) == "<Plan 1 unchanged, 1 set, 2 skipped, 1 invalid in 1 stages>"
+    assert str(step) == "PITCH_P 4.0 -> 6.5"
+    assert str(made.rows["PICTH_P"]).startswith("PICTH_P 1, skipped: not on this vehicle")
+    assert str(made.rows["ROLL_P"]) == "ROLL_P = 4"
+
+
+def test_nothing_to_do_is_met_and_what_is_missing_is_not() -> None:
+    table = held(ROLL_P=4.0, STAT_RUNTIME=5)
+    assert plan(table, written(ROLL_P=4, STAT_RUNTIME=6), autopilot="ardupilot").is_met
+    assert not plan(table, written(ROLL_P=4, ROLL_I=6), autopilot="ardupilot").is_met
+
+
+def test_who_is_mistyped_is_told_the_nearest_names() -> None:
+    table = copy_of(ardupilot_table())
+    made = plan(table, written(ATC_RAT_RRL_P=0.1, wpnav_speed=500, NO_SUCH_THING=1), autopilot="ardupilot")
+    assert made.rows["ATC_RAT_RRL_P"].nearest[0] == "ATC_RAT_RLL_P"
+    assert made.rows["wpnav_speed"].nearest[0] == "WPNAV_SPEED"
+    assert made.rows["NO_SUCH_THING"].nearest == ()
+    assert "did you mean ATC_RAT_RLL_P" in str(made.rows["ATC_RAT_RRL_P"])
+
+
+def test_the_file_of_another_vehicle_is_not_taken_for_mistyped() -> None:
+    names = {f"WPNAV_SPEEE{number}": 1 for number in range(MOST_SUGGESTED + 1)}
+    made = plan(copy_of(ardupilot_table()), written(**names), autopilot="ardupilot")
+    assert {row.nearest for row in made.rows.values()} == {()}
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "name", "category"),
+    [
+        ("ardupilot", "SYSID_THISMAV", "identity"),
+        ("ardupilot", "MAV_SYSID", "identity"),
+        ("ardupilot", "COMPASS_DEV_ID2", "hardware"),
+        ("ardupilot", "COMPASS_PRIO1_ID", "hardware"),
+        ("ardupilot", "BARO1_DEVID", "read-only"),
+        ("ardupilot", "INS_ACC2_ID", "hardware"),
+        ("ardupilot", "INS_GYR_ID", "hardware"),
+        ("ardupilot", "COMPASS_OFS2_X", "calibration"),
+        ("ardupilot", "INS_ACC2OFFS_Y", "calibration"),
+        ("ardupilot", "INS_GYROFFS_Z", "measured"),
+        ("ardupilot", "INS4_GYR2_CALTEMP", "measured"),
+        ("ardupilot", "BARO2_GND_PRESS", "read-only"),
+        ("ardupilot", "ARSPD_OFFSET", "measured"),
+        ("ardupilot", "COMPASS_DEC", "measured"),
+        ("ardupilot", "AHRS_TRIM_X", "calibration"),
+        (
+            "ardupilot",
+            "COMPASS_MOTCT",
+            "calibration",
+        ),  # says by what the vehicle's COMPASS_MOT_? are multiplied
+        ("ardupilot", "INS4_ACCOFFS_X", "calibration"),
+        ("ardupilot", "INS_TCAL1_TMAX", "calibration"),
+        ("ardupilot", "INS5_GYR_ID", "hardware"),
+        ("ardupilot", "ADSB_ICAO_ID", "identity"),
+        ("ardupilot", "NET_MACADDR0", "identity"),
+        ("ardupilot", "STAT_RESET", "counter"),
+        ("ardupilot", "MIS_TOTAL", "counter"),
+        ("ardupilot", "ESC_CALIBRATION", "action"),
+        ("px4", "UXRCE_DDS_KEY", "identity"),
+        ("px4", "ASPD_SCALE_1", "calibration"),
+        ("px4", "SYS_BL_UPDATE", "action"),
+        ("px4", "SYS_CAL_GYRO", "action"),
+        ("px4", "MAV_SYS_ID", "identity"),
+        ("px4", "CAL_MAG0_ID", "hardware"),
+        ("px4", "CAL_MAG0_XOFF", "calibration"),
+        ("px4", "CAL_BARO0_OFF", "measured"),
+        ("px4", "SENS_BOARD_X_OFF", "calibration"),
+        ("px4", "LND_FLIGHT_T_LO", "counter"),
+        ("px4", "_HASH_CHECK", "counter"),
+        ("px4", "SYS_AUTOCONFIG", "action"),
+    ],
+)
+def test_what_is_not_a_setting_is_left_out_and_can_be_included(
+    autopilot: str, name: str, category: str
+) -> None:
+    table, wanted = held(**{name: 1}), written(**{name: 2})
+    left_out = plan(table, wanted, autopilot=autopilot)
+    status, kind, reason = only_row(left_out)
+    assert (status, kind) == (PlanStatus.SKIPPED, category)
+    assert reason.startswith("left out: it ")
+    assert left_out.rows[name].differs
+    assert not left_out.stages
+    for include in (category, name, name[:5] + "*", (category,)):
+        assert order(plan(table, wanted, autopilot=autopilot, include=include)) == [[name]]
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "name", "switch", "value"),
+    [
+        ("ardupilot", "INS_GYR2OFFS_X", "INS_GYR_CAL", 0),
+        ("ardupilot", "ARSPD2_OFFSET", "ARSPD2_SKIP_CAL", 2),
+        ("ardupilot", "COMPASS_DEC", "COMPASS_AUTODEC", 0),
+        ("px4", "CAL_BARO0_OFF", "SENS_BAR_AUTOCAL", 0),
+    ],
+)
+def test_what_a_vehicle_measures_is_a_calibration_where_it_is_told_not_to(
+    autopilot: str, name: str, switch: str, value: int
+) -> None:
+    def category(held_value: int, **wanted: Value) -> str:
+        table = held(**{name: 1, switch: held_value})
+        return plan(table, written(**{name: 2}, **wanted), autopilot=autopilot).rows[name].category
+
+    assert category(1) == category(value, **{switch: 1}) == "measured"
+    assert category(value) == category(1, **{switch: value}) == "calibration"
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "COMPASS_USE",
+        "COMPASS_ORIENT",
+        "INS_GYRO_FILTER",
+        "INS_POS1_X",
+        "INS_HNTCH_ENABLE",
+        "INS_TCAL1_ENABLE",
+    ],
+)
+def test_settings_of_a_sensor_are_no_calibration(name: str) -> None:
+    assert only_row(plan(held(**{name: 1}), written(**{name: 2}), autopilot="ardupilot"))[0] is PlanStatus.SET
+
+
+@pytest.mark.parametrize("name", ["ASPD_SCALE_APPLY", "ASPD_SCALE_NSD", "SYS_CAL_TMAX"])
+def test_how_px4_calibrates_is_a_setting(name: str) -> None:
+    assert only_row(plan(held(**{name: 1}), written(**{name: 2}), autopilot="px4"))[0] is PlanStatus.SET
+
+
+def test_what_erases_all_others_comes_first_and_before_a_start() -> None:
+    table, wanted = held(RTL_ALT=1500, FORMAT_VERSION=120), written(RTL_ALT=2000, FORMAT_VERSION=0)
+    assert order(plan(table, wanted, autopilot="ardupilot")) == [["RTL_ALT"]]
+    made = plan(table, wanted, autopilot="ardupilot", include="action")
+    assert order(made) == [["FORMAT_VERSION"], ["RTL_ALT"]]
+    assert made.stages[0].reboot_first
+
+
+def test_of_an_unknown_autopilot_both_lists_count() -> None:
+    table = held(SYSID_THISMAV=1, MAV_SYS_ID=1, OTHER=1)
+    assert order(plan(table, written(SYSID_THISMAV=2, MAV_SYS_ID=2, OTHER=2))) == [["OTHER"]]
+    assert order(plan(table, written(SYSID_THISMAV=2, OTHER=2), autopilot="px4")) == [
+        ["SYSID_THISMAV", "OTHER"]
+    ]
+
+
+def test_a_snapshot_says_itself_whose_it_is() -> None:
+    identity = Identity(1, "sim:", autopilot=3)
+    current = ParamSet.of(held(STAT_RUNTIME=1, BIG=1).values(), identity=identity)
+    made = plan(current, written(STAT_RUNTIME=2, BIG=16777217))
+    assert made.identity is identity
+    assert made.rows["STAT_RUNTIME"].category == "counter"
+    assert made.rows["BIG"].status is PlanStatus.INVALID
+
+
+@pytest.mark.parametrize("include", ["compass", "Calibration", "", ["calibration", "ofs*"]])
+def test_what_can_be_included_is_a_category_or_a_glob(include: str | list[str]) -> None:
+    with pytest.raises(UsageError, match=r"neither a glob of parameter names.*identity, hardware"):
+        plan(held(A=1), written(A=2), include=include)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "encoding", "says"),
+    [
+        (ParamType.INT8, 128, Encoding.BYTEWISE, "128 does not fit INT8, which holds -128 to 127"),
+        (ParamType.INT8, 1.5, Encoding.BYTEWISE, "1.5 is not a whole number, and the parameter is INT8"),
+        (ParamType.INT8, 1.5, Encoding.C_CAST, "1.5 is not a whole number, and the parameter is INT8"),
+        (ParamType.REAL32, 1e39, Encoding.BYTEWISE, "beyond the range of a float32"),
+        (ParamType.INT32, 16777217, Encoding.C_CAST, "the nearest is 16777216"),
+        (ParamType.REAL32, math.nan, Encoding.C_CAST, "ArduPilot ignores NaN"),
+    ],
+)
+def test_what_the_type_cannot_take_is_found_beforehand(
+    kind: ParamType, value: Value, encoding: Encoding, says: str
+) -> None:
+    table = held(P=(kind, 0))
+    made = plan(table, written(P=value), encoding=encoding, include=CATEGORIES)
+    status, category, reason = only_row(made)
+    assert (status, category) == (PlanStatus.INVALID, WRONG)
+    assert says in reason
+    assert not made.stages
+
+
+def test_integers_beyond_24_bits_are_sent_where_they_are_exact() -> None:
+    table = held(P=0)
+    for value in (16777217, -5000000, 2**31 - 1):
+        assert plan(table, written(P=value), autopilot="px4").steps
+    assert plan(table, written(P=2**30), autopilot="ardupilot").steps
+
+
+def test_the_range_counts_where_metadata_is_there() -> None:
+    table = held(P=1.0, Q=7.0)
+    info = {"P": Info(minimum=0.1, maximum=2.0), "Q": Info(maximum=2.0)}
+    for value, says in ((0.05, "0.05 is below its minimum, 0.1"), (2.5, "2.5 is above its maximum, 2")):
+        status, category, reason = only_row(plan(table, written(P=value), info=info))
+        assert (status, category, reason) == (PlanStatus.INVALID, OUT_OF_RANGE, says)
+        assert plan(table, written(P=value), info=info, include=OUT_OF_RANGE).steps
+        assert plan(table, written(P=value)).steps
+    for value in (0.1, 2, 0.10000000149011612):
+        assert plan(table, written(P=value), info=info).steps
+    assert plan(table, written(P=3.0), info={"P": Info(minimum=-1e300, maximum=1e300)}).steps
+    # what the vehicle has already is no mistake of the file
+    assert only_row(plan(table, written(Q=7), info=info))[0] is PlanStatus.UNCHANGED
+
+
+def test_what_is_no_number_has_to_be_asked_for() -> None:
+    for value in (math.nan, math.inf):
+        made = plan(held(P=1.0), written(P=value))
+        assert only_row(made)[:2] == (PlanStatus.INVALID, OUT_OF_RANGE)
+        assert plan(held(P=1.0), written(P=value), include=OUT_OF_RANGE).steps
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize(("autopilot", "says"), [("px4", "may stop"), ("ardupilot", "does not answer")])
+def test_what_an_autopilot_cannot_store_has_to_be_forced(value: float, autopilot: str, says: str) -> None:
+    table, wanted = held(P=1.0), written(P=value)
+    made = plan(table, wanted, autopilot=autopilot, include=OUT_OF_RANGE)
+    status, category, reason = only_row(made)
+    assert (status, category) == (PlanStatus.INVALID, WRONG)
+    assert says in reason
+    forced = plan(table, wanted, autopilot=autopilot, force=True)
+    assert forced.force
+    assert [step.name for step in forced.steps] == ["P"]
+    assert plan(held(P=math.nan), written(P=math.nan), autopilot="px4").is_met
+
+
+def test_metadata_knows_what_can_only_be_read_and_what_needs_a_reboot() -> None:
+    info = {"A": Info(is_read_only=True), "B": Info(reboot_required=True)}
+    made = plan(held(A=1, B=1, C=1), written(A=2, B=2, C=2), info=info)
+    assert (made.rows["A"].status, made.rows["A"].category) == (PlanStatus.SKIPPED, READ_ONLY)
+    assert made.reboot_for == ("B",)
+    assert order(plan(held(A=1), written(A=2), info=info, include=READ_ONLY)) == [["A"]]
+
+
+def test_what_a_firmware_says_of_its_parameters_is_such_metadata() -> None:
+    described = Metadata.of(
+        [
+            ParamInfo("P", minimum=0, maximum=1, reboot_required=True),
+            ParamInfo("SERVO{n}_MIN", minimum=500),
+        ]
+    )
+    made = plan(held(P=0.5, SERVO3_MIN=1000, Q=1), written(P=1, SERVO3_MIN=100, Q=2), info=described)
+    assert made.reboot_for == ("P",)
+    assert made.rows["SERVO3_MIN"].reason == "100 is below its minimum, 500"
+    assert made.rows["Q"].status is PlanStatus.SET
+
+
+def test_values_are_compared_in_the_type_that_the_vehicle_gives_them() -> None:
+    table = held(A=0.1, B=(ParamType.UINT8, 3), C=-0.0, D=16777217)
+    assert plan(table, written(A=0.1, B=3.0, C=0, D=16777217), autopilot="px4").is_met
+    assert [step.name for step in plan(table, written(A=0.1, D=16777216), autopilot="px4").steps] == ["D"]
+
+
+def test_a_snapshot_without_types_is_compared_as_numbers() -> None:
+    current = ParamSet({"A": WrittenParam("A", 0.1), "B": WrittenParam("B", 16777217)})
+    assert plan(current, written(A=0.1, B=16777217)).is_met
+    assert [step.type for step in plan(current, written(A=0.2, B=16777216)).steps] == [ParamType.REAL32] * 2
+
+
+def test_a_system_id_is_one_that_can_be() -> None:
+    for value in (0, 256, b"abcd"):
+        made = plan(held(MAV_SYS_ID=1), written(MAV_SYS_ID=value), autopilot="px4", include="identity")
+        assert only_row(made) == (PlanStatus.INVALID, WRONG, "a system id is a number from 1 to 255")
+
+
+def test_raw_bytes_are_compared_with_raw_bytes() -> None:
+    table = held(ODD=(77, b"\x01\x02\x03\x04"))
+    assert plan(table, written(ODD=b"\x01\x02\x03\x04")).is_met
+    assert plan(table, written(ODD=b"\x01\x02\x03\x05")).steps[0].value == b"\x01\x02\x03\x05"
+    assert plan(table, written(ODD=5)).rows["ODD"].status is PlanStatus.INVALID
+    made = plan(held(NUMBER=1), written(NUMBER=b"\x01\x02\x03\x04"))
+    assert only_row(made) == (
+        PlanStatus.INVALID,
+        WRONG,
+        "0x04030201 are raw bytes, and the vehicle gives a number",
+    )
+
+
+def test_the_order_is_one_that_works_on_ardupilot() -> None:
+    table = held(
+        WPNAV_SPEED=500.0,
+        SYSID_ENFORCE=0,
+        EK2_ENABLE=0,
+        FRAME_CLASS=1,
+        GPS1_TYPE=1,
+        FENCE_ENABLE=1,
+        SYSID_THISMAV=1,
+    )
+    made = plan(
+        table,
+        written(
+            SYSID_THISMAV=7,
+            FENCE_ENABLE=0,
+            WPNAV_SPEED=600,
+            SYSID_ENFORCE=1,
+            GPS1_TYPE=2,
+            EK2_ENABLE=1,
+            FRAME_CLASS=2,
+        ),
+        autopilot="ardupilot",
+        include="identity",
+    )
+    assert order(made) == [
+        ["FRAME_CLASS"],
+        ["GPS1_TYPE", "EK2_ENABLE"],
+        ["WPNAV_SPEED"],
+        ["FENCE_ENABLE"],
+        ["SYSID_ENFORCE", "SYSID_THISMAV"],
+    ]
+    assert [stage.reveals for stage in made.stages] == [True, True, False, False, False]
+    assert not any(stage.reboot_first for stage in made.stages)
+    assert set(made.reboot_for) == {"FRAME_CLASS", "EK2_ENABLE", "GPS1_TYPE"}
+
+
+def test_what_a_step_may_show_is_set_later_and_not_given_up() -> None:
+    table = held(EK2_ENABLE=0, WPNAV_SPEED=500.0)
+    wanted = written(EK2_ALT_M_NSE=3.0, EK2_ENABLE=1, WPNAV_SPEED=600)
+    made = plan(table, wanted, autopilot="ardupilot")
+    row = made.rows["EK2_ALT_M_NSE"]
+    assert (row.status, row.category, row.before) == (PlanStatus.LATER, MISSING, None)
+    assert order(made) == [["EK2_ENABLE"], ["WPNAV_SPEED"]]
+    assert made.stages[0].reboot_first
+    shown = plan(table | held(EK2_ENABLE=1, EK2_ALT_M_NSE=2.0), wanted, autopilot="ardupilot")
+    assert order(shown) == [["EK2_ALT_M_NSE", "WPNAV_SPEED"]]
+    hidden = plan(table | held(EK2_ENABLE=1), wanted, autopilot="ardupilot")
+    assert hidden.rows["EK2_ALT_M_NSE"].status is PlanStatus.SKIPPED
+
+
+def test_px4_starts_again_between_the_frame_and_all_that_it_resets() -> None:
+    table = held(SYS_AUTOSTART=4001, MC_ROLL_P=6.5, SYS_AUTOCONFIG=0, MAV_SYS_ID=1)
+    made = plan(
+        table, written(MC_ROLL_P=7, MAV_SYS_ID=3, SYS_AUTOSTART=4050), autopilot="px4", include="identity"
+    )
+    assert order(made) == [["SYS_AUTOSTART"], ["MC_ROLL_P"], ["MAV_SYS_ID"]]
+    assert made.stages[0].reboot_first
+    assert made.reboot_for == ("SYS_AUTOSTART", "MAV_SYS_ID")
+
+
+def test_a_table_is_its_own_plan() -> None:
+    """What was saved from a vehicle asks nothing of it."""
+    for table, autopilot in ((px4_table(), "px4"), (ardupilot_table(), "ardupilot")):
+        current = copy_of(table)
+        wanted = ParamSet.of(current.values())
+        made = plan(current, wanted, autopilot=autopilot)
+        assert made.is_met
+        assert not made.steps
+        left_out = made.of(PlanStatus.SKIPPED)
+        assert 30 < len(left_out) < 170
+        everything = plan(current, wanted, autopilot=autopilot, include=CATEGORIES)
+        assert everything.counts == {PlanStatus.UNCHANGED: len(current)}
+
+
+def test_a_file_of_another_component_is_none_of_this_one() -> None:
+    camera = ParamSet({"A": WrittenParam("A", 1)}, component=100, source="cam.params")
+    autopilot = ParamSet.of(held(A=2).values(), component=1)
+    with pytest.raises(
+        UsageError, match=r"parameters of cam.params are those of component 100, not of component 1"
+    ):
+        plan(autopilot, camera)
+    with pytest.raises(UsageError, match="component 100"):
+        overlay(camera, autopilot)
+
+
+def test_a_file_of_another_autopilot_is_none_of_this_one() -> None:
+    for own, other, number in (("px4", "ardupilot", 3), ("ardupilot", "px4", 12)):
+        wanted = ParamSet(
+            {"A": WrittenParam("A", 2)}, identity=Identity(1, "sim:", autopilot=number), source="f"
+        )
+        with pytest.raises(UsageError, match=f"of f are those of a vehicle with {other}, not with {own}"):
+            plan(held(A=1), wanted, autopilot=own)
+        assert plan(held(A=1), wanted, autopilot=other).steps
+        assert plan(held(A=1), wanted, autopilot="generic").steps
+        assert plan(held(A=1), wanted).steps
+
+
+def test_one_set_lies_over_another() -> None:
+    base = ParamSet({name: WrittenParam(name, 1) for name in "ABC"}, component=1, source="base")
+    over = ParamSet({"B": WrittenParam("B", 2), "D": WrittenParam("D", 3)}, system=7, source="over")
+    both = overlay(base, over)
+    assert {name: param.value for name, param in both.items()} == {"A": 1, "B": 2, "C": 1, "D": 3}
+    assert (both.component, both.system, both.source) == (1, 7, "base + over")
+    assert list(both) == ["A", "B", "C", "D"]
+
+
+@pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
+@pytest.mark.parametrize("section", SECTIONS)
+def test_every_glob_of_the_list_hits_something_or_says_where_it_would(section: str, autopilot: str) -> None:
+    table = px4_table() if autopilot == "px4" else (*ardupilot_table(), *ek2_group())
+    names = [row.name for row in table]
+    entries: tuple[Caution, ...] = tuple(cautions_for(autopilot).entries[section])
+    for caution in entries:
+        assert caution.reason
+        assert caution.autopilot == autopilot
+        assert (caution.category in CATEGORIES) is (section == "left_out")
+        assert set(caution.elsewhere) <= set(caution.names)
+        for glob in caution.names:
+            hits = fnmatch.filter(names, glob)
+            assert bool(hits) is (glob not in caution.elsewhere), f"{section}: {glob} hits {hits}"
+    assert set(cautions_for(autopilot).entries) == set(SECTIONS)

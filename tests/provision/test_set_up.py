@@ -1,0 +1,1527 @@
+"""Setting vehicles up: everything arrives, in an order that works, and is proven; or it is said why not."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import itertools
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import anyio
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from paramclient import Component, ParamCache, ParamClient, read_file
+from paramclient.errors import (
+    AnotherVehicle,
+    CacheError,
+    CommandRefused,
+    FileError,
+    InvalidParameters,
+    LinkError,
+    NoReply,
+    UsageError,
+    VehicleArmed,
+)
+from paramclient.metadata import ParamInfo
+from paramclient.model.identity import Identity
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.values import ParamType, Value, bits_of, from_bits
+from paramclient.protocol import wire
+from paramclient.protocol.ftp.packets import Opcode, Packet
+from paramclient.provision import (
+    MISSING,
+    ApplyProgress,
+    ApplyStatus,
+    PlanStatus,
+    apply,
+    apply_all,
+    overlay,
+    prepare,
+    restore,
+    verify,
+    verify_all,
+)
+from paramclient.provision.execution import LASTING_TIME, Run
+from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, PX4Vehicle, SimParam
+from paramclient.sim.param_table import Entry
+from tests.shell import FlakyLink, Tap, a_client, residue, swiftly
+
+SETTINGS: dict[str, Value | tuple[ParamType, Value]] = {
+    f"TUNE_{number:02}": number / 4 if number % 3 else number for number in range(30)
+}
+"""What is set in most of these tests."""
+OTHERS: dict[str, Value | tuple[ParamType, Value]] = {
+    "STAT_RUNTIME": 5,
+    "MAV_SYS_ID": 1,
+    "SYSID_THISMAV": (ParamType.INT16, 1),
+    "SYSID_ENFORCE": (ParamType.INT8, 0),
+    "CAL_ACC0_XOFF": 0.25,
+    "COMPASS_OFS_X": 0.25,
+    "SYS_AUTOSTART": 4001,
+    "SYS_AUTOCONFIG": 0,
+    "FRAME_CLASS": (ParamType.INT8, 1),
+    "EK2_ENABLE": (ParamType.INT8, 0),
+    "SMALL": (ParamType.INT8, 1),
+}
+GROUP: dict[str, Value | tuple[ParamType, Value]] = {
+    "EK2_ALT_M_NSE": 3.0,
+    "EK2_GPS_TYPE": (ParamType.INT8, 0),
+}
+
+
+class Hiding(ArduPilotVehicle):
+    """An ArduPilot that does not know the parameters of a group by name while it is hidden."""
+
+    def _find(self, name: str) -> Entry | None:
+        entry = super()._find(name)
+        return entry if entry is not None and (not self._listed or self._is_listed(entry)) else None
+
+
+class Clamping(ArduPilotVehicle):
+    """An ArduPilot that keeps TUNE_01 within 0 to 10."""
+
+    def _write(self, entry: Entry, bits: int) -> None:
+        value = from_bits(bits, entry.type)
+        if entry.name == "TUNE_01" and not isinstance(value, bytes):
+            bits = bits_of(min(max(value, 0.0), 10.0), entry.type)
+        super()._write(entry, bits)
+
+
+class Meddling(PX4Vehicle):
+    """A PX4 of which TUNE_19 takes TUNE_01 back.
+
+    Attributes:
+        quarrels: whether TUNE_01 also takes back TUNE_19.
+    """
+
+    quarrels = False
+
+    def _write(self, entry: Entry, bits: int) -> None:
+        super()._write(entry, bits)
+        if entry.name == "TUNE_19":
+            super()._write(self._entry("TUNE_01"), bits_of(0.25, ParamType.REAL32))
+        if entry.name == "TUNE_01" and self.quarrels:
+            super()._write(self._entry("TUNE_19"), bits_of(4.75, ParamType.REAL32))
+
+
+CLAMPED: dict[str, Value | tuple[ParamType, Value]] = {
+    "MPC_TILTMAX_AIR": 45.0,
+    "MPC_TILTMAX_LND": 12.0,
+    "MPC_XY_VEL_MAX": 12.0,
+    "MPC_XY_CRUISE": 5.0,
+    "MPC_VEL_MANUAL": 10.0,
+}
+"""What PX4's position controller sets to limits."""
+
+
+def ardupilot(make: type[ArduPilotVehicle] = ArduPilotVehicle, **options: Any) -> ArduPilotVehicle:
+    defaults: dict[str, Any] = {"table": SETTINGS | OTHERS, "groups": {"EK2_ENABLE": GROUP}, "live": ()}
+    return make(**defaults | options)
+
+
+def px4(kind: type[PX4Vehicle] = PX4Vehicle, **options: Any) -> PX4Vehicle:
+    rows = [
+        SimParam(
+            name,
+            ParamType.REAL32 if isinstance(value, float) else ParamType.INT32,
+            value,
+            name == "CAL_ACC0_XOFF",
+        )
+        for name, entry in (SETTINGS | OTHERS | GROUP).items()
+        for value in [entry[1] if isinstance(entry, tuple) else entry]
+    ]
+    late_use = {"EK2_ENABLE": list(GROUP)}
+    defaults: dict[str, Any] = {"table": rows, "not_in_use": list(GROUP), "late_use": late_use}
+    return kind(**defaults | options)
+
+
+EVERY_KIND = pytest.mark.parametrize("make", [ardupilot, px4], ids=["ardupilot", "px4"])
+
+
+def written(values: Mapping[str, Value], **options: Any) -> ParamSet:
+    return ParamSet({name: WrittenParam(name, value) for name, value in values.items()}, **options)
+
+
+def another(*names: str) -> dict[str, Value]:
+    """Other values than those of SETTINGS."""
+    wanted: dict[str, Value] = {}
+    for name in names or SETTINGS:
+        value = SETTINGS[name]
+        assert not isinstance(value, tuple | bytes)
+        wanted[name] = value + 1
+    return wanted
+
+
+def statuses(result: Any) -> dict[str, str]:
+    return {name: str(row.status) for name, row in result.rows.items()}
+
+
+def sets(tap: Tap) -> list[str]:
+    """The names of what was written, once each, in order."""
+    return list(dict.fromkeys(message.param_id for message in tap.messages(wire.ParamSet)))
+
+
+@EVERY_KIND
+@pytest.mark.parametrize("loss", [0.0, 0.15])
+@swiftly
+async def test_everything_arrives_and_is_proven(make: Callable[[], Any], loss: float) -> None:
+    vehicle = make()
+    air = Air([vehicle], uplink=FaultyLink(loss=loss, seed=1), downlink=FaultyLink(loss=loss, seed=2))
+    wanted = another() | {"STAT_RUNTIME": 6, "CAL_ACC0_XOFF": 1.0, "COMPASS_OFS_X": 1.0, "EK2_GPS_TYPE": 3}
+    async with a_client(air) as client:
+        component = await client.component()
+        result = await apply(component, written(wanted | {"EK2_ENABLE": 1}))
+        await anyio.sleep(3.0)  # the client asks for the hash by itself after writes
+        assert residue(component) == []
+    assert result.error is None
+    left_out = {name for name, row in result.rows.items() if row.status is ApplyStatus.SKIPPED}
+    assert left_out == ({"STAT_RUNTIME", "COMPASS_OFS_X"} if make is ardupilot else {"CAL_ACC0_XOFF"})
+    assert result.complete
+    for name, value in wanted.items():
+        assert (vehicle.param(name).value == value) is (name not in left_out), name
+    assert statuses(result)["TUNE_03"] == "set"
+    assert result.rows["TUNE_03"].before == 3
+    assert result.rows["TUNE_03"].actual == 4
+    assert "FRAME_CLASS" in result.extra
+
+
+@EVERY_KIND
+@swiftly
+async def test_what_would_be_sent_is_told_beforehand_and_nothing_else_is_sent(
+    make: Callable[[], Any],
+) -> None:
+    tap = Tap(make())
+    wanted = written(another("TUNE_01", "TUNE_02") | {"EK2_ALT_M_NSE": 1.0, "EK2_ENABLE": 1, "TUNE_04": 1.0})
+    async with a_client(tap) as client:
+        component = await client.component()
+        plan = await prepare(component, wanted)
+        assert tap.messages(wire.ParamSet) == []
+        assert [[step.name for step in stage.steps] for stage in plan.stages] == [
+            ["EK2_ENABLE"],
+            ["TUNE_01", "TUNE_02", "EK2_ALT_M_NSE"],
+        ]
+        result = await apply(component, plan)
+    assert result.complete
+    assert sets(tap) == [step.name for step in plan.steps]
+    assert result.rows["TUNE_04"].status is ApplyStatus.UNCHANGED
+
+
+@EVERY_KIND
+@swiftly
+async def test_the_proof_is_asked_for_after_the_last_write(make: Callable[[], Any]) -> None:
+    tap = Tap(make())
+    async with a_client(tap) as client:
+        assert (await apply(await client.component(), written(another()))).complete
+    messages = [message for _, _, message in tap.heard]
+    last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSet))
+    asked = messages[last + 1 :]
+    if make is ardupilot:
+        assert any(isinstance(message, wire.FileTransfer) for message in asked)
+    else:
+        hashes = [message for message in asked if isinstance(message, wire.ParamRequestRead)]
+        assert {message.param_id for message in hashes} == {wire.HASH_CHECK}
+
+
+@swiftly
+async def test_a_value_that_the_last_list_leaves_out_is_not_proven() -> None:
+    vehicle = ardupilot(ftp=False)
+
+    def lose(progress: ApplyProgress) -> None:
+        if progress.row is not None and progress.row.name == "TUNE_02":
+            vehicle.when_listed(1, lambda: vehicle._entry("TUNE_01").store(0))
+            vehicle.when_listed(1, lambda: vehicle._dead.add("TUNE_01"))
+
+    async with a_client(vehicle) as client:
+        result = await apply(await client.component(), written(another("TUNE_01", "TUNE_02")), progress=lose)
+    assert statuses(result) == {"TUNE_01": "unproven", "TUNE_02": "set"}
+    assert "does not tell" in str(result.rows["TUNE_01"])
+    assert not result.complete
+
+
+@swiftly
+async def test_what_no_hash_covers_is_read_again_for_the_proof() -> None:
+    vehicle = px4()
+
+    def learn(progress: ApplyProgress) -> None:
+        if progress.phase == "reading":  # in flight, without a word
+            vehicle._entry("CAL_ACC0_XOFF").store(bits_of(0.75, ParamType.REAL32))
+
+    wanted = written({"TUNE_01": 9.5, "CAL_ACC0_XOFF": 0.5})
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        await component.fetch_all()
+        result = await apply(component, wanted, include="calibration", progress=learn)
+    assert result.before["CAL_ACC0_XOFF"].value == 0.75
+    assert statuses(result) == {"TUNE_01": "set", "CAL_ACC0_XOFF": "adjusted"}
+    assert result.rows["CAL_ACC0_XOFF"].actual == 0.75
+
+
+@EVERY_KIND
+@pytest.mark.parametrize("policy", ["hash-only", "cache-only"])
+@swiftly
+async def test_a_policy_that_allows_no_download_does_not_spare_the_proof(
+    make: Callable[[], Any], policy: str, tmp_path: Path
+) -> None:
+    vehicle = make()
+    with ParamCache(tmp_path / "cache.sqlite3") as cache:
+        async with ParamClient(vehicle, cache=cache) as client:
+            await (await client.component()).fetch_all()
+        tap = Tap(vehicle)
+        async with ParamClient(tap, cache=cache, policy=policy) as client:
+            result = await apply(await client.component(), written(another("TUNE_01", "TUNE_04")))
+        assert result.complete
+        (kept,) = cache.snapshots(cache.vehicles()[0].key)
+    messages = [message for _, _, message in tap.heard]
+    last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSet))
+    asked = {each.param_id for each in messages[last + 1 :] if isinstance(each, wire.ParamRequestRead)}
+    by_hash = make is px4 and policy == "hash-only"
+    assert asked == ({wire.HASH_CHECK} if by_hash else {"TUNE_01", "TUNE_04"})
+    assert not kept.complete  # what was only believed is not in it
+
+
+@EVERY_KIND
+@swiftly
+async def test_where_there_is_nothing_to_do_nothing_is_written_or_read_again(make: Callable[[], Any]) -> None:
+    vehicle = make()
+    tap = Tap(vehicle)
+    wanted = ParamSet.of(vehicle.params.values())
+    async with a_client(tap) as client:
+        component = await client.component()
+        result = await apply(component, wanted)
+        listed = vehicle.requests["PARAM_REQUEST_LIST"]
+        assert (await verify(component, wanted)).is_met
+    assert result.complete
+    assert set(statuses(result).values()) == {"unchanged", "skipped"}
+    assert tap.messages(wire.ParamSet) == []
+    assert listed <= 1
+
+
+def downloads(tap: Tap) -> int:
+    """How often the table was requested, as a file or as a list."""
+    packets = [Packet.unpack(message.payload) for message in tap.messages(wire.FileTransfer)]
+    files = {packet.sequence for packet in packets if packet.opcode == Opcode.OPEN_FILE_RO}
+    return len(files) or len(tap.messages(wire.ParamRequestList))
+
+
+@pytest.mark.parametrize("ftp", [True, False])
+@swiftly
+async def test_two_downloads_are_enough_for_any_file(ftp: bool) -> None:
+    switch: dict[str, Value | tuple[ParamType, Value]] = {"GRIP_ENABLE": (ParamType.INT8, 1)}
+    grip: dict[str, Value | tuple[ParamType, Value]] = {"GRIP_TYPE": (ParamType.INT8, 0), "GRIP_REGRAB": 1.0}
+    groups = {"EK2_ENABLE": GROUP, "GRIP_ENABLE": grip}
+    vehicle = ArduPilotVehicle(table=SETTINGS | OTHERS | switch, groups=groups, ftp=ftp)
+    tap = Tap(vehicle)
+    hidden = {"EK2_ENABLE": 1, "EK2_ALT_M_NSE": 1.5, "EK2_GPS_TYPE": 2, "GRIP_ENABLE": 0, "GRIP_REGRAB": 2.0}
+    of_a_hidden_group = {f"GRIP_NONE{number}": 1 for number in range(15)}
+    unknown = {f"NO_SUCH_{number}": 1 for number in range(60)} | of_a_hidden_group
+    async with a_client(tap) as client:
+        component = await client.component()
+        await anyio.sleep(10.0)  # what it measures at its start has been read
+        began = anyio.current_time()
+        result = await apply(component, written(another() | hidden))
+        plain = anyio.current_time() - began
+        assert result.complete
+        assert downloads(tap) == 2
+        assert sets(tap)[0] == "EK2_ENABLE"
+        for name, value in hidden.items():
+            assert vehicle.param(name).value == value
+        for name in ("EK2_ENABLE", "TUNE_01"):
+            vehicle.set_param(name, 0)
+        tap.heard.clear()
+        began = anyio.current_time()
+        result = await apply(component, written(another() | hidden | unknown))
+        assert {row.name for row in result.rows.values() if row.category == MISSING} == unknown.keys()
+        assert downloads(tap) == 2
+        assert anyio.current_time() - began < plain + 0.5
+        requested = {message.param_id for message in tap.messages(wire.ParamRequestRead)}
+        assert of_a_hidden_group.keys() <= requested
+        assert requested.isdisjoint(unknown.keys() - of_a_hidden_group), "no hidden group can have them"
+
+
+@pytest.mark.parametrize(
+    ("listed", "ftp", "is_beside"),
+    [(6, True, True), (7, True, False), (6, False, False)],
+    ids=["few", "too many", "a list, which reads slow down"],
+)
+@swiftly
+async def test_members_of_a_group_that_is_to_be_shown_are_requested_beside_the_file(
+    listed: int, ftp: bool, is_beside: bool
+) -> None:
+    hidden: dict[str, Value | tuple[ParamType, Value]] = {f"GRIP_{number}": 1.0 for number in range(30)}
+    fence: dict[str, Value | tuple[ParamType, Value]] = {f"FENCE_{number}": 1.0 for number in range(listed)}
+    switches: dict[str, Value | tuple[ParamType, Value]] = dict.fromkeys(
+        ("GRIP_ENABLE", "FENCE_ENABLE"), (ParamType.INT8, 0)
+    )
+    table = SETTINGS | OTHERS | switches | fence
+    tap = Tap(ArduPilotVehicle(table=table, groups={"GRIP_ENABLE": hidden}, ftp=ftp))
+    wanted = dict.fromkeys(switches, 1) | dict.fromkeys((*fence, *hidden), 2.0)
+    async with a_client(tap) as client:
+        component = await client.component()
+        await anyio.sleep(10.0)  # what it measures at its start has been read
+        tap.heard.clear()
+        result = await apply(component, written(wanted))
+    assert result.complete
+    assert statuses(result) == dict.fromkeys(wanted, "set")
+    assert downloads(tap) == 2
+    way = wire.FileTransfer if ftp else wire.ParamRequestList
+    sent = [message for _, _, message in tap.heard]
+    sent = sent[: next(at for at, message in enumerate(sent) if isinstance(message, wire.ParamSet))]
+    reads = [each for each in sent if isinstance(each, wire.ParamRequestRead) and each.param_index < 0]
+    last_of_table = max(at for at, message in enumerate(sent) if isinstance(message, way))
+    assert (sent.index(reads[0]) < last_of_table) is is_beside
+    assert {each.param_id for each in reads} >= hidden.keys()
+
+
+@swiftly
+async def test_a_group_that_cannot_be_asked_by_name_is_set_once_it_is_there() -> None:
+    vehicle = ardupilot(Hiding)
+    wanted = written({"EK2_GPS_TYPE": 3, "TUNE_01": 9.0, "EK2_ENABLE": 1, "EK2_NO_SUCH": 1})
+    tap = Tap(vehicle)
+    asked: list[int] = []
+
+    def count(progress: ApplyProgress) -> None:
+        reads = tap.messages(wire.ParamRequestRead)
+        asked.append(sum(message.param_id == "EK2_NO_SUCH" for message in reads))
+
+    async with a_client(tap) as client:
+        component = await client.component()
+        plan = await prepare(component, wanted)
+        assert plan.rows["EK2_GPS_TYPE"].status is PlanStatus.LATER
+        result = await apply(component, wanted, progress=count)
+        count(ApplyProgress("over", 0, 0))
+    # what was not there was asked for again when others had been shown, and the whole table was not
+    assert asked[0] < asked[1] < asked[-1]
+    assert downloads(tap) == 3  # one for the plan, one before the first write, one for the proof
+    assert statuses(result) == {
+        "EK2_GPS_TYPE": "set",
+        "TUNE_01": "set",
+        "EK2_ENABLE": "set",
+        "EK2_NO_SUCH": "skipped",
+    }
+    assert sets(tap) == ["EK2_ENABLE", "EK2_GPS_TYPE", "TUNE_01"]
+    assert result.rows["EK2_GPS_TYPE"].before is None
+    assert result.rows["EK2_NO_SUCH"].category == MISSING
+    assert not result.complete
+
+
+@swiftly
+async def test_what_is_not_there_is_named_and_not_written() -> None:
+    tap = Tap(ardupilot())
+    async with a_client(tap) as client:
+        result = await apply(
+            await client.component(), written({"TUNE_X1": 1, "TUNE_01": 7, "a name too long!!": 1})
+        )
+    assert result.rows["TUNE_X1"].status is ApplyStatus.SKIPPED
+    assert result.rows["TUNE_X1"].nearest == ("TUNE_10", "TUNE_11", "TUNE_12")
+    assert str(result.rows["TUNE_X1"]).startswith(
+        "TUNE_X1 = 1, skipped: not on this vehicle (did you mean TUNE_"
+    )
+    assert sets(tap) == ["TUNE_01"]
+    assert not result.complete
+
+
+@swiftly
+async def test_what_one_refuses_or_adjusts_does_not_stop_the_others() -> None:
+    vehicle = ardupilot(Clamping, read_only=["TUNE_02", "TUNE_04"], param_error=True)
+    wanted = written(another() | {"TUNE_01": 99.0})
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        result = await apply(component, wanted)
+        again = await apply(component, wanted)
+    expected = dict.fromkeys(SETTINGS, "set") | {
+        "TUNE_01": "adjusted",
+        "TUNE_02": "refused",
+        "TUNE_04": "refused",
+    }
+    assert statuses(result) == expected
+    assert result.rows["TUNE_01"].actual == 10.0
+    assert "read only" in result.rows["TUNE_02"].reason
+    assert result.rows["TUNE_02"].actual == SETTINGS["TUNE_02"]
+    assert not result.complete
+    assert result.error is None
+    # it has what it made of it already, and does not say why that does not change
+    assert {name for name, status in statuses(again).items() if status == "refused"} == {
+        *("TUNE_01", "TUNE_02", "TUNE_04")
+    }
+    assert again.counts[ApplyStatus.UNCHANGED] == len(SETTINGS) - 3
+
+
+@pytest.mark.parametrize("bring", [apply, restore])
+@swiftly
+async def test_every_value_that_is_written_tells_who_asked(bring: Callable[..., Any]) -> None:
+    async with a_client(px4()) as client:
+        component = await client.component()
+        await component.fetch_all()
+        changes = component.changes()
+        wanted = written({"TUNE_01": 8.0, "TUNE_02": 9.0, "MAV_SYS_ID": 7})
+        result = await bring(component, wanted, include="identity", asker="anna@10.0.0.2")
+        assert set(statuses(result).values()) == {"set"}
+        told = {}
+        with anyio.move_on_after(1.0):
+            async for change in changes:
+                told[change.name] = change.by
+    assert told == dict.fromkeys(wanted, "us for anna@10.0.0.2")
+    async with a_client(Air([px4(), px4(system=2)])) as client:
+        components = [await client.component(1), await client.component(2)]
+        feeds = [each.changes() for each in components]
+        await apply_all(components, written({"TUNE_01": 8.0}), asker="anna@10.0.0.2")
+        for feed in feeds:
+            async for change in feed:
+                if change.name == "TUNE_01" and change.by != "vehicle":
+                    assert change.by == "us for anna@10.0.0.2"
+                    break
+
+
+@swiftly
+async def test_values_that_cannot_be_are_told_before_anything_is_sent() -> None:
+    tap = Tap(ardupilot())
+    wanted = written({"TUNE_01": 7.0, "SMALL": 300, "TUNE_03": 2**24 + 1})
+    async with a_client(tap) as client:
+        component = await client.component()
+        with pytest.raises(InvalidParameters, match="SMALL: 300 does not fit INT8") as caught:
+            await apply(component, wanted)
+        assert set(caught.value.problems) == {"SMALL", "TUNE_03"}
+        assert tap.messages(wire.ParamSet) == []
+        result = await apply(component, wanted, skip_invalid=True)
+    assert statuses(result) == {"TUNE_01": "set", "SMALL": "skipped", "TUNE_03": "skipped"}
+    assert "cannot be sent exactly" in result.rows["TUNE_03"].reason
+    assert not result.complete
+
+
+@swiftly
+async def test_a_wrong_choice_is_told_before_the_vehicle_is_asked() -> None:
+    tap = Tap(ardupilot())
+    async with a_client(tap) as client:
+        component = await client.component()
+        asked = len(tap.messages(wire.ParamRequestRead))
+        for call in (apply, prepare):
+            with pytest.raises(UsageError, match="neither a glob"):
+                await call(component, written({"TUNE_01": 1}), include="everything")
+            with pytest.raises(UsageError, match="component 100"):
+                await call(component, written({"TUNE_01": 1}, component=100))
+        assert len(tap.messages(wire.ParamRequestRead)) == asked
+
+
+@swiftly
+async def test_what_is_left_out_can_be_included() -> None:
+    vehicle = ardupilot()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        wanted = written({"COMPASS_OFS_X": 7.0, "STAT_RUNTIME": 9})
+        result = await apply(component, wanted, include="calibration")
+        assert statuses(result) == {"COMPASS_OFS_X": "set", "STAT_RUNTIME": "skipped"}
+        assert result.complete
+        assert (await verify(component, wanted, include="calibration")).is_met
+        assert not (await verify(component, wanted, include=["STAT_*"])).is_met
+
+
+@swiftly
+async def test_another_that_takes_a_value_back_has_it_set_again() -> None:
+    for quarrels in (False, True):
+        vehicle = px4(Meddling)
+        assert isinstance(vehicle, Meddling)
+        vehicle.quarrels = quarrels
+        tap = Tap(vehicle)
+        async with a_client(tap) as client:
+            result = await apply(await client.component(), written(another("TUNE_01", "TUNE_19")))
+        assert result.complete is not quarrels
+        for name, row in result.rows.items():
+            assert row.actual == vehicle.param(name).value
+            assert row.is_as_wanted is (row.actual == another(name)[name])
+        assert len(tap.messages(wire.ParamSet)) <= 5
+
+
+@swiftly
+async def test_what_the_vehicle_has_is_stored_before_anything_is_sent(tmp_path: Path) -> None:
+    cache = ParamCache(tmp_path / "cache.sqlite3")
+    vehicle = ardupilot()
+    tap = Tap(vehicle)
+    seen: list[tuple[str, int]] = []
+    store = ParamCache.store_snapshot
+
+    def spy(*args: Any, **kwargs: Any) -> Any:
+        seen.append((kwargs["reason"], len(tap.messages(wire.ParamSet))))
+        return store(*args, **kwargs)
+
+    with mock.patch.object(ParamCache, "store_snapshot", spy):
+        async with ParamClient(tap, cache=cache) as client:
+            component = await client.component()
+            first = await apply(component, written(another("TUNE_01")))
+            await apply(component, written(another("TUNE_01")))  # nothing to do, nothing to undo
+            key = component.identity.key
+    assert seen == [("before apply", 0)]
+    (summary,) = cache.snapshots(key, 1)
+    state = cache.state_at(key, 1, summary.id)
+    assert {name: param.value for name, param in state.items()} == {
+        name: param.value for name, param in ardupilot().params.items()
+    }
+    assert dict(first.before) == dict(state)
+
+
+@swiftly
+async def test_where_the_state_cannot_be_stored_nothing_is_sent(tmp_path: Path) -> None:
+    tap = Tap(ardupilot())
+    broken = mock.Mock(side_effect=CacheError("disk full"))
+    with mock.patch.object(ParamCache, "store_snapshot", broken):
+        async with ParamClient(tap, cache=tmp_path / "cache.sqlite3") as client:
+            with pytest.raises(CacheError, match="disk full"):
+                await apply(await client.component(), written(another()))
+    assert tap.messages(wire.ParamSet) == []
+
+
+@pytest.mark.parametrize("bring", [apply, restore])
+@swiftly
+async def test_before_anything_is_stored_or_written_the_caller_may_stop_it(
+    bring: Callable[..., Any], tmp_path: Path
+) -> None:
+    cache = ParamCache(tmp_path / "cache.sqlite3")
+    tap = Tap(ardupilot())
+    seen: list[int] = []
+
+    async def stop() -> None:
+        seen.append(len(component.params))
+        raise UsageError("not now")
+
+    async with ParamClient(tap, cache=cache) as client:
+        component = await client.component()
+        with pytest.raises(UsageError, match="not now"):
+            await bring(component, written(another()), before_writing=stop)
+        assert len(seen) == 1
+        assert seen[0] > len(SETTINGS), "it has been read"
+        assert not tap.messages(wire.ParamSet)
+        key = component.identity.key
+        await anyio.sleep(1.0)
+    assert cache.snapshots(key) == []
+
+
+@swiftly
+async def test_of_several_vehicles_each_may_be_stopped() -> None:
+    one, two = ardupilot(system=1), ardupilot(system=2)
+
+    async def stop(component: Component) -> None:
+        if component.system == 2:
+            raise UsageError("not this one")
+
+    async with a_client(Air([one, two])) as client:
+        both = [await client.component(system) for system in (1, 2)]
+        fleet = await apply_all(both, written(another("TUNE_01")), before_writing=stop)
+    assert fleet.results[1, 1].complete
+    assert str(fleet.errors[2, 1]) == "not this one"
+    assert (one.requests["PARAM_SET"], two.requests["PARAM_SET"]) == (1, 0)
+
+
+@swiftly
+async def test_progress_is_told() -> None:
+    told: list[ApplyProgress] = []
+    async with a_client(ardupilot()) as client:
+        await apply(await client.component(), written(another()), progress=told.append)
+    phases = list(dict.fromkeys(each.phase for each in told))
+    assert phases == ["reading", "writing"]
+    done = [each.done for each in told if each.phase == "writing"]
+    assert done == list(range(1, len(SETTINGS) + 1))
+    assert {each.total for each in told if each.phase == "writing"} == {len(SETTINGS)}
+    assert {each.row.name for each in told if each.row is not None} == set(SETTINGS)
+
+
+@swiftly
+async def test_a_vehicle_that_falls_silent_ends_it_and_the_next_one_goes_on() -> None:
+    vehicle = ardupilot()
+    tap = Tap(vehicle)
+    async with a_client(tap) as client:
+        component = await client.component()
+
+        def fall_silent(progress: ApplyProgress) -> None:
+            if progress.phase == "writing" and progress.done == 5:
+                tap.is_deaf = tap.is_mute = True
+
+        result = await apply(component, written(another()), progress=fall_silent)
+        assert isinstance(result.error, NoReply)
+        assert not result.complete
+        counts = result.counts
+        assert counts[ApplyStatus.UNPROVEN] >= 5
+        assert counts[ApplyStatus.FAILED] > 0
+        assert sum(counts.values()) == len(SETTINGS)
+        assert {row.reason for row in result.of(ApplyStatus.FAILED) if row.name == "TUNE_29"} == {
+            "not reached"
+        }
+        assert "ended by no reply" in repr(result)
+        tap.is_deaf = tap.is_mute = False
+        await anyio.sleep(3)
+        again = await apply(component, written(another()))
+    assert again.complete
+    assert again.counts[ApplyStatus.UNCHANGED] >= 5
+    assert all(vehicle.param(name).value == value for name, value in another().items())
+
+
+@swiftly
+async def test_a_link_that_fails_ends_it_with_what_is_known() -> None:
+    vehicle = ardupilot()
+    link = FlakyLink(vehicle)
+    async with a_client(link) as client:
+        component = await client.component()
+        async with anyio.create_task_group() as tasks:
+
+            def cut(progress: ApplyProgress) -> None:
+                if progress.phase == "writing" and progress.done == 5:
+                    tasks.start_soon(lambda: link.drop(stays_away=True))
+
+            result = await apply(component, written(another()), progress=cut)
+        assert isinstance(result.error, LinkError)
+        assert result.counts[ApplyStatus.FAILED] > 0
+        with pytest.raises(LinkError):  # nothing was sent this time
+            await apply(component, written(another()))
+        link.is_away = False
+        await anyio.sleep(10)
+        assert (await apply(component, written(another()))).complete
+
+
+@swiftly
+async def test_the_time_that_is_given_ends_it() -> None:
+    vehicle = ardupilot()
+    async with a_client(Air.symmetric([vehicle], rate=1000.0)) as client:
+        component = await client.component()
+        with pytest.raises(NoReply, match="the set-up of 1/1"):
+            await apply(component, written(another()), timeout=0.1)
+        began = anyio.current_time()
+        await prepare(component, written(another()))
+        took = anyio.current_time() - began
+        result = await apply(component, written(another()), timeout=took + 0.5)
+        assert result.elapsed < took + 1
+        assert isinstance(result.error, NoReply)
+        assert "sent, not acknowledged" in {row.reason[:22] for row in result.of(ApplyStatus.UNPROVEN)}
+        assert residue(component) == []
+
+
+@swiftly
+async def test_a_vehicle_gets_an_earlier_state_of_its_own_back() -> None:
+    vehicle = ardupilot()
+    original = vehicle.values
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        wanted = written(
+            another() | {"COMPASS_OFS_X": 9.0, "STAT_RUNTIME": 77, "EK2_ENABLE": 1, "EK2_ALT_M_NSE": 1.0}
+        )
+        first = await apply(component, wanted, include=["calibration", "counter"])
+        assert first.complete
+        undone = await restore(component, first.before)
+    assert undone.complete
+    assert undone.rows["COMPASS_OFS_X"].status is ApplyStatus.SET
+    assert undone.rows["STAT_RUNTIME"].category == "counter"
+    vehicle.set_param("STAT_RUNTIME", 5)
+    assert vehicle.values == original
+    # it was asked for by name before it was shown, so it is part of the state
+    assert vehicle.param("EK2_ALT_M_NSE").value == 3.0
+    assert undone.extra == ()
+
+
+@swiftly
+async def test_a_state_brings_back_nothing_that_the_vehicle_measures_or_keeps_to_itself() -> None:
+    own: dict[str, Value | tuple[ParamType, Value]]
+    own = {"BARO1_GND_PRESS": 94500.0, "BARO1_DEVID": 65540, "INS_GYROFFS_X": 0.25, "LOCKED": 1.0}
+    vehicle = ArduPilotVehicle(
+        table=SETTINGS | OTHERS | own, read_only=["BARO1_GND_PRESS", "BARO1_DEVID", "LOCKED"], live_period=0.0
+    )
+    tap = Tap(vehicle)
+    async with a_client(tap) as client:
+        component = await client.component()
+        before = (await apply(component, written(another("TUNE_01")))).before
+        for name, value in {
+            "BARO1_GND_PRESS": 9.0,
+            "BARO1_DEVID": 7,
+            "INS_GYROFFS_X": 0.5,
+            "LOCKED": 2.0,
+        }.items():
+            vehicle.set_param(name, value)
+        result = await restore(component, before)
+        assert result.complete
+        assert set(sets(tap)) == {"LOCKED", "TUNE_01"}
+        told = {row.name: (row.category, row.actual) for row in result.news}
+        assert told == {
+            "TUNE_01": ("", 0.25),
+            "BARO1_GND_PRESS": ("read-only", 9.0),
+            "BARO1_DEVID": ("read-only", 7),
+            "INS_GYROFFS_X": ("measured", 0.5),
+            "LOCKED": ("read-only", 2.0),
+        }
+        assert "it can only be read" in str(result.rows["LOCKED"])
+        # who asks for just this is told that it was refused
+        assert statuses(await apply(component, written({"LOCKED": 1.0}))) == {"LOCKED": "refused"}
+
+
+@swiftly
+async def test_more_than_the_state_has_is_left_alone_and_said() -> None:
+    vehicle = ardupilot()
+    state = {name: param for name, param in vehicle.params.items() if name != "TUNE_05"}
+    vehicle.set_param("TUNE_05", 5.0)
+    vehicle.set_param("TUNE_04", 5.0)
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        await component.fetch_all()
+        kept = ParamSet.of(state.values(), identity=component.identity)
+        result = await restore(component, kept)
+        assert result.extra == ("TUNE_05",)
+        assert statuses(result)["TUNE_04"] == "set"
+        # of a state that does not say whose it is, only the settings
+        vehicle.set_param("COMPASS_OFS_X", 4.0)
+        unsaid = await restore(component, ParamSet.of(state.values()))
+        assert unsaid.rows["COMPASS_OFS_X"].category == "calibration"
+        assert (await restore(component, kept)).rows["COMPASS_OFS_X"].status is ApplyStatus.SET
+
+
+@swiftly
+async def test_the_state_or_the_plan_of_another_vehicle_is_none_of_this_one() -> None:
+    async with a_client(ardupilot(uid2=b"another")) as client:
+        component = await client.component()
+        plan = await prepare(component, written(another()))
+        state = ParamSet.of(component.params.values(), identity=component.identity)
+    async with a_client(ardupilot()) as client:
+        component = await client.component()
+        await component.fetch_all()
+        with pytest.raises(
+            UsageError, match="the plan is one for another vehicle: the ardupilot 616e6f74686572"
+        ):
+            await apply(component, plan)
+        with pytest.raises(
+            UsageError, match="the state is that of another vehicle: the ardupilot 616e6f74686572"
+        ):
+            await restore(component, state)
+
+
+@swiftly
+async def test_several_vehicles_are_set_up_side_by_side() -> None:
+    vehicles = [ardupilot(), px4(system=2), ardupilot(system=3, read_only=["TUNE_01"])]
+    base = written(another())
+    async with a_client(Air(vehicles)) as client:
+        await client.fetch_all()
+        components = [client.components[vehicle.system, 1] for vehicle in vehicles]
+        over = {
+            (1, 1): base,
+            (2, 1): overlay(base, written({"TUNE_02": 42.0})),
+            (3, 1): overlay(base, written({"SMALL": 1000})),
+        }
+        with pytest.raises(UsageError, match="nothing that component 3/1 shall have"):
+            await apply_all(components, {address: over[address] for address in [(1, 1), (2, 1)]})
+        told: list[tuple[int, str]] = []
+        applied = await apply_all(
+            components, over, progress=lambda component, how: told.append((component.system, how.phase))
+        )
+        assert list(applied.results) == [(1, 1), (2, 1)]
+        assert isinstance(applied.errors[3, 1], InvalidParameters)
+        assert not applied.complete
+        assert {system for system, phase in told if phase == "writing"} == {1, 2}
+        assert vehicles[1].param("TUNE_02").value == 42.0
+        verified = await verify_all(components, lambda component: over[component.system, 1])
+        assert [plan.is_met for plan in verified.results.values()] == [True, True, False]
+        assert not verified.is_met
+        assert (await verify_all(components[:1], base)).is_met
+        assert (await apply_all(components[:1], base)).complete
+
+
+@EVERY_KIND
+@swiftly
+async def test_an_armed_vehicle_is_left_alone_unless_told_otherwise(make: Callable[..., Any]) -> None:
+    vehicle = make(armed=True)
+    tap = Tap(vehicle)
+    async with a_client(tap) as client:
+        component = await client.component()
+        with pytest.raises(VehicleArmed, match="1/1 is armed"):
+            await apply(component, written(another()))
+        assert tap.messages(wire.ParamSet) == []
+        assert (await prepare(component, written(another()))).steps
+        assert (await apply(component, written(another("TUNE_01")), allow_armed=True)).complete
+        # it refuses to start again then, and that is the end of it
+        result = await apply(component, written({"FRAME_CLASS": 2}), allow_armed=True, reboot=True)
+        if make is ardupilot:
+            assert isinstance(result.error, CommandRefused)
+            assert statuses(result) == {"FRAME_CLASS": "set"}
+
+
+@swiftly
+async def test_so_is_another_part_of_an_armed_vehicle() -> None:
+    for system in (1, 2):
+        camera = GenericVehicle({"TUNE_01": 0.25}, system=1, component=100)
+        air = Air.symmetric([camera, ardupilot(armed=True, system=system)])
+        async with a_client(air) as client:
+            await client.component(system=system, component=1)
+            component = await client.component(system=1, component=100)
+            if system == 1:
+                with pytest.raises(VehicleArmed, match="1/100 is armed"):
+                    await apply(component, written({"TUNE_01": 1.5}))
+            assert (await apply(component, written({"TUNE_01": 1.5}), allow_armed=system == 1)).complete
+
+
+@swiftly
+async def test_who_does_not_say_whether_it_is_armed_may_be() -> None:
+    vehicle = ardupilot()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        with (
+            mock.patch.object(Component, "is_armed", None),
+            pytest.raises(VehicleArmed, match="1/1 does not say whether it is armed"),
+        ):
+            await apply(component, written(another()))
+        assert vehicle.requests["PARAM_SET"] == 0
+
+
+@swiftly
+async def test_a_vehicle_that_is_armed_meanwhile_ends_it() -> None:
+    vehicle = ardupilot()
+
+    def arm(progress: ApplyProgress) -> None:
+        if progress.row is not None:
+            vehicle.armed = True
+
+    async with a_client(vehicle) as client:
+        wanted = written({"EK2_ENABLE": 1, "EK2_NO_SUCH": 1})
+        component = await client.component()
+        result = await apply(component, wanted, progress=arm)
+        assert statuses(result)["EK2_ENABLE"] == "set"
+        await anyio.sleep(2)
+        with pytest.raises(VehicleArmed):
+            await apply(component, written(another()))
+
+
+@swiftly
+async def test_a_reboot_follows_where_values_count_only_then() -> None:
+    vehicle = ardupilot(reboot_groups=["EK2_ENABLE"], make=Hiding)
+    tap = Tap(vehicle)
+    wanted = written(another("TUNE_01") | {"EK2_ALT_M_NSE": 1.5, "EK2_ENABLE": 1, "FRAME_CLASS": 2})
+    async with a_client(tap) as client:
+        component = await client.component()
+        unstarted = await apply(component, wanted)
+        assert unstarted.reboots == 0
+        assert unstarted.reboot_required == ("FRAME_CLASS", "EK2_ENABLE")
+        assert unstarted.rows["EK2_ALT_M_NSE"].category == MISSING
+        plan = await prepare(component, wanted)
+        assert plan.unstarted == ("EK2_ENABLE",)
+        told: list[str] = []
+        result = await apply(component, wanted, reboot=True, progress=lambda how: told.append(how.phase))
+    assert result.complete
+    assert (result.reboots, result.reboot_required) == (1, ())
+    assert list(dict.fromkeys(told)) == ["reading", "rebooting", "writing"]
+    assert vehicle.param("EK2_ALT_M_NSE").value == 1.5
+
+
+@swiftly
+async def test_a_change_too_small_for_px4_is_told_and_its_value_after_the_start() -> None:
+    vehicle = px4(table=SETTINGS | {"SYS_HITL": 0}, not_in_use=(), late_use={})
+    near = from_bits(bits_of(0.25, ParamType.REAL32) + 1, ParamType.REAL32)
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        told = await apply(component, written({"TUNE_01": near}))
+        assert told.complete
+        assert told.rows["TUNE_01"].reason == (
+            "PX4 takes a change of at most 1.19e-07 for none: its next start may bring 0.25 back"
+        )
+        result = await apply(component, written({"TUNE_01": near, "SYS_HITL": 1}), reboot=True)
+        assert result.reboots == 1
+        assert statuses(result) == {"TUNE_01": "unchanged", "SYS_HITL": "set"}  # all were saved with SYS_HITL
+        for value in (0.5, 0.25):
+            vehicle.set_param("TUNE_01", value)
+            await anyio.sleep(2.5)  # it saves at most every 2 s
+        info = {"TUNE_01": ParamInfo("TUNE_01", reboot_required=True)}
+        result = await apply(component, written({"TUNE_01": near}), reboot=True, info=info)
+    assert result.reboots == 1
+    row = result.rows["TUNE_01"]
+    assert (row.status, row.actual) == (ApplyStatus.ADJUSTED, 0.25)
+    assert row.reason == "the vehicle acknowledged it, and has another value since it has started again"
+    assert vehicle.requests["PARAM_SET"] == 3  # what the next start takes back is not set again
+
+
+@swiftly
+async def test_a_group_that_comes_with_a_start_is_set_after_it() -> None:
+    vehicle = ardupilot(reboot_groups=["EK2_ENABLE"], make=Hiding)
+    tap = Tap(vehicle)
+    async with a_client(tap) as client:
+        result = await apply(
+            await client.component(),
+            written(another("TUNE_01") | {"EK2_ALT_M_NSE": 1.5, "EK2_ENABLE": 1}),
+            reboot=True,
+        )
+    assert result.complete
+    assert result.reboots == 1
+    assert sets(tap) == ["EK2_ENABLE", "TUNE_01", "EK2_ALT_M_NSE"]
+
+
+@swiftly
+async def test_names_that_no_start_brings_cost_one_start_at_most() -> None:
+    async with a_client(ardupilot(make=Hiding)) as client:
+        component = await client.component()
+        wanted = written({"EK2_NO_SUCH": 1.5, "EK2_ENABLE": 1})
+        assert (await apply(component, wanted, reboot=True)).reboots == 1
+        assert (await apply(component, wanted, reboot=True)).reboots == 1
+        assert (await apply(component, written({"TUNE_X": 1, "EK2_ENABLE": 1}), reboot=True)).reboots == 0
+
+
+@swiftly
+async def test_px4_starts_again_before_what_the_frame_would_reset() -> None:
+    vehicle = px4(uid=77)
+    vehicle.set_param("TUNE_05", 9.0)
+    tap = Tap(vehicle)
+    wanted = written(another("TUNE_01") | {"SYS_AUTOSTART": 4050, "SYS_AUTOCONFIG": 1, "TUNE_05": 9.0})
+    async with a_client(tap) as client:
+        component = await client.component()
+        with pytest.raises(UsageError, match="SYS_AUTOCONFIG gives others their defaults back"):
+            await apply(component, wanted, include="SYS_AUTOCONFIG")
+        assert tap.messages(wire.ParamSet) == []
+        result = await apply(component, wanted, include="SYS_AUTOCONFIG", reboot=True)
+    assert result.complete
+    assert result.reboots == 1
+    # what was right before had been reset with the others, and was set again
+    assert [message.param_id for message in tap.messages(wire.ParamSet)] == [
+        *("SYS_AUTOSTART", "SYS_AUTOCONFIG", "TUNE_01", "TUNE_05")
+    ]
+    assert result.rows["SYS_AUTOCONFIG"].reason == "done by the vehicle"
+    assert [vehicle.param(name).value for name in ("TUNE_01", "TUNE_05", "SYS_AUTOCONFIG")] == [1.25, 9.0, 0]
+
+
+@swiftly
+async def test_a_reset_that_changes_the_system_id_is_followed() -> None:
+    vehicle = px4(uid=77, system=5)
+    vehicle.set_param("MAV_SYS_ID", 5)
+    async with a_client(vehicle) as client:
+        wanted = written(another("TUNE_01") | {"SYS_AUTOCONFIG": 1})
+        first = await apply(await client.component(), wanted, include="action", reboot=True)
+        assert (first.complete, first.system) == (True, 1)
+        back = await apply(
+            client.components[1, 1], written({"MAV_SYS_ID": 5}), include="identity", reboot=True
+        )
+        assert (back.complete, back.system) == (True, 5)
+
+
+@EVERY_KIND
+@swiftly
+async def test_a_changed_system_id_is_followed(make: Callable[..., Any]) -> None:
+    vehicle = make() if make is ardupilot else make(uid=77)
+    name = "SYSID_THISMAV" if make is ardupilot else "MAV_SYS_ID"
+    tap = Tap(vehicle)
+    async with a_client(tap) as client:
+        component = await client.component()
+        wanted = written({name: 7} | another("TUNE_01", "TUNE_02"))
+        result = await apply(component, wanted, include=[name], reboot=True)
+        assert result.complete, result
+        assert (result.system, result.component) == (7, 1)
+        assert (vehicle.system, vehicle.param(name).value) == (7, 7)
+        assert sets(tap)[-1] == name
+        assert result.reboots == 1
+        assert client.components[7, 1].state == "synced"
+        await anyio.sleep(5.0)  # what is measured at a start is read again
+        assert residue(component) == []
+        # and back again, although it was just heard under that id
+        undone = await restore(client.components[7, 1], result.before, reboot=True)
+    assert undone.complete
+    assert (undone.system, vehicle.system) == (1, 1)
+
+
+@swiftly
+async def test_plane_and_rover_take_their_system_id_without_a_reboot() -> None:
+    vehicle = ardupilot(kind="plane")
+    async with a_client(vehicle) as client:
+        result = await apply(
+            await client.component(), written({"SYSID_THISMAV": 7}), include="identity", reboot=True
+        )
+    assert result.complete
+    assert (result.reboots, result.reboot_required, result.plan.reboot_for) == (0, (), ())
+    assert (result.system, vehicle.system) == (7, 7)
+
+
+@swiftly
+async def test_copter_keeps_its_system_id_until_it_starts_again() -> None:
+    """Which is known beforehand, and seen: another firmware may take it at once."""
+    vehicle = ardupilot()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        result = await apply(component, written({"SYSID_THISMAV": 7}), include="identity")
+        assert (result.system, vehicle.system) == (1, 1)
+        assert result.plan.reboot_for == result.reboot_required == ("SYSID_THISMAV",)
+        assert statuses(result) == {"SYSID_THISMAV": "set"}
+        started = await apply(component, written({"SYSID_THISMAV": 7}), include="identity", reboot=True)
+    assert (started.reboots, started.system, vehicle.system) == (1, 7, 7)
+
+
+@swiftly
+async def test_a_copter_that_takes_its_system_id_at_once_is_followed() -> None:
+    vehicle = ardupilot(kind="plane")
+    vehicle._heartbeat = dataclasses.replace(vehicle._heartbeat, type=2)
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        result = await apply(component, written({"SYSID_THISMAV": 7}), include="identity", reboot=True)
+    assert result.plan.reboot_for == ("SYSID_THISMAV",)
+    assert (result.reboots, result.reboot_required) == (0, ())
+    assert (result.system, vehicle.system) == (7, 7)
+
+
+@swiftly
+async def test_a_system_id_that_another_one_has_is_not_taken() -> None:
+    vehicles = [ardupilot(), ardupilot(system=7)]
+    async with a_client(Air(vehicles)) as client:
+        component = await client.component(1, 1)
+        await client.component(7, 1)
+        result = await apply(component, written({"SYSID_THISMAV": 7}), include="identity")
+    assert statuses(result) == {"SYSID_THISMAV": "skipped"}
+    assert result.rows["SYSID_THISMAV"].reason == "another one on this link is system 7"
+    assert not result.complete
+    assert [vehicle.system for vehicle in vehicles] == [1, 7]
+
+
+@swiftly
+async def test_without_a_reboot_a_px4_keeps_its_system_id_for_now() -> None:
+    vehicle = px4(uid=77)
+    async with a_client(vehicle) as client:
+        result = await apply(await client.component(), written({"MAV_SYS_ID": 7}), include="identity")
+        assert (result.system, vehicle.system) == (1, 1)
+        # that it has the id only from its next start on can be seen
+        component = await client.component()
+        started = await apply(component, written({"MAV_SYS_ID": 7}), include="identity", reboot=True)
+    assert statuses(result) == {"MAV_SYS_ID": "set"}
+    assert result.reboot_required == ("MAV_SYS_ID",)
+    assert statuses(started) == {"MAV_SYS_ID": "unchanged"}
+    assert (started.reboots, started.system, vehicle.system) == (1, 7, 7)
+
+
+@swiftly
+async def test_the_backup_is_a_file_that_brings_everything_back(tmp_path: Path) -> None:
+    vehicle = ardupilot()
+    original = vehicle.values
+    path = tmp_path / "before.json"
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        with pytest.raises(FileError):
+            await apply(component, written(another()), backup=tmp_path / "nowhere" / "before.json")
+        assert vehicle.values == original
+        assert (await apply(component, written(another()), backup=path)).complete
+        assert vehicle.values != original
+        (state,) = read_file(path).sets
+        assert (await restore(component, state)).complete
+    assert vehicle.values == original
+
+
+@swiftly
+async def test_what_may_end_the_conversation_is_done_one_by_one() -> None:
+    tap = Tap(ardupilot())
+    async with a_client(tap) as client:
+        wanted = written({"SYSID_THISMAV": 7, "SYSID_ENFORCE": 1})
+        assert (await apply(await client.component(), wanted, include="identity")).complete
+    heard = [(at, message) for at, _, message in tap.heard if isinstance(message, wire.ParamSet)]
+    times = {message.param_id: at for at, message in reversed(heard)}
+    assert times["SYSID_ENFORCE"] + 0.001 < times["SYSID_THISMAV"]
+
+
+@swiftly
+async def test_a_link_that_fails_while_the_system_id_changes_ends_it() -> None:
+    broken = mock.AsyncMock(side_effect=LinkError("gone", link="x"))
+    async with a_client(ardupilot()) as client:
+        component = await client.component()
+        with mock.patch.object(ParamClient, "successor", broken):
+            result = await apply(component, written({"SYSID_THISMAV": 7}), include="identity")
+        assert isinstance(result.error, LinkError)
+        assert statuses(result) == {"SYSID_THISMAV": "failed"}
+        assert residue(component) == []
+
+
+@swiftly
+async def test_what_the_cache_believes_is_not_taken_for_what_the_vehicle_has(tmp_path: Path) -> None:
+    wanted = written({"EK2_ALT_M_NSE": 3.0, "TUNE_01": 0.25})
+    for vehicle in (ardupilot(), px4(uid=77)):
+        with ParamCache(tmp_path / f"{type(vehicle).__name__}.sqlite3") as cache:
+            async with ParamClient(vehicle, cache=cache) as client:
+                assert (await apply(await client.component(), wanted)).counts == {ApplyStatus.UNCHANGED: 2}
+            vehicle.set_param("EK2_ALT_M_NSE", 9.0)
+            vehicle.set_param("TUNE_01", 9.0)
+            async with ParamClient(vehicle, cache=cache) as client:
+                result = await apply(await client.component(), wanted)
+        assert statuses(result) == {"EK2_ALT_M_NSE": "set", "TUNE_01": "set"}
+        assert {row.before for row in result.rows.values()} == {9.0}
+
+
+@swiftly
+async def test_the_state_before_is_all_of_it_what_no_hash_covers_too(tmp_path: Path) -> None:
+    vehicle = px4(uid=77)
+    path = tmp_path / "cache.sqlite3"
+    async with ParamClient(vehicle, cache=path) as client:
+        assert (await apply(await client.component(), written({"TUNE_01": 0.25}))).complete
+    vehicle.set_param("CAL_ACC0_XOFF", 0.75)
+    vehicle.reboot()  # so that it does not tell by itself
+    async with ParamClient(vehicle, cache=path) as client:
+        result = await apply(await client.component(), written({"TUNE_01": 0.25}))
+    assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
+    assert result.before["CAL_ACC0_XOFF"].value == 0.75
+
+
+@swiftly
+async def test_a_vehicle_that_answers_nothing_any_more_is_not_asked_for_every_value() -> None:
+    tap = Tap(ardupilot())
+
+    def go_deaf(progress: ApplyProgress) -> None:
+        tap.is_deaf = progress.phase == "writing"
+
+    async with a_client(tap) as client:
+        component = await client.component()
+        result = await apply(component, written(another()), progress=go_deaf)
+        assert component.state != "lost"
+    assert isinstance(result.error, NoReply)
+    assert [row.reason for row in result.rows.values()].count("not reached") >= 5
+
+
+@swiftly
+async def test_another_vehicle_in_its_place_ends_it() -> None:
+    vehicle = ardupilot()
+    tap = Tap(vehicle)
+    async with a_client(tap) as client:
+        component = await client.component()
+        with mock.patch.object(Identity, "is_same_vehicle", return_value=False):
+            result = await apply(component, written(another()))
+    assert isinstance(result.error, AnotherVehicle)
+    assert not result.complete
+    assert len(tap.messages(wire.ParamSet)) == len(SETTINGS)
+
+
+@swiftly
+async def test_a_failure_before_anything_is_sent_is_raised() -> None:
+    vehicle = ardupilot()
+    tap = Tap(vehicle)
+
+    async def arm(run: Run) -> None:
+        vehicle.armed = True
+        await anyio.sleep(2)
+
+    async with a_client(tap) as client:
+        with mock.patch.object(Run, "_store", arm), pytest.raises(VehicleArmed):
+            await apply(await client.component(), written(another()))
+    assert tap.messages(wire.ParamSet) == []
+
+
+class Ending(Tap):
+    """An endpoint that has something happen when the station has sent so many frames."""
+
+    def __init__(self, endpoint: Any, frames: int, happen: Callable[[], object]) -> None:
+        super().__init__(endpoint)
+        self._frames = frames
+        self._happen = happen
+
+    def receive(self, data: bytes, now: float) -> None:
+        super().receive(data, now)
+        if len(self.heard) >= self._frames > 0:
+            self._frames = 0
+            self._happen()
+
+
+class Story:
+    """A vehicle, what it shall have, and how it is set up; the same each time it is made.
+
+    Attributes:
+        vehicle: the vehicle, with the same hardware id each time.
+        wanted: what it shall have.
+        options: those of `apply`.
+    """
+
+    def __init__(self, kind: str) -> None:
+        wanted = another() | {"EK2_ALT_M_NSE": 1.5, "EK2_ENABLE": 1, "SMALL": 7}
+        self.options: dict[str, Any] = {}
+        self.vehicle: ArduPilotVehicle | PX4Vehicle
+        if kind == "ardupilot":
+            self.vehicle = ardupilot()
+        elif kind == "px4":
+            self.vehicle = px4(uid=77)
+        elif kind == "ardupilot that starts":
+            self.vehicle = ardupilot(Hiding, reboot_groups=["EK2_ENABLE"])
+            wanted |= {"FRAME_CLASS": 2, "SYSID_THISMAV": 7}
+        else:
+            self.vehicle = px4(uid=77)
+            wanted |= {"SYS_AUTOSTART": 4050, "MAV_SYS_ID": 7}
+        if kind.endswith("that starts"):
+            self.options = {"reboot": True, "include": "identity"}
+        self.wanted = written(wanted)
+
+    def truth(self) -> dict[str, Value]:
+        """What it holds, hidden or not."""
+        return {entry.name: entry.value for entry in self.vehicle._entries}
+
+
+async def session_that_ends(story: Story, cache: ParamCache, *, frames: int, how: str, **faults: Any) -> None:
+    """Set a vehicle up until the station has sent so many frames; then the session ends in some way."""
+    scope = anyio.CancelScope()
+
+    def end() -> None:
+        if how == "silence":
+            tap.is_deaf = tap.is_mute = True
+        else:
+            scope.cancel()
+        if how == "kill":  # what is not on disk by now never will be
+            client._writer._cache = None
+
+    tap = Ending(Air.symmetric([story.vehicle], **faults), frames, end)
+    with scope:
+        async with ParamClient(tap, cache=cache) as client:
+            with contextlib.suppress(NoReply):
+                result = await apply(await client.component(), story.wanted, **story.options)
+                assert result.complete or isinstance(result.error, NoReply)
+
+
+@pytest.mark.parametrize("kind", ["ardupilot", "px4", "ardupilot that starts", "px4 that starts"])
+@settings(max_examples=15, deadline=None, derandomize=True)
+@given(
+    frames=st.integers(1, 160),
+    how=st.sampled_from(["cancel", "kill", "silence"]),
+    loss=st.sampled_from([0.0, 0.0, 0.1]),
+    seed=st.integers(0, 1000),
+)
+def test_wherever_it_ends_the_next_one_brings_exactly_what_is_wanted(
+    kind: str, frames: int, how: str, loss: float, seed: int, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    path = tmp_path_factory.mktemp("cache") / "cache.sqlite3"
+
+    @swiftly
+    async def told() -> None:
+        story = Story(kind)
+        before = story.truth()
+        wanted = {name: param.value for name, param in story.wanted.items()}
+        with ParamCache(path) as cache:
+            await session_that_ends(story, cache, frames=frames, how=how, loss=loss, seed=seed)
+            air = Air.symmetric([story.vehicle], loss=loss, seed=seed + 1)
+            async with ParamClient(air, cache=cache) as client:
+                result = await apply(await client.component(), story.wanted, **story.options)
+            assert result.complete, result.rows
+            assert story.truth() == before | wanted
+            assert story.vehicle.system == result.system == (7 if kind.endswith("that starts") else 1)
+            (key,) = [known.key for known in cache.vehicles() if known.identity.uid is not None]
+            history = cache.history(key)
+            first = cache.state_at(key, 1, cache.snapshots(key)[0].id)
+            # the state before anything was sent is there, and every step from it to what is now
+            assert {name: param.value for name, param in first.items()} == {
+                name: value for name, value in before.items() if name in first
+            }
+            assert first.keys() >= before.keys() - GROUP.keys()
+            for name in before.keys() - GROUP.keys():  # those come and go, with what shows them
+                lines = [line for line in history if line.name == name]
+                steps = [(line.old.value, line.new and line.new.value) for line in lines]
+                assert all(earlier[1] == later[0] for earlier, later in itertools.pairwise(steps)), steps
+                ends = (steps[0][0], steps[-1][1]) if steps else (before[name], before[name])
+                assert ends == (before[name], wanted.get(name, before[name])), steps
+                assert all(old != new for old, new in steps)
+
+    told()
+
+
+@EVERY_KIND
+@swiftly
+async def test_a_file_of_another_autopilot_is_refused_before_the_vehicle_is_asked(
+    make: Callable[[], Any],
+) -> None:
+    tap = Tap(make())
+    other = written(another(), identity=Identity(1, "sim:", autopilot=12 if make is ardupilot else 3))
+    async with a_client(tap) as client:
+        component = await client.component()
+        for call in (prepare, verify, apply):
+            with pytest.raises(UsageError, match="are those of a vehicle with"):
+                await call(component, other)
+    assert not {wire.ParamSet, wire.ParamRequestRead, wire.ParamRequestList} & {
+        type(message) for _, _, message in tap.heard
+    }
+
+
+# what the vehicle changes after it has acknowledged it
+
+
+@pytest.mark.parametrize("delay", [0.02, 0.8, 1.1])
+@swiftly
+async def test_what_modules_clamp_within_a_second_is_adjusted(delay: float) -> None:
+    vehicle = PX4Vehicle(table=SETTINGS | CLAMPED, clamp_delay=delay)
+    wanted = {"MPC_TILTMAX_LND": 80.0, "TUNE_01": 9.5, "MPC_XY_CRUISE": 6.0}
+    async with a_client(vehicle) as client:
+        result = await apply(await client.component(), written(wanted))
+    assert statuses(result) == {"MPC_TILTMAX_LND": "adjusted", "TUNE_01": "set", "MPC_XY_CRUISE": "set"}
+    row = result.rows["MPC_TILTMAX_LND"]
+    assert (row.before, row.actual) == (12.0, 45.0)
+    assert "changed it afterwards" in row.reason
+    assert not result.complete
+    assert vehicle.requests["PARAM_SET"] == 4  # once more, as another one that was set may have changed it
+
+
+@swiftly
+async def test_a_clamp_back_to_the_old_value_is_no_failure_but_an_adjustment() -> None:
+    vehicle = PX4Vehicle(table=SETTINGS | CLAMPED | {"MPC_TILTMAX_LND": 45.0}, clamp_delay=0.5)
+    async with a_client(vehicle) as client:
+        result = await apply(await client.component(), written({"MPC_TILTMAX_LND": 80.0}))
+    assert statuses(result) == {"MPC_TILTMAX_LND": "adjusted"}
+    assert result.rows["MPC_TILTMAX_LND"].actual == 45.0
+
+
+@swiftly
+async def test_what_is_clamped_by_another_wanted_value_arrives_with_the_second_try() -> None:
+    vehicle = PX4Vehicle(table=SETTINGS | CLAMPED, clamp_delay=0.0)
+    async with a_client(vehicle) as client:
+        wanted = {"MPC_XY_CRUISE": 18.0, "MPC_XY_VEL_MAX": 19.0}
+        assert (await apply(await client.component(), written(wanted))).complete
+
+
+@swiftly
+async def test_what_was_as_wanted_and_is_changed_by_another_one_is_seen() -> None:
+    vehicle = PX4Vehicle(table=SETTINGS | CLAMPED, clamp_delay=1.0)
+    async with a_client(vehicle) as client:
+        wanted = {"MPC_XY_VEL_MAX": 8.0, "MPC_VEL_MANUAL": 10.0}
+        result = await apply(await client.component(), written(wanted))
+    assert statuses(result) == {"MPC_XY_VEL_MAX": "set", "MPC_VEL_MANUAL": "adjusted"}
+
+
+@swiftly
+async def test_the_proof_begins_long_enough_after_the_last_write() -> None:
+    tap = Tap(px4())
+    async with a_client(tap) as client:
+        assert (await apply(await client.component(), written(another()))).complete
+    sets = [at for at, _, message in tap.heard if isinstance(message, wire.ParamSet)]
+    hashes = [
+        at
+        for at, _, message in tap.heard
+        if isinstance(message, wire.ParamRequestRead) and message.param_id == wire.HASH_CHECK
+    ]
+    assert hashes[-1] - sets[-1] >= LASTING_TIME
+
+
+@swiftly
+async def test_where_nothing_is_to_be_written_nothing_is_waited_for() -> None:
+    async with a_client(px4()) as client:
+        result = await apply(await client.component(), written({"TUNE_01": 0.25}))
+    assert result.complete
+    assert result.elapsed < LASTING_TIME
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("-inf")])
+@swiftly
+async def test_what_px4_cannot_save_is_only_set_when_forced(value: float) -> None:
+    vehicle = px4()
+    async with a_client(vehicle) as client:
+        component = await client.component()
+        with pytest.raises(InvalidParameters, match="cannot save NaN"):
+            await apply(component, written({"TUNE_01": value}), include="out-of-range")
+        assert vehicle.requests["PARAM_SET"] == 0
+        state = (await apply(component, written({"TUNE_02": 0.75}))).before
+        forced = await apply(component, written({"TUNE_01": value}), force=True)
+        assert statuses(forced) == {"TUNE_01": "set"}
+        await apply(component, written({"TUNE_01": 0.25}))
+        state = ParamSet({**state.params, **written({"TUNE_01": value}).params}, identity=state.identity)
+        result = await restore(component, state)
+        assert statuses(result)["TUNE_01"] == "skipped"
+        assert "cannot save NaN" in result.rows["TUNE_01"].reason
+        assert statuses(await restore(component, state, force=True))["TUNE_01"] == "set"
+
+
+# On a radio
+
+
+def on_a_radio(vehicle: ArduPilotVehicle | PX4Vehicle) -> Tap:
+    """A vehicle on a serial port of 57600 baud."""
+    return Tap(Air.symmetric([vehicle], rate=5760.0, delay=0.02))
+
+
+def ardupilot_on_a_serial_port(**options: Any) -> ArduPilotVehicle:
+    return ArduPilotVehicle(live=(), burst=1, period=0.025, ftp_rate=5760.0, **options)
+
+
+def tuned(vehicle: ArduPilotVehicle, count: int) -> ParamSet:
+    """Other values of so many floats that the vehicle has, one above."""
+    values = {
+        name: param.value
+        for name, param in vehicle.params.items()
+        if name.startswith(("ATC_", "LOIT_", "PSC_", "WPNAV_")) and isinstance(param.value, float)
+    }
+    return written({name: values[name] + 1.0 for name in [*values][:count]})
+
+
+def reads_behind_the_last_set(tap: Tap) -> list[str]:
+    """The names that were asked for by name after the last write."""
+    messages = [message for _, _, message in tap.heard]
+    last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSet))
+    return [each.param_id for each in messages[last + 1 :] if isinstance(each, wire.ParamRequestRead)]
+
+
+@swiftly
+async def test_twenty_values_over_a_radio_take_one_download_and_are_proven_by_name() -> None:
+    tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
+    wanted = tuned(vehicle, 21)
+    first, *changed = wanted
+    assert len(changed) == 20
+    as_it_is = vehicle.params[first].value
+    wanted = written({first: as_it_is, **{name: wanted[name].value for name in changed}})
+    async with a_client(tap) as client:
+        component = await client.component()
+        result = await apply(component, wanted)
+    assert result.complete
+    assert statuses(result) == {**dict.fromkeys(changed, "set"), first: "unchanged"}
+    assert result.elapsed <= 6.5
+    assert downloads(tap) == 1
+    assert sorted(reads_behind_the_last_set(tap)) == sorted(wanted)
+
+
+@swiftly
+async def test_switches_of_groups_take_one_download_over_a_radio_too() -> None:
+    tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
+    hidden = {"EK2_ENABLE": 1, "EK2_ALT_M_NSE": 4.0, "EK2_GPS_TYPE": 2}
+    async with a_client(tap) as client:
+        result = await apply(await client.component(), written(hidden))
+    assert result.complete
+    assert {name: vehicle.param(name).value for name in hidden} == hidden
+    assert result.elapsed <= 6.5
+    assert downloads(tap) == 1
+
+
+@swiftly
+async def test_a_value_that_changes_behind_its_acknowledgement_is_seen_over_a_radio() -> None:
+    tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
+    wanted = tuned(vehicle, 4)
+    one, other, dead, *_ = wanted
+
+    def change(progress: ApplyProgress) -> None:
+        if progress.row is not None and progress.row.name == one:  # on board, without a word
+            vehicle._entry(one).store(bits_of(77.0, ParamType.REAL32))
+            vehicle._dead.add(dead)
+
+    async with a_client(tap) as client:
+        result = await apply(await client.component(), wanted, progress=change)
+    assert (statuses(result)[one], statuses(result)[other]) == ("adjusted", "set")
+    assert result.rows[one].actual == 77.0
+    assert statuses(result)[dead] == "unproven"
+    assert "does not tell" in str(result.rows[dead])
+    assert not result.complete
+    assert downloads(tap) == 1
+
+
+@swiftly
+async def test_a_vehicle_that_falls_silent_before_the_proof_over_a_radio_ends_it() -> None:
+    tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
+    wanted = tuned(vehicle, 3)
+
+    def go_deaf(progress: ApplyProgress) -> None:
+        tap.is_deaf = progress.phase == "reading" and vehicle.requests["PARAM_SET"] > 0
+
+    async with a_client(tap) as client:
+        result = await apply(await client.component(), wanted, progress=go_deaf)
+    assert isinstance(result.error, NoReply)
+    assert set(statuses(result).values()) == {"unproven"}
+
+
+@swiftly
+async def test_a_large_file_is_proven_by_a_download_over_a_radio_too() -> None:
+    tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
+    wanted = ParamSet.of(vehicle.params.values())
+    wanted = ParamSet({**wanted.params, **tuned(vehicle, 5).params})
+    async with a_client(tap) as client:
+        result = await apply(await client.component(), wanted)
+    assert result.complete
+    assert downloads(tap) == 2
+    assert reads_behind_the_last_set(tap) == []
+
+
+@swiftly
+async def test_a_hash_proves_all_of_it_over_a_radio_too() -> None:
+    tap = on_a_radio(PX4Vehicle(burst=3, period=0.025))
+    async with a_client(tap) as client:
+        result = await apply(await client.component(), written({"MC_ROLL_P": 6.25, "MC_PITCH_P": 6.25}))
+    assert result.complete
+    assert set(reads_behind_the_last_set(tap)) == {wire.HASH_CHECK}
+    assert downloads(tap) == 1

@@ -1,0 +1,375 @@
+"""The parts of a client over a service, without one: addresses, documents, problems, events, mirrors."""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from paramclient import (
+    AnotherVehicle,
+    CacheError,
+    Change,
+    CommandRefused,
+    InvalidParameters,
+    LinkError,
+    NoReply,
+    Param,
+    ParamClient,
+    ParamClientError,
+    ParamType,
+    Refused,
+    Trust,
+    TypeMismatch,
+    UnknownParameter,
+    UsageError,
+    ValueNotApplied,
+    VehicleArmed,
+)
+from paramclient.documents.param import ParamDoc
+from paramclient.model.values import Value, from_bits, type_name
+from paramclient.remote import RemoteClient, RemoteComponent
+from paramclient.remote.bounded import MOST_EVENT, EventReader
+from paramclient.remote.decoding import number_of, param_of, value_as_sent
+from paramclient.remote.mirror import MOST_WAITING, Mirror
+from paramclient.remote.problems import error_of
+from paramclient.remote.service_address import TOKEN_VARIABLE, ServiceAddress, chosen_token
+
+WHOM: dict[str, Any] = {"system": 1, "component": 1}
+
+
+# Addresses
+
+
+@pytest.mark.parametrize(
+    ("text", "base", "link"),
+    [
+        ("http://127.0.0.1:8765", "http://127.0.0.1:8765", None),
+        (" HTTPS://Station.local/params/ ", "https://station.local/params", None),
+        ("http://[::1]:8765/", "http://[::1]:8765", None),
+        ("http://h:1?link=udp:14550", "http://h:1", "udpin:0.0.0.0:14550"),
+        ("http://h:1?link=tcpout:Host:5760", "http://h:1", "tcp:host:5760"),
+        ("http://h:1/?link=sim:px4%3Floss=0.1%26seed=2", "http://h:1", "sim:px4?loss=0.1&seed=2"),
+    ],
+)
+def test_addresses_of_services(text: str, base: str, link: str | None) -> None:
+    address = ServiceAddress.read(text)
+    assert (address.base, address.link) == (base, link)
+    assert address.name == (base if link is None else f"{base}?link={link}")
+    client = ParamClient(text)
+    assert type(client) is RemoteClient
+    assert isinstance(client, ParamClient)
+    assert repr(client) == f"<RemoteClient {address.name} closed, 0 components>"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("http://", "http://HOST:PORT"),
+        ("http://:8765", "http://HOST:PORT"),
+        ("http://h:0", "http://HOST:PORT"),
+        ("http://h:99999", "out of range"),
+        ("http://h:1#top", "behind #"),
+        ("http://h:1?token=x", "link=NAME"),
+        ("http://h:1?link=", "link=NAME"),
+        ("http://h:1?link=a&link=b", "link=NAME"),
+    ],
+)
+def test_addresses_that_cannot_be(text: str, words: str) -> None:
+    with pytest.raises(UsageError, match=re.escape(words)):
+        ParamClient(text)
+
+
+def test_a_password_in_an_address_is_refused_and_not_repeated() -> None:
+    with pytest.raises(UsageError, match="token=") as caught:
+        ParamClient("http://anna:secret@h:1")
+    assert "secret" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "option",
+    [
+        *({"cache": False}, {"cache": "x"}, {"system": 1}, {"component": 1}, {"watch_interval": 5}),
+        *({"policy": "hash-only"}, {"traffic": True}, {"listen_only": True}, {"forward": "udpout:h:1"}),
+        *({"tlog": "x"}, {"signing": object()}, {"encoding": "bytewise"}),
+    ],
+    ids=lambda option: next(iter(option)),
+)
+def test_arguments_for_a_link_of_ones_own_are_refused(option: dict[str, Any]) -> None:
+    with pytest.raises(UsageError, match=f"{next(iter(option))} is for a client with a link of its own"):
+        ParamClient("http://h:1", **option)
+
+
+def test_arguments_that_say_nothing_are_not() -> None:
+    ParamClient("http://h:1", cache=None, system=255, component=190, policy="auto", listen_only=False)
+    with pytest.raises(TypeError, match="colour"):
+        ParamClient("http://h:1", colour="red")  # type: ignore[call-arg]  # that there is none is the point
+
+
+def test_a_token_is_given_or_stands_in_the_environment(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(TOKEN_VARIABLE, raising=False)
+    assert chosen_token(None) is None
+    monkeypatch.setenv(TOKEN_VARIABLE, "from-there")
+    assert chosen_token(None) == "from-there"
+    assert chosen_token("given") == "given"
+    for bad in ("two words", "line\nbreak", "grün"):
+        with pytest.raises(UsageError, match="token"):
+            ParamClient("http://h:1", token=bad)
+    with pytest.raises(UsageError, match="a token is for a service"):
+        ParamClient("sim:px4", token="given")
+
+
+def test_everything_public_is_answered_for() -> None:
+    """What a client or a component offers either goes over the service or is refused in words."""
+    for local, remote in ((ParamClient, RemoteClient), (RemoteComponent.__base__, RemoteComponent)):
+        offered = {name for name in vars(local) if not name.startswith("_")}
+        assert offered <= vars(remote).keys()
+        assert {"__repr__", "__init__"} <= vars(remote).keys()
+
+
+# Documents
+
+
+def a_param(kind: int, bits: int, *, is_raw: bool, default: Value | None = None) -> Param:
+    value = from_bits(bits, kind, is_raw=is_raw)
+    known = ParamType(kind) if kind <= ParamType.REAL64 else kind
+    return Param("PARAM", value, known, 3, bits, Trust.VERIFIED, default)
+
+
+def through_json(param: Param) -> Param:
+    return param_of(json.loads(json.dumps(ParamDoc.kept(param).as_json(), allow_nan=False)))
+
+
+@given(st.sampled_from([*ParamType]), st.data())
+def test_a_parameter_loses_no_bit_on_the_way(kind: ParamType, data: st.DataObject) -> None:
+    bits = data.draw(st.integers(0, (1 << 8 * kind.size) - 1))
+    param = a_param(kind, bits, is_raw=False)
+    param = a_param(kind, bits, is_raw=False, default=param.value)
+    came = through_json(param)
+    assert came == param
+    assert repr(came.value) == repr(param.value)
+    assert repr(came.default) == repr(param.default)
+    assert came.is_changed is False
+    assert came.trust is Trust.VERIFIED
+
+
+@given(st.sampled_from([1, 6, 8, 77, 255]), st.integers(0, 2**32 - 1))
+def test_raw_bytes_stay_raw(kind: int, bits: int) -> None:
+    param = a_param(kind, bits, is_raw=True)
+    came = through_json(param)
+    assert (came, came.value, came.is_raw) == (param, param.value, True)
+    assert type_name(came.type) == type_name(param.type)
+
+
+@pytest.mark.parametrize("value", [0, -(2**63), 2**64, 2.0, -0.0, 1e300, math.inf, -math.inf, math.nan])
+def test_what_is_written_stays_a_whole_number_or_a_fraction(value: float) -> None:
+    sent = json.loads(json.dumps(value_as_sent(value), allow_nan=False))
+    assert repr(number_of(sent)) == repr(value)
+
+
+def test_raw_bytes_are_written_in_the_order_of_the_message() -> None:
+    assert value_as_sent(b"\x01\x02\x03\x04") == {"raw": "01020304"}
+
+
+# Problems
+
+ERRORS: list[ParamClientError] = [
+    UsageError("nothing such"),
+    UnknownParameter("gone", **WHOM, name="A"),
+    UnknownParameter("gone", **WHOM, index=7),
+    Refused("no", **WHOM, code=5, name="A"),
+    CommandRefused(1, 1, 246, 1),
+    TypeMismatch("no", **WHOM, name="A"),
+    ValueNotApplied("no", **WHOM, name="A", requested=1.5, actual=b"\x01\x02\x03\x04"),
+    ValueNotApplied("no", **WHOM, name="A", requested=3, actual=math.inf),
+    VehicleArmed("no", **WHOM),
+    AnotherVehicle(1, 1, "this", "that"),
+    NoReply("A of 1/1", attempts=4, waited=2.1234),
+    LinkError("gone", link="udpin:0.0.0.0:14550"),
+    CacheError("broken"),
+    InvalidParameters({"A": "is too large", "B": "is no number"}),
+]
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+def test_an_error_is_the_same_on_both_sides(error: ParamClientError) -> None:
+    from paramclient.service.problems import problem_of
+
+    problem = problem_of(error).as_json()
+    came = error_of(json.loads(json.dumps(problem)), status=problem["status"], link="http://h:1")
+    assert type(came) is type(error)
+    assert str(came) == str(error)
+    assert vars(came) == vars(error)
+
+
+def test_a_problem_that_no_exception_stands_behind() -> None:
+    def told(kind: str, status: int) -> ParamClientError:
+        problem = {"type": f"urn:paramclient:{kind}", "detail": "So it is."}
+        return error_of(problem, status=status, link="http://h:1")
+
+    for kind, status in (("forbidden", 403), ("invalid-request", 422), ("ambiguous", 409)):
+        error = told(kind, status)
+        assert type(error) is UsageError
+        assert str(error) == "So it is."
+    assert isinstance(told("unknown-component", 404), NoReply)
+    for kind, status in (("internal", 500), ("too-many", 429)):
+        error = told(kind, status)
+        assert type(error) is LinkError
+        assert str(error) == "http://h:1: So it is."
+    assert str(error_of({}, status=418, link="http://h:1")) == "http://h:1: the service answers 418"
+
+
+# Events
+
+
+def cut(text: bytes, size: int) -> list[str]:
+    reader = EventReader()
+    return [
+        each.decode() for at in range(0, len(text), size) for each in reader.receive(text[at : at + size])
+    ]
+
+
+def test_events_are_read_however_they_are_cut() -> None:
+    text = 'id: r-1\ndata: {"a": "\u2028"}\n\n: \nid: r-1\n\n'
+    text += "event: x\r\ndata: one\r\ndata:two\r\n\r\nretry: 1\n\n"
+    for size in range(1, 60):
+        assert cut(text.encode(), size) == ['{"a": "\u2028"}', "one\ntwo"]
+
+
+def test_an_event_without_end() -> None:
+    reader = EventReader()
+    for _ in range(MOST_EVENT >> 20):
+        reader.receive(b"x" * (1 << 20))
+    with pytest.raises(ValueError, match="without end"):
+        reader.receive(b"x")
+
+
+# Mirrors
+
+
+def param(value: int, trust: Trust = Trust.LIVE, name: str = "A") -> Param:
+    return Param(name, value, ParamType.INT32, 0, value, trust)
+
+
+def shown(mirror: Mirror) -> dict[str, tuple[Value, Trust]]:
+    return {name: (each.value, each.trust) for name, each in mirror.params.items()}
+
+
+def loaded(mirror: Mirror, seq: int, *params: Param) -> list[Change] | None:
+    mirror.begin()
+    return mirror.load(seq, {each.name: each for each in params})
+
+
+def test_what_happened_before_a_snapshot_is_in_it_and_what_came_after_is_added() -> None:
+    mirror = Mirror()
+    mirror.begin()
+    for seq in (4, 5, 6):
+        assert mirror.take(seq, Change("A", None, param(seq))) is None
+    assert mirror.load(5, {"A": param(5)}) == [Change("A", param(5), param(6))]
+    assert shown(mirror) == {"A": (6, Trust.LIVE)}
+    assert mirror.take(6, Change("A", None, param(1))) is None
+    assert mirror.take(7, Change("A", param(6), param(7), "us")) == Change("A", param(6), param(7), "us")
+    assert mirror.take(8, Change("A", param(7), None)) == Change("A", param(7), None)
+    assert shown(mirror) == {}
+
+
+def test_a_first_table_is_no_change_and_a_later_one_tells_what_is_different() -> None:
+    mirror = Mirror()
+    assert loaded(mirror, 1, param(1), param(2, name="B"), param(3, name="C")) == []
+    mirror.doubt()
+    changes = loaded(mirror, 9, param(1, Trust.CACHED), param(5, name="B"), param(6, name="D"))
+    assert changes == [
+        Change("C", param(3, name="C"), None),
+        Change("B", param(2, name="B"), param(5, name="B")),
+        Change("D", None, param(6, name="D")),
+    ]
+    assert list(mirror.params) == ["A", "B", "D"]
+
+
+def test_a_change_of_trust_alone_is_none() -> None:
+    mirror = Mirror()
+    loaded(mirror, 1, param(1, Trust.CACHED))
+    assert mirror.take(2, Change("A", None, param(1, Trust.LIVE))) is None
+    assert shown(mirror) == {"A": (1, Trust.LIVE)}
+    mirror.confirm(param(1, Trust.VERIFIED))
+    assert shown(mirror) == {"A": (1, Trust.VERIFIED)}
+    mirror.confirm(param(2))
+    assert shown(mirror) == {"A": (1, Trust.VERIFIED)}, "what happens is told by events alone"
+
+
+@pytest.mark.parametrize("how", [Mirror.doubt, Mirror.leave])
+def test_what_may_be_old_is_cached(how: Callable[[Mirror], None]) -> None:
+    mirror = Mirror()
+    loaded(mirror, 1, param(1))
+    how(mirror)
+    assert shown(mirror) == {"A": (1, Trust.CACHED)}
+    mirror.confirm(param(1, Trust.LIVE))
+    assert shown(mirror) == {"A": (1, Trust.CACHED)}
+    mirror.resume()
+    is_known = how is Mirror.leave
+    assert shown(mirror) == {"A": (1, Trust.LIVE if is_known else Trust.CACHED)}
+    if not is_known:
+        loaded(mirror, 2, param(1))
+        assert shown(mirror) == {"A": (1, Trust.LIVE)}
+
+
+def test_a_table_that_is_doubted_while_it_is_loaded_is_loaded_again() -> None:
+    mirror = Mirror()
+    mirror.begin()
+    mirror.doubt()
+    assert mirror.load(5, {"A": param(5)}) is None
+    assert not mirror.is_loaded
+    mirror.begin()
+    for seq in range(MOST_WAITING + 1):
+        mirror.take(seq, Change("A", None, param(seq)))
+    assert mirror.load(5, {"A": param(5)}) is None, "more came meanwhile than is kept"
+
+
+@given(st.data())
+def test_a_mirror_has_what_the_service_has(data: st.DataObject) -> None:
+    """Whatever happens there, and whenever the connection drops or the table is loaded."""
+    there: dict[str, Param] = {}
+    log: list[tuple[int, Change]] = []
+    mirror = Mirror()
+    seen = 0
+    snapshot: tuple[int, dict[str, Param]] | None = None
+    steps = st.sampled_from(["happen", "happen", "hear", "begin", "snapshot", "load", "leave", "gap"])
+    for step in data.draw(st.lists(steps, max_size=60)):
+        if step == "happen":
+            name, value = data.draw(st.sampled_from("ABC")), data.draw(st.none() | st.integers(0, 3))
+            old = there.pop(name, None) if value is None else there.get(name)
+            new = None if value is None else param(value, name=name)
+            if new is not None:
+                there[name] = new
+            log.append((len(log) + 1, Change(name, old, new)))
+        elif step == "hear" and seen < len(log):
+            mirror.take(*log[seen])
+            seen += 1
+        elif step == "begin" and not mirror.is_loaded:
+            mirror.begin()
+            snapshot = None
+        elif step == "snapshot":
+            snapshot = len(log), dict(there)
+        elif step == "load" and snapshot is not None and not mirror.is_loaded:
+            mirror.load(*snapshot)
+            snapshot = None
+        elif step == "leave":
+            mirror.leave()
+            assert {trust for _, trust in shown(mirror).values()} <= {Trust.CACHED}
+            mirror.resume()
+        elif step == "gap":
+            mirror.doubt()
+            seen, snapshot = len(log), None
+            assert {trust for _, trust in shown(mirror).values()} <= {Trust.CACHED}
+    if not mirror.is_loaded:
+        mirror.begin()
+        mirror.load(len(log), dict(there))
+    for event in log[seen:]:
+        mirror.take(*event)
+    assert mirror.params == there

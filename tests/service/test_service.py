@@ -1,0 +1,622 @@
+"""The service over HTTP, in this process: what it tells of vehicles, what it does, how it fails."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from paramclient import ParamCache, UsageError
+from paramclient.documents.component import ComponentDoc
+from paramclient.documents.job import JobDoc
+from paramclient.documents.param import ParamDoc
+from paramclient.links import SimLink
+from paramclient.model.values import ParamType
+from paramclient.service import Hub, create_app, followed_component
+from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle, SimParam
+from tests.asgi import a_browser
+from tests.recordings import DATA
+from tests.served import C, met, problem, service
+from tests.shell import VALUES, FlakyLink, Tap, generic, settled, small_px4, swiftly
+
+# links and components
+
+
+@swiftly
+async def test_it_begins_without_a_vehicle_and_with_a_link_that_is_not_there() -> None:
+    link = FlakyLink(generic())
+    link.is_away = True
+    async with service(link, fetches=True) as (_, browser):
+        await asyncio.sleep(3)
+        [told] = (await browser.get("/api/v1/links")).json()["links"]
+        assert told["state"] == "failed"
+        assert "connection refused" in told["error"]
+        assert told["stats"] is None
+        assert (await browser.get("/api/v1/components")).json()["components"] == []
+        assert 3 <= link.openings <= 6  # with back-off
+
+        link.is_away = False
+        found = await met(browser)
+        assert (found["link"], found["system"], found["component"]) == ("tcp:flaky:5760", 1, 1)
+        await asyncio.sleep(5)
+        component = ComponentDoc.model_validate((await browser.get(C)).json())
+        assert component.state == "synced"
+        assert component.params == component.count == len(VALUES)
+        [told] = (await browser.get("/api/v1/links")).json()["links"]
+        assert (told["state"], told["error"], told["openings"]) == ("open", None, 1)
+        assert told["stats"]["round_trips"]["1/1"] > 0
+
+
+@swiftly
+async def test_who_asks_what_is_in_the_cache_of_a_service_that_ends_is_told_so(tmp_path: Path) -> None:
+    with ParamCache(tmp_path / "cache.sqlite3") as cache:
+        async with Hub([small_px4()], cache=cache) as hub, a_browser(create_app(hub)) as browser:
+            assert (await browser.get("/api/v1/vehicles")).status_code == 200
+        async with a_browser(create_app(hub)) as late, asyncio.timeout(60):
+            problem(await late.get("/api/v1/vehicles"), 503, "closing")
+            headers = {"Content-Type": "application/octet-stream"}
+            answer = await late.post("/api/v1/files?name=a.param", content=b"A,1", headers=headers)
+            problem(answer, 503, "closing")
+
+
+@swiftly
+async def test_a_link_that_drops_is_away_until_it_is_back() -> None:
+    link = FlakyLink(generic())
+    async with service(link) as (hub, browser):
+        await met(browser)
+        await link.drop(stays_away=True)
+        await asyncio.sleep(1)
+        assert (await browser.get(C)).json()["link_state"] == "away"
+        link.is_away = False
+        await asyncio.sleep(6)
+        assert (await browser.get(C)).json()["link_state"] == "open"
+        assert [each.state for each in hub.lines.values()] == ["open"]
+
+
+@swiftly
+async def test_a_link_that_fails_for_good_is_opened_with_a_fresh_client() -> None:
+    link = FlakyLink(generic())
+    link.reconnects = False
+    async with service(link) as (hub, browser):
+        await met(browser)
+        await link.drop()
+        await asyncio.sleep(0.1)
+        assert hub.followed == []
+        assert hub.lines[link.name].state == "failed"
+        await met(browser)
+        assert hub.lines[link.name].openings == 2
+
+
+@swiftly
+async def test_a_log_is_followed_to_its_end_and_stays_to_be_looked_at() -> None:
+    name = f"replay:{DATA / 'px4_full_download.tlog'}?speed=0"
+    async with service(name, cache=None, fetches=True) as (hub, browser):
+        found = await met(browser)
+        await asyncio.sleep(20)
+        [told] = (await browser.get("/api/v1/links")).json()["links"]
+        assert (told["state"], told["error"], told["openings"]) == ("ended", None, 1)
+        assert told["listens_only"]
+        assert found["link_state"] in ("open", "ended")
+        assert len((await browser.get(f"{C}/params")).json()["params"]) > 900
+        assert hub.jobs.all == []
+
+
+@swiftly
+async def test_ids_that_two_links_carry_need_the_link_beside_them() -> None:
+    async with service(SimLink(generic(), "sim:a"), SimLink(generic(), "sim:b")) as (_, browser):
+        await met(browser)
+        await asyncio.sleep(2)
+        told = problem(await browser.get(C), 409, "ambiguous")
+        assert told["links"] == ["sim:a", "sim:b"]
+        assert (await browser.get(C, params={"link": "sim:b"})).json()["link"] == "sim:b"
+        problem(await browser.get(C, params={"link": "sim:c"}), 404, "unknown-component")
+        problem(await browser.post("/api/v1/find", json={}, params={"link": "sim:c"}), 404, "unknown-link")
+
+
+@swiftly
+async def test_who_is_not_heard_in_time_is_a_problem_that_says_so() -> None:
+    async with service(SimLink(generic())) as (_, browser):
+        told = problem(
+            await browser.post("/api/v1/find", json={"system": 7, "timeout_s": 2}), 504, "no-reply"
+        )
+        assert told["error"] == "NoReply"
+        assert told["waited"] == pytest.approx(2, abs=0.01)
+        assert "system id 7" in told["detail"]
+        problem(await browser.get("/api/v1/components/7/1"), 404, "unknown-component")
+
+
+@swiftly
+async def test_everybody_is_fetched_on_all_links() -> None:
+    two = Air.symmetric([generic(system=1), generic(system=2)])
+    async with service(SimLink(two, "sim:two"), SimLink(generic(system=3), "sim:one")) as (_, browser):
+        await met(browser)
+        fetched = (await browser.post("/api/v1/fetch", json={})).json()
+        assert sorted((each["link"], each["system"]) for each in fetched["results"]) == [
+            ("sim:one", 3),
+            ("sim:two", 1),
+            ("sim:two", 2),
+        ]
+        assert fetched["silent"] == []
+        only = (await browser.post("/api/v1/fetch", json={"system": 3}, params={"link": "sim:one"})).json()
+        assert [each["system"] for each in only["results"]] == [3]
+
+
+@swiftly
+async def test_a_vehicle_starts_again() -> None:
+    async with service(SimLink(small_px4())) as (_, browser):
+        await met(browser)
+        done = await browser.post(f"{C}/reboot", json={})
+        assert done.status_code == 200, done.text
+        assert done.json()["system"] == 1
+
+
+# parameters
+
+
+@swiftly
+async def test_what_is_known_of_parameters_is_told_as_the_documents_have_it(tmp_path: Path) -> None:
+    """The quick way of writing them says to the letter what the documents would."""
+    async with service(SimLink(ArduPilotVehicle()), cache=tmp_path / "cache") as (hub, browser):
+        await met(browser)
+        assert (await browser.post(f"{C}/fetch", json={})).json()["source"] == "ftp"
+        everything = (await browser.get(f"{C}/params")).json()
+        [followed] = hub.followed
+        assert everything["run"] == hub.feed.run
+        assert list(everything["params"]) == list(followed.component.params)
+        for name, param in followed.component.params.items():
+            told = ParamDoc.kept(param, heard_at=followed.heard_at(name)).as_json()
+            assert everything["params"][name] == told
+            assert told["heard_at"] > 1_700_000_000
+        one = (await browser.get(f"{C}/params/RTL_ALT")).json()
+        assert one == everything["params"]["RTL_ALT"]
+        assert one["trust"] == "live"
+        some = (await browser.get(f"{C}/params", params={"names": ["RTL_*", "ATC_RAT_*"]})).json()["params"]
+        assert some.keys() == {each for each in everything["params"] if each.startswith(("RTL_", "ATC_RAT_"))}
+        changed = (await browser.get(f"{C}/params", params={"changed": True})).json()["params"]
+        assert changed.keys() == followed.component.params.changed().keys()
+        assert changed
+
+
+@swiftly
+async def test_one_is_asked_for_by_name_and_by_index() -> None:
+    vehicle = generic()
+    async with service(SimLink(vehicle)) as (_, browser):
+        await met(browser)
+        problem(await browser.get(f"{C}/params/PARAM_03"), 404, "unknown-parameter")
+        by_name = (await browser.post(f"{C}/params/PARAM_03/read", json={})).json()
+        assert (by_name["value"], by_name["index"]) == (0.75, 3)
+        assert (await browser.post(f"{C}/params/%233/read", json={})).json()["name"] == "PARAM_03"
+        assert (await browser.post(f"{C}/read", json={"index": 3})).json()["name"] == "PARAM_03"
+        assert (await browser.post(f"{C}/read", json={"name": "PARAM_03"})).json()["value"] == 0.75
+        assert (await browser.get(f"{C}/params/PARAM_03")).json()["value"] == 0.75
+        problem(await browser.post(f"{C}/read", json={}), 422, "usage")
+        told = problem(await browser.post(f"{C}/read", json={"name": "NONE"}), 404, "unknown-parameter")
+        assert told["name"] == "NONE"
+        assert vehicle.requests["PARAM_REQUEST_LIST"] == 0
+
+
+@swiftly
+async def test_values_of_every_kind_are_written() -> None:
+    table = [
+        SimParam("F", ParamType.REAL32, 1.0),
+        SimParam("I", ParamType.INT32, 1),
+        SimParam("B", ParamType.UINT8, 1),
+    ]
+    async with service(SimLink(generic(table=table))) as (hub, browser):
+        await met(browser)
+
+        async def put(name: str, value: Any) -> dict[str, Any]:
+            answer = await browser.put(f"{C}/params/{name}", json={"value": value})
+            assert answer.status_code == 200, answer.text
+            done: dict[str, Any] = answer.json()
+            return done
+
+        [followed] = hub.followed
+        known = followed.component.params
+        assert (await put("F", 2.5))["param"]["value"] == 2.5
+        assert (await put("F", "NaN"))["param"]["value"] == "NaN"
+        assert (await put("F", "-Infinity"))["actual"] == "-Infinity"
+        await put("F", {"bits": "3f800000"})
+        assert known["F"].value == 1.0
+        await put("F", {"raw": "00000040"})
+        assert known["F"].value == 2.0
+        await put("I", -7)
+        await put("I", {"bits": "ffffffff"})
+        assert known["I"].value == -1
+        assert (await put("B", {"bits": "000000ff"}))["param"]["value"] == 255
+
+        for name, value in {"B": 256, "I": 0.5, "F": "fast", "b\u00e9": 1}.items():
+            problem(await browser.put(f"{C}/params/{name}", json={"value": value}), 422, "usage")
+        problem(await browser.put(f"{C}/params/B", json={"value": {"bits": "100"}}), 422, "usage")
+        for value in (None, True, [], {}, {"bits": "xyz"}, {"raw": "00"}):
+            answer = await browser.put(f"{C}/params/F", json={"value": value})
+            problem(answer, 422, "invalid-request")
+        assert known["F"].value == 2.0
+
+
+@swiftly
+async def test_of_many_values_each_is_tried_and_told_of() -> None:
+    vehicle = small_px4(param_error=True)
+    async with service(SimLink(vehicle)) as (hub, browser):
+        await met(browser)
+        values = {"PARAM_01": 11, "NOT_THERE": 1, "PARAM_03": 0.5, "PARAM_04": 0.5}
+        results = (await browser.patch(f"{C}/params", json={"values": values})).json()["results"]
+        assert list(results) == list(values)
+        assert results["PARAM_01"]["status"] == "accepted"
+        assert results["PARAM_03"]["actual"] == 0.5
+        assert results["NOT_THERE"]["problem"]["type"] == "urn:paramclient:unknown-parameter"
+        assert results["PARAM_04"]["problem"]["error"] == "UsageError"
+        assert hub.followed[0].component.params["PARAM_01"].value == 11
+        problem(await browser.patch(f"{C}/params", json={"values": {}}), 422, "invalid-request")
+
+
+@swiftly
+async def test_a_write_may_be_watched_or_forced() -> None:
+    async with service(SimLink(PX4Vehicle())) as (_, browser):
+        await met(browser)
+        body = {"value": 80, "settle_s": 1.2}
+        done = (await browser.put(f"{C}/params/MPC_TILTMAX_LND", json=body)).json()
+        assert (done["status"], done["actual"]) == ("adjusted", 45.0)
+        values = {"MPC_XY_CRUISE": 18, "MC_ROLL_P": "NaN"}
+        answer = await browser.patch(f"{C}/params", json={"values": values, "settle_s": 1.2})
+        many = answer.json()["results"]
+        assert many["MPC_XY_CRUISE"]["status"] == "adjusted"
+        assert many["MC_ROLL_P"]["problem"]["error"] == "UsageError"
+        assert "cannot save NaN" in many["MC_ROLL_P"]["problem"]["detail"]
+        forced = await browser.put(f"{C}/params/MC_ROLL_P", json={"value": "NaN", "force": True})
+        assert forced.json()["status"] == "accepted"
+        for settle in (-1, 61, "x"):
+            wrong = {"value": 1, "settle_s": settle}
+            problem(await browser.put(f"{C}/params/MC_ROLL_P", json=wrong), 422, "invalid-request")
+
+
+@swiftly
+async def test_what_a_call_has_changed_is_told_before_it_is_answered() -> None:
+    async with service(SimLink(small_px4())) as (hub, browser):
+        await met(browser)
+        before = hub.feed.listen()
+        done = await browser.put(f"{C}/params/PARAM_01", json={"value": 11})
+        run, _, seq = done.headers["x-seq"].partition("-")
+        assert run == hub.feed.run
+        await asyncio.sleep(0.2)
+        news = await before.next(1)
+        assert news is not None
+        [number] = [
+            number
+            for number, text in news[0].texts
+            if '"type":"change"' in text and json.loads(text)["new"]["value"] == 11
+        ]
+        assert number <= int(seq)
+        params = (await browser.get(f"{C}/params")).json()
+        assert params["seq"] >= number
+
+
+@swiftly
+async def test_how_the_component_stands_after_a_call_is_told_before_it_is_answered() -> None:
+    """Also where it was told a moment before, and would else wait for its turn."""
+    async with service(SimLink(small_px4())) as (hub, browser):
+        await met(browser)
+        await browser.post(f"{C}/fetch", json={})
+        for value in (21, 22, 23):
+            listener = hub.feed.listen()
+            done = await browser.put(f"{C}/params/PARAM_01", json={"value": value})
+            now = (await browser.get(C)).json()["hash"]
+            await asyncio.sleep(0.01)
+            news = await listener.next(1)
+            assert news is not None
+            told = [json.loads(text) for _, text in news[0].texts]
+            last = [each for each in told if each["type"] == "component"][-1]
+            assert last["component_doc"]["hash"] == now
+            assert last["seq"] <= int(done.headers["x-seq"].partition("-")[2])
+
+
+def test_a_value_that_comes_again_is_as_young_as_that(monkeypatch: pytest.MonkeyPatch) -> None:
+    times = iter(range(2_000_000_000, 2_000_000_100))
+
+    @swiftly
+    async def ask() -> None:
+        async with service(SimLink(generic())) as (_, browser):
+            await met(browser)
+
+            async def age() -> float:
+                return float((await browser.get(f"{C}/params/PARAM_01")).json()["heard_at"])
+
+            await browser.post(f"{C}/fetch", json={})
+            first = await age()
+            monkeypatch.setattr(followed_component, "_now", lambda: next(times))
+            await browser.post(f"{C}/fetch", json={"refresh": True})
+            fetched = await age()
+            await browser.post(f"{C}/params/PARAM_01/read", json={})
+            assert first < 2_000_000_000 <= fetched < await age()
+
+    ask()
+
+
+@pytest.mark.parametrize("most_told_singly", [0, 32])
+def test_values_of_before_are_cached_with_their_age_until_the_hash_confirms_them(
+    most_told_singly: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """That their trust has moved is told one by one where they are few, else at once for all."""
+    monkeypatch.setattr(followed_component, "MOST_TOLD_SINGLY", most_told_singly)
+    swiftly(confirm)(most_told_singly, tmp_path)
+
+
+async def confirm(most_told_singly: int, tmp_path: Path) -> None:
+    vehicle = small_px4()
+    with ParamCache(tmp_path / "cache") as cache:
+        async with service(SimLink(vehicle), cache=cache, fetches=True) as (_, browser):
+            await met(browser)
+            await asyncio.sleep(5)
+        assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
+        async with service(SimLink(vehicle), cache=cache, policy="cache-only") as (hub, browser):
+            await met(browser)
+            await asyncio.sleep(2)
+            old = (await browser.get(f"{C}/params/PARAM_01")).json()
+            assert old["trust"] == "cached"
+            kept = cache.component(system=1)
+            assert old["heard_at"] == kept.heard_at["PARAM_01"]
+        async with service(SimLink(vehicle), cache=cache) as (hub, browser):
+            listener = hub.feed.listen()
+            await met(browser)
+            await browser.post(f"{C}/fetch", json={})
+            await asyncio.sleep(1)
+            assert (await browser.get(f"{C}/params/PARAM_01")).json()["trust"] == "verified"
+            news = await listener.next(1)
+            assert news is not None
+            told = [json.loads(text) for _, text in news[0].texts]
+            if most_told_singly:
+                first, moved = [each for each in told if each.get("name") == "PARAM_01"]
+                assert (first["old"], first["new"]["trust"]) == (None, "cached")
+                assert (moved["old"]["trust"], moved["new"]["trust"]) == ("cached", "verified")
+            else:
+                assert {each["count"] for each in told if each["type"] == "params"} == {len(VALUES) + 1}
+                assert len([each for each in told if each.get("name") == "PARAM_01"]) == 1
+        assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
+
+
+# fetches and jobs
+
+
+@swiftly
+async def test_two_who_fetch_at_once_cause_one_download_and_one_may_leave() -> None:
+    vehicle = generic(burst=1, period=0.1)
+    async with service(SimLink(vehicle)) as (hub, browser):
+        await met(browser)
+        first = asyncio.create_task(browser.post(f"{C}/fetch", json={}))
+        second = asyncio.create_task(browser.post(f"{C}/fetch", json={}))
+        await asyncio.sleep(1)
+        first.cancel()
+        await asyncio.sleep(0.5)
+        assert sorted(job.state for job in hub.jobs.all) == ["cancelled", "running"]
+        result = (await second).json()
+        assert result["received"] == len(VALUES)
+        assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
+
+
+@swiftly
+async def test_a_download_that_nobody_waits_for_any_more_stops() -> None:
+    vehicle = generic(burst=1, period=0.2)
+    async with service(SimLink(vehicle)) as (hub, browser):
+        await met(browser)
+        call = asyncio.create_task(browser.post(f"{C}/fetch", json={}))
+        await asyncio.sleep(0.5)
+        assert (await browser.get(C)).json()["fetch"]["received"] > 0
+        call.cancel()
+        await asyncio.sleep(0.1)
+        assert (await browser.get(C)).json()["fetch"] is None
+        assert [job.state for job in hub.jobs.all] == ["cancelled"]
+
+
+@swiftly
+async def test_a_fetch_is_a_job_that_can_be_looked_at_and_cancelled() -> None:
+    async with service(SimLink(generic(burst=1, period=0.1))) as (_, browser):
+        await met(browser)
+        begun = await browser.post(f"{C}/fetch", json={"wait": False})
+        assert begun.status_code == 202
+        place = begun.headers["location"]
+        assert begun.json()["id"] in place
+        await asyncio.sleep(1)
+        running = JobDoc.model_validate((await browser.get(place)).json())
+        assert (running.state, running.kind, running.asked_by) == ("running", "fetch", "local")
+        assert running.progress is not None
+        another = (await browser.post(f"{C}/fetch", json={"wait": False})).headers["location"]
+        assert (await browser.delete(another)).status_code == 204
+        await asyncio.sleep(0.1)
+        cancelled = (await browser.get(another)).json()
+        assert (cancelled["state"], cancelled["problem"]["type"]) == (
+            "cancelled",
+            "urn:paramclient:cancelled",
+        )
+        await asyncio.sleep(5)
+        done = (await browser.get(place)).json()
+        assert done["state"] == "done"
+        assert done["result"]["received"] == len(VALUES)
+        assert [each["state"] for each in (await browser.get("/api/v1/jobs")).json()["jobs"]] == [
+            "done",
+            "cancelled",
+        ]
+        problem(await browser.get("/api/v1/jobs/nonesuch"), 404, "unknown-job")
+        problem(await browser.delete("/api/v1/jobs/nonesuch"), 404, "unknown-job")
+
+
+@swiftly
+async def test_a_fetch_that_fails_says_why() -> None:
+    vehicle = Tap(generic())
+    async with service(SimLink(vehicle)) as (_, browser):
+        await met(browser)
+        vehicle.is_deaf = True
+        told = problem(await browser.post(f"{C}/fetch", json={}), 504, "no-reply")
+        assert told["attempts"] > 1
+        answer = await browser.post(f"{C}/fetch", json={"sample": 0})
+        problem(answer, 422, "invalid-request")
+
+
+@swiftly
+async def test_a_call_whose_client_leaves_is_given_up() -> None:
+    vehicle = Tap(generic())
+    async with service(SimLink(vehicle)) as (hub, browser):
+        await met(browser)
+        vehicle.is_deaf = True
+        call = asyncio.create_task(browser.post(f"{C}/params/PARAM_01/read", json={}))
+        await asyncio.sleep(0.05)
+        machine = hub.followed[0].component._machine
+        assert len(machine.reads) == 1
+        call.cancel()
+        await settled()
+        assert len(machine.reads) == 0
+
+
+# the end
+
+
+@swiftly
+async def test_at_the_end_whoever_waits_is_answered() -> None:
+    vehicle = Tap(generic())
+    hub = Hub([SimLink(vehicle)], cache=False, fetches=False)
+    browser = a_browser(create_app(hub))
+    async with hub:
+        await met(browser)
+        vehicle.is_deaf = True
+        calls = [
+            asyncio.create_task(browser.post(f"{C}/fetch", json={})),
+            asyncio.create_task(browser.put(f"{C}/params/PARAM_01", json={"value": 1})),
+            asyncio.create_task(browser.post("/api/v1/find", json={"system": 9, "timeout_s": None})),
+        ]
+        await asyncio.sleep(0.05)
+    for call in calls:
+        problem(await call, 503, "closing")
+    problem(await browser.get("/api/v1/events"), 503, "closing")
+
+
+# errors
+
+
+@pytest.mark.parametrize(
+    ("method", "path", "body", "status", "kind"),
+    [
+        ("GET", "/nothing/here", None, 404, "not-found"),
+        ("GET", "/page/../app.py", None, 404, "not-found"),
+        ("GET", "/docs/", None, 404, "not-found"),
+        ("DELETE", "/health", None, 405, "method-not-allowed"),
+        ("GET", "/api/v1/components/0/1", None, 422, "invalid-request"),
+        ("GET", "/api/v1/components/x/1", None, 422, "invalid-request"),
+        ("GET", "/api/v1/components/1/1", None, 404, "unknown-component"),
+        ("POST", "/api/v1/find", "{", 422, "invalid-request"),
+        ("POST", "/api/v1/find", '{"sistem": 1}', 422, "invalid-request"),
+        ("POST", "/api/v1/find", '{"timeout_s": -1}', 422, "invalid-request"),
+        ("GET", "/api/v1/events?system=x", None, 422, "invalid-request"),
+    ],
+)
+def test_whatever_cannot_be_done_is_a_problem(
+    method: str, path: str, body: str | None, status: int, kind: str
+) -> None:
+    @swiftly
+    async def ask() -> None:
+        async with service() as (_, browser):
+            headers = {"content-type": "application/json"}
+            problem(await browser.request(method, path, content=body, headers=headers), status, kind)
+
+    ask()
+
+
+@swiftly
+async def test_what_fails_inside_tells_nothing_of_the_inside(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with service() as (hub, browser):
+        monkeypatch.setattr(type(hub), "followed", property(lambda _: dict[str, str]()["the secret"]))
+        told = problem(await browser.get("/api/v1/components"), 500, "internal")
+        assert "secret" not in json.dumps(told)
+        assert "the secret" in caplog.text
+
+
+def test_links_that_cannot_be_are_refused_at_once() -> None:
+    for links in (["udpin:0.0.0.0:99999"], ["sim:px4", "sim:px4"]):
+        with pytest.raises(UsageError):
+            Hub(links, cache=False)
+    with pytest.raises(UsageError):
+        Hub(["sim:px4"], cache=False, policy="often")
+
+
+# the service itself
+
+
+@swiftly
+async def test_its_numbers_are_in_the_format_of_prometheus() -> None:
+    async with service(SimLink(small_px4(), 'sim:"odd\\one"')) as (_, browser):
+        await met(browser)
+        await browser.post(f"{C}/fetch", json={})
+        answer = await browser.get("/metrics")
+        assert answer.headers["content-type"] == "text/plain; version=0.0.4; charset=utf-8"
+        kinds = dict(re.findall(r"^# TYPE (\S+) (\w+)$", answer.text, re.MULTILINE))
+        sample = re.compile(r'(\w+)(\{(\w+="([^"\\\n]|\\[\\"n])*",?)+\})? -?[0-9.e+-]+')
+        numbers = {}
+        for line in answer.text.splitlines():
+            if not line.startswith("#"):
+                found = sample.fullmatch(line)
+                assert found, line
+                assert found[1] in kinds
+                assert (kinds[found[1]] == "counter") == found[1].endswith("_total")
+                numbers[line.rpartition(" ")[0]] = float(line.rpartition(" ")[2])
+        link = r'{link="sim:\"odd\\one\""}'
+        assert numbers[f"paramclient_link_downloads_total{link}"] == 1
+        assert numbers[f'paramclient_component_parameters{link[:-1]},system="1",component="1"}}'] == 25
+
+
+@swiftly
+async def test_health_says_what_may_be_known() -> None:
+    async with service(SimLink(generic(), "sim:a")) as (_, browser):
+        await met(browser)
+        told = (await browser.get("/health")).json()
+        assert told["status"] == "ok"
+        assert told["links"] == [{"name": "sim:a", "state": "open"}]
+
+
+@swiftly
+async def test_the_document_of_the_api_names_everything() -> None:
+    async with service() as (_, browser):
+        document = (await browser.get("/openapi.json")).json()
+        assert document["openapi"].startswith("3.1")
+        assert "HTTPValidationError" not in document["components"]["schemas"]
+        operations = [each for path in document["paths"].values() for each in path.values()]
+        assert all(each["summary"] and each["description"] for each in operations)
+        for each in operations:
+            assert "application/problem+json" in each["responses"]["default"]["content"]
+
+
+@swiftly
+async def test_the_page_of_the_api_needs_nothing_from_elsewhere() -> None:
+    async with service() as (_, browser):
+        page = await browser.get("/docs")
+        assert page.headers["content-type"] == "text/html; charset=utf-8"
+        policy = page.headers["content-security-policy"]
+        assert "default-src 'none'" in policy
+        assert "unsafe" not in policy
+        names = re.findall(r'(?:src|href)="([^"]+)"', page.text)
+        assert names
+        for name in names:
+            if name == "data:,":
+                continue
+            assert name.startswith("/docs/")
+            part = await browser.get(name)
+            assert part.status_code == 200
+            assert "http" not in part.text.replace("http://www.w3.org/", "")
+            assert "innerHTML" not in part.text
+            again = await browser.get(name, headers={"if-none-match": part.headers["etag"]})
+            assert again.status_code == 304
+        assert "<script>" not in page.text
+        assert " on" not in re.sub(r">[^<]*<", "><", page.text)
+
+
+@swiftly
+async def test_every_answer_forbids_a_browser_to_make_a_program_of_it() -> None:
+    async with service() as (hub, browser):
+        for path in ("/health", "/api/v1/components", "/nothing", "/docs", "/metrics"):
+            headers = (await browser.get(path)).headers
+            assert headers["x-content-type-options"] == "nosniff"
+            assert headers["content-security-policy"].startswith("default-src 'none'")
+            assert headers["x-seq"] == str(hub.feed.place)

@@ -1,0 +1,441 @@
+"""What one request may cost the others: limits before anything is parsed, work in threads, quotas."""
+
+from __future__ import annotations
+
+import base64
+import json
+import threading
+import tracemalloc
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import anyio
+import httpx
+import pytest
+from fastapi import FastAPI
+
+from paramclient.documents.component import ComponentsDoc
+from paramclient.documents.diff import DiffDoc
+from paramclient.documents.job import JobsDoc
+from paramclient.errors import FileError, UsageError
+from paramclient.files import loads
+from paramclient.model import comparison as compare_room
+from paramclient.model import patterns
+from paramclient.model.paramset import ParamSet, WrittenParam
+from paramclient.model.patterns import NameChoice
+from paramclient.provision import inspection
+from paramclient.service import (
+    AccessSettings,
+    Hub,
+    Settings,
+    Tokens,
+    answering,
+    create_app,
+    jobs,
+    quota,
+)
+from paramclient.service.answering import written_out
+from paramclient.service.param_sources import LARGEST_UPLOAD, MOST_NAMES, MOST_PATTERNS, MOST_VALUES
+from paramclient.service.quota import LONG_REQUESTS_OF_ONE
+from paramclient.service.reading import MOST_PIECES
+from paramclient.service.routes import params as params_room
+from paramclient.service.routes import setup as setup_room
+from paramclient.sim import GenericVehicle
+from tests.asgi import a_browser
+from tests.served import C, met, problem, service
+from tests.shell import Tap, swiftly, until
+
+TABLE = {f"ABC_{number % 5}_P{number:02}": float(number) for number in range(40)}
+VALUES = {name: value + 1 for name, value in TABLE.items()}
+LARGE = {f"ABC_{number % 50}_P{number:04}": float(number) for number in range(1_500)}
+"""As many parameters as an autopilot has."""
+A_FILE = {"content-type": "application/octet-stream"}
+A_JSON = {"content-type": "application/json"}
+READER = "paramclient files"
+"""The thread in which that is done which requests bring."""
+
+
+@contextmanager
+def peak() -> Iterator[Callable[[], float]]:
+    """Bytes that were in use at the most since the beginning, in MiB."""
+    tracemalloc.start()
+    try:
+        yield lambda: tracemalloc.get_traced_memory()[1] / 2**20
+    finally:
+        tracemalloc.stop()
+
+
+@contextmanager
+def threads_of(monkeypatch: pytest.MonkeyPatch, *calls: tuple[Any, str]) -> Iterator[dict[str, set[str]]]:
+    """The names of the threads in which functions run, by their names."""
+    seen: dict[str, set[str]] = {name: set() for _, name in calls}
+
+    def watched(name: str, function: Any) -> Any:
+        def call(*args: Any, **kwargs: Any) -> Any:
+            seen[name].add(threading.current_thread().name)
+            return function(*args, **kwargs)
+
+        return call
+
+    with monkeypatch.context() as patch:
+        for place, name in calls:
+            patch.setattr(place, name, watched(name, getattr(place, name)))
+        yield seen
+
+
+async def fetched(browser: httpx.AsyncClient) -> None:
+    await met(browser)
+    assert (await browser.post(f"{C}/fetch", json={})).status_code == 200
+
+
+def a_file(text: str, name: str = "a.parm") -> dict[str, Any]:
+    return {"file": {"name": name, "text": text}}
+
+
+# Patterns
+
+
+def test_an_exact_name_is_looked_up_and_never_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    compared: list[str] = []
+
+    def translate(text: str) -> str:
+        compared.append(text)
+        return "x"
+
+    monkeypatch.setattr(patterns, "translate", translate)
+    choice = NameChoice([*TABLE, "A*", "B?", "[C]"])
+    assert compared == ["A*", "B?", "[C]"]
+    assert choice.choose(TABLE.keys())[0] == TABLE.keys()
+
+
+def test_names_and_patterns_choose_as_the_shell_does() -> None:
+    names = ["MC_ROLL_P", "MC_PITCH_P", "SERVO1_TRIM", "SERVO12_TRIM", "A[1]"]
+    assert NameChoice(["MC_*", "SERVO?_TRIM"]).choose(names) == ({*names[:3]}, "")
+    assert NameChoice(["MC_ROLL_P", "A[[]1]"]).choose(names) == ({"MC_ROLL_P", "A[1]"}, "")
+    assert NameChoice(["mc_*", "X", "MC_*"]).choose(names) == ({*names[:2]}, "X or mc_*")
+    many = NameChoice([f"X{number:02}" for number in range(30)]).choose(names)[1]
+    assert many.endswith("X19 (and 10 more)")
+    assert not NameChoice([]).has("A")
+    wanted = ParamSet({name: WrittenParam(name, 1) for name in names})
+    with pytest.raises(UsageError, match=r"no parameter is called MC_ROL$"):
+        wanted.only(["MC_ROL", "MC_PITCH_P"])
+
+
+@swiftly
+async def test_a_request_has_few_patterns_and_many_names(monkeypatch: pytest.MonkeyPatch) -> None:
+    many = [f"A*{number}" for number in range(10_000)]
+    few = ["ABC_*", *[f"*{number % 40:02}" for number in range(MOST_PATTERNS - 1)]]
+    async with service(GenericVehicle(table=TABLE)) as (_, browser):
+        await fetched(browser)
+        for path, member in (("diff", "only"), ("plan", "only"), ("plan", "include"), ("verify", "include")):
+            body = {"wanted": {"values": VALUES}, member: many}
+            told = problem(await browser.post(f"{C}/{path}", json=body), 422, "invalid-request")
+            assert f"at most {MOST_PATTERNS} of them may be patterns" in told["detail"]
+            body = {"wanted": {"values": VALUES}, member: [*few, *TABLE]}
+            assert (await browser.post(f"{C}/{path}", json=body)).status_code == 200
+        body = {"wanted": {"values": VALUES}, "only": [f"A{number}" for number in range(MOST_NAMES + 1)]}
+        told = problem(await browser.post(f"{C}/diff", json=body), 422, "invalid-request")
+        assert str(MOST_NAMES) in told["detail"]
+        told = problem(
+            await browser.post("/api/v1/fleet/diff", json={"names": many[:500]}), 422, "invalid-request"
+        )
+        assert f"at most {MOST_PATTERNS}" in told["detail"]
+
+        with threads_of(monkeypatch, (params_room, "NameChoice")) as seen:
+            answer = await browser.get(f"{C}/params", params={"names": few})
+            assert answer.json()["params"].keys() == TABLE.keys()
+        assert seen == {"NameChoice": {"paramclient service"}}
+        query = {"names": many[: MOST_PATTERNS + 1]}
+        problem(await browser.get(f"{C}/params", params=query), 422, "invalid-request")
+
+
+# Sizes
+
+
+BODIES: list[tuple[str, bytes]] = [
+    ("unknown members", b"{" + b",".join(b'"a%d":0' % number for number in range(250_000)) + b"}"),
+    ("empty objects", b'{"wanted":[' + b",".join([b"{}"] * 900_000) + b"]}"),
+    ("values", json.dumps({"wanted": {"values": dict.fromkeys(range(110_000), 1)}}).encode()),
+    ("brackets", b"[" * 3_000_000),
+]
+
+
+@pytest.mark.parametrize(("_", "body"), BODIES, ids=[name for name, _ in BODIES])
+@swiftly
+async def test_what_has_too_many_values_is_not_parsed(
+    _: str, body: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with service(GenericVehicle(table=TABLE)) as (_hub, browser):
+        await fetched(browser)
+        with threads_of(monkeypatch, (json, "loads")) as seen:
+            answer = await browser.post(f"{C}/diff", content=body, headers=A_JSON)
+        assert seen == {"loads": set()}
+        assert problem(answer, 413, "too-large")["most"] == MOST_PIECES
+
+
+FILES: list[tuple[str, bytes]] = [
+    ("a.json", b'{"paramclient":1,"sets":[' + b",".join([b"{}"] * 690_000) + b"]}"),
+    ("a.yaml", b"paramclient: 1\nsets: [" + b",".join([b"{}"] * 690_000) + b"]\n"),
+    ("a.yaml", b"paramclient: 1\nsets:\n" + b"- \n" * 690_000),
+    ("a.parm", b"A 1\n" * 500_000),
+]
+
+
+@pytest.mark.parametrize(("name", "data"), FILES)
+@swiftly
+async def test_a_file_with_too_many_values_is_not_read(name: str, data: bytes) -> None:
+    """As it is, and in a body: with line ends and brackets it is the file that has too many."""
+    assert len(data) <= LARGEST_UPLOAD
+    coded = {"file": {"name": name, "base64": base64.b64encode(data).decode()}}
+    async with service(GenericVehicle(table=TABLE)) as (_, browser):
+        await fetched(browser)
+        with peak() as used:
+            answer = await browser.post(f"/api/v1/files?name={name}", content=data, headers=A_FILE)
+            assert problem(answer, 413, "too-large")["most"] == MOST_PIECES
+            answer = await browser.post(f"{C}/plan", json={"wanted": coded})
+            assert problem(answer, 413, "too-large")["most"] == MOST_PIECES
+            assert used() < 40
+
+
+@swiftly
+async def test_nobody_wants_more_values_than_a_vehicle_has() -> None:
+    unknown = {f"U{number}": number for number in range(60_000)}
+    text = "".join(f"U{number} 1\n" for number in range(MOST_VALUES + 1))
+    vehicle = Tap(GenericVehicle(table=TABLE))
+    async with service(vehicle) as (_, browser):
+        await fetched(browser)
+        vehicle.heard.clear()
+        answer = await browser.post(f"{C}/plan", json={"wanted": {"values": unknown}})
+        assert problem(answer, 413, "too-large")["most"] == MOST_PIECES
+        few = dict(list(unknown.items())[: MOST_VALUES + 1])
+        answer = await browser.post(f"{C}/plan", json={"wanted": {"values": few}})
+        assert str(MOST_VALUES) in problem(answer, 422, "invalid-request")["detail"]
+        for path in ("plan", "verify", "diff"):
+            told = problem(await browser.post(f"{C}/{path}", json={"wanted": a_file(text)}), 413, "too-large")
+            assert told["most"] == MOST_VALUES
+        answer = await browser.post("/api/v1/files?name=a.parm", content=text.encode(), headers=A_FILE)
+        assert problem(answer, 413, "too-large")["most"] == MOST_VALUES
+        assert not vehicle.heard, "the vehicle is asked for none of them"
+
+
+@swiftly
+async def test_what_a_vehicle_has_is_within_all_limits() -> None:
+    """The page sends a whole file in base64, with the names that were chosen; programs send values."""
+    text = "".join(f"{name},{value + 1}\n" for name, value in LARGE.items())
+    coded = {"file": {"name": "a.param", "base64": base64.b64encode(text.encode()).decode()}}
+    chosen = {"only": [*LARGE], "include": [*LARGE]}
+    async with service(GenericVehicle(table=LARGE)) as (_, browser):
+        await fetched(browser)
+        planned = await browser.post(f"{C}/plan", json={"wanted": coded, **chosen})
+        assert planned.json()["counts"]["set"] == len(LARGE)
+        bits = {"values": {name: {"bits": "40d00000"} for name in LARGE}}
+        compared = await browser.post(f"{C}/diff", json={"wanted": bits, "full": True})
+        assert len(compared.json()["params"]) == len(LARGE)
+
+
+# Errors, one by one
+
+
+@pytest.mark.parametrize(
+    ("path", "body", "where"),
+    [
+        ("diff", {f"a{number}": 0 for number in range(40_000)}, "body.a0"),
+        ("diff", {"wanted": {f"a{number}": 0 for number in range(40_000)}}, "body.wanted.a0"),
+        ("plan", {"wanted": {"values": {"A": 1}}, "only": [{}] * 25_000}, "body.only.0"),
+        ("restore", {"include": [[]] * 9_000}, "body.include.0"),
+    ],
+)
+@swiftly
+async def test_of_many_faults_of_one_kind_the_first_is_told(
+    path: str, body: dict[str, Any], where: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with service(GenericVehicle(table=TABLE)) as (_, browser):
+        await fetched(browser)
+        with threads_of(monkeypatch, (json, "loads")) as seen:
+            answer = await browser.post(f"{C}/{path}", content=json.dumps(body).encode(), headers=A_JSON)
+        places = [fault["where"] for fault in problem(answer, 422, "invalid-request")["faults"]]
+        assert [place for place in places if place.startswith(where.rstrip("0"))] == [where]
+        assert READER in seen["loads"]
+
+
+@swiftly
+async def test_of_many_wrong_values_a_part_is_looked_at() -> None:
+    body = json.dumps({"wanted": {"values": {f"A{number}": [] for number in range(5_000)}}}).encode()
+    async with service(GenericVehicle(table=TABLE)) as (_, browser):
+        await fetched(browser)
+        with peak() as used:
+            answer = await browser.post(f"{C}/plan", content=body, headers=A_JSON)
+            told = problem(answer, 422, "invalid-request")
+            assert used() < 4
+        assert told["faults"][0]["where"].startswith("body.wanted.values.A0")
+
+
+MANY = 3_000
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("a.json", '{"paramclient":1,"sets":[' + ",".join(["{}"] * MANY) + "]}"),
+        ("a.yaml", "paramclient: 1\nsets: [" + ",".join(["{}"] * MANY) + "]\n"),
+        ("a.json", '{"paramclient":1,"sets":[{' + ",".join(f'"A{n}":0' for n in range(MANY)) + "}]}"),
+        (
+            "a.json",
+            '{"paramclient":1,"sets":[{"params":{' + ",".join(f'"A{n}":{{}}' for n in range(MANY)) + "}}]}",
+        ),
+        (
+            "a.yaml",
+            "paramclient: 1\nsets:\n- identity: {" + ", ".join(f"a{n}: 0" for n in range(MANY)) + "}\n",
+        ),
+    ],
+    ids=["empty sets, JSON", "empty sets, YAML", "unknown members", "empty parameters", "unknown identity"],
+)
+def test_the_faults_of_a_document_are_counted_and_not_kept(name: str, text: str) -> None:
+    data = text.encode()
+    with peak() as used:
+        with pytest.raises(FileError) as caught:
+            loads(data, source=name)
+        assert used() < 2
+    lines = str(caught.value).splitlines()
+    assert len(lines) <= 21
+    assert lines[-1].startswith("and ")
+    assert int(lines[-1].split()[1]) >= MANY - 20
+
+
+def test_a_document_in_yaml_takes_as_much_memory_as_its_values() -> None:
+    rows = "".join(f"      A{number}: {{value: {number}, type: INT32}}\n" for number in range(1_000))
+    data = f"paramclient: 1\nsets:\n  - params:\n{rows}".encode()
+    with peak() as used:
+        [read] = loads(data, source="a.yaml").sets
+        assert used() < 1.5
+    assert len(read) == 1_000
+
+
+# Threads
+
+
+@swiftly
+async def test_what_takes_long_is_done_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    text = f"# {'long ' * 1_000}\n" + "".join(f"{name},{value}\n" for name, value in VALUES.items())
+    calls = (
+        *((json, "loads"), (setup_room, "compare"), (answering, "written_out")),
+        *((inspection, "plan"), (NameChoice, "choose")),
+    )
+    async with service(GenericVehicle(table=TABLE)) as (_, browser):
+        await fetched(browser)
+        with threads_of(monkeypatch, *calls) as seen:
+            for path in ("diff", "plan", "verify"):
+                body = json.dumps({"wanted": a_file(text, "a.param"), "only": ["ABC_*"]}).encode()
+                answer = await browser.post(f"{C}/{path}", content=body, headers=A_JSON)
+                assert answer.status_code == 200
+        assert {name: threads for name, threads in seen.items() if threads != {READER}} == {}
+
+
+@swiftly
+async def test_the_document_of_the_api_is_made_once_and_in_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    async with service() as (_, browser):
+        with threads_of(monkeypatch, (FastAPI, "openapi")) as seen:
+            documents = [(await browser.get("/openapi.json")).content for _ in range(2)]
+            assert seen == {"openapi": {"paramclient service"}}
+        with threads_of(monkeypatch, (FastAPI, "openapi")) as seen:
+            documents.append((await browser.get("/openapi.json")).content)
+            assert seen == {"openapi": set()}
+        assert len(set(documents)) == 1
+
+
+def test_a_document_is_written_as_pydantic_writes_it() -> None:
+    def of(count: int, add: float) -> ParamSet:
+        return ParamSet({f"A{each}": WrittenParam(f"A{each}", each + add) for each in range(count)})
+
+    for count in (0, 3, 500):
+        document = DiffDoc.of(compare_room.compare(of(count, 0.5), of(count + 1, 1.5)), everything=True)
+        assert written_out(document) == document.model_dump_json().encode()
+    assert written_out(JobsDoc(jobs=[])) == b'{"jobs":[]}'
+    assert written_out(ComponentsDoc(run="a", seq=1, components=[])) == b'{"run":"a","seq":1,"components":[]}'
+
+
+# Quotas
+
+
+TOKENS = Tokens.of_text("anna write anna-may-write-0123456789\nben read ben-may-read-0123456789ab")
+
+
+def bearer(token: str) -> dict[str, str]:
+    return {"Authorization": f"Bearer {token}"}
+
+
+ANNA = bearer("anna-may-write-0123456789")
+BEN = bearer("ben-may-read-0123456789ab")
+
+
+@swiftly
+async def test_jobs_have_a_quota_for_each_holder() -> None:
+    vehicle = Tap(GenericVehicle(table=TABLE))
+    settings = Settings(access=AccessSettings(tokens=TOKENS))
+    async with (
+        Hub([vehicle], cache=False, fetches=False) as hub,
+        a_browser(create_app(hub, settings)) as browser,
+    ):
+        body = {"wait": False}
+        await browser.post("/api/v1/find", json={}, headers=BEN)
+        vehicle.is_deaf = True
+        statuses = [
+            (await browser.post(f"{C}/fetch", json=body, headers=BEN)).status_code for _ in range(256)
+        ]
+        assert statuses == [202] * jobs.MOST_OF_ONE + [429] * (256 - jobs.MOST_OF_ONE)
+        told = problem(await browser.post(f"{C}/fetch", json=body, headers=BEN), 429, "too-many")
+        assert told["most"] == jobs.MOST_OF_ONE
+        others = await browser.post(f"{C}/fetch", json=body, headers=ANNA)
+        assert others.status_code == 202
+        hub.begin_fetch(hub.find(1, 1), "service")
+        listed = (await browser.get("/api/v1/jobs", headers=ANNA)).json()["jobs"]
+        assert len(listed) == jobs.MOST_OF_ONE + 2
+        own = next(job["id"] for job in listed if job["asked_by"].startswith("ben"))
+        await browser.delete(f"/api/v1/jobs/{own}", headers=BEN)
+        await until(lambda: hub.jobs.find(own).state == "cancelled")
+        assert (await browser.post(f"{C}/fetch", json=body, headers=BEN)).status_code == 202
+
+
+@swiftly
+async def test_plans_have_a_quota_for_each_holder_and_for_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without tokens an address is the holder."""
+    vehicle = Tap(GenericVehicle(table=TABLE))
+    body = {"wanted": {"values": {"A": 1}}, "timeout_s": 20}
+    async with service(vehicle) as (hub, browser), a_browser(create_app(hub), client=("::1", 1)) as other:
+        await fetched(browser)
+        vehicle.is_deaf = True
+        answers: list[int] = []
+
+        async def ask(client: httpx.AsyncClient) -> None:
+            answers.append((await client.post(f"{C}/plan", json=body)).status_code)
+
+        async with anyio.create_task_group() as tasks:
+            for _ in range(LONG_REQUESTS_OF_ONE):
+                tasks.start_soon(ask, browser)
+            await anyio.sleep(0.5)
+            assert not answers, "they wait for the vehicle"
+            for path in ("plan", "diff", "verify"):
+                told = problem(await browser.post(f"{C}/{path}", json=body), 429, "too-many")
+                assert told["most"] == LONG_REQUESTS_OF_ONE
+            dry = {**body, "dry_run": True}
+            problem(await browser.post(f"{C}/apply", json=dry), 429, "too-many")
+            problem(await browser.post("/api/v1/files", content=b"A 1\n", headers=A_FILE), 429, "too-many")
+            read = await other.post("/api/v1/files", content=b"A 1\n", headers=A_FILE)
+            assert read.status_code == 200
+            assert (await browser.get(f"{C}/params")).status_code == 200
+            monkeypatch.setattr(hub, "long_requests", quota.Quota("requests", most=0, most_of_one=1))
+            problem(await other.post("/api/v1/files", content=b"A 1\n", headers=A_FILE), 429, "too-many")
+        assert answers == [504] * LONG_REQUESTS_OF_ONE
+
+
+@swiftly
+async def test_a_list_of_jobs_has_their_results() -> None:
+    async with service(GenericVehicle(table=TABLE)) as (_, browser):
+        await fetched(browser)
+        answer = await browser.post(f"{C}/apply", json={"wanted": {"values": VALUES}})
+        assert answer.status_code == 200
+        [first, last] = (await browser.get("/api/v1/jobs")).json()["jobs"]
+        assert (first["kind"], last["kind"]) == ("fetch", "apply")
+        assert last["result"] == answer.json()
+        assert (await browser.get(f"/api/v1/jobs/{last['id']}")).json() == last

@@ -1,0 +1,508 @@
+"""What befalls simulated vehicles: dead indices, broken lists, reboots, other stations, satellite links."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from functools import partial
+
+import pytest
+
+from paramclient.errors import UsageError
+from paramclient.model.values import Encoding, ParamType
+from paramclient.protocol import wire
+from paramclient.sim import (
+    Air,
+    ArduPilotVehicle,
+    FaultyLink,
+    GenericVehicle,
+    OtherStation,
+    PX4Vehicle,
+    SimParam,
+    Vehicle,
+)
+from tests.ground import LIST, SIGNS_OF_LIFE, SMALL, Station, cast, indices, names, read, write
+from tests.simulation import Simulation
+
+NO_INDEX = wire.NO_INDEX
+TEN = {f"P{number}": number for number in range(10)}
+CLOCK_REQUEST = wire.CommandLong(1, 1, wire.MAV_CMD_REQUEST_MESSAGE, (float(wire.SYSTEM_TIME_ID), *[0.0] * 6))
+EVERY_KIND = pytest.mark.parametrize("kind", [GenericVehicle, PX4Vehicle, ArduPilotVehicle])
+
+
+def listed(station: Station, seconds: float = 0.5) -> list[int]:
+    """The indices that come of a list."""
+    return [index for index in indices(station.ask(LIST, seconds=seconds)) if index != NO_INDEX]
+
+
+@pytest.mark.parametrize(
+    "make",
+    [
+        lambda: GenericVehicle(TEN, dead=["NO_SUCH"]),
+        lambda: GenericVehicle(TEN, dead=[-1]),
+        lambda: GenericVehicle(TEN, dead=[65535]),
+        lambda: GenericVehicle(TEN, list_stops_at=-1),
+        lambda: GenericVehicle(TEN, list_stops=-1),
+        lambda: GenericVehicle(TEN, list_stops=math.nan),
+        lambda: GenericVehicle(TEN).when_listed(0, list),
+        lambda: OtherStation(system=0),
+        lambda: OtherStation(component=256),
+        lambda: OtherStation(list_every=0.0),
+        lambda: OtherStation(list_every=math.nan),
+        lambda: OtherStation(sets=[(-1.0, SimParam("A", ParamType.INT32, 1))]),
+        lambda: OtherStation(sets=[(math.inf, SimParam("A", ParamType.INT32, 1))]),
+    ],
+)
+def test_what_cannot_be(make: Callable[[], object]) -> None:
+    with pytest.raises(UsageError):
+        make()
+
+
+@EVERY_KIND
+class TestDead:
+    def test_neither_listed_nor_read_but_counted(self, kind: Callable[..., Vehicle]) -> None:
+        vehicle = kind(table=TEN, dead=[3, "P7", 500], param_error=True)
+        station = Station(vehicle)
+        values = station.ask(LIST, seconds=0.5)
+        listed = [value.param_index for value in values if value.param_index != NO_INDEX]
+        assert listed == [0, 1, 2, 4, 5, 6, 8, 9]
+        assert {value.param_count for value in values} == {10}
+        dead = [read(index=3), read("P3"), read(index=7), read("P7")]
+        assert not station.ask(*dead, seconds=0.5)
+        station.send(*dead).wait(0.5)
+        assert not station.heard(wire.ParamError)
+        assert len(station.ask(read(index=2), read("P6"))) == 2
+        assert len(vehicle.params) == 10
+
+    def test_a_set_is_answered(self, kind: Callable[..., Vehicle]) -> None:
+        vehicle = kind(table=TEN, dead=["P7"])
+        request = cast("P7", 70) if kind is ArduPilotVehicle else write("P7", 70, ParamType.INT32)
+        assert set(names(Station(vehicle).ask(request))) == {"P7"}
+        assert vehicle.values["P7"] == 70
+
+
+def test_an_index_stays_dead_when_others_move_there() -> None:
+    vehicle = PX4Vehicle(table=TEN, dead=[3], not_in_use=["P0"])
+    station = Station(vehicle)
+    assert "P4" not in names(station.ask(LIST))
+    vehicle.use("P0")
+    values = station.ask(LIST)
+    assert "P3" not in names(values)
+    assert "P4" in names(values)
+
+
+def test_dead_reads_take_no_place_among_those_of_a_slot() -> None:
+    station = Station(ArduPilotVehicle(table=TEN, dead=[0, 1]))
+    assert indices(station.ask(*(read(index=index) for index in range(7)), seconds=0.15)) == [2, 3, 4, 5, 6]
+
+
+@EVERY_KIND
+class TestListStops:
+    def test_once(self, kind: Callable[..., Vehicle]) -> None:
+        station = Station(kind(table=TEN, list_stops_at=4))
+        assert listed(station) == [0, 1, 2, 3]
+        assert indices(station.ask(read(index=8))) == [8]
+        assert listed(station) == list(range(10))
+
+    def test_several_times(self, kind: Callable[..., Vehicle]) -> None:
+        station = Station(kind(table=TEN, list_stops_at=4, list_stops=2))
+        assert [len(listed(station)) for _ in range(4)] == [4, 4, 10, 10]
+
+    def test_always_also_after_a_reboot(self, kind: Callable[..., Vehicle]) -> None:
+        vehicle = kind(table=TEN, list_stops_at=4, list_stops=math.inf)
+        station = Station(vehicle)
+        for _ in range(5):
+            assert len(listed(station)) == 4
+            vehicle.reboot(station.now)
+
+    def test_from_the_start(self, kind: Callable[..., Vehicle]) -> None:
+        station = Station(kind(table=TEN, list_stops_at=0))
+        assert listed(station) == []
+        assert len(listed(station)) == 10
+
+    def test_it_counts_from_the_start_of_each_list(self, kind: Callable[..., Vehicle]) -> None:
+        """Asked for again in mid-stream, the list has all its values before it once more."""
+        vehicle = kind(table=TEN, list_stops_at=4, burst=1, period=0.01)
+        station = Station(vehicle).send(LIST)
+        while len(station.times()) < 3:
+            station.wait(0.005)
+        assert listed(station, 1.0)[-4:] == [0, 1, 2, 3]
+
+
+def test_px4_gives_its_hash_before_a_list_that_stops() -> None:
+    station = Station(PX4Vehicle(table=TEN, list_stops_at=2))
+    assert names(station.ask(LIST)) == ["_HASH_CHECK", "P0", "P1"]
+    assert names(station.ask(LIST))[:2] == ["_HASH_CHECK", "P0"]
+
+
+def test_a_list_that_ends_there_by_itself_has_not_stopped() -> None:
+    vehicle = PX4Vehicle(table=TEN, not_in_use=["P9"], list_stops_at=9)
+    station = Station(vehicle)
+    assert len(listed(station)) == 9
+    vehicle.use("P9")
+    assert [len(listed(station)) for _ in range(2)] == [9, 10]
+
+
+class TestWhenListed:
+    @EVERY_KIND
+    def test_a_value_changes_in_mid_stream(self, kind: Callable[..., Vehicle]) -> None:
+        vehicle = kind(table=TEN, burst=1)
+        vehicle.when_listed(4, lambda: vehicle.set_param("P1", 100))
+        vehicle.when_listed(4, lambda: vehicle.set_param("P8", 800))
+        values = Station(vehicle).ask(LIST, seconds=0.5)
+        first = {value.param_index: value.raw for value in reversed(values)}
+        before, after = vehicle.param("P1"), vehicle.param("P8")
+        assert (before.value, after.value) == (100, 800)
+        encoding = Encoding.C_CAST if kind is ArduPilotVehicle else Encoding.BYTEWISE
+        assert first[1] == write("P1", 1, ParamType.INT32, cast=encoding is Encoding.C_CAST).raw
+        assert first[8] == write("P8", 800, ParamType.INT32, cast=encoding is Encoding.C_CAST).raw
+
+    def test_once_and_at_its_count(self) -> None:
+        vehicle = GenericVehicle(TEN, burst=1)
+        seen: list[float] = []
+        vehicle.when_listed(3, lambda: seen.append(len(vehicle.data_to_send())))
+        vehicle.receive(wire.encode(LIST, system=255, component=190, sequence=0), 0.0)
+        vehicle.tick(1.0)
+        assert seen == [3 + len(SIGNS_OF_LIFE) * 2]
+        vehicle.receive(wire.encode(LIST, system=255, component=190, sequence=0), 1.0)
+        vehicle.tick(2.0)
+        assert len(seen) == 1
+
+    def test_the_count_rises_and_falls(self) -> None:
+        vehicle = ArduPilotVehicle(
+            table=TEN | {"Q_ENABLE": 0, "R": 5}, groups={"Q_ENABLE": {"Q_A": 1, "Q_B": 2}}, burst=1
+        )
+        vehicle.when_listed(3, lambda: vehicle.set_param("Q_ENABLE", 1))
+        vehicle.when_listed(12, lambda: vehicle.set_param("Q_ENABLE", 0))
+        values = Station(vehicle).ask(LIST, seconds=1.0)
+        assert [count for count, _ in Counter(value.param_count for value in values).items()] == [12, 14]
+        stream = [value for value in values if value.param_index != NO_INDEX]
+        assert names(stream) == [*TEN, "Q_ENABLE", "Q_A", "R"]
+        assert indices(stream) == list(range(13))
+
+    def test_a_parameter_comes_into_use(self) -> None:
+        vehicle = PX4Vehicle(table=TEN, not_in_use=["P0"], burst=1)
+        vehicle.when_listed(4, lambda: vehicle.use("P0"))
+        values = Station(vehicle).ask(LIST, seconds=1.0)[1:]
+        assert [value.param_count for value in values] == [9] * 4 + [10] * 6
+        assert names(values) == ["P1", "P2", "P3", "P4", "P4", "P5", "P6", "P7", "P8", "P9"]
+
+    @EVERY_KIND
+    @pytest.mark.parametrize("down", [0.0, 2.0, math.inf])
+    def test_a_reboot_in_mid_stream(self, kind: Callable[..., Vehicle], down: float) -> None:
+        vehicle = kind(table=TEN, burst=1)
+        vehicle.when_listed(6, lambda: vehicle.reboot(down=down))
+        station = Station(vehicle).wait(1.5).send(LIST).wait(0.5)
+        assert max(value.param_index for value in station.values() if value.param_index < 10) == 4
+        beats = station.wait(4.0).heard(wire.Heartbeat)
+        assert len(beats) == {0.0: 4, 2.0: 3, math.inf: 0}[down]
+        assert (len(listed(station)) == 10) == (down < math.inf)
+
+
+@EVERY_KIND
+class TestSwitchingOn:
+    def test_the_heartbeat_starts_with_the_vehicle(self, kind: Callable[..., Vehicle]) -> None:
+        vehicle = kind(table=TEN)
+        station = Station(vehicle, start=100.0).wait(2.5)
+        assert len(station.heard(wire.Heartbeat)) == 3
+        vehicle.reboot(station.now, down=0.7)
+        assert len(station.wait(2.0).heard(wire.Heartbeat)) == 2
+
+    def test_the_heartbeat_says_that_it_boots(self, kind: Callable[..., Vehicle]) -> None:
+        vehicle = kind(table=TEN, boot_time=2.5)
+        station = Station(vehicle).wait(4.5)
+        beats = station.heard(wire.Heartbeat)
+        ready = beats[-1].system_status
+        assert ready in (3, 4)
+        assert [beat.system_status for beat in beats] == [1, 1, 1, ready, ready]
+        vehicle.reboot(station.now)
+        assert station.wait(0.5).heard(wire.Heartbeat)[0].system_status == 1
+
+    def test_without_a_boot_time_it_is_ready_at_once(self, kind: Callable[..., Vehicle]) -> None:
+        beats = Station(kind(table=TEN)).heard(wire.Heartbeat)
+        assert beats[0].system_status != wire.MAV_STATE_BOOT
+
+
+class TestClock:
+    def test_system_time_starts_with_the_vehicle(self) -> None:
+        vehicle = GenericVehicle(table=TEN)
+        station = Station(vehicle, start=100.0).wait(2.5)
+        assert [time.time_boot_ms for time in station.heard(wire.SystemTime)] == [0, 1000, 2000]
+        vehicle.reboot(station.now, down=0.7)
+        times = station.wait(2.0).heard(wire.SystemTime)
+        assert times == [wire.SystemTime(0, 0), wire.SystemTime(0, 1000)]
+
+    @pytest.mark.parametrize("kind", [GenericVehicle, ArduPilotVehicle])
+    def test_telemetry_carries_it(self, kind: Callable[..., Vehicle]) -> None:
+        vehicle = kind(table=TEN, telemetry=10.0)
+        vehicle.tick(5.0)
+        clock: list[int] = []
+        for step in range(1, 40):
+            if step == 25:
+                vehicle.reboot(5.0 + step / 10 + 0.01)
+            vehicle.tick(5.0 + step / 10 + 0.01)
+            for data in vehicle.data_to_send():
+                (frame,) = wire.Framer().receive(data)
+                if frame.message_id == 30:
+                    clock.append(int.from_bytes(frame.payload[:4], "little"))
+        assert clock[:3] == pytest.approx([110, 210, 310], abs=1)
+        falls = [at for at in range(1, len(clock)) if clock[at] < clock[at - 1]]
+        assert len(falls) == 1
+        assert clock[falls[0]] == pytest.approx(100, abs=1)
+
+    def test_it_has_32_bits(self) -> None:
+        station = Station(GenericVehicle(table=TEN, telemetry=1.0))
+        station.now = 2.0**32 / 1000 + 5.0
+        (time,) = station.wait(0.0).heard(wire.SystemTime)[1:]
+        assert time.time_boot_ms == 5000
+
+    @pytest.mark.parametrize(("kind", "asked"), [("copter", [True]), ("plane", []), ("rover", [])])
+    def test_ardupilot_tells_it_when_its_main_loop_runs(self, kind: str, asked: list[bool]) -> None:
+        """A Copter on request alone; what is requested earlier is acknowledged, and sent then."""
+        vehicle = ArduPilotVehicle(table=TEN, kind=kind)
+        station = Station(vehicle).wait(5.5)
+        unasked = [time.time_boot_ms for time in station.heard(wire.SystemTime)]
+        assert unasked == ([] if asked else [2000, 3000, 4000, 5000])
+        vehicle.reboot(station.now, down=1.0)
+        station.wait(1.2)
+        station.log.clear()
+        station.send(CLOCK_REQUEST).wait(1.1)
+        assert [message.result for message in station.heard(wire.CommandAck)] == [wire.MAV_RESULT_ACCEPTED]
+        assert [time.time_boot_ms for time in station.wait(0.2).heard(wire.SystemTime)] == [1400]
+        station.send(CLOCK_REQUEST).wait(0.001)
+        assert [time.time_boot_ms for time in station.heard(wire.SystemTime)] == [1500]
+
+    def test_px4_tells_it_with_its_telemetry(self) -> None:
+        vehicle = PX4Vehicle(table=TEN)
+        vehicle.tick(10.0)
+        vehicle.receive(wire.encode(CLOCK_REQUEST, system=255, component=190, sequence=0), 10.1)
+        for second in (11.0, 12.0, 12.5):
+            vehicle.tick(second)
+        frames = [frame for data in vehicle.data_to_send() for frame in wire.Framer().receive(data)]
+        clocks = [int.from_bytes(frame.payload[:4], "little") for frame in frames if frame.message_id == 30]
+        assert clocks == [300, 1300, 2300]
+        assert wire.SYSTEM_TIME_ID not in {frame.message_id for frame in frames}
+
+    @pytest.mark.parametrize(
+        ("make", "first", "then"),
+        [
+            (PX4Vehicle, 0, 3),
+            (ArduPilotVehicle, 4, 3),
+            (partial(ArduPilotVehicle, kind="plane"), 2, 3),
+            (partial(ArduPilotVehicle, kind="rover"), 2, 4),
+        ],
+    )
+    def test_the_state_after_a_restart(self, make: Callable[..., Vehicle], first: int, then: int) -> None:
+        vehicle = make(table=TEN)
+        station = Station(vehicle).wait(3.5)
+        assert {beat.system_status for beat in station.heard(wire.Heartbeat)} == {then}
+        vehicle.reboot(station.now)
+        states = [beat.system_status for beat in station.wait(5.0).heard(wire.Heartbeat)]
+        assert states[0] == first
+        assert states[-1] == then
+        assert states == sorted(states, key=[first, then].index)
+
+
+def test_after_a_reboot_in_mid_stream_px4_counts_anew() -> None:
+    vehicle = PX4Vehicle(table=TEN, not_in_use=["P5"], burst=1)
+    station = Station(vehicle)
+    vehicle.use("P5")
+    before = vehicle.announced_hash()
+    vehicle.when_listed(5, lambda: vehicle.reboot(down=1.0))
+    assert {value.param_count for value in station.ask(LIST, seconds=2.0)} == {10}
+    assert {value.param_count for value in station.ask(LIST, seconds=2.0)} == {9}
+    assert vehicle.announced_hash() != before
+
+
+class TestRepeatedNames:
+    TABLE = (
+        SimParam("CAMERA_EXPOSURE_", ParamType.INT32, 1),
+        SimParam("GAIN", ParamType.INT32, 5),
+        SimParam("CAMERA_EXPOSURE_", ParamType.REAL32, 2.0),
+    )
+
+    @EVERY_KIND
+    def test_only_where_they_are_asked_for(self, kind: Callable[..., Vehicle]) -> None:
+        with pytest.raises(UsageError):
+            kind(table=self.TABLE)
+
+    @EVERY_KIND
+    def test_each_has_its_index_and_the_first_its_name(self, kind: Callable[..., Vehicle]) -> None:
+        vehicle = kind(table=self.TABLE, repeated_names=True)
+        first, last = (0, 1) if kind is PX4Vehicle else (0, 2)
+        station = Station(vehicle)
+        values = [value for value in station.ask(LIST, seconds=0.5) if value.param_index != NO_INDEX]
+        assert names(values) == [param.name for param in vehicle.listed]
+        assert [value.param_index for value in values if value.param_id != "GAIN"] == [first, last]
+        by_index = station.ask(read(index=first), read(index=last), seconds=0.5)
+        assert [value.param_type for value in by_index] == [ParamType.INT32, ParamType.REAL32]
+        (by_name,) = station.ask(read("CAMERA_EXPOSURE_"))
+        assert by_name.param_type == ParamType.INT32
+        assert vehicle.params["CAMERA_EXPOSURE_"] == vehicle.param("CAMERA_EXPOSURE_") == vehicle.listed[0]
+        assert vehicle.values == {"CAMERA_EXPOSURE_": 1, "GAIN": 5}
+
+    def test_a_set_means_the_first(self) -> None:
+        vehicle = GenericVehicle(self.TABLE, repeated_names=True)
+        Station(vehicle).ask(write("CAMERA_EXPOSURE_", 9, ParamType.INT32))
+        assert [param.value for param in vehicle.listed] == [9, 5, 2.0]
+
+
+def test_two_components_with_the_same_names_do_not_mix() -> None:
+    autopilot = GenericVehicle(TEN, autopilot=wire.MAV_AUTOPILOT_PX4)
+    camera = GenericVehicle({name: value + 100 for name, value in TEN.items()}, component=100)
+    station = Station(Air([autopilot, camera])).send(wire.ParamRequestList(1, 0)).wait(1.0)
+    found: dict[int, list[int]] = {1: [], 100: []}
+    for _, frame, message in station.log:
+        if isinstance(message, wire.ParamValue):
+            found[frame.component].append(int.from_bytes(message.raw, "little"))
+    assert found == {1: list(TEN.values()), 100: [value + 100 for value in TEN.values()]}
+    assert station.send(write("P1", 7, ParamType.INT32, component=100)).wait(0.1)
+    assert (autopilot.values["P1"], camera.values["P1"]) == (1, 7)
+
+    world = Simulation(autopilot, camera)
+    world.until(lambda: {(1, 1), (1, 100)} <= world.station.components.keys())
+    world.run(3.0)
+    fetches = [machine.begin_fetch(world.now) for machine in world.station.components.values()]
+    for fetch in fetches:
+        world.outcome(fetch)
+    for vehicle in (autopilot, camera):
+        table = world.station.components[1, vehicle.component].table
+        assert {name: param.value for name, param in table.params.items()} == vehicle.values
+        assert table.complete
+
+
+class TestHighLatency:
+    @EVERY_KIND
+    def test_one_message_every_5_s(self, kind: Callable[..., Vehicle]) -> None:
+        station = Station(kind(table=TEN, high_latency=True, telemetry=50.0)).wait(12.0)
+        assert [time for time, _, _ in station.log] == [0.0, 5.0, 10.0]
+        ours = Station(kind(table=TEN)).heard(wire.Heartbeat)[0]
+        assert station.heard(wire.HighLatency2) == [wire.HighLatency2(ours.type, ours.autopilot)] * 3
+
+    @EVERY_KIND
+    def test_on_and_off_in_flight(self, kind: Callable[..., Vehicle]) -> None:
+        vehicle = kind(table=TEN, telemetry=2.0)
+        station = Station(vehicle).wait(3.5)
+        assert vehicle.high_latency is False
+        vehicle.high_latency = True
+        station.log.clear()
+        station.wait(7.0)
+        assert [time for time, _, _ in station.log] == [3.5, 8.5]
+        vehicle.high_latency = False
+        station.log.clear()
+        station.wait(1.2)
+        beats = [time for time, _, message in station.log if isinstance(message, wire.Heartbeat)]
+        assert beats == [10.5, 11.5]
+
+    def test_the_telemetry_that_was_not_sent_does_not_come_later(self) -> None:
+        vehicle = GenericVehicle(TEN, telemetry=50.0)
+        vehicle.tick(0.0)
+        vehicle.high_latency = True
+        vehicle.tick(60.0)
+        vehicle.data_to_send()
+        vehicle.high_latency = False
+        vehicle.tick(60.1)
+        ids = [frame.message_id for data in vehicle.data_to_send() for frame in wire.Framer().receive(data)]
+        assert ids == [0, 2, *[30] * 6]
+
+    @EVERY_KIND
+    def test_it_outlives_a_reboot(self, kind: Callable[..., Vehicle]) -> None:
+        vehicle = kind(table=TEN, high_latency=True)
+        station = Station(vehicle).wait(1.0)
+        vehicle.reboot(1.0, down=1.0)
+        assert {type(message) for _, _, message in station.wait(9.0).log} == {wire.HighLatency2}
+
+    @EVERY_KIND
+    def test_reads_are_answered_and_the_list_waits(self, kind: Callable[..., Vehicle]) -> None:
+        vehicle = kind(table=TEN, high_latency=True)
+        station = Station(vehicle)
+        assert indices(station.ask(read(index=3))) == [3]
+        assert listed(station, 30.0) == []
+        vehicle.high_latency = False
+        found = [index for index in indices(station.ask(seconds=0.5)) if index != NO_INDEX]
+        assert found == list(range(10))
+
+    def test_a_list_that_had_begun_goes_on_at_its_pace(self) -> None:
+        vehicle = GenericVehicle(TEN, burst=1, period=0.1)
+        vehicle.when_listed(4, lambda: setattr(vehicle, "high_latency", True))
+        station = Station(vehicle)
+        assert listed(station, 5.0) == [0, 1, 2, 3]
+        vehicle.high_latency = False
+        station.wait(2.0)
+        assert station.times() == pytest.approx([5.0 + step / 10 for step in range(6)])
+
+    def test_px4_pushes_nothing_meanwhile(self) -> None:
+        vehicle = PX4Vehicle(table=TEN, high_latency=True, autosave=60.0)
+        station = Station(vehicle)
+        assert len(station.ask(write("P1", 5, ParamType.INT32), seconds=20.0)) == 1
+        vehicle.high_latency = False
+        assert names(station.ask()) == ["P1"]
+
+
+class TestOtherStation:
+    def test_it_restarts_the_list(self) -> None:
+        vehicle = PX4Vehicle()
+        air = Air([vehicle], others=[OtherStation(list_every=0.3)])
+        values = Station(air).ask(LIST, seconds=1.0)
+        assert indices(values).count(0) == 4
+        assert vehicle.requests["PARAM_REQUEST_LIST"] == 4
+
+    def test_everybody_hears_it(self) -> None:
+        vehicles = [GenericVehicle(SMALL, system=1), GenericVehicle(SMALL, system=2)]
+        setting = SimParam("B_INT", ParamType.INT32, 8)
+        other = OtherStation(target_system=2, list_every=1.0, sets=[(2.5, setting), (0.5, setting)])
+        station = Station(Air(vehicles, others=[other])).wait(3.2)
+        assert [vehicle.requests["HEARTBEAT"] for vehicle in vehicles] == [4, 4]
+        assert vehicles[1].requests == {"HEARTBEAT": 4, "PARAM_REQUEST_LIST": 3, "PARAM_SET": 2}
+        assert (vehicles[0].values["B_INT"], vehicles[1].values["B_INT"]) == (7, 8)
+        heard = [(time, frame, message) for time, frame, message in station.log if frame.system == 254]
+        assert [(time, type(message)) for time, _, message in heard] == [
+            (0.0, wire.Heartbeat),
+            (0.5, wire.ParamSet),
+            (1.0, wire.Heartbeat),
+            (1.0, wire.ParamRequestList),
+            (2.0, wire.Heartbeat),
+            (2.0, wire.ParamRequestList),
+            (2.5, wire.ParamSet),
+            (3.0, wire.Heartbeat),
+            (3.0, wire.ParamRequestList),
+        ]
+        assert [frame.sequence for _, frame, _ in heard] == list(range(9))
+        assert wire.ParamSet(2, 1, "B_INT", b"\x08\0\0\0", ParamType.INT32) in [each[2] for each in heard]
+
+    def test_its_values_in_the_encoding_of_the_vehicle(self) -> None:
+        vehicle = ArduPilotVehicle()
+        row = SimParam("RTL_ALT", ParamType.INT32, 2000)
+        Station(Air([vehicle], others=[OtherStation(sets=[(0.5, row)], encoding=Encoding.C_CAST)])).wait(1.0)
+        assert vehicle.values["RTL_ALT"] == 2000
+
+    def test_it_shares_the_links(self) -> None:
+        other = OtherStation(list_every=0.001)
+        uplink = FaultyLink(rate=1000.0, queue=100)
+        vehicle = GenericVehicle(SMALL)
+        Station(Air([vehicle], uplink=uplink, others=[other])).wait(0.9).send(read("B_INT")).wait(1.0)
+        assert uplink.lost
+        assert vehicle.requests.keys() == {"HEARTBEAT", "PARAM_REQUEST_LIST"}
+        lossy = Air.symmetric([GenericVehicle(SMALL)], loss=1.0, others=[OtherStation(list_every=0.1)])
+        assert Station(lossy).wait(5.0).log == []
+
+    def test_a_late_call_makes_up_for_nothing(self) -> None:
+        other = OtherStation(list_every=0.5)
+        assert other.next_deadline() is None
+        other.tick(0.0)
+        assert other.next_deadline() == 0.5
+        other.tick(1000.0)
+        assert len(other.data_to_send()) == 1 + 2
+        assert other.data_to_send() == []
+        assert other.next_deadline() == 1000.5
+
+    def test_our_station_takes_it_for_no_vehicle(self) -> None:
+        vehicle = PX4Vehicle(table=TEN)
+        other = OtherStation(list_every=0.7, sets=[(2.0, SimParam("P1", ParamType.INT32, 50))])
+        world = Simulation(air=Air.symmetric([vehicle], delay=0.05, others=[other]))
+        result = world.fetch()
+        assert not result.missing
+        world.run(5.0)
+        assert {name: param.value for name, param in world.machine.table.params.items()} == vehicle.values
+        assert vehicle.values["P1"] == 50

@@ -1,0 +1,519 @@
+"""MAVFTP of the simulated vehicles, one request at a time, and what they do not do."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import pytest
+
+from paramclient.errors import FileErrorCode, UsageError
+from paramclient.model.values import ParamType, crc32_px4
+from paramclient.protocol import wire
+from paramclient.protocol.ftp import param_pck
+from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.ftp.param_pck import PackedParam
+from paramclient.sim import Air, ArduPilotVehicle, GenericVehicle, PX4Vehicle, SimParam, Vehicle
+
+PARAMS = b"@PARAM/param.pck"
+
+
+class Pilot:
+    """A ground station that asks one thing after the other, each with its own number."""
+
+    def __init__(self, vehicle: Vehicle, *, component: int = 190) -> None:
+        self.vehicle = vehicle
+        self.component = component
+        self.now = 0.0
+        self.sequence = 0
+        self.framer = wire.Framer(stream=False)
+        vehicle.tick(0.0)
+        vehicle.data_to_send()
+
+    def send(self, packet: Packet) -> None:
+        self.vehicle.receive(file_request(packet, component=self.component), self.now)
+
+    def listen(self, seconds: float) -> list[Packet]:
+        """What comes in so long a time."""
+        end = self.now + seconds
+        heard = []
+        while (due := self.vehicle.next_deadline()) is not None and due <= end:
+            self.now = max(due, self.now)
+            self.vehicle.tick(self.now)
+            for data in self.vehicle.data_to_send():
+                (frame,) = self.framer.receive(data)
+                message = wire.decode(frame)
+                if isinstance(message, wire.FileTransfer):
+                    assert (message.target_system, message.target_component) == (255, self.component)
+                    heard.append(Packet.unpack(message.payload))
+        self.now = end
+        return heard
+
+    def ask(
+        self, opcode: Opcode, data: bytes = b"", *, session: int = 3, offset: int = 0, size: int = 0
+    ) -> Packet:
+        """One request, and its only answer."""
+        self.sequence += 2
+        self.send(Packet(self.sequence, session, opcode, data, size, offset))
+        (answer,) = self.listen(0.1)
+        assert answer.sequence == self.sequence + 1
+        assert answer.requested == opcode
+        return answer
+
+    def burst(self, *, session: int = 3, offset: int = 0, size: int = MOST_DATA) -> list[Packet]:
+        self.sequence += 2
+        self.send(Packet(self.sequence, session, Opcode.BURST_READ_FILE, size=size, offset=offset))
+        self.sequence += 10_000
+        return self.listen(10.0)
+
+
+def file_request(packet: Packet, *, component: int = 190) -> bytes:
+    message = wire.FileTransfer(0, 1, 1, packet.pack())
+    return wire.encode(message, system=255, component=component, sequence=0)
+
+
+def refusal(answer: Packet) -> tuple[int, ...]:
+    assert answer.opcode == Opcode.NAK
+    return tuple(answer.data)
+
+
+def test_a_file_is_read_in_a_burst_to_its_end() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    content = bytes(range(256)) * 3
+    pilot.vehicle.files["logs/1.bin"] = content
+    opened = pilot.ask(Opcode.OPEN_FILE_RO, b"logs/1.bin")
+    assert (opened.opcode, opened.session, opened.data) == (Opcode.ACK, 3, (768).to_bytes(4, "little"))
+    *blocks, end = pilot.burst()
+    assert [each.offset for each in blocks] == [0, 239, 478, 717]
+    assert b"".join(each.data for each in blocks) == content
+    assert refusal(end) == (FileErrorCode.EOF,)
+    assert end.offset == 768
+    sequences = [each.sequence for each in (*blocks, end)]
+    assert sequences == list(range(sequences[0], sequences[0] + 5))
+
+
+def test_single_reads_go_anywhere() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    pilot.vehicle.files["a"] = b"abcdefgh"
+    pilot.ask(Opcode.OPEN_FILE_RO, b"a")
+    assert pilot.ask(Opcode.READ_FILE, offset=2, size=3).data == b"cde"
+    assert pilot.ask(Opcode.READ_FILE, offset=6, size=30).data == b"gh"
+    assert refusal(pilot.ask(Opcode.READ_FILE, offset=8, size=30)) == (FileErrorCode.EOF,)
+
+
+def test_the_parameters_must_be_read_by_one_size() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    assert pilot.ask(Opcode.OPEN_FILE_RO, PARAMS).data == (12 * 1382).to_bytes(4, "little")
+    first = pilot.ask(Opcode.READ_FILE, size=100).data
+    assert first == param_pck.encode(packed(pilot.vehicle), read_size=100)[:100]
+    assert refusal(pilot.ask(Opcode.READ_FILE, size=101)) == (FileErrorCode.FAIL_ERRNO, 22)
+    assert pilot.ask(Opcode.READ_FILE, size=100).data == first
+    assert len(pilot.burst(size=100)) == 1 + -(
+        -len(param_pck.encode(packed(pilot.vehicle), read_size=100)) // 100
+    )
+
+
+def packed(vehicle: Vehicle) -> list[PackedParam]:
+    return [PackedParam(each.name, ParamType(each.type), each.bits, None) for each in vehicle.params.values()]
+
+
+def content_of(pilot: Pilot, query: bytes) -> param_pck.Pack:
+    pilot.ask(Opcode.OPEN_FILE_RO, PARAMS + query)
+    data = b"".join(each.data for each in pilot.burst() if each.opcode == Opcode.ACK)
+    pilot.ask(Opcode.TERMINATE_SESSION)
+    return param_pck.decode(data)
+
+
+def test_a_part_of_the_parameters() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    everything = packed(pilot.vehicle)
+    assert content_of(pilot, b"?start=5&count=3") == param_pck.Pack(tuple(everything[5:8]), 1382, False)
+    assert content_of(pilot, b"?start=1380") == param_pck.Pack(tuple(everything[1380:]), 1382, False)
+    assert len(content_of(pilot, b"?count=9999").entries) == 1382
+
+
+@pytest.mark.parametrize("query", [b"?start=1382", b"?withdefaults=2", b"?count=x", b"?start=70000"])
+def test_queries_that_cannot_be(query: bytes) -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, PARAMS + query)) == (FileErrorCode.FAIL_ERRNO, 22)
+
+
+def test_the_file_is_made_of_what_the_vehicle_holds_at_the_moment() -> None:
+    pilot = Pilot(ArduPilotVehicle(live_period=0.0))
+    before = {each.name: each for each in content_of(pilot, b"?withdefaults=1").entries}
+    pilot.vehicle.set_param("RTL_ALT", 1234.0)
+    pilot.vehicle.set_param("COMPASS_DEC", 0.0)
+    after = {each.name: each for each in content_of(pilot, b"?withdefaults=1").entries}
+    assert before["RTL_ALT"].default is None
+    assert after["RTL_ALT"].default == before["RTL_ALT"].bits
+    assert before["COMPASS_DEC"].default == 0
+    assert after["COMPASS_DEC"].default is None
+
+
+def test_a_value_that_is_almost_the_default_counts_as_it() -> None:
+    rows = [
+        SimParam("A", ParamType.REAL32, 1e-7, default=0.0),
+        SimParam("B", ParamType.REAL32, 2e-7, default=0.0),
+        SimParam("C", ParamType.REAL32, 1500.1, default=1500.1),
+        SimParam("D", ParamType.INT32, 16777217, default=16777216.0),
+        SimParam("E", ParamType.INT8, 3),
+    ]
+    entries = content_of(Pilot(ArduPilotVehicle(table=rows)), b"?withdefaults=1").entries
+    assert [each.default for each in entries] == [None, 0, None, None, None]
+
+
+def test_a_table_that_no_file_can_hold_has_none() -> None:
+    pilot = Pilot(ArduPilotVehicle(table={"A": (ParamType.UINT16, 1)}))
+    assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, PARAMS)) == (FileErrorCode.FILE_NOT_FOUND,)
+
+
+def test_a_file_is_written_and_stands_when_it_is_closed() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    pilot.vehicle.files["a"] = b"old and long"
+    assert pilot.ask(Opcode.CREATE_FILE, b"a").opcode == Opcode.ACK
+    assert pilot.ask(Opcode.WRITE_FILE, b"cd", offset=2).offset == 2
+    pilot.ask(Opcode.WRITE_FILE, b"ab")
+    assert refusal(pilot.ask(Opcode.READ_FILE, size=3)) == (FileErrorCode.FAIL,)
+    assert pilot.vehicle.files["a"] == b"old and long"
+    assert pilot.ask(Opcode.TERMINATE_SESSION).opcode == Opcode.ACK
+    assert pilot.vehicle.files["a"] == b"abcd"
+    assert refusal(pilot.ask(Opcode.WRITE_FILE, b"x")) == (FileErrorCode.FILE_NOT_FOUND,)
+
+
+def upload(pilot: Pilot, data: bytes) -> Packet:
+    assert pilot.ask(Opcode.CREATE_FILE, PARAMS).opcode == Opcode.ACK
+    for at in range(0, len(data), 200):
+        assert pilot.ask(Opcode.WRITE_FILE, data[at : at + 200], offset=at).opcode == Opcode.ACK
+    return pilot.ask(Opcode.TERMINATE_SESSION)
+
+
+def test_parameters_are_set_by_a_file_when_it_is_closed() -> None:
+    pilot = Pilot(ArduPilotVehicle(read_only=["RTL_SPEED"]))
+    rows = [
+        PackedParam("RTL_ALT", ParamType.REAL32, 0x449A4000),  # 1234, for an INT16 or an INT32
+        PackedParam("STAT_RESET", ParamType.INT32, 16777217),
+        PackedParam("RTL_SPEED", ParamType.INT16, 7),
+        PackedParam("COMPASS_DEC", ParamType.REAL32, 0x7FC00000),
+        PackedParam("EK2_ENABLE", ParamType.INT8, 1),
+        PackedParam("NOT_THERE", ParamType.INT8, 1),
+    ]
+    speed, declination = (pilot.vehicle.param(name).bits for name in ("RTL_SPEED", "COMPASS_DEC"))
+    assert upload(pilot, param_pck.encode_upload(rows)).opcode == Opcode.ACK
+    assert pilot.vehicle.param("RTL_ALT").value == 1234
+    assert pilot.vehicle.param("STAT_RESET").value == 16777217
+    assert pilot.vehicle.param("RTL_SPEED").bits == speed
+    assert pilot.vehicle.param("COMPASS_DEC").bits == declination
+    assert len(pilot.vehicle.params) == 1434
+
+
+def test_a_file_that_is_none_sets_nothing() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    before = pilot.vehicle.values
+    data = param_pck.encode_upload([PackedParam("RTL_ALT", ParamType.INT16, 5)])
+    assert refusal(upload(pilot, data[:-1])) == (FileErrorCode.FAIL_ERRNO, 22)
+    assert pilot.vehicle.values == before
+
+
+def test_directories_and_checksums() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    pilot.vehicle.files.update({"logs/1.bin": b"abc", "logs/old/2.bin": b"", "x": b"y"})
+    assert pilot.ask(Opcode.LIST_DIRECTORY, b"logs").data == b"F1.bin\t3\0Dold\0"
+    assert pilot.ask(Opcode.LIST_DIRECTORY, b"logs/", offset=1).data == b"Dold\0"
+    assert refusal(pilot.ask(Opcode.LIST_DIRECTORY, b"logs", offset=2)) == (FileErrorCode.EOF,)
+    assert refusal(pilot.ask(Opcode.LIST_DIRECTORY, b"log")) == (FileErrorCode.FILE_NOT_FOUND,)
+    assert pilot.ask(Opcode.LIST_DIRECTORY, b"").data == b"Dlogs\0Fx\t1\0"
+    checksum = pilot.ask(Opcode.CALC_FILE_CRC32, b"logs/1.bin")
+    assert int.from_bytes(checksum.data, "little") == crc32_px4(b"abc")
+    assert refusal(pilot.ask(Opcode.CALC_FILE_CRC32, b"nothing")) == (FileErrorCode.FILE_NOT_FOUND,)
+
+
+def test_what_it_cannot_do() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    pilot.send(Packet(1, 3, 12))
+    (answer,) = pilot.listen(1.0)
+    assert refusal(answer) == (FileErrorCode.UNKNOWN_COMMAND,)
+    assert answer.requested == 12
+
+
+def test_a_long_directory_comes_in_pieces() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    names = [f"file{number:03d}" for number in range(60)]
+    pilot.vehicle.files.update(dict.fromkeys((f"d/{name}" for name in names), b""))
+    heard: list[bytes] = []
+    while (answer := pilot.ask(Opcode.LIST_DIRECTORY, b"d", offset=len(heard))).opcode == Opcode.ACK:
+        assert len(answer.data) <= MOST_DATA
+        heard += answer.data.split(b"\0")[:-1]
+    assert heard == [f"F{name}\t0".encode() for name in names]
+
+
+class TestSessions:
+    def test_ardupilot_has_one(self) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.vehicle.files["a"] = b"a"
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
+        assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)) == (FileErrorCode.FAIL,)
+        assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4)) == (FileErrorCode.INVALID_SESSION,)
+        assert refusal(pilot.ask(Opcode.READ_FILE, session=4, size=1)) == (FileErrorCode.INVALID_SESSION,)
+        assert refusal(pilot.ask(Opcode.WRITE_FILE, b"x", session=4)) == (FileErrorCode.INVALID_SESSION,)
+        assert pilot.ask(Opcode.RESET_SESSIONS, session=4).opcode == Opcode.ACK
+        assert pilot.ask(Opcode.READ_FILE, session=3, size=1).data == b"a"
+        assert pilot.ask(Opcode.RESET_SESSIONS, session=3).opcode == Opcode.ACK
+        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
+
+    @pytest.mark.parametrize("opcode", [Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS])
+    def test_ardupilot_acknowledges_to_others_and_closes_nothing(self, opcode: Opcode) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.vehicle.files["a"] = b"a"
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
+        assert pilot.ask(opcode, session=4).opcode == Opcode.ACK
+        assert pilot.vehicle.open_files == ["a"]
+        assert pilot.ask(opcode, session=3).opcode == Opcode.ACK
+        assert pilot.vehicle.open_files == []
+        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
+
+    @pytest.mark.parametrize(
+        "opcode",
+        [Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE, Opcode.LIST_DIRECTORY, Opcode.CALC_FILE_CRC32],
+    )
+    def test_ardupilot_has_one_for_all_stations(self, opcode: Opcode) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.vehicle.files["a"] = b"a"
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
+        other = Pilot(pilot.vehicle, component=191)
+        other.now = pilot.now
+        assert refusal(other.ask(opcode, b"a", session=4)) == (FileErrorCode.INVALID_SESSION,)
+        assert other.ask(Opcode.READ_FILE, session=3, size=1).data == b"a"
+
+    def test_ardupilot_gives_up_one_after_3_s_without_an_answer(self) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.vehicle.files["a"] = b"a"
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
+        pilot.listen(2.85)
+        assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4)) == (FileErrorCode.INVALID_SESSION,)
+        pilot.listen(2.95)
+        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
+        assert refusal(pilot.ask(Opcode.READ_FILE, session=3, size=1)) == (FileErrorCode.INVALID_SESSION,)
+
+    def test_ardupilot_is_kept_from_giving_it_up_by_each_refusal(self) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.vehicle.files["a"] = b"a"
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
+        for _ in range(20):
+            pilot.listen(0.4)
+            answer = pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4)
+            assert refusal(answer) == (FileErrorCode.INVALID_SESSION,)
+
+    def test_what_is_written_stands_when_the_session_is_given_up(self) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.ask(Opcode.CREATE_FILE, b"a", session=3)
+        pilot.ask(Opcode.WRITE_FILE, b"abc", session=3)
+        pilot.listen(3.0)
+        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
+        assert pilot.vehicle.files["a"] == b"abc"
+
+    @pytest.mark.parametrize(("path", "texts"), [(b"a", 0), (PARAMS, 3), (PARAMS + b"?withdefaults=1", 3)])
+    def test_ardupilot_sends_its_banner_with_the_parameters(self, path: bytes, texts: int) -> None:
+        vehicle = ArduPilotVehicle()
+        vehicle.files["a"] = b"a"
+        vehicle.tick(0.0)
+        vehicle.receive(file_request(Packet(2, 3, Opcode.OPEN_FILE_RO, path)), 0.0)
+        vehicle.tick(0.1)
+        framer = wire.Framer(stream=False)
+        frames = [frame for data in vehicle.data_to_send() for frame in framer.receive(data)]
+        assert sum(isinstance(wire.decode(frame), wire.StatusText) for frame in frames) == texts
+
+    def test_px4_closes_one_after_11_s(self) -> None:
+        pilot = Pilot(PX4Vehicle())
+        pilot.vehicle.files["a"] = b"a"
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
+        pilot.listen(10.5)
+        assert pilot.ask(Opcode.READ_FILE, session=0, size=1).data == b"a"
+        pilot.listen(11.0)
+        assert refusal(pilot.ask(Opcode.READ_FILE, session=0, size=1)) == (FileErrorCode.INVALID_SESSION,)
+        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a").opcode == Opcode.ACK
+
+    def test_px4_numbers_its_own(self) -> None:
+        pilot = Pilot(PX4Vehicle(ftp=True))
+        pilot.vehicle.files["a"] = b"a"
+        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3).session == 0
+        assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4)) == (
+            FileErrorCode.NO_SESSIONS_AVAILABLE,
+        )
+        assert refusal(pilot.ask(Opcode.TERMINATE_SESSION, session=3)) == (FileErrorCode.INVALID_SESSION,)
+        assert pilot.ask(Opcode.TERMINATE_SESSION, session=0).opcode == Opcode.ACK
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
+        assert pilot.ask(Opcode.RESET_SESSIONS, session=9).opcode == Opcode.ACK
+        assert pilot.ask(Opcode.OPEN_FILE_RO, b"a").opcode == Opcode.ACK
+
+    def test_a_reboot_closes_all(self) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.vehicle.files["a"] = bytes(5000)
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
+        pilot.send(Packet(90, 3, Opcode.BURST_READ_FILE, size=239))
+        assert pilot.listen(0.05)
+        pilot.vehicle.reboot(pilot.now)
+        assert pilot.listen(1.0) == []
+        assert refusal(pilot.ask(Opcode.READ_FILE, size=1)) == (FileErrorCode.FILE_NOT_FOUND,)
+
+
+class TestPace:
+    def test_a_request_that_comes_again_gets_the_same_answer(self) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.vehicle.files["a"] = b"a"
+        request = Packet(7, 3, Opcode.OPEN_FILE_RO, b"a")
+        pilot.send(request)
+        pilot.send(request)
+        first, second = pilot.listen(0.1)
+        assert first == second
+        assert first.opcode == Opcode.ACK
+        other = Pilot(pilot.vehicle, component=191)
+        other.now = pilot.now
+        other.send(request)
+        (answer,) = other.listen(0.1)
+        assert refusal(answer) == (FileErrorCode.FAIL,)
+
+    def test_five_requests_wait_and_more_are_dropped(self) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.vehicle.files["a"] = bytes(5000)
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
+        for number in range(8):
+            pilot.send(Packet(100 + 2 * number, 3, Opcode.READ_FILE, size=10, offset=10 * number))
+        assert [each.offset for each in pilot.listen(1.0)] == [0, 10, 20, 30, 40]
+
+    def test_what_comes_while_a_burst_runs_waits_for_its_end(self) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.vehicle.files["a"] = bytes(5000)
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
+        pilot.send(Packet(100, 3, Opcode.BURST_READ_FILE, size=239))
+        assert pilot.listen(0.03)
+        pilot.send(Packet(200, 3, Opcode.READ_FILE, size=239))
+        *_, end, answer = pilot.listen(1.0)
+        assert refusal(end) == (FileErrorCode.EOF,)
+        assert answer.sequence == 201
+
+    @pytest.mark.parametrize("size", [239, 110])
+    def test_a_burst_takes_a_third_of_the_link(self, size: int) -> None:
+        pilot = Pilot(ArduPilotVehicle(ftp_rate=1920.0))
+        pilot.vehicle.files["a"] = bytes(10 * size)
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
+        pilot.send(Packet(100, 3, Opcode.BURST_READ_FILE, size=size))
+        frame = size + 27
+        heard = pilot.listen(9.5 * frame / 1920)
+        assert len(heard) == 10
+        assert len(heard + pilot.listen(frame / 1920)) == 11
+
+    def test_on_a_serial_port_the_first_block_comes_behind_the_banner(self) -> None:
+        """On a real one at 57600 baud 0.095 to 0.105 s after open and burst were asked for."""
+        air = Air.symmetric([ArduPilotVehicle(ftp_rate=5760.0)], rate=5760.0)
+        framer = wire.Framer(stream=False)
+        air.tick(0.0)
+        opening = Packet(100, 3, Opcode.OPEN_FILE_RO, PARAMS + b"?withdefaults=1")
+        for request in (opening, opening, Packet(200, 3, Opcode.BURST_READ_FILE, size=MOST_DATA)):
+            air.receive(file_request(request), 0.5)
+        blocks: list[float] = []
+        now = 0.5
+        while len(blocks) < 4:
+            due = air.next_deadline()
+            assert due is not None
+            now = max(now, due)
+            air.tick(now)
+            for data in air.data_to_send():
+                message = wire.decode(framer.receive(data)[0])
+                if isinstance(message, wire.FileTransfer):
+                    answer = Packet.unpack(message.payload)
+                    blocks += [now] * (answer.requested == Opcode.BURST_READ_FILE)
+        assert 0.095 <= blocks[0] - 0.5 <= 0.125
+        gaps = [later - earlier for earlier, later in pairwise(blocks)]
+        assert gaps == pytest.approx([(MOST_DATA + 27) / 5760] * 3, abs=0.01)
+
+    def test_px4_ends_a_burst_early_and_says_so(self) -> None:
+        pilot = Pilot(PX4Vehicle())
+        pilot.vehicle.files["a"] = bytes(50_000)
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
+        blocks = pilot.burst(session=0, size=100)
+        assert [each.burst_complete for each in blocks] == [False] * 167 + [True]
+        assert {len(each.data) for each in blocks} == {239}
+        rest = pilot.burst(session=0, offset=168 * 239)
+        assert sum(len(each.data) for each in (*blocks, *rest) if each.opcode == Opcode.ACK) == 50_000
+
+    def test_px4_sends_a_burst_in_its_loop_and_answers_meanwhile(self) -> None:
+        pilot = Pilot(PX4Vehicle())
+        pilot.vehicle.files["a"] = bytes(50_000)
+        pilot.ask(Opcode.OPEN_FILE_RO, b"a")
+        pilot.send(Packet(100, 0, Opcode.BURST_READ_FILE, size=239))
+        assert pilot.listen(0.009) == []
+        first = pilot.listen(0.006)
+        assert len(first) == 57
+        pilot.send(Packet(300, 0, Opcode.READ_FILE, size=5))
+        (answer,) = pilot.listen(0.001)
+        assert answer.requested == Opcode.READ_FILE
+        pilot.send(Packet(400, 0, Opcode.BURST_READ_FILE, offset=20_000, size=239))
+        blocks = pilot.listen(0.1)
+        assert [each.offset for each in blocks] == [20_000 + 239 * at for at in range(126)] + [50_000]
+        assert [each.sequence for each in blocks[:2]] == [401, 402]
+
+
+class TestSwitches:
+    def test_px4_has_the_parameters_as_a_file_if_it_is_new(self) -> None:
+        old, new = Pilot(PX4Vehicle()), Pilot(PX4Vehicle(ftp=True))
+        assert refusal(old.ask(Opcode.OPEN_FILE_RO, PARAMS)) == (FileErrorCode.FILE_NOT_FOUND,)
+        assert new.ask(Opcode.OPEN_FILE_RO, PARAMS).opcode == Opcode.ACK
+        data = b"".join(each.data for each in new.burst(session=0) if each.opcode == Opcode.ACK)
+        assert list(param_pck.decode(data).entries) == packed(new.vehicle)
+
+    def test_px4_takes_parameters_of_the_right_type(self) -> None:
+        pilot = Pilot(PX4Vehicle(ftp=True))
+        rows = [
+            PackedParam("MC_ROLL_P", ParamType.REAL32, 0x40E00000),
+            PackedParam("SYS_AUTOSTART", ParamType.INT8, 1),
+        ]
+        autostart = pilot.vehicle.param("SYS_AUTOSTART").bits
+        pilot.ask(Opcode.CREATE_FILE, PARAMS)
+        pilot.ask(Opcode.WRITE_FILE, param_pck.encode_upload(rows), session=0)
+        assert pilot.ask(Opcode.TERMINATE_SESSION, session=0).opcode == Opcode.ACK
+        assert pilot.vehicle.param("MC_ROLL_P").value == 7.0
+        assert pilot.vehicle.param("SYS_AUTOSTART").bits == autostart
+
+    @pytest.mark.parametrize(
+        "vehicle", [ArduPilotVehicle(ftp=False), GenericVehicle({"A": 1})], ids=["ardupilot", "generic"]
+    )
+    def test_without_it_there_is_silence(self, vehicle: Vehicle) -> None:
+        pilot = Pilot(vehicle)
+        pilot.send(Packet(1, 0, Opcode.OPEN_FILE_RO, PARAMS))
+        assert pilot.listen(1.0) == []
+        with pytest.raises(UsageError, match="does not speak MAVFTP"):
+            assert vehicle.files
+
+    @pytest.mark.parametrize(
+        ("vehicle", "has_it"),
+        [(ArduPilotVehicle(), True), (ArduPilotVehicle(ftp=False), False), (PX4Vehicle(), True)],
+    )
+    def test_the_capabilities_tell(self, vehicle: Vehicle, has_it: bool) -> None:
+        vehicle.tick(0.0)
+        ask = wire.CommandLong(1, 1, wire.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, (1.0,) + (0.0,) * 6)
+        vehicle.receive(wire.encode(ask, system=255, component=190, sequence=0), 0.1)
+        framer = wire.Framer(stream=False)
+        messages = [wire.decode(frame) for data in vehicle.data_to_send() for frame in framer.receive(data)]
+        (version,) = [each for each in messages if isinstance(each, wire.AutopilotVersion)]
+        assert bool(version.capabilities & wire.CAPABILITY_FTP) is has_it
+
+    @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
+    def test_rates_that_cannot_be(self, rate: float) -> None:
+        with pytest.raises(UsageError, match="rate of MAVFTP"):
+            ArduPilotVehicle(ftp_rate=rate)
+
+    def test_answers_are_no_requests(self) -> None:
+        pilot = Pilot(ArduPilotVehicle())
+        pilot.send(Packet(1, 0, Opcode.ACK))
+        pilot.send(Packet(1, 0, Opcode.NAK))
+        assert pilot.listen(1.0) == []
+
+
+def test_files_wait_for_the_end_of_the_high_latency_mode() -> None:
+    pilot = Pilot(ArduPilotVehicle())
+    pilot.vehicle.files["a"] = b"abcdefgh"
+    pilot.vehicle.high_latency = True
+    pilot.send(Packet(2, 3, Opcode.OPEN_FILE_RO, b"a"))
+    assert pilot.listen(10.0) == []
+    pilot.vehicle.high_latency = False
+    (answer,) = pilot.listen(0.1)
+    assert (answer.opcode, answer.requested) == (Opcode.ACK, Opcode.OPEN_FILE_RO)

@@ -1,0 +1,415 @@
+"""The recordings of real autopilots: decoded, and held against the simulated ones."""
+
+from __future__ import annotations
+
+import dataclasses
+import struct
+from collections.abc import Callable, Iterable
+
+import pytest
+
+from paramclient.model.values import (
+    Encoding,
+    Param,
+    ParamType,
+    Value,
+    decode,
+    encode,
+    from_bits,
+    known_type,
+    px4_hash,
+)
+from paramclient.protocol import wire
+from paramclient.protocol.ftp import param_pck
+from paramclient.protocol.ftp.packets import Opcode, Packet
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle, SimParam, ardupilot_table, px4_table
+from tests.recordings import (
+    NAMES,
+    Messages,
+    differences,
+    from_ground,
+    from_vehicle,
+    last_list,
+    param_values,
+    read,
+    replay,
+)
+
+PX4_HASH = 0xCF579589
+BAROMETER = ("CAL_BARO0_ID", "CAL_BARO0_OFF", "CAL_BARO0_PRIO")
+"""What the PX4 vehicle's firmware sets while it boots, and saves only after the first change by a user."""
+
+UNKNOWN_IDS = {8, 380, 410, 411}
+"""Messages in the logs that pymavlink's dialect does not define."""
+
+
+def message_id(data: bytes) -> int:
+    return int.from_bytes(data[7:10], "little")
+
+
+def params(values: Iterable[wire.ParamValue], encoding: Encoding) -> list[Param]:
+    """What a full download says, without the hash."""
+    found = []
+    for value in values:
+        if value.param_index != wire.NO_INDEX:
+            number, bits = decode(value.raw, value.param_type, encoding)
+            found.append(Param(value.param_id, number, known_type(value.param_type), value.param_index, bits))
+    return found
+
+
+class TestDecoding:
+    def test_there_are_nineteen(self) -> None:
+        assert len(NAMES) == 19
+
+    @pytest.mark.parametrize("name", NAMES)
+    def test_every_frame_of_a_known_message_is_found_and_checked(self, name: str) -> None:
+        records = read(name)
+        assert {message_id(record.data) for record in records if record.frame is None} <= UNKNOWN_IDS
+        for record in records:
+            if record.frame is not None:
+                assert record.frame.message_id == message_id(record.data)
+                assert record.frame.system == record.system
+        assert {record.system for record in records} == {1, 255}
+
+    @pytest.mark.parametrize("name", NAMES)
+    def test_the_session_as_one_stream_gives_the_same_frames(self, name: str) -> None:
+        records = [record for record in read(name) if record.frame is not None]
+        framer = wire.Framer()
+        stream = b"".join(record.data for record in records)
+        frames = [
+            frame for at in range(0, len(stream), 100) for frame in framer.receive(stream[at : at + 100])
+        ]
+        assert frames == [record.frame for record in records]
+        assert framer.skipped == 0
+
+    @pytest.mark.parametrize("name", NAMES)
+    def test_encoding_what_was_decoded_gives_the_bytes_of_the_log(self, name: str) -> None:
+        """For the messages of the protocol itself, which `wire` holds in full."""
+        values = wire.ParamValue | wire.ParamSet | wire.ParamRequestRead | wire.ParamRequestList
+        kinds = values | wire.FileTransfer
+        for record in read(name):
+            message = record.message
+            if isinstance(message, kinds):
+                assert record.frame is not None
+                _, system, component, sequence, _, version = record.frame
+                again = wire.encode(
+                    message, system=system, component=component, sequence=sequence, version=version
+                )
+                assert again == record.data
+
+    def test_px4_gives_the_table_and_its_hash(self) -> None:
+        values = param_values(from_vehicle("px4_full_download"))
+        first = next(at for at, value in enumerate(values) if value.param_id == wire.HASH_CHECK)
+        announced = values[first]
+        assert [value.param_id for value in values[:first]] == list(BAROMETER)
+        assert announced[1:] == (PX4_HASH.to_bytes(4, "little"), ParamType.UINT32, 903, wire.NO_INDEX)
+        found = params(values[first:], Encoding.BYTEWISE)
+        assert found == [
+            Param(row.name, row.value, row.type, index, row.bits) for index, row in enumerate(px4_table())
+        ]
+        assert len(found) == 903
+        assert {value.param_count for value in values} == {903}
+        volatile = [row.name for row in px4_table() if row.volatile]
+        assert len(volatile) == 58
+        assert px4_hash(found, leave_out=volatile) == PX4_HASH
+        assert px4_hash(found) != PX4_HASH
+
+    def test_ardupilot_gives_the_table(self) -> None:
+        values = param_values(from_vehicle("ardupilot_full_download"))
+        found = params(values, Encoding.C_CAST)
+        assert len(found) == len(values) == 1382
+        assert found == [
+            Param(row.name, row.value, row.type, index, row.bits)
+            for index, row in enumerate(ardupilot_table())
+        ]
+        assert {value.param_count for value in values} == {1382}
+
+
+# What a replay leaves out, and why
+
+OTHER_TEXTS = ("GPS 1:", "EKF", "Field Elevation", "[logger]")
+"""How texts begin that other parts of the firmware send; no client of parameters reads them."""
+UNASKED = (
+    *("STAT_RUNTIME", "BARO1_GND_PRESS", "BARO2_GND_PRESS"),
+    *("CAL_BARO0_ID", "CAL_BARO0_OFF", "CAL_BARO0_PRIO"),
+)
+"""Values that the firmware itself changes and tells of at moments of its own; those in a list count."""
+
+
+def compared(messages: Messages) -> Messages:
+    """What of a session a replay has to reproduce, but for the values that are told of unasked.
+
+    The first 3 s after a start PX4's heartbeat has the state 0; the simulated one has been on for longer.
+    """
+    kept: Messages = []
+    for time, message in messages:
+        if isinstance(message, wire.StatusText) and message.text.startswith(OTHER_TEXTS):
+            continue
+        if isinstance(message, wire.Heartbeat) and message.system_status == 0:
+            message = dataclasses.replace(message, system_status=3)
+        kept.append((time, message))
+    return kept
+
+
+# What the vehicles had on board, where it differs from the tables that are shipped
+
+
+def px4_of(name: str) -> PX4Vehicle:
+    """PX4 with the parameters of a list: five more are in use with its logger on, none of them volatile."""
+    volatile = {row.name for row in px4_table() if row.volatile}
+    rows = []
+    for value in last_list(name):
+        number, _ = decode(value.raw, value.param_type, Encoding.BYTEWISE)
+        rows.append(SimParam(value.param_id, value.param_type, number, value.param_id in volatile))
+    return PX4Vehicle(table=rows)
+
+
+def ardupilot_of(name: str) -> ArduPilotVehicle:
+    """ArduPilot with the values of a list."""
+    vehicle = ArduPilotVehicle(live_period=0.0)
+    for value in last_list(name):
+        take(vehicle, value)
+    return vehicle
+
+
+def take(vehicle: ArduPilotVehicle, value: wire.ParamValue) -> None:
+    """Hold a value as it was sent, if it is another one."""
+    param = vehicle.param(value.param_id)
+    if encode(param.value, param.type, Encoding.C_CAST) != value.raw:
+        (number,) = struct.unpack("<f", value.raw)
+        vehicle.set_param(value.param_id, number if param.type == ParamType.REAL32 else int(number))
+
+
+def ardupilot_of_file(name: str) -> ArduPilotVehicle:
+    """ArduPilot with the values and defaults of a file that the log has."""
+    blocks = {}
+    for _, message in from_vehicle(name):
+        if isinstance(message, wire.FileTransfer):
+            packet = Packet.unpack(message.payload)
+            if packet.requested == Opcode.BURST_READ_FILE and packet.opcode == Opcode.ACK:
+                blocks[packet.offset] = packet.data
+    shipped = {row.name: row for row in ardupilot_table()}
+    rows = []
+    for entry in param_pck.decode(b"".join(blocks[at] for at in sorted(blocks))).entries:
+        value = from_bits(entry.bits, entry.type)
+        default = value if entry.default is None else from_bits(entry.default, entry.type)
+        assert not isinstance(default, bytes)
+        is_shipped = shipped[entry.name].bits == entry.bits
+        rows.append(
+            shipped[entry.name] if is_shipped else SimParam(entry.name, entry.type, value, default=default)
+        )
+    return ArduPilotVehicle(table=rows, live_period=0.0)
+
+
+def with_groups(name: str) -> ArduPilotVehicle:
+    """ArduPilot before two groups are shown: what the list has, and the shipped table has not."""
+    shipped = {row.name for row in ardupilot_table()}
+    groups: dict[str, list[SimParam]] = {"GRIP_ENABLE": [], "SCR_ENABLE": []}
+    for value in last_list(name):
+        if value.param_id not in shipped:
+            (number,) = struct.unpack("<f", value.raw)
+            kind = ParamType(value.param_type)
+            group = groups[f"{value.param_id.split('_')[0]}_ENABLE"]
+            group.append(SimParam(value.param_id, kind, number if kind == ParamType.REAL32 else int(number)))
+    vehicle = ArduPilotVehicle(live_period=0.0, groups=groups)
+    for value in last_list(name):
+        if not value.param_id.endswith("_ENABLE"):
+            take(vehicle, value)
+    return vehicle
+
+
+def without_pushes(name: str, messages: Messages, start: float) -> Messages:
+    """All but the PARAM_VALUEs after a time that are not the first ones after a set of their names."""
+    sets = [record.message for record in from_ground(name) if record.time >= start]
+    awaited = {message.param_id for message in sets if isinstance(message, wire.ParamSet)}
+    kept: Messages = []
+    for time, message in messages:
+        if isinstance(message, wire.ParamValue) and time >= start:
+            if message.param_id not in awaited:
+                continue
+            awaited.remove(message.param_id)
+        kept.append((time, message))
+    return kept
+
+
+def quiet(name: str) -> ArduPilotVehicle:
+    return ArduPilotVehicle(live_period=0.0)
+
+
+def px4(name: str) -> PX4Vehicle:
+    return PX4Vehicle()
+
+
+ARDUPILOT: dict[str, tuple[Callable[[str], ArduPilotVehicle], float]] = {
+    "ardupilot_30_sets": (quiet, 0.9968),
+    "ardupilot_enable_groups": (with_groups, 0.0019),
+    "ardupilot_ftp_closed_by_others": (ardupilot_of_file, 0.9971),
+    "ardupilot_ftp_session_left_open": (ardupilot_of_file, 0.0030),
+    "ardupilot_ftp_three_downloads": (ardupilot_of_file, 0.0030),
+    "ardupilot_full_download": (quiet, 0.0041),
+    "ardupilot_list_beside_100_reads": (ardupilot_of, 0.0010),
+    "ardupilot_list_beside_50_reads": (ardupilot_of, 0.0022),
+    "ardupilot_list_beside_ftp": (ardupilot_of_file, 0.0010),
+    "ardupilot_list_restarted": (ardupilot_of, 0.0080),
+}
+"""With the vehicle, and the phase of its loop."""
+
+PX4: dict[str, tuple[Callable[[str], PX4Vehicle], float]] = {
+    "px4_hash_hit_and_stop": (px4, 0.7681),
+    "px4_list_beside_reads": (px4_of, 0.0074),
+    "px4_list_restarted": (px4_of, 0.0124),
+    "px4_restart_mid_stream": (px4, 0.7770),
+}
+
+
+class TestDifferences:
+    """What a replay is judged by finds what is wrong; the messages are those of the log, changed."""
+
+    NAME = "ardupilot_get_set"
+
+    def found(self, changed: Messages) -> list[str]:
+        return differences(self.NAME, compared(from_vehicle(self.NAME)), changed, burst=10)
+
+    def changed(self, at: int, *instead: tuple[float, wire.Message]) -> Messages:
+        """The log with other messages in the place of one that answers a read or set."""
+        messages = compared(from_vehicle(self.NAME))
+        place = [place for place, (_, each) in enumerate(messages) if isinstance(each, wire.ParamValue)][at]
+        return sorted([*messages[:place], *instead, *messages[place + 1 :]], key=lambda item: item[0])
+
+    def answer(self, at: int) -> tuple[float, wire.ParamValue]:
+        messages = compared(from_vehicle(self.NAME))
+        return [(time, each) for time, each in messages if isinstance(each, wire.ParamValue)][at]
+
+    def test_the_log_itself_is_right(self) -> None:
+        assert self.found(compared(from_vehicle(self.NAME))) == []
+
+    @pytest.mark.parametrize("at", [0, 1, -1])
+    def test_a_message_that_is_missing(self, at: int) -> None:
+        assert self.found(self.changed(at))
+
+    def test_a_message_more(self) -> None:
+        time, value = self.answer(1)
+        assert self.found(self.changed(1, (time, value), (time + 0.001, value)))
+
+    def test_another_value_or_count_or_type(self) -> None:
+        time, value = self.answer(0)
+        for other in (
+            value._replace(raw=b"\0\0\0\0"),
+            value._replace(param_count=1),
+            value._replace(param_type=1),
+        ):
+            assert self.found(self.changed(0, (time, other)))
+
+    def test_a_message_that_is_late_or_early(self) -> None:
+        """The first read was answered 41 ms after its request: 20 ms count, not 20 %."""
+        time, value = self.answer(0)
+        assert self.found(self.changed(0, (time + 0.019, value))) == []
+        assert self.found(self.changed(0, (time - 0.019, value))) == []
+        assert self.found(self.changed(0, (time + 0.021, value)))
+        assert self.found(self.changed(0, (time - 0.021, value)))
+
+    def test_a_list_that_is_slower(self) -> None:
+        """By 25 %; a burst of 10 more or less would not count."""
+        name = "ardupilot_full_download"
+        recorded = compared(from_vehicle(name))
+
+        def slowed(by: float) -> Messages:
+            return [
+                (2.06 + (time - 2.06) * by if isinstance(each, wire.ParamValue) else time, each)
+                for time, each in recorded
+            ]
+
+        assert differences(name, recorded, slowed(1.15), burst=10) == []
+        assert differences(name, recorded, slowed(1.25), burst=10)
+
+    def test_messages_of_two_kinds_in_another_order(self) -> None:
+        """The end of a file comes 0.54 s after its request. 0.1 s more are within 20 %, but out of order."""
+        name = "ardupilot_list_beside_ftp"
+        recorded = compared(from_vehicle(name))
+        ends = max(time for time, each in recorded if isinstance(each, wire.FileTransfer) and time < 1.0)
+
+        def with_end(later: float) -> Messages:
+            moved = [(time + later if time == ends else time, each) for time, each in recorded]
+            return sorted(moved, key=lambda item: item[0])
+
+        assert differences(name, recorded, with_end(0.04), burst=10) == []
+        (found,) = {each.split(",")[-1] for each in differences(name, recorded, with_end(0.1), burst=10)}
+        assert found == " before what came before"
+
+
+class TestReplay:
+    """The same messages, in the same order, at the same times; `tests.recordings` says what that means."""
+
+    def test_none_is_left_out(self) -> None:
+        alone = {name for name in NAMES if hasattr(TestReplay, f"test_{name}")}
+        assert set(NAMES) == set(ARDUPILOT) | set(PX4) | alone
+
+    @pytest.mark.parametrize("name", ARDUPILOT)
+    def test_ardupilot(self, name: str) -> None:
+        make, phase = ARDUPILOT[name]
+        sent = replay(make(name), name, phase=phase)
+        assert (
+            differences(name, compared(from_vehicle(name)), compared(sent), burst=10, unasked=UNASKED) == []
+        )
+
+    @pytest.mark.parametrize("name", PX4)
+    def test_px4(self, name: str) -> None:
+        make, phase = PX4[name]
+        sent = replay(make(name), name, phase=phase)
+        assert (
+            differences(name, compared(from_vehicle(name)), compared(sent), burst=20, unasked=UNASKED) == []
+        )
+
+    def test_px4_full_download(self) -> None:
+        """The barometer, found 1.4 s into the log and told of unasked, is replayed as an event."""
+        name = "px4_full_download"
+        vehicle = PX4Vehicle()
+        found = [vehicle.param(each) for each in BAROMETER]
+        for param in found:
+            vehicle.set_param(param.name, -1)
+        events = [(1.4147, param.name, param.value) for param in found]
+        sent = replay(vehicle, name, phase=0.19, on_board=events)
+        assert differences(name, compared(from_vehicle(name)), compared(sent), burst=20) == []
+
+    def test_px4_get_set(self) -> None:
+        """Including the barometer's parameters, unsaved since boot, which the first set pushes as well."""
+        name = "px4_get_set"
+        vehicle = PX4Vehicle(unsaved=BAROMETER)
+        recorded = compared(from_vehicle(name))
+        sent = compared(replay(vehicle, name, phase=0.004))
+        assert differences(name, recorded, sent, burst=20) == []
+        last = param_values(recorded)[-1]
+        assert int.from_bytes(last.raw, "little") == vehicle.announced_hash() != PX4_HASH
+
+    def test_px4_20_sets(self) -> None:
+        """From 3.34 s on the real one repeats no set: pushes of sets that follow each other closely are
+        missing now and then, other ones in each session. So only the acknowledgements count there."""
+        name = "px4_20_sets"
+        recorded = without_pushes(name, compared(from_vehicle(name)), 3.34)
+        vehicle = px4_of("px4_list_beside_reads")
+        sent = without_pushes(name, compared(replay(vehicle, name, phase=0.0095)), 3.34)
+        assert differences(name, recorded, sent, burst=20, unasked=UNASKED) == []
+
+    def test_ardupilot_get_set(self) -> None:
+        """The ground pressures of two barometers are live sensor values: replayed as events with the
+        recorded values."""
+        name = "ardupilot_get_set"
+        recorded = compared(from_vehicle(name))
+        events: list[tuple[float, str, Value]] = [
+            (time - 0.005, message.param_id, struct.unpack("<f", message.raw)[0])
+            for time, message in recorded
+            if isinstance(message, wire.ParamValue)
+            and message.param_id in ("BARO1_GND_PRESS", "BARO2_GND_PRESS")
+        ]
+        assert len(events) == 2
+        sent = compared(replay(ArduPilotVehicle(live_period=0.0), name, phase=0.005, on_board=events))
+        assert differences(name, recorded, sent, burst=10) == []
+
+    def test_ardupilot_ftp_download(self) -> None:
+        """Both files, every block of them, and the end of each."""
+        name = "ardupilot_ftp_download"
+        recorded = compared(from_vehicle(name))
+        sent = compared(replay(ArduPilotVehicle(live_period=0.0), name, phase=0.003))
+        assert differences(name, recorded, sent, burst=10) == []
+        answers = [message for _, message in sent if isinstance(message, wire.FileTransfer)]
+        assert len(answers) == 2 * (2 + 64 + 1 + 1)

@@ -1,0 +1,304 @@
+"""How simulated vehicles start again when they are told to, and what takes effect with that."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+import pytest
+
+from paramclient import CommandResult, UsageError
+from paramclient.cli.simulate import Misfortunes
+from paramclient.model.values import Encoding, ParamType, encode
+from paramclient.protocol import wire
+from paramclient.protocol.ftp.param_pck import PackedParam
+from paramclient.sim import ArduPilotVehicle, PX4Vehicle, Vehicle
+from tests.shell import generic
+
+T = TypeVar("T")
+
+REBOOT = 246
+
+
+class Desk:
+    """A ground station's view of one vehicle."""
+
+    def __init__(self, vehicle: Vehicle) -> None:
+        self.vehicle = vehicle
+        self.now = 0.0
+        self.heard: list[tuple[float, wire.Frame, wire.Message]] = []
+        self._framer = wire.Framer(wire.UNDERSTOOD, stream=False)
+        self._sequence = 0
+        vehicle.tick(0.0)
+        self._take()
+
+    def run(self, until: float) -> None:
+        """Let time pass; everything happens when it is due."""
+        while True:
+            self._take()
+            due = self.vehicle.next_deadline()
+            if due is not None and self.now < due <= until:
+                self.now = due
+            elif self.now < until:
+                self.now = until
+            else:
+                return
+            self.vehicle.tick(self.now)
+
+    def send(self, message: wire.Message) -> None:
+        data = wire.encode(message, system=255, component=190, sequence=self._sequence)
+        self._sequence = (self._sequence + 1) % 256
+        self.vehicle.receive(data, self.now)
+        self._take()
+
+    def command(self, mode: float = 1.0) -> list[int]:
+        """Tell it to start again; what it answers at once."""
+        self.heard.clear()
+        self.send(wire.CommandLong(self.vehicle.system, 1, REBOOT, (mode, *[0.0] * 6)))
+        acks = self.messages(wire.CommandAck)
+        assert acks == [wire.CommandAck(REBOOT, ack.result, 255, 190) for ack in acks]
+        return [ack.result for ack in acks]
+
+    def set(self, name: str, value: int, kind: ParamType, encoding: Encoding) -> None:
+        self.send(wire.ParamSet(self.vehicle.system, 1, name, encode(value, kind, encoding), kind))
+
+    def messages(self, kind: type[T]) -> list[T]:
+        return [message for _, _, message in self.heard if isinstance(message, kind)]
+
+    def silence(self, since: float, until: float) -> bool:
+        return not any(since < when < until for when, _, _ in self.heard)
+
+    def _take(self) -> None:
+        for data in self.vehicle.data_to_send():
+            for frame in self._framer.receive(data):
+                message = wire.decode(frame)
+                assert message is not None
+                self.heard.append((self.now, frame, message))
+
+
+@pytest.mark.parametrize(("make", "delay"), [(PX4Vehicle, 0.4), (ArduPilotVehicle, 0.2), (generic, 0.3)])
+def test_it_acknowledges_goes_off_and_comes_back(make: Any, delay: float) -> None:
+    desk = Desk(make(reboot_down=5.0))
+    version = desk.vehicle._version
+    desk.run(10.25)
+    assert desk.command() == [CommandResult.ACCEPTED]
+    desk.run(30.0)
+    on_at = 10.25 + delay + 5.0
+    assert desk.silence(10.25 + delay, on_at)
+    started_at = [when for when, frame, _ in desk.heard if frame.sequence == 0][-1]
+    assert started_at == pytest.approx(on_at)
+    assert desk.vehicle._version == version
+    assert [each for _, each, _ in desk.heard if each.sequence == 0][-1].message_id == 0
+    assert desk.vehicle.system == 1
+
+
+def test_one_that_stays_off_is_off() -> None:
+    desk = Desk(generic(reboot_down=math.inf))
+    desk.command()
+    desk.run(100.0)
+    assert desk.silence(0.3, 100.0)
+    assert desk.vehicle.next_deadline() is None
+
+
+@pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle, generic])
+def test_it_need_not_acknowledge(make: Any) -> None:
+    desk = Desk(make(reboot_ack=False))
+    assert desk.command() == []
+    desk.run(0.9)
+    assert desk.silence(0.45, 0.9)
+    desk.run(5.0)
+    assert desk.messages(wire.Heartbeat)
+    desk.vehicle.armed = True
+    assert len(desk.command()) == 1  # what it does not obey, it says
+
+
+@pytest.mark.parametrize(
+    ("make", "answers"),
+    [
+        (PX4Vehicle, {0: CommandResult.ACCEPTED, 2: CommandResult.DENIED, 3: CommandResult.DENIED}),
+        (ArduPilotVehicle, {0: CommandResult.UNSUPPORTED, 2: CommandResult.UNSUPPORTED}),
+        (generic, {0: CommandResult.UNSUPPORTED}),
+    ],
+)
+def test_what_is_no_restart(make: Any, answers: Mapping[int, int]) -> None:
+    desk = Desk(make())
+    for mode, answer in answers.items():
+        assert desk.command(mode) == [answer]
+    desk.heard.clear()
+    desk.run(5.0)
+    beats = [when for when, _, each in desk.heard if isinstance(each, wire.Heartbeat)]
+    assert beats == [1.0, 2.0, 3.0, 4.0, 5.0]
+
+
+@pytest.mark.parametrize(
+    ("make", "answer"),
+    [
+        (PX4Vehicle, CommandResult.DENIED),
+        (ArduPilotVehicle, CommandResult.FAILED),
+        (generic, CommandResult.DENIED),
+    ],
+)
+def test_armed_it_says_so_and_refuses(make: Any, answer: int) -> None:
+    desk = Desk(make(armed=True))
+    assert desk.messages(wire.Heartbeat)[-1].base_mode & 128
+    assert desk.command() == [answer]
+    desk.run(1.0)
+    desk.vehicle.armed = False
+    desk.run(2.0)
+    beats = desk.messages(wire.Heartbeat)
+    assert [bool(beat.base_mode & 128) for beat in beats] == [True, False]
+    assert beats[0].base_mode & ~128 == beats[1].base_mode
+    assert desk.command() == [CommandResult.ACCEPTED]
+
+
+def test_px4_takes_its_system_id_with_the_start() -> None:
+    desk = Desk(PX4Vehicle(uid=7))
+    desk.set("MAV_SYS_ID", 9, ParamType.INT32, Encoding.BYTEWISE)
+    desk.run(10.0)
+    assert {frame.system for _, frame, _ in desk.heard} == {1}
+    desk.command()
+    desk.run(20.0)
+    assert desk.vehicle.system == 9
+    assert {frame.system for when, frame, _ in desk.heard if when > 10.5} == {9}
+    desk.heard.clear()
+    desk.send(wire.ParamRequestRead(1, 1, "MAV_SYS_ID"))
+    assert not desk.heard
+    desk.send(wire.ParamRequestRead(9, 1, "MAV_SYS_ID"))
+    assert desk.messages(wire.ParamValue)
+
+
+@pytest.mark.parametrize("value", [0, -1, 256])
+def test_an_id_that_cannot_be_is_not_taken(value: int) -> None:
+    desk = Desk(PX4Vehicle())
+    desk.set("MAV_SYS_ID", value, ParamType.INT32, Encoding.BYTEWISE)
+    desk.command()
+    desk.run(5.0)
+    assert desk.vehicle.system == 1
+
+
+@pytest.mark.parametrize(("make", "name"), [(PX4Vehicle, "MAV_SYS_ID"), (ArduPilotVehicle, "SYSID_THISMAV")])
+def test_the_tables_of_real_ones_hold_the_system_id(make: Any, name: str) -> None:
+    vehicle = make(system=7)
+    assert vehicle.param(name).value == 7
+    vehicle.tick(0.0)
+    vehicle.reboot(1.0)
+    vehicle.tick(10.0)
+    assert vehicle.system == 7
+
+
+def test_a_table_of_ones_own_says_the_system_id_too() -> None:
+    assert ArduPilotVehicle(system=7, table={"SYSID_THISMAV": 1}).param("SYSID_THISMAV").value == 7
+    assert PX4Vehicle(system=7, table={"A": 1}).values == {"A": 1}
+
+
+def test_sys_autoconfig_resets_what_it_does_not_keep() -> None:
+    vehicle = PX4Vehicle(first_start_only=(), system=3)
+    desk = Desk(vehicle)
+    before = vehicle.values
+    kept = {"SYS_AUTOSTART": 4001, "CAL_ACC0_PRIO": 75, "COM_FLTMODE1": 2, "RC1_MIN": 1100}
+    reset = {"COM_RC_IN_MODE": 2, "SYS_HAS_MAG": 0}
+    assert {**kept, **reset}.keys() <= before.keys()
+    for name, value in {**kept, **reset}.items():
+        assert before[name] != value
+        vehicle.set_param(name, value)
+    desk.command()
+    desk.run(5.0)
+    assert vehicle.values == before | kept | reset  # not without SYS_AUTOCONFIG
+    announced = vehicle.announced_hash()
+    vehicle.set_param("SYS_AUTOCONFIG", 1)
+    desk.command()
+    desk.run(10.0)
+    assert vehicle.values == before | kept | {"MAV_SYS_ID": 1}
+    assert vehicle.system == 1
+    assert vehicle.announced_hash() != announced
+    vehicle.set_param("SYS_HAS_MAG", 0)
+    desk.command()
+    desk.run(15.0)
+    assert vehicle.param("SYS_HAS_MAG").value == 0  # once only
+
+
+def test_px4_no_longer_uses_from_its_second_start_on_what_it_has_stored() -> None:
+    px4 = PX4Vehicle()
+    count, announced = len(px4.params), px4.announced_hash()
+    px4.reboot(5.0, down=1.0)
+    assert len(px4.params) == count - 3
+    assert px4.announced_hash() != announced
+    second = px4.announced_hash()
+    px4.reboot(10.0, down=1.0)
+    assert (len(px4.params), px4.announced_hash()) == (count - 3, second)
+    with pytest.raises(UsageError, match="not in the table: NO_SUCH"):
+        PX4Vehicle(first_start_only=["NO_SUCH"])
+
+
+@pytest.mark.parametrize("by_file", [True, False])
+def test_plane_and_rover_take_their_system_id_within_a_second(by_file: bool) -> None:
+    desk = Desk(ArduPilotVehicle(kind="plane"))
+    desk.run(10.25)
+    if by_file:
+        desk.vehicle._apply_packed([PackedParam("SYSID_THISMAV", ParamType.INT16, 9)])
+    else:
+        desk.set("SYSID_THISMAV", 9, ParamType.INT16, Encoding.C_CAST)
+    desk.run(10.9)
+    assert {frame.system for _, frame, _ in desk.heard} == {1}
+    desk.heard.clear()
+    desk.run(12.0)
+    assert {frame.system for _, frame, _ in desk.heard} == {9}
+    assert desk.vehicle._version.uid2 == ArduPilotVehicle()._version.uid2
+    desk.command()
+    desk.run(20.0)
+    assert desk.vehicle.system == 9
+
+
+def test_copter_takes_its_system_id_with_the_next_start() -> None:
+    desk = Desk(ArduPilotVehicle())
+    desk.set("SYSID_THISMAV", 9, ParamType.INT16, Encoding.C_CAST)
+    desk.run(5.0)
+    assert desk.vehicle.system == 1
+    desk.command()
+    desk.run(10.0)
+    assert desk.vehicle.system == 9
+
+
+def test_a_group_that_waits_for_the_start() -> None:
+    vehicle = ArduPilotVehicle(
+        table={"A_ENABLE": 0, "B_ENABLE": 1, "C_ENABLE": 0},
+        groups={"A_ENABLE": {"A_X": 1}, "B_ENABLE": {"B_X": 1}, "C_ENABLE": {"C_X": 1}},
+        reboot_groups=["A_ENABLE", "B_ENABLE"],
+    )
+    desk = Desk(vehicle)
+    assert list(vehicle.params) == ["A_ENABLE", "B_ENABLE", "B_X", "C_ENABLE"]
+    for name, value in {"A_ENABLE": 1, "B_ENABLE": 0, "C_ENABLE": 1}.items():
+        vehicle.set_param(name, value)
+    assert list(vehicle.params) == ["A_ENABLE", "B_ENABLE", "B_X", "C_ENABLE", "C_X"]
+    desk.command()
+    desk.run(5.0)
+    assert list(vehicle.params) == ["A_ENABLE", "A_X", "B_ENABLE", "C_ENABLE", "C_X"]
+
+
+def test_a_late_call_does_not_change_when_it_is_back() -> None:
+    vehicle = generic(reboot_down=2.0)
+    desk = Desk(vehicle)
+    desk.command()
+    vehicle.data_to_send()
+    vehicle.tick(9.3)
+    assert vehicle._on_at == pytest.approx(2.3)
+    desk.now = 9.3
+    desk.heard.clear()
+    desk.run(9.3)
+    assert [each.time_boot_ms for each in desk.messages(wire.SystemTime)] == [7000]
+
+
+def test_arguments_that_cannot_be() -> None:
+    with pytest.raises(UsageError, match="copter, plane, rover"):
+        ArduPilotVehicle(kind="blimp")
+    with pytest.raises(UsageError, match="reboot_down"):
+        generic(reboot_down=-1.0)
+    with pytest.raises(UsageError, match="A_ENABLE"):
+        ArduPilotVehicle(table={"A_ENABLE": 0}, reboot_groups=["A_ENABLE"])
+
+
+def test_the_command_passes_them_on() -> None:
+    options = Misfortunes(armed=True, reboot_down=7.0).options
+    assert (options["armed"], options["reboot_down"]) == (True, 7.0)
+    assert Misfortunes().options["armed"] is False

@@ -1,0 +1,1239 @@
+"""The simulated vehicles and the faulty link, clause by clause, in a time that is passed in."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import struct
+from collections import Counter
+from collections.abc import Callable
+from time import process_time
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from paramclient import sim
+from paramclient.errors import ParamErrorCode, UsageError
+from paramclient.model.values import Param, ParamType, Value, px4_hash
+from paramclient.protocol import wire
+from paramclient.sim import (
+    Air,
+    ArduPilotVehicle,
+    FaultyLink,
+    GenericVehicle,
+    PX4Vehicle,
+    SimParam,
+    Vehicle,
+    ardupilot_table,
+    px4_table,
+)
+from tests.ground import LIST, SIGNS_OF_LIFE, SMALL, Station, cast, indices, names, read, write
+
+NO_INDEX = wire.NO_INDEX
+
+
+class TestTables:
+    def test_shipped(self) -> None:
+        assert len(px4_table()) == 903
+        assert len(ardupilot_table()) == 1382
+        assert px4_table() is px4_table()
+        assert PX4Vehicle().announced_hash() == 0xCF579589
+
+    def test_a_mapping(self) -> None:
+        vehicle = GenericVehicle(SMALL)
+        assert vehicle.param("A_FLOAT") == Param("A_FLOAT", 1.5, ParamType.REAL32, 0, 0x3FC00000)
+        assert vehicle.param("D_SHORT") == Param("D_SHORT", -3, ParamType.INT16, 3, 0xFFFD)
+        assert vehicle.values == {"A_FLOAT": 1.5, "B_INT": 7, "C_BYTE": 200, "D_SHORT": -3}
+        assert list(vehicle.params.values()) == [vehicle.param(name) for name in SMALL]
+
+    def test_all_types(self) -> None:
+        rows = [SimParam(f"T{kind}", kind, 1) for kind in ParamType]
+        assert [row.bits for row in rows] == [1] * 8 + [0x3F800000, 0x3FF0000000000000]
+        assert SimParam("N", ParamType.INT64, -2).bits == 2**64 - 2
+        odd = SimParam("ODD", 77, b"\x01\x02\x03\x04")
+        assert (odd.type, odd.bits) == (77, 0x04030201)
+
+    @pytest.mark.parametrize(
+        "make",
+        [
+            lambda: SimParam("", ParamType.INT8, 0),
+            lambda: SimParam("A" * 17, ParamType.INT8, 0),
+            lambda: SimParam("A", ParamType.UINT8, 256),
+            lambda: SimParam("A", ParamType.UINT64, -1),
+            lambda: SimParam("A", ParamType.INT32, 1.5),
+            lambda: SimParam("A", 77, 1),
+            lambda: GenericVehicle([SimParam("A", ParamType.INT8, 0)] * 2),
+            lambda: GenericVehicle({f"P{number}": 0 for number in range(65536)}),
+            lambda: GenericVehicle(SMALL, system=0),
+            lambda: GenericVehicle(SMALL, component=256),
+            lambda: GenericVehicle(SMALL, mavlink_version=3),
+            lambda: GenericVehicle(SMALL, mavlink_version=1, param_error=True),
+            lambda: GenericVehicle(SMALL, burst=0),
+            lambda: GenericVehicle(SMALL, period=0.0),
+            lambda: GenericVehicle(SMALL, period=math.inf),
+            lambda: GenericVehicle(SMALL, boot_time=-1.0),
+            lambda: GenericVehicle(SMALL, telemetry=-1.0),
+            lambda: GenericVehicle(SMALL, telemetry=math.nan),
+            lambda: PX4Vehicle(not_in_use=["NO_SUCH"]),
+            lambda: PX4Vehicle(table=SMALL, late_use={"NO_SUCH": ["B_INT"]}),
+            lambda: PX4Vehicle(table=SMALL, unsaved=["NO_SUCH"]),
+            lambda: PX4Vehicle(autosave=math.nan),
+            lambda: ArduPilotVehicle(table=SMALL, groups={"NO_SUCH": {}}),
+            lambda: ArduPilotVehicle(table=SMALL, groups={"B_INT": {"A_FLOAT": 1.0}}),
+            lambda: ArduPilotVehicle(read_only=["NO_SUCH"]),
+            lambda: ArduPilotVehicle(uid2=bytes(19)),
+            lambda: ArduPilotVehicle(live_period=-1.0),
+            lambda: GenericVehicle(SMALL).param("NO_SUCH"),
+            lambda: GenericVehicle(SMALL).set_param("NO_SUCH", 1),
+            lambda: GenericVehicle(SMALL).set_param("C_BYTE", 256),
+            lambda: PX4Vehicle().use("NO_SUCH"),
+        ],
+    )
+    def test_what_cannot_be(self, make: Callable[[], object]) -> None:
+        with pytest.raises(UsageError):
+            make()
+
+    def test_the_public_names_are_there(self) -> None:
+        assert all(hasattr(sim, name) for name in sim.__all__)
+
+
+EVERY_KIND = [lambda: GenericVehicle(SMALL), PX4Vehicle, ArduPilotVehicle]
+
+
+@pytest.mark.parametrize("kind", EVERY_KIND)
+class TestEveryVehicle:
+    def test_nothing_is_due_before_the_first_call(self, kind: Callable[[], Vehicle]) -> None:
+        vehicle = kind()
+        assert vehicle.next_deadline() is None
+        assert vehicle.data_to_send() == []
+
+    def test_a_value_changed_before_the_first_call_is_told_to_nobody(
+        self, kind: Callable[[], Vehicle]
+    ) -> None:
+        vehicle = kind()
+        name = next(iter(vehicle.params))
+        vehicle.set_param(name, 5)
+        assert not Station(vehicle).wait(1.0).values()
+        assert vehicle.values[name] == 5
+
+    @pytest.mark.parametrize("start", [0.0, -5.0, 1e6])
+    def test_a_heartbeat_each_second_from_the_first_call_on(
+        self, kind: Callable[[], Vehicle], start: float
+    ) -> None:
+        station = Station(kind(), start=start).wait(3.5)
+        beats = [time - start for time, _, message in station.log if isinstance(message, wire.Heartbeat)]
+        assert beats == pytest.approx([0.0, 1.0, 2.0, 3.0])
+
+    def test_a_late_call_makes_up_for_no_heartbeats(self, kind: Callable[[], Vehicle]) -> None:
+        vehicle = kind()
+        station = Station(vehicle)
+        station.now = 1000.0
+        assert len(station.wait(0.5).heard(wire.Heartbeat)) == 2
+        assert vehicle.next_deadline() == 1001.0
+
+    @pytest.mark.parametrize(
+        "request_", [wire.CommandLong(1, 1, 512, (148.0,) + (0.0,) * 6), wire.CommandLong(1, 0, 520)]
+    )
+    def test_identity(self, kind: Callable[[], Vehicle], request_: wire.CommandLong) -> None:
+        station = Station(kind()).send(request_)
+        answers = {type(message): message for _, _, message in station.log}
+        assert answers[wire.CommandAck] == wire.CommandAck(request_.command, 0, 255, 190)
+        assert isinstance(answers[wire.AutopilotVersion], wire.AutopilotVersion)
+
+    def test_other_commands_are_not_supported(self, kind: Callable[[], Vehicle]) -> None:
+        requests = [wire.CommandLong(1, 1, 512, (math.nan,) * 7), wire.CommandLong(1, 1, 400)]
+        station = Station(kind()).send(*requests)
+        assert [ack.result for ack in station.heard(wire.CommandAck)] == [3, 3]
+
+    def test_what_is_for_others_is_left_alone(self, kind: Callable[[], Vehicle]) -> None:
+        vehicle = kind()
+        station = Station(vehicle).wait(0.5)
+        name = next(iter(vehicle.params))
+        assert not station.ask(
+            wire.ParamRequestList(2, 1),
+            wire.ParamRequestList(1, 2),
+            read(name, system=2),
+            read(name, component=99),
+            write(name, 1.0, ParamType.REAL32, system=2),
+        )
+        assert not vehicle.requests
+
+    def test_component_0_is_everyone(self, kind: Callable[[], Vehicle]) -> None:
+        vehicle = kind()
+        assert len(Station(vehicle).ask(read(index=0, component=0))) == 1
+        assert vehicle.requests == {"PARAM_REQUEST_READ": 1}
+
+    def test_counts_what_it_was_asked(self, kind: Callable[[], Vehicle]) -> None:
+        vehicle = kind()
+        Station(vehicle).send(
+            LIST,
+            read(index=0),
+            read("NO_SUCH"),
+            write("NO_SUCH", 1.0, ParamType.REAL32),
+            wire.CommandLong(1, 1, 520),
+            wire.Heartbeat(6, 8),
+            wire.StatusText(6, "not a request"),
+        )
+        assert vehicle.requests == {
+            "PARAM_REQUEST_LIST": 1,
+            "PARAM_REQUEST_READ": 2,
+            "PARAM_SET": 1,
+            "COMMAND_LONG": 1,
+            "HEARTBEAT": 1,
+        }
+
+    def test_frames_are_numbered(self, kind: Callable[[], Vehicle]) -> None:
+        vehicle = kind()
+        vehicle.receive(wire.encode(LIST, system=255, component=190, sequence=0), 0.0)
+        vehicle.tick(1.0)
+        frames = [frame for data in vehicle.data_to_send() for frame in wire.Framer().receive(data)]
+        assert [frame.sequence for frame in frames] == [number % 256 for number in range(len(frames))]
+        assert {(frame.system, frame.component) for frame in frames} == {(1, 1)}
+
+    def test_a_reboot_ends_everything_but_keeps_the_values(self, kind: Callable[[], Vehicle]) -> None:
+        vehicle = kind()
+        name = next(iter(vehicle.params))
+        station = Station(vehicle).send(LIST)
+        vehicle.set_param(name, 3)
+        vehicle.reboot(station.now, down=2.0)
+        assert vehicle.next_deadline() == 2.0
+        station.log.clear()
+        station.send(LIST).wait(1.9)
+        assert station.log == []
+        station.wait(0.2)
+        kinds = [type(message) for _, _, message in station.log]
+        assert kinds in ([wire.Heartbeat], [wire.Heartbeat, wire.SystemTime])
+        assert station.log[0][1].sequence == 0
+        assert vehicle.param(name).value == 3
+        assert len(station.ask(LIST, seconds=1.5)) >= len(vehicle.params)
+
+    def test_what_was_not_yet_fetched_is_gone_after_a_reboot(self, kind: Callable[[], Vehicle]) -> None:
+        vehicle = kind()
+        vehicle.receive(wire.encode(LIST, system=255, component=190, sequence=0), 0.0)
+        vehicle.reboot(0.5)
+        assert len(vehicle.data_to_send()) <= len(SIGNS_OF_LIFE)
+
+    def test_switched_off_for_good(self, kind: Callable[[], Vehicle]) -> None:
+        vehicle = kind()
+        station = Station(vehicle).send(LIST)
+        vehicle.reboot(0.0, down=math.inf)
+        station.log.clear()
+        assert vehicle.next_deadline() is None
+        assert station.send(LIST).wait(100.0).log == []
+
+    def test_a_full_download_gives_the_table(self, kind: Callable[[], Vehicle]) -> None:
+        vehicle = kind()
+        values = Station(vehicle).ask(LIST, seconds=1.2)
+        listed = [value for value in values if value.param_index != NO_INDEX]
+        assert names(listed) == list(vehicle.params)
+        assert indices(listed) == list(range(len(listed)))
+        assert {value.param_count for value in values} == {len(listed)}
+
+    def test_a_frame_in_pieces_is_joined_on_a_stream_only(self, kind: Callable[[], Vehicle]) -> None:
+        frame = wire.encode(read(index=0), system=255, component=190, sequence=0)
+        vehicle = kind()
+        vehicle.receive(frame[:10], 0.0)
+        vehicle.receive(frame[10:], 0.0)
+        assert not vehicle.requests
+
+    @given(data=st.lists(st.binary(max_size=300), max_size=5))
+    @settings(max_examples=30, deadline=None)
+    def test_noise_does_no_harm(self, kind: Callable[[], Vehicle], data: list[bytes]) -> None:
+        vehicle = _SHARED.setdefault(kind, kind())
+        for piece in data:
+            vehicle.receive(piece, 0.0)
+        assert len(vehicle.data_to_send()) <= len(SIGNS_OF_LIFE)
+
+
+_SHARED: dict[Callable[[], Vehicle], Vehicle] = {}
+_text = st.sampled_from(["", "A_FLOAT", "b_int", "_HASH_CHECK", "A" * 16, "\xff\x01"])
+_target = st.sampled_from([0, 1, 2])
+_kind = st.integers(0, 255)
+_requests = st.one_of(
+    st.builds(wire.ParamRequestList, _target, _target),
+    st.builds(wire.ParamRequestRead, _target, _target, _text, st.integers(-32768, 32767)),
+    st.builds(wire.ParamSet, _target, _target, _text, st.binary(min_size=4, max_size=4), _kind),
+    st.builds(wire.CommandLong, _target, _target, st.sampled_from([512, 520, 1])),
+    st.builds(wire.Heartbeat, _kind, _kind),
+)
+
+
+@pytest.mark.parametrize("error", [False, True])
+@pytest.mark.parametrize("kind", [GenericVehicle, PX4Vehicle, ArduPilotVehicle])
+@given(script=st.lists(st.tuples(st.floats(0, 1e4), _requests), max_size=40))
+@settings(max_examples=30, deadline=None)
+def test_no_request_does_harm(
+    kind: Callable[..., Vehicle], error: bool, script: list[tuple[float, wire.Message]]
+) -> None:
+    """Whatever is asked and however time jumps: no exception, and all pending work ends."""
+    vehicle = kind(table=SMALL, param_error=error, telemetry=7.0, stream=True)
+    now = 0.0
+    for pause, message in script:
+        now += pause
+        vehicle.receive(wire.encode(message, system=255, component=190, sequence=0), now)
+        deadline = vehicle.next_deadline()
+        assert deadline is not None
+        assert deadline > now
+    assert len(vehicle.data_to_send()) <= 40 * (8 + 4 * len(SMALL)) + 4
+    Station(vehicle, start=now + 10).wait(10)
+
+
+def test_what_nobody_fetches_is_bounded() -> None:
+    vehicle = GenericVehicle(SMALL, burst=1000)
+    request = wire.encode(read(index=0), system=255, component=190, sequence=0) * 1000
+    for _ in range(30):
+        vehicle.receive(request, 0.0)
+    assert len(vehicle.data_to_send()) == 20_000
+    vehicle.receive(request[: len(request) // 1000], 0.0)
+    assert len(vehicle.data_to_send()) == 1
+
+
+class TestOptions:
+    def test_mavlink_1(self) -> None:
+        vehicle = ArduPilotVehicle(mavlink_version=1, telemetry=10.0)
+        station = Station(vehicle).send(LIST, wire.CommandLong(1, 1, 520)).wait(1.2)
+        assert {frame.version for _, frame, _ in station.log} == {1}
+        assert len(station.values()) == 1382
+
+    @pytest.mark.parametrize("version", [1, 2])
+    def test_telemetry_at_its_rate(self, version: int) -> None:
+        vehicle = GenericVehicle(SMALL, telemetry=50.0, mavlink_version=version)
+        framer = wire.Framer()
+        vehicle.tick(0.0)
+        seen: Counter[int] = Counter()
+        for step in range(1, 201):
+            vehicle.tick(step * 0.01 + 0.001)
+            seen.update(frame.message_id for data in vehicle.data_to_send() for frame in framer.receive(data))
+        assert seen == {30: 100, 0: 3, 2: 3}
+        assert framer.skipped == 0
+
+    def test_telemetry_is_made_up_for_one_second_at_most(self) -> None:
+        vehicle = GenericVehicle(SMALL, telemetry=50.0)
+        vehicle.tick(0.0)
+        vehicle.tick(1e5)
+        assert len(vehicle.data_to_send()) == pytest.approx(51 + 2 * len(SIGNS_OF_LIFE), abs=1)
+        assert vehicle.next_deadline() == pytest.approx(1e5 + 0.02, abs=0.02)
+
+    def test_a_stream_joins_pieces(self) -> None:
+        vehicle = GenericVehicle(SMALL, stream=True)
+        station = Station(vehicle)
+        for byte in wire.encode(read("B_INT"), system=255, component=190, sequence=0):
+            station.send_bytes(bytes((byte,)))
+        assert names(station.values()) == ["B_INT"]
+
+    def test_ids_of_its_own(self) -> None:
+        vehicle = PX4Vehicle(system=7, component=42)
+        station = Station(vehicle)
+        (value,) = station.ask(read("SYS_AUTOSTART", system=7, component=42))
+        assert value.param_id == "SYS_AUTOSTART"
+        assert not station.ask(read("SYS_AUTOSTART"))
+
+    def test_every_system_has_its_own_hardware_id(self) -> None:
+        seen = set()
+        for vehicle in [kind(system=n) for n in (1, 2, 255) for kind in (PX4Vehicle, ArduPilotVehicle)]:
+            station = Station(vehicle).send(wire.CommandLong(vehicle.system, 1, 520))
+            (version,) = station.heard(wire.AutopilotVersion)
+            seen.add((version.uid, version.uid2))
+        assert len(seen) == 6
+
+    def test_a_hardware_id_can_be_given(self) -> None:
+        for vehicle in (
+            PX4Vehicle(uid=99, system=3),
+            ArduPilotVehicle(uid2=b"hello", system=3),
+            GenericVehicle(SMALL, uid=5, system=3, capabilities=8192, autopilot=8),
+        ):
+            station = Station(vehicle).send(wire.CommandLong(3, 1, 520))
+            (version,) = station.heard(wire.AutopilotVersion)
+            assert (version.uid, version.uid2, version.capabilities) in [
+                (99, bytes(18), 59647),
+                (0, b"hello".ljust(18, b"\0"), 64495),
+                (5, bytes(18), 8192),
+            ]
+
+    def test_hot_enough(self) -> None:
+        """A full list costs 5 ms of processor time; the best of three runs stays below ten times that."""
+        request = wire.encode(LIST, system=255, component=190, sequence=0)
+        spent = []
+        for _ in range(3):
+            vehicle = ArduPilotVehicle()
+            start = process_time()
+            vehicle.receive(request, 0.0)
+            vehicle.tick(1.0)
+            spent.append(process_time() - start)
+            assert len(vehicle.data_to_send()) == 1382 + 3 + 2  # heartbeats
+        assert min(spent) < 0.05
+
+
+class TestGeneric:
+    def test_every_type_goes_and_comes_byte_wise(self) -> None:
+        vehicle = GenericVehicle({f"T{int(kind)}": (kind, 1) for kind in ParamType} | {"T77": (77, b"abcd")})
+        station = Station(vehicle)
+        by_name = {value.param_id: value for value in station.ask(LIST)}
+        assert by_name["T2"].raw == b"\x01\0\0\0"
+        assert by_name["T9"].raw == struct.pack("<f", 1.0)
+        assert by_name["T8"].raw == b"\x01\0\0\0"
+        assert (by_name["T77"].raw, by_name["T77"].param_type) == (b"abcd", 77)
+        (value,) = station.ask(wire.ParamSet(1, 1, "T2", b"\xff\x01\x02\x03", 2))
+        assert value.raw == b"\xff\0\0\0"
+        assert vehicle.values["T2"] == -1
+        (value,) = station.ask(wire.ParamSet(1, 1, "T77", b"wxyz", 77))
+        assert vehicle.values["T77"] == value.raw == b"wxyz"
+
+    @pytest.mark.parametrize("bits", [0xFFB3B4C0, 0x7F800001, 0xFF800001, 0x7FBFFFFF])
+    def test_signalling_nans_survive(self, bits: int) -> None:
+        vehicle = GenericVehicle({"N": 0})
+        raw = bits.to_bytes(4, "little")
+        (value,) = Station(vehicle).ask(wire.ParamSet(1, 1, "N", raw, ParamType.INT32))
+        assert value.raw == raw
+        assert vehicle.param("N").bits == bits
+
+    def test_reads(self) -> None:
+        station = Station(GenericVehicle(SMALL))
+        assert indices(station.ask(read("C_BYTE"), read(index=1))) == [2, 1]
+        assert names(station.ask(read("C_BYTE", index=-2))) == ["C_BYTE"]
+        assert not station.ask(read("NO_SUCH"), read(index=4), read(index=32767))
+
+    def test_a_wrong_type_changes_nothing_and_is_answered(self) -> None:
+        vehicle = GenericVehicle(SMALL)
+        (value,) = Station(vehicle).ask(write("B_INT", 3.0, ParamType.REAL32))
+        assert value == wire.ParamValue("B_INT", b"\x07\0\0\0", ParamType.INT32, 4, 1)
+
+    def test_errors(self) -> None:
+        station = Station(GenericVehicle(SMALL, param_error=True))
+        station.send(
+            read("NO_SUCH"),
+            read("B_INT", index=99),
+            write("NO_SUCH", 3.0, ParamType.REAL32),
+            write("B_INT", 3.0, ParamType.REAL32),
+        )
+        assert station.heard(wire.ParamError) == [
+            wire.ParamError(255, 190, "NO_SUCH", -1, ParamErrorCode.DOES_NOT_EXIST),
+            wire.ParamError(255, 190, "", 99, ParamErrorCode.DOES_NOT_EXIST),
+            wire.ParamError(255, 190, "NO_SUCH", -1, ParamErrorCode.DOES_NOT_EXIST),
+            wire.ParamError(255, 190, "B_INT", -1, ParamErrorCode.TYPE_MISMATCH),
+        ]
+
+    def test_system_0_is_everyone(self) -> None:
+        assert len(Station(GenericVehicle(SMALL)).ask(wire.ParamRequestList(0, 0))) == 4
+
+    def test_an_empty_table(self) -> None:
+        station = Station(GenericVehicle({}))
+        assert not station.ask(LIST)
+        assert station.endpoint.next_deadline() == 1.0
+
+
+HASH = read("_HASH_CHECK")
+
+
+def hash_set(value: int = 0) -> wire.ParamSet:
+    return wire.ParamSet(1, 1, "_HASH_CHECK", value.to_bytes(4, "little"), ParamType.UINT32)
+
+
+class TestPX4:
+    def test_the_list_begins_with_the_hash(self) -> None:
+        vehicle = PX4Vehicle()
+        values = Station(vehicle).ask(LIST, seconds=2.0)
+        raw = (0xCF579589).to_bytes(4, "little")
+        assert values[0] == wire.ParamValue("_HASH_CHECK", raw, ParamType.UINT32, 903, NO_INDEX)
+        assert indices(values[1:]) == list(range(903))
+
+    def test_20_messages_every_20_ms(self) -> None:
+        station = Station(PX4Vehicle()).send(LIST).wait(2.0)
+        times = station.times()
+        assert [len(list(group)) for _, group in itertools.groupby(times)] == [20] * 45 + [4]
+        assert times[-1] - times[0] == pytest.approx(0.9)
+
+    def test_other_paces(self) -> None:
+        station = Station(PX4Vehicle(burst=1, period=0.125)).send(LIST).wait(200.0)
+        assert station.times()[-1] == pytest.approx(903 * 0.125)
+
+    def test_asked_again_it_starts_again_without_the_hash(self) -> None:
+        station = Station(PX4Vehicle())
+        assert len(station.ask(LIST, seconds=0.29)) == 15 * 20
+        values = station.ask(LIST, seconds=2.0)
+        assert indices(values) == list(range(903))
+
+    def test_after_the_end_the_hash_comes_again(self) -> None:
+        station = Station(PX4Vehicle(table=SMALL))
+        for _ in range(2):
+            assert names(station.ask(LIST)) == ["_HASH_CHECK", *SMALL]
+
+    def test_a_read_of_the_hash_starts_nothing(self) -> None:
+        (value,) = Station(PX4Vehicle()).ask(HASH, seconds=1.0)
+        assert (value.param_id, value.param_index, value.param_type) == ("_HASH_CHECK", NO_INDEX, 5)
+        assert indices(Station(PX4Vehicle()).ask(read("_HASH_CHECK", index=3))) == [3]
+
+    @pytest.mark.parametrize("value", [0, 0xCF579589])
+    def test_a_set_of_the_hash_stops_the_list_after_what_is_queued(self, value: int) -> None:
+        station = Station(PX4Vehicle())
+        assert len(station.ask(LIST, hash_set(value), seconds=2.0)) == 20
+        assert len(station.ask(LIST, seconds=0.1)) == 120
+        assert not station.ask(hash_set(value), seconds=2.0)
+        assert names(station.ask(LIST))[0] == "_HASH_CHECK"
+
+    @pytest.mark.parametrize("by_parameter", [False, True])
+    def test_without_the_hash(self, by_parameter: bool) -> None:
+        vehicle = PX4Vehicle(hash_check=by_parameter)
+        if by_parameter:
+            vehicle.set_param("MAV_HASH_CHK_EN", 0)
+        assert vehicle.announced_hash() is None
+        station = Station(vehicle)
+        assert not station.ask(HASH, hash_set())
+        assert indices(station.ask(LIST, hash_set(), seconds=2.0)) == list(range(903))
+
+    def test_volatile_values_are_not_in_the_hash(self) -> None:
+        vehicle = PX4Vehicle()
+        before = vehicle.announced_hash()
+        vehicle.set_param("COM_FLIGHT_UUID", 12345)
+        assert vehicle.announced_hash() == before
+        vehicle.set_param("SYS_AUTOSTART", 4001)
+        after = vehicle.announced_hash()
+        assert after != before
+        volatile = [row.name for row in px4_table() if row.volatile]
+        assert after == px4_hash(vehicle.params.values(), leave_out=volatile)
+
+    def test_silence(self) -> None:
+        vehicle = PX4Vehicle()
+        before = vehicle.values
+        station = Station(vehicle)
+        assert not station.ask(
+            read("NO_SUCH"),
+            read(index=903),
+            read("sys_autostart"),
+            write("NO_SUCH", 1, ParamType.INT32),
+            write("SYS_AUTOSTART", 1.0, ParamType.REAL32),
+            write("SYS_AUTOSTART", 1, ParamType.UINT32),
+            read("SYS_AUTOSTART", system=0),
+            wire.ParamRequestList(0, 0),
+        )
+        assert vehicle.values == before
+        assert not station.heard(wire.ParamError)
+
+    def test_errors_of_newer_firmware(self) -> None:
+        station = Station(PX4Vehicle(param_error=True))
+        station.send(
+            read("NO_SUCH"),
+            read(index=5000),
+            write("NO_SUCH", 1, ParamType.INT32),
+            write("SYS_AUTOSTART", 1.0, ParamType.REAL32),
+        )
+        assert [
+            (error.param_id, error.param_index, error.error) for error in station.heard(wire.ParamError)
+        ] == [
+            ("NO_SUCH", -1, 1),
+            ("", 5000, 1),
+            ("NO_SUCH", -1, 1),
+            ("SYS_AUTOSTART", -1, 7),
+        ]
+
+    def test_a_set_is_acknowledged_and_pushed_once(self) -> None:
+        vehicle = PX4Vehicle()
+        station = Station(vehicle).wait(0.3).send(write("MPC_XY_VEL_MAX", 11.5, ParamType.REAL32)).wait(2.0)
+        assert [time - 0.3 for time in station.times()] == pytest.approx([0.0, 0.010])
+        first, second = station.values()
+        assert first == second
+        assert first.param_index == vehicle.param("MPC_XY_VEL_MAX").index
+        assert vehicle.values["MPC_XY_VEL_MAX"] == 11.5
+
+    @pytest.mark.parametrize(
+        ("name", "value", "changed"),
+        [
+            ("MPC_TILTMAX_LND", 80.0, {"MPC_TILTMAX_LND": 45.0}),
+            ("MPC_TILTMAX_AIR", 95.0, {"MPC_TILTMAX_AIR": 89.0}),
+            ("MPC_XY_VEL_MAX", 3.0, {"MPC_VEL_MANUAL": 3.0, "MPC_XY_CRUISE": 3.0}),
+            ("MPC_VEL_MAN_SIDE", 20.0, {"MPC_VEL_MAN_SIDE": 10.0}),
+            ("MPC_THR_HOVER", 0.125, {}),
+            ("MPC_THR_HOVER", 0.0625, {"MPC_THR_HOVER": 0.12}),
+        ],
+    )
+    def test_its_position_controller_keeps_values_within_limits(
+        self, name: str, value: float, changed: dict[str, float]
+    ) -> None:
+        vehicle = PX4Vehicle()
+        station = Station(vehicle).wait(0.3).send(write(name, value, ParamType.REAL32))
+        station.wait(0.39)
+        assert vehicle.values[name] == value
+        station.wait(2.0)
+        expected = {name: value, **changed}
+        assert {each: vehicle.values[each] for each in expected} == pytest.approx(expected)
+        assert {each.param_id for each in station.values()} == expected.keys()
+        still = PX4Vehicle(clamp_delay=None)
+        Station(still).wait(0.3).send(write(name, value, ParamType.REAL32)).wait(2.0)
+        assert still.values[name] == value
+        with pytest.raises(UsageError, match="clamp_delay"):
+            PX4Vehicle(clamp_delay=-1.0)
+
+    def test_an_unchanged_value_is_only_acknowledged(self) -> None:
+        vehicle = PX4Vehicle(unsaved=["SYS_AUTOSTART"])
+        value = vehicle.param("MPC_XY_VEL_MAX").value
+        assert isinstance(value, float)
+        values = Station(vehicle).ask(write("MPC_XY_VEL_MAX", value, ParamType.REAL32))
+        assert names(values) == ["MPC_XY_VEL_MAX"]
+
+    def test_no_range_check(self) -> None:
+        vehicle = PX4Vehicle()
+        raw = b"\x01\x00\x80\x7f"  # a signalling NaN
+        values = Station(vehicle).ask(wire.ParamSet(1, 1, "MPC_XY_VEL_MAX", raw, ParamType.REAL32))
+        assert [value.raw for value in values] == [raw, raw]
+        assert vehicle.param("MPC_XY_VEL_MAX").bits == 0x7F800001
+
+    def test_with_a_change_everything_unsaved_is_pushed_in_the_order_of_the_list(self) -> None:
+        vehicle = PX4Vehicle(unsaved=["WV_GAIN", "BAT1_SOURCE"])
+        station = Station(vehicle)
+        assert names(station.ask(write("SYS_AUTOSTART", 5, ParamType.INT32), seconds=0.25)) == [
+            "SYS_AUTOSTART",
+            "BAT1_SOURCE",
+            "SYS_AUTOSTART",
+            "WV_GAIN",
+        ]
+        assert len(station.ask(write("SYS_AUTOSTART", 6, ParamType.INT32), seconds=0.25)) == 4
+        station.wait(1.0)
+        assert names(station.ask(write("SYS_AUTOSTART", 7, ParamType.INT32))) == ["SYS_AUTOSTART"] * 2
+
+    def test_further_changes_put_off_neither_the_push_nor_the_save(self) -> None:
+        station = Station(PX4Vehicle(unsaved=["WV_GAIN"]))
+        for value in range(5000, 5040):
+            station.send(write("SYS_AUTOSTART", value, ParamType.INT32)).wait(0.015)
+        pushes = [time for time, _, message in station.log if "WV_GAIN" in str(message)]
+        assert len(pushes) >= 10
+        assert pushes[0] == pytest.approx(0.010)
+        assert pushes[-1] <= 0.3
+
+    def test_many_changes_are_pushed_20_at_a_time(self) -> None:
+        vehicle = PX4Vehicle()
+        changed = [row.name for row in px4_table() if row.type is ParamType.INT32][:50]
+        station = Station(vehicle)
+        for name in changed:
+            vehicle.set_param(name, 77)
+        station.wait(0.2)
+        times = station.times()
+        assert [len(list(group)) for _, group in itertools.groupby(times)] == [20, 20, 10]
+        assert names(station.values()) == changed
+
+    def test_a_change_behind_the_place_of_a_running_push_is_told_to_nobody(self) -> None:
+        vehicle = PX4Vehicle(autosave=60.0)
+        changed = [row.name for row in px4_table() if row.type is ParamType.INT32][:50]
+        station = Station(vehicle)
+        for name in changed[5:]:
+            vehicle.set_param(name, 77)
+        station.wait(0.025)
+        assert names(station.values()) == changed[5:25]
+        vehicle.set_param(changed[0], 78)
+        vehicle.set_param(changed[49], 78)
+        station.wait(1.0)
+        assert names(station.values()) == changed[25:]
+        vehicle.set_param(changed[20], 79)
+        station.wait(1.0)
+        assert names(station.values()) == [changed[0], *changed[5:]], "with the next change it is"
+
+    def test_what_is_saved_is_not_pushed(self) -> None:
+        """Saved 0.3 s after a change, and 2 s after the last time."""
+        vehicle = PX4Vehicle()
+        changed = [row.name for row in px4_table() if row.type is ParamType.INT32][:400]
+        station = Station(vehicle)
+        for name in changed:
+            vehicle.set_param(name, 77)
+        station.wait(0.4)
+        assert names(station.values()) == changed[:300]
+        vehicle.set_param(changed[0], 78)
+        station.wait(1.0)
+        vehicle.set_param(changed[1], 78)
+        station.wait(0.5)
+        assert names(station.values()) == [changed[0], changed[0], changed[1]]
+        station.wait(1.0)
+        vehicle.set_param(changed[2], 78)
+        station.wait(0.5)
+        assert names(station.values()) == [changed[2]]
+
+    def test_what_is_loaded_or_reset_is_told_to_nobody(self) -> None:
+        vehicle = PX4Vehicle(table=SMALL)
+        station = Station(vehicle)
+        before, bits = vehicle.announced_hash(), {name: each.bits for name, each in vehicle.params.items()}
+        vehicle.load({"B_INT": 8})
+        station.wait(1.0)
+        assert station.values() == []
+        assert vehicle.values["B_INT"] == 8
+        assert vehicle.announced_hash() != before
+        station.ask(write("B_INT", 9, ParamType.INT32))
+        command = wire.CommandLong(1, 1, wire.MAV_CMD_PREFLIGHT_STORAGE, (2.0, *[0.0] * 6))
+        station.send(command).wait(1.0)
+        assert station.times() == []
+        assert [each.result for each in station.heard(wire.CommandAck)] == [wire.MAV_RESULT_ACCEPTED]
+        assert {name: each.bits for name, each in vehicle.params.items()} == bits
+        assert vehicle.announced_hash() == before
+        with pytest.raises(UsageError):
+            vehicle.load({"NO_SUCH": 1})
+
+    def test_a_change_on_board_is_pushed(self) -> None:
+        vehicle = PX4Vehicle()
+        station = Station(vehicle)
+        vehicle.set_param("SYS_AUTOSTART", 9)
+        assert names(station.ask()) == ["SYS_AUTOSTART"]
+        vehicle.set_param("SYS_AUTOSTART", 9)
+        assert not station.ask()
+        vehicle.set_param("ASPD_SCALE_1", 2.0)  # the first of the list
+        assert "ASPD_SCALE_1" in names(station.ask())
+
+    def test_a_push_waits_for_the_end_of_the_list(self) -> None:
+        vehicle = PX4Vehicle(autosave=5.0)
+        station = Station(vehicle).send(LIST).wait(0.1)
+        values = station.ask(write("BAT1_SOURCE", 1, ParamType.INT32), seconds=2.0)
+        assert names(values)[0] == names(values)[-1] == "BAT1_SOURCE"
+        assert len(values) == 2 + 904 - 120
+
+    def test_what_is_not_in_use(self) -> None:
+        vehicle = PX4Vehicle(table=SMALL, not_in_use=["B_INT"])
+        before = vehicle.announced_hash()
+        station = Station(vehicle)
+        assert names(station.ask(LIST)) == ["_HASH_CHECK", "A_FLOAT", "C_BYTE", "D_SHORT"]
+        (value,) = station.ask(read("B_INT"))
+        assert value == wire.ParamValue("B_INT", b"\x07\0\0\0", ParamType.INT32, 3, NO_INDEX)
+        (value,) = station.ask(write("B_INT", 8, ParamType.INT32))
+        assert (value.raw, value.param_index) == (b"\x08\0\0\0", NO_INDEX)
+        assert vehicle.announced_hash() == before
+        assert vehicle.param("B_INT") == Param("B_INT", 8, ParamType.INT32, None, 8)
+        vehicle.use("B_INT")
+        assert vehicle.announced_hash() != before
+        assert indices(station.ask(read("B_INT"), read("C_BYTE"))) == [1, 2]
+        vehicle.reboot(station.now)
+        assert list(vehicle.values) == ["A_FLOAT", "C_BYTE", "D_SHORT"]
+
+    def test_a_calibration_id_brings_others_into_use(self) -> None:
+        vehicle = PX4Vehicle()
+        fourth = vehicle.param("CAL_MAG3_ID").index
+        assert fourth is not None
+        station = Station(vehicle)
+        (value,) = station.ask(read("CAL_MAG2_XOFF"))
+        assert value.param_index == NO_INDEX
+        values = station.ask(write("CAL_MAG2_ID", 197900, ParamType.INT32))
+        assert [value.param_count for value in values] == [903, 919]
+        assert vehicle.param("CAL_MAG3_ID").index == fourth + 16
+        values = station.ask(LIST, seconds=2.0)
+        assert len(values) == 920
+        assert names(values[1:]) == sorted(names(values[1:]))
+
+    def test_use_in_the_middle_of_a_list(self) -> None:
+        """What is used for the first time behind the list's place makes one come twice; the count moves."""
+        vehicle = PX4Vehicle(not_in_use=["ATT_EN", "WV_EN"])
+        station = Station(vehicle)
+        first = station.ask(LIST, seconds=0.01)
+        vehicle.use("ATT_EN", "WV_EN")
+        rest = station.wait(2.0).values()
+        assert {value.param_count for value in first} == {901}
+        assert {value.param_count for value in rest} == {903}
+        assert first[-1].param_id == rest[0].param_id
+        assert rest[0].param_index == first[-1].param_index + 1 == 19
+        assert indices(rest) == list(range(19, 903))
+
+    def test_a_list_asked_for_while_it_boots_comes_later(self) -> None:
+        station = Station(PX4Vehicle(table=SMALL, boot_time=2.0))
+        assert not station.ask(LIST, seconds=1.9)
+        assert len(station.ask(seconds=0.2)) == 5
+        station = Station(PX4Vehicle(table=SMALL, boot_time=2.0))
+        assert not station.ask(LIST, LIST, seconds=1.9)
+        assert names(station.ask(seconds=0.2)) == list(SMALL)
+        station = Station(PX4Vehicle(table=SMALL, boot_time=2.0))
+        assert not station.ask(LIST, hash_set(), seconds=3.0)
+
+    def test_identity_before_its_acknowledgement(self) -> None:
+        station = Station(PX4Vehicle())
+        station.log.clear()
+        station.send(wire.CommandLong(1, 1, 520))
+        (_, _, version), (_, _, ack) = station.log
+        assert isinstance(version, wire.AutopilotVersion)
+        assert (version.capabilities, version.uid) == (59647, 5283920058631409231)
+        assert isinstance(ack, wire.CommandAck)
+
+
+class TestArduPilot:
+    def test_the_list(self) -> None:
+        station = Station(ArduPilotVehicle()).wait(0.05).send(LIST).wait(2.0)
+        texts = [message.text for _, _, message in station.log if isinstance(message, wire.StatusText)]
+        assert len(texts) == 3
+        times = station.times()
+        assert times[0] == pytest.approx(0.1)
+        assert times[-1] - 0.05 == pytest.approx(0.9, rel=0.1)
+        assert max(len(list(group)) for _, group in itertools.groupby(times)) == 10
+        assert indices(station.values()) == list(range(1382))
+
+    def test_on_a_slow_link(self) -> None:
+        station = Station(ArduPilotVehicle(burst=1, period=0.025, live_period=0.0)).send(LIST).wait(60.0)
+        assert station.times()[-1] == pytest.approx(34.6, rel=0.01)
+
+    @pytest.mark.parametrize("name", ["EK3_IMU_MASK", "INS_GYRO_FILTER"])
+    def test_a_set_to_the_default_is_answered_with_another_type(self, name: str) -> None:
+        """Until the parameter has had another value once; measured on a real one."""
+        vehicle = ArduPilotVehicle()
+        param = vehicle.param(name)
+        assert isinstance(param.value, int)
+        station = Station(vehicle)
+        kinds = [
+            [value.param_type for value in station.ask(cast(name, value))]
+            for value in (param.value, param.value, param.value + 1, param.value + 1, param.value)
+        ]
+        assert kinds == [[ParamType.REAL32], [ParamType.REAL32], [param.type], [param.type], [param.type]]
+        assert vehicle.param(name).type == param.type
+
+    @pytest.mark.parametrize("name", ["RTL_ALT", "FLTMODE1"])
+    def test_a_set_of_a_parameter_in_no_group_keeps_its_type(self, name: str) -> None:
+        vehicle = ArduPilotVehicle()
+        param = vehicle.param(name)
+        assert isinstance(param.value, int)
+        (value,) = Station(vehicle).ask(cast(name, param.value))
+        assert value.param_type == param.type
+
+    def test_early_after_boot_the_list_is_ignored(self) -> None:
+        station = Station(ArduPilotVehicle(boot_time=2.0, table=SMALL))
+        assert not station.ask(LIST, seconds=5.0)
+        assert len(station.ask(LIST)) == 4
+
+    def test_values_are_cast(self) -> None:
+        table: dict[str, Value | tuple[ParamType | int, Value]] = {
+            "BYTE": (ParamType.INT8, -5),
+            "BIG": 16777217,
+            "DOUBLE": (ParamType.REAL64, 1e300),
+            "FLOAT": 0.1,
+            "ODD": (77, b"abcd"),
+        }
+        vehicle = ArduPilotVehicle(table=table)
+        raws = [value.raw for value in Station(vehicle).ask(LIST)]
+        assert raws[:3] == [struct.pack("<f", value) for value in (-5.0, 16777216.0, math.inf)]
+        assert raws[3:] == [struct.pack("<f", 0.1), b"abcd"]
+        assert vehicle.values["BIG"] == 16777217
+
+    def test_a_read_by_name_has_no_index_and_the_spelling_asked_for(self) -> None:
+        station = Station(ArduPilotVehicle())
+        (value,) = station.ask(read("rtl_Alt"))
+        assert value == wire.ParamValue("rtl_Alt", struct.pack("<f", 1500), ParamType.INT32, 1382, NO_INDEX)
+        (value,) = station.ask(read(index=8))
+        assert (value.param_id, value.param_index) == ("RTL_ALT", 8)
+
+    def test_reads_one_at_a_time_go_at_10_a_second(self) -> None:
+        station = Station(ArduPilotVehicle())
+        for index in range(100):
+            station.send(read(index=index))
+            while not station.times():
+                due = station.endpoint.next_deadline()
+                assert due is not None
+                station.wait(due - station.now)
+            station.log.clear()
+        assert station.now == pytest.approx(10.0)
+
+    def test_five_every_100_ms(self) -> None:
+        station = Station(ArduPilotVehicle()).wait(0.03)
+        station.send(*(read(index=index) for index in range(15))).wait(1.0)
+        assert station.times() == pytest.approx([0.1] * 5 + [0.2] * 5 + [0.3] * 5)
+        assert indices(station.values()) == list(range(15))
+
+    @pytest.mark.parametrize(("asked", "answered"), [(25, 25), (40, 25), (300, 25)])
+    def test_the_queue_overflows_without_a_word(self, asked: int, answered: int) -> None:
+        station = Station(ArduPilotVehicle())
+        assert indices(station.ask(*(read(index=index) for index in range(asked)), seconds=5.0)) == list(
+            range(answered)
+        )
+        assert len(station.ask(read(index=0))) == 1
+
+    def test_unknown_reads_are_silent_and_take_no_slot(self) -> None:
+        station = Station(ArduPilotVehicle())
+        unknown = [read("NO_SUCH"), read(index=1382), read("RTL_ALT", index=-2)]
+        assert not station.ask(*unknown, seconds=1.0)
+        assert indices(station.ask(*unknown, *(read(index=index) for index in range(5)))) == list(range(5))
+        assert not station.heard(wire.ParamError)
+
+    def test_a_read_may_answer_with_the_value_before_a_set(self) -> None:
+        station = Station(ArduPilotVehicle())
+        first, second = station.ask(read("RTL_ALT"), cast("RTL_ALT", 2000))
+        assert first.raw == struct.pack("<f", 2000)
+        assert second.raw == struct.pack("<f", 1500)
+
+    @pytest.mark.parametrize(
+        ("name", "value", "stored"),
+        [
+            ("RTL_ALT", 1234.7, 1234),
+            ("RTL_ALT", -1234.7, -1234),
+            ("RTL_ALT", 3e9, 2**31 - 1),
+            ("RTL_ALT", -3e9, -(2**31)),
+            ("FLTMODE1", 200, 127),
+            ("FLTMODE1", -200, -128),
+            ("FS_THR_VALUE", 1e30, 32767),
+            ("PILOT_TKOFF_ALT", 0.25, 0.25),
+            ("DOUBLE", 0.25, 0.25),
+        ],
+    )
+    @pytest.mark.parametrize("kind", [ParamType.REAL32, ParamType.INT32, 0, 255])
+    def test_a_set_is_converted_and_kept_in_range(
+        self, name: str, value: float, stored: float, kind: int
+    ) -> None:
+        vehicle = ArduPilotVehicle(table=[*ardupilot_table(), SimParam("DOUBLE", ParamType.REAL64, 0.0)])
+        station = Station(vehicle).wait(0.0301).send(cast(name, value, kind)).wait(0.1)
+        (time,) = station.times()
+        assert 0.0 < time - 0.0301 < 0.007
+        (answer,) = station.values()
+        assert (answer.param_id, answer.param_index) == (name, NO_INDEX)
+        assert answer.param_type == vehicle.param(name).type
+        assert vehicle.param(name).value == stored
+        assert answer.raw == struct.pack("<f", stored)
+
+    def test_a_set_of_a_type_that_mavlink_does_not_define(self) -> None:
+        vehicle = ArduPilotVehicle(table={"ODD": (77, b"abcd")})
+        (answer,) = Station(vehicle).ask(cast("ODD", 1.0))
+        assert answer.raw == struct.pack("<f", 1.0)
+
+    def test_an_unchanged_value_is_answered_too_by_its_own_name(self) -> None:
+        assert names(Station(ArduPilotVehicle()).ask(cast("rtl_alt", 1500))) == ["RTL_ALT"]
+
+    def test_sets_in_quick_succession_share_an_answer(self) -> None:
+        vehicle = ArduPilotVehicle()
+        station = Station(vehicle)
+        for number in range(100):
+            station.send(cast("RTL_ALT", 1000 + number), cast("RTL_SPEED", number)).wait(0.0015)
+        station.wait(0.1)
+        values = [value.raw for value in station.values() if value.param_id == "RTL_ALT"]
+        assert len(values) == 26
+        assert values[-1] == struct.pack("<f", 1099)
+
+    @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
+    @pytest.mark.parametrize("error", [False, True])
+    def test_not_a_number(self, value: float, error: bool) -> None:
+        vehicle = ArduPilotVehicle(param_error=error)
+        station = Station(vehicle).send(cast("RTL_ALT", value), cast("NO_SUCH", 1.0)).wait(1.0)
+        assert vehicle.values["RTL_ALT"] == 1500
+        assert not station.times()
+        assert [error.error for error in station.heard(wire.ParamError)] == [2, 1] * error
+
+    @pytest.mark.parametrize("error", [False, True])
+    def test_read_only(self, error: bool) -> None:
+        vehicle = ArduPilotVehicle(read_only=["RTL_ALT"], param_error=error)
+        station = Station(vehicle)
+        station.log.clear()
+        station.send(cast("RTL_ALT", 7)).wait(0.5)
+        assert [message for _, _, message in station.log] == [
+            wire.ParamValue("RTL_ALT", struct.pack("<f", 1500), ParamType.INT32, 1382, NO_INDEX),
+            wire.StatusText(4, "Param write denied (RTL_ALT)"),
+            wire.ParamError(255, 190, "RTL_ALT", -1, ParamErrorCode.READ_ONLY),
+        ][: 3 if error else 2]
+        assert vehicle.values["RTL_ALT"] == 1500
+        vehicle.set_param("RTL_ALT", 8)
+        assert vehicle.values["RTL_ALT"] == 8
+
+    def test_a_name_that_does_not_exist_takes_its_time_and_no_place(self) -> None:
+        vehicle = ArduPilotVehicle()
+        unknown = [read(f"NO_SUCH_{number}") for number in range(19)]
+        station = Station(vehicle).send(*unknown, *[read("RTL_ALT")] * 3).wait(0.5)
+        assert (
+            len(station.heard(wire.ParamValue)) == 2
+        )  # one looked up, 20 that wait: the last one is dropped
+        station = Station(ArduPilotVehicle()).send(*unknown[:14], *[read("RTL_ALT")] * 5).wait(0.11)
+        assert len(station.heard(wire.ParamValue)) == 5
+
+    def test_errors_of_newer_firmware_for_reads(self) -> None:
+        station = (
+            Station(ArduPilotVehicle(param_error=True)).send(read("NO_SUCH"), read(index=5000)).wait(0.5)
+        )
+        assert station.heard(wire.ParamError) == [
+            wire.ParamError(255, 190, "NO_SUCH", -1, ParamErrorCode.DOES_NOT_EXIST),
+            wire.ParamError(255, 190, "", 5000, ParamErrorCode.DOES_NOT_EXIST),
+        ]
+
+    def test_a_group_is_shown_and_hidden(self) -> None:
+        vehicle = ArduPilotVehicle()
+        station = Station(vehicle)
+        switch = vehicle.param("EK2_ENABLE").index
+        assert switch is not None
+        (value,) = station.ask(cast("EK2_ENABLE", 1))
+        assert value.param_count == 1434
+        assert vehicle.param("EK2_GPS_TYPE").index == switch + 1
+        assert vehicle.param("EK3_ENABLE").index == switch + 53
+        values = station.ask(LIST, seconds=2.0)
+        assert indices(values) == list(range(1434))
+        assert names(values) == list(vehicle.params)
+        (value,) = station.ask(cast("EK2_ENABLE", 0))
+        assert value.param_count == 1382
+        assert vehicle.param("EK2_GPS_TYPE").index is None
+        assert vehicle.param("EK3_ENABLE").index == switch + 1
+
+    def test_a_hidden_parameter_can_be_read_and_set_by_name(self) -> None:
+        vehicle = ArduPilotVehicle(table=SMALL | {"G_ENABLE": 0}, groups={"G_ENABLE": {"G_GAIN": 2.0}})
+        station = Station(vehicle)
+        assert list(vehicle.values) == [*SMALL, "G_ENABLE"]
+        assert names(station.ask(read("G_GAIN"), cast("G_GAIN", 3.0))) == ["G_GAIN"] * 2
+        vehicle.set_param("G_ENABLE", 1)
+        assert vehicle.values["G_GAIN"] == 3.0
+
+    def test_during_a_list_two_counts_alternate(self) -> None:
+        """The list goes on with its first count, answers give the new one, and the new ones are not lost."""
+        vehicle = ArduPilotVehicle()
+        station = Station(vehicle)
+        values = station.ask(LIST, seconds=0.3)
+        values += station.ask(cast("EK2_ENABLE", 1), seconds=2.0)
+        (answer,) = [value for value in values if value.param_index == NO_INDEX]
+        listed = [value for value in values if value.param_index != NO_INDEX]
+        assert answer.param_count == 1434
+        assert {value.param_count for value in listed} == {1382}
+        assert indices(listed) == list(range(1434))
+        assert names(listed) == list(vehicle.params)
+
+    def test_a_group_hidden_at_the_end_of_a_list_ends_it(self) -> None:
+        vehicle = ArduPilotVehicle(
+            table=SMALL | {"G_ENABLE": 1}, groups={"G_ENABLE": {"G_GAIN": 2.0}}, burst=5
+        )
+        station = Station(vehicle)
+        assert len(station.ask(LIST, seconds=0.103)) == 5
+        vehicle.set_param("G_ENABLE", 0)
+        assert names(station.ask()) == ["G_ENABLE"]
+
+    def test_a_change_on_board_is_told(self) -> None:
+        vehicle = ArduPilotVehicle()
+        station = Station(vehicle)
+        vehicle.set_param("RTL_ALT", 77)
+        (value,) = station.ask()
+        assert (value.param_id, value.param_index) == ("RTL_ALT", NO_INDEX)
+
+    def test_live_values_come_unasked(self) -> None:
+        vehicle = ArduPilotVehicle(live_period=10.0)
+        before = vehicle.values
+        station = Station(vehicle).wait(35.0)
+        assert station.times() == pytest.approx([t for t in (10, 20, 30) for _ in "ab"], abs=0.007)
+        values = station.values()
+        assert names(values) == ["BARO1_GND_PRESS", "STAT_RUNTIME"] * 3
+        assert set(indices(values)) == {NO_INDEX}
+        assert vehicle.values["STAT_RUNTIME"] == before["STAT_RUNTIME"] + 30  # type: ignore[operator]  # ints
+        assert vehicle.values["BARO1_GND_PRESS"] == pytest.approx(before["BARO1_GND_PRESS"])
+        assert values[0].raw != values[2].raw
+
+    def test_live_values_stay_within_their_type(self) -> None:
+        vehicle = ArduPilotVehicle(table={"N": (ParamType.INT8, 126)}, live=["N"], live_period=1.0)
+        seen = [struct.unpack("<f", value.raw)[0] for value in Station(vehicle).wait(4.1).values()]
+        assert seen == [127, 0, 1, 2]
+
+    def test_live_values_can_be_switched_off(self) -> None:
+        assert not Station(ArduPilotVehicle(live_period=0.0)).wait(100.0).values()
+
+    def test_a_late_call_changes_live_values_once(self) -> None:
+        station = Station(ArduPilotVehicle(live_period=10.0))
+        station.now = 1000.0
+        assert len(station.wait(1.0).values()) == 2
+
+    def test_identity_after_its_acknowledgement(self) -> None:
+        station = Station(ArduPilotVehicle())
+        station.log.clear()
+        station.send(wire.CommandLong(1, 1, 520))
+        (_, _, ack), (_, _, version) = station.log
+        assert isinstance(ack, wire.CommandAck)
+        assert isinstance(version, wire.AutopilotVersion)
+        assert (version.capabilities, version.uid2) == (64495, b"3d1219c7c4c5404aa\0")
+
+
+def pass_through(link: FaultyLink, count: int = 5000, gap: float = 0.001) -> list[tuple[float, int]]:
+    """Send numbered datagrams at an even pace: when each that arrives does, and its number."""
+    for number in range(count):
+        link.send(number.to_bytes(4, "big"), number * gap)
+    arrived = []
+    while (due := link.next_deadline()) is not None:
+        arrived += [(due, int.from_bytes(data, "big")) for data in link.deliver(due)]
+    return arrived
+
+
+class TestFaultyLink:
+    def test_perfect(self) -> None:
+        link = FaultyLink()
+        assert link.next_deadline() is None
+        assert pass_through(link, 10) == [(number * 0.001, number) for number in range(10)]
+        assert (link.sent, link.lost, link.duplicated, link.delivered) == (10, 0, 0, 10)
+        assert link.deliver(99.0) == []
+
+    @pytest.mark.parametrize("seed", [0, 1, 2])
+    def test_loss(self, seed: int) -> None:
+        link = FaultyLink(loss=0.2, seed=seed)
+        arrived = pass_through(link)
+        assert 900 <= link.lost <= 1100
+        assert len(arrived) == link.delivered == link.sent - link.lost
+        assert pass_through(FaultyLink(loss=1.0), 100) == []
+
+    def test_delay(self) -> None:
+        link = FaultyLink(delay=0.25)
+        link.send(b"x", 1.0)
+        assert link.deliver(1.249) == []
+        assert link.next_deadline() == 1.25
+        assert link.deliver(1.25) == [b"x"]
+
+    def test_loss_in_bursts(self) -> None:
+        link = FaultyLink(loss=0.2, loss_burst=8.0, seed=6)
+        arrived = {number for _, number in pass_through(link)}
+        assert 0.15 <= link.lost / link.sent <= 0.25
+        runs = [
+            len(list(run))
+            for is_lost, run in itertools.groupby(range(5000), lambda n: n not in arrived)
+            if is_lost
+        ]
+        assert 6.0 <= sum(runs) / len(runs) <= 10.0
+        assert link.lost == sum(runs)
+
+    def test_everything_lost_in_bursts(self) -> None:
+        assert pass_through(FaultyLink(loss=1.0, loss_burst=3.0)) == []
+
+    def test_jitter_keeps_the_order(self) -> None:
+        arrived = pass_through(FaultyLink(delay=0.01, jitter=0.05, seed=3))
+        assert [number for _, number in arrived] == list(range(5000))
+        ways = [time - number * 0.001 for time, number in arrived]
+        assert min(ways) >= 0.01
+        assert max(ways) <= 0.06 + 1e-9
+        assert max(ways) - min(ways) > 0.02
+
+    def test_reorder(self) -> None:
+        link = FaultyLink(reorder=0.1, seed=4)
+        order = [number for _, number in pass_through(link)]
+        assert sorted(order) == list(range(5000))
+        overtaken = sum(later < earlier for earlier, later in itertools.pairwise(order))
+        assert 300 <= overtaken <= 500
+        assert max(abs(place - number) for place, number in enumerate(order)) <= 31
+
+    def test_duplicate(self) -> None:
+        link = FaultyLink(duplicate=0.1, seed=5)
+        counts = Counter(number for _, number in pass_through(link))
+        assert set(counts.values()) == {1, 2}
+        assert 400 <= link.duplicated == sum(count == 2 for count in counts.values()) <= 600
+        assert link.delivered == link.sent - link.lost + link.duplicated
+
+    def test_bit_errors(self) -> None:
+        link = FaultyLink(bit_errors=0.01, seed=6)
+        for _ in range(1000):
+            link.send(bytes(100), 0.0)
+        turned = sum(bit.bit_count() for data in link.deliver(0.0) for bit in data)
+        assert 7500 <= turned <= 8500
+        half = FaultyLink(bit_errors=0.5, seed=6)
+        half.send(bytes(10_000), 0.0)
+        assert 39_000 <= sum(bit.bit_count() for data in half.deliver(0.0) for bit in data) <= 41_000
+        all_of_them = FaultyLink(bit_errors=1.0)
+        all_of_them.send(b"\x00\xf0", 0.0)
+        assert all_of_them.deliver(0.0) == [b"\xff\x0f"]
+        hardly = FaultyLink(bit_errors=1e-300)
+        hardly.send(b"\x00\xf0", 0.0)
+        assert hardly.deliver(0.0) == [b"\x00\xf0"]
+
+    def test_rate(self) -> None:
+        link = FaultyLink(rate=1000.0, delay=0.5)
+        for _ in range(3):
+            link.send(bytes(100), 0.0)
+        assert [len(link.deliver(time)) for time in (0.59, 0.6, 0.69, 0.7, 0.8)] == [0, 1, 0, 1, 1]
+        link.send(bytes(100), 10.0)
+        assert link.next_deadline() == pytest.approx(10.6)
+
+    def test_a_full_queue_drops(self) -> None:
+        link = FaultyLink(rate=1000.0, queue=250)
+        for _ in range(10):
+            link.send(bytes(100), 0.0)
+        assert (link.sent, link.lost) == (10, 8)
+        link.send(bytes(100), 0.1)
+        assert link.lost == 8
+        nothing_waits = FaultyLink(rate=1000.0, queue=0)
+        for at in (0.0, 0.05, 0.1):
+            nothing_waits.send(bytes(100), at)
+        assert nothing_waits.lost == 1
+
+    def test_the_same_seed_gives_the_same_faults(self) -> None:
+        def once(seed: int) -> list[tuple[float, int]]:
+            return pass_through(
+                FaultyLink(
+                    loss=0.1, jitter=0.01, duplicate=0.1, reorder=0.1, bit_errors=0.001, rate=1e5, seed=seed
+                ),
+                500,
+            )
+
+        assert once(1) == once(1) != once(2)
+
+    @pytest.mark.parametrize(
+        "arguments",
+        [
+            {"loss": -0.1},
+            {"loss": 1.1},
+            {"loss_burst": 0.5},
+            {"loss_burst": math.inf},
+            {"duplicate": math.nan},
+            {"reorder": 2.0},
+            {"bit_errors": -1.0},
+            {"delay": -0.1},
+            {"jitter": math.inf},
+            {"rate": 0.0},
+            {"rate": math.nan},
+            {"queue": 100},
+            {"rate": 100.0, "queue": -1},
+        ],
+    )
+    def test_what_cannot_be(self, arguments: dict[str, float]) -> None:
+        with pytest.raises(UsageError):
+            FaultyLink(**arguments)  # type: ignore[arg-type]  # one dict for arguments of several types
+
+
+class TestAir:
+    def test_several_vehicles_hear_and_are_heard(self) -> None:
+        air = Air([PX4Vehicle(system=1), ArduPilotVehicle(system=2), GenericVehicle(SMALL, system=3)])
+        assert air.next_deadline() is None
+        station = Station(air)
+        station.send(wire.ParamRequestList(2, 1), wire.ParamRequestList(1, 1), wire.ParamRequestList(3, 1))
+        station.wait(2.0)
+        systems = Counter(
+            frame.system for _, frame, message in station.log if isinstance(message, wire.ParamValue)
+        )
+        assert systems == {1: 904, 2: 1382, 3: 4}
+
+    def test_a_delay_in_both_directions_makes_a_round_trip(self) -> None:
+        station = Station(Air.symmetric([GenericVehicle(SMALL)], delay=0.05)).wait(0.5)
+        station.send(read("B_INT")).wait(0.5)
+        assert station.times() == pytest.approx([0.6])
+
+    def test_the_directions_draw_different_numbers(self) -> None:
+        air = Air.symmetric(
+            [], loss=0.5, jitter=0.1, duplicate=0.1, reorder=0.1, bit_errors=0.01, rate=1e6, queue=99, seed=7
+        )
+        other = Air.symmetric(
+            [], loss=0.5, jitter=0.1, duplicate=0.1, reorder=0.1, bit_errors=0.01, rate=1e6, queue=99, seed=8
+        )
+        runs = [pass_through(link, 100) for link in (air.uplink, air.downlink, other.uplink, other.downlink)]
+        assert all(a != b for a, b in itertools.combinations(runs, 2))
+
+    @given(steps=st.lists(st.floats(0.001, 0.3), max_size=20), seed=st.integers(0, 2**32))
+    @settings(max_examples=15, deadline=None)
+    def test_the_outcome_does_not_depend_on_when_it_is_called(self, steps: list[float], seed: int) -> None:
+        def session(times: list[float]) -> list[bytes]:
+            air = Air.symmetric(
+                [PX4Vehicle(table=SMALL, telemetry=20.0)], loss=0.2, jitter=0.02, reorder=0.1, seed=seed
+            )
+            air.receive(wire.encode(LIST, system=255, component=190, sequence=0), 0.0)
+            for time in times:
+                air.tick(time)
+            air.tick(10.0)
+            return air.data_to_send()
+
+        assert session(list(itertools.accumulate(steps))) == session([])
+
+    def test_faults_apply_in_each_direction(self) -> None:
+        vehicle = GenericVehicle(SMALL)
+        deaf = Station(Air([vehicle], uplink=FaultyLink(loss=1.0)))
+        assert deaf.wait(2.5).heard(wire.Heartbeat)
+        deaf.send(LIST)
+        assert not vehicle.requests
+        mute = Station(Air([vehicle], downlink=FaultyLink(loss=1.0)))
+        mute.send(LIST).wait(1.0)
+        assert vehicle.requests == {"PARAM_REQUEST_LIST": 1}
+        assert mute.log == []
+
+    def test_what_happens_to_a_vehicle_from_outside_is_seen(self) -> None:
+        vehicle = ArduPilotVehicle()
+        air = Air([vehicle])
+        station = Station(air).wait(0.5)
+        vehicle.set_param("RTL_ALT", 5)
+        assert air.next_deadline() == pytest.approx(0.5, abs=0.006)
+        assert names(station.ask()) == ["RTL_ALT"]
+
+    def test_what_nobody_fetches_is_bounded(self) -> None:
+        air = Air([GenericVehicle(SMALL, telemetry=10_000.0)])
+        for second in range(4):
+            air.tick(float(second))
+        assert len(air.data_to_send()) == 20_000
+
+    def test_an_air_in_an_air(self) -> None:
+        inner = Air.symmetric([GenericVehicle(SMALL)], delay=0.01)
+        station = Station(Air.symmetric([inner], delay=0.01)).send(read("B_INT")).wait(0.5)
+        assert station.times() == pytest.approx([0.04])
