@@ -56,6 +56,8 @@ BLOCKED: Final = 50.0
 """Milliseconds of processor time of the longest callback of the event loop."""
 MEMORY: Final = 64.0
 """Megabytes by which the memory of the service grows at most."""
+MEMORY_OF_COMPONENTS: Final = 80.0
+"""The same where it follows as many components as it may, by docs/bounds.md."""
 LOG: Final = 10.0
 """Kilobytes in the log."""
 ENDED: Final = 3.0
@@ -550,7 +552,8 @@ async def udp(rows: list[Row], quick: bool) -> None:
         if quick:
             return
         service.attack = "heartbeats of 65,025 systems on UDP"
-        with service.watched(blocked=None), socket.socket(type=socket.SOCK_DGRAM) as peer:
+        watched = service.watched(memory=MEMORY_OF_COMPONENTS, blocked=None)
+        with watched, socket.socket(type=socket.SOCK_DGRAM) as peer:
             for number in range(255 * 255):
                 mav = common.MAVLink(None, 1 + number % 255, 1 + number // 255)
                 beat = mav.heartbeat_encode(2, 12, 81, 0, 4)

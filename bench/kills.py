@@ -11,8 +11,8 @@ database  the PostgreSQL of a station, with all of its processes; the station go
 
 Then the cache is opened. It must not be damaged, and table and history must have every set that was
 acknowledged as durable, and every other one that was acknowledged more than 0.25 s and the slack before the
-kill. 0.25 s is how long changes are gathered. The slack is for a batch under way at that time, for the
-commit, and for two waits for a core where other programs take them. The table has the age of the oldest set
+kill. By then a change should be on the disk. The slack is for a batch under way at that time, for the commit,
+and for two waits for a core where other programs take them. The table has the age of the oldest set
 that was lost. Of a database, nothing that was acknowledged may be missing, as its station lives on.
 
 Exit code 1 says that something was lost.

@@ -41,6 +41,8 @@ __all__ = ["WriteThrough", "chosen_cache"]
 FLUSH_INTERVAL: Final = 0.25
 """Seconds after which a change is on the disk, as long as the machine keeps up: changes are gathered for so
 long, less what the last commit took. A download fills several batches."""
+FLUSH_RESERVE: Final = 0.04
+"""Seconds of that for a commit that takes longer than the last one."""
 DOWNLOAD_INTERVAL: Final = 10.0
 FEW_FETCHES: Final = 8
 """Seconds for which what a fetch under way brings is gathered, and the number of fetches above which that is
@@ -242,7 +244,7 @@ class WriteThrough:
         """Write whatever is new, in batches, until cancelled."""
         while True:
             await self._something_to_write.wait()
-            pause = FLUSH_INTERVAL - min(self._commit_time, FLUSH_INTERVAL / 2)
+            pause = FLUSH_INTERVAL - FLUSH_RESERVE - min(self._commit_time, FLUSH_INTERVAL / 2)
             await anyio.sleep_until(self._waiting_since + pause)
             self._something_to_write = anyio.Event()
             begun_at = anyio.current_time()
