@@ -39,6 +39,9 @@ from typing import Any, Final
 
 from pymavlink.dialects.v20 import common
 
+from paramclient.links import create_link, serve_endpoint
+from paramclient.sim import GenericVehicle
+
 ROOT: Final = Path(__file__).parent.parent
 CERT: Final = ROOT / "tests" / "data" / "tls_station.pem"
 KEY: Final = ROOT / "tests" / "data" / "tls_station.key"
@@ -372,6 +375,39 @@ async def requests(service: Service, quick: bool) -> None:
         await service.reached("/health meanwhile", times=1)
 
 
+async def large_table(rows: list[Row], quick: bool) -> None:
+    """Clause 7: what a reader asks of a vehicle that has as many parameters as one request may name."""
+    table = {f"A{number % 97}_P{number:05}": float(number) for number in range(300 if quick else 10_000)}
+    values = {"wanted": {"values": {name: value + 1 for name, value in table.items()}}, "timeout_s": 60}
+    asked: list[tuple[str, str, bytes]] = [
+        ("GET", f"{C}/params", b""),
+        ("GET", f"{C}/params?names=A1*", b""),
+        ("GET", f"{C}/file?from=known&form=parm", b""),
+        ("GET", f"{C}/file?form=parm", b""),
+        ("POST", f"{C}/diff", as_json(values, known=True)),
+        ("POST", f"{C}/diff", as_json(values, partial=True)),
+        ("POST", f"{C}/plan", as_json(values)),
+        ("POST", f"{C}/verify", as_json(values)),
+    ]
+    with socket.socket(type=socket.SOCK_DGRAM) as free:
+        free.bind((HERE, 0))
+        port = free.getsockname()[1]
+    vehicle = GenericVehicle(table=table, burst=100)
+    far_end = asyncio.create_task(serve_endpoint(vehicle, create_link(f"udpout:{HERE}:{port}")))
+    try:
+        async with serving(rows, f"udpin:{HERE}:{port}", "--no-cache", "--no-fetch") as service:
+            for path in ("/api/v1/find", f"{C}/fetch"):
+                status, answer = await service.ask("POST", path, b'{"timeout_s": 60}', token(READER))
+                assert status == 200, answer
+            for method, path, body in asked:
+                service.attack = f"{len(table):,} parameters: {path.removeprefix(C)}"
+                with service.watched():
+                    status, answer = await service.ask(method, path, body, token(READER))
+                    assert status == 200, answer
+    finally:
+        far_end.cancel()
+
+
 async def guesses(service: Service, quick: bool) -> None:
     """Clause 8, with 127.0.0.2 for a proxy that is trusted."""
     service.attack = "30 wrong tokens, then a right one"
@@ -586,6 +622,7 @@ async def attack(quick: bool, only: str) -> list[Row]:
         "handshakes over TLS": lambda: on_service(handshakes, *bare, tls=True),
         "handshakes without TLS": lambda: on_service(handshakes, *bare),
         "requests": lambda: on_service(requests, *sim),
+        "large table": lambda: large_table(rows, quick),
         "guesses": lambda: on_service(guesses, *bare, "--trusted-proxy", ELSEWHERE),
         "origins": lambda: on_service(
             origins, *bare, "--allow-origin", "https://station.example", tokens=False

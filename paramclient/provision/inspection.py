@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import Final, Self
@@ -12,6 +12,7 @@ import anyio
 
 from paramclient.client.component import Component
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
+from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Param, ParamType, Trust, check_name
 from paramclient.protocol.params.fetch_result import FetchResult
@@ -19,6 +20,7 @@ from paramclient.protocol.params.name_search import NameSearch
 from paramclient.protocol.wire import HASH_CHECK
 from paramclient.provision.cautions import cautions_for
 from paramclient.provision.planning import ParamInfo, Plan, check_component, plan
+from paramclient.provision.runner import Runner, run_here
 
 __all__ = [
     "LOOKING_PACE",
@@ -29,7 +31,6 @@ __all__ = [
     "look_for",
     "plan_for",
     "prepare",
-    "prepare_aside",
     "verify",
 ]
 
@@ -82,6 +83,7 @@ async def look(
     absent: frozenset[str] = frozenset(),
     *,
     whole: bool = False,
+    run: Runner = run_here,
 ) -> Seen:
     """Bring the table up to date, and ask by name for what is wanted and not in it.
 
@@ -95,42 +97,58 @@ async def look(
         wanted: what it is to have.
         absent: names that the vehicle is known not to have, unless they are in the list by now.
         whole: ask again for everything that has not been told again, not only for what is wanted.
+        run: runs what takes long for a large table.
 
     Raises:
         NoReply: it did not answer.
         LinkError: the link failed, or the client was closed.
     """
     component._machine.sync.expire_hash()  # what was announced before may have moved
-    heard = {name for name, param in component.params.items() if param.trust is Trust.LIVE}
+    before = copy_params(component.params)
     with _Search(component, _probably_hidden(component, wanted).difference(absent)) as search:
         fetched = await component.fetch_all()
         await component.refreshed()
         search.leave_out(component.params)
         await search.wait()
     shown, silent = search.result()
-    listed = {name: param for name, param in component.params.items() if param.index is not None}
-    table = {name: param for name, param in listed.items() if param.trust is not Trust.CACHED}
-    is_whole = fetched.complete and len(table) == len(listed)
-    if is_whole and component.autopilot == "ardupilot":
-        silent |= _in_no_hidden_group(table, wanted).difference(component.params)
-    missing = frozenset(fetched.missing)
-    given_up = {name for name, param in table.items() if param.index in missing}
-    unsure = given_up | heard.intersection(table, _not_covered(component, fetched))
-    known = absent | silent | shown.keys()
-    asked = [name for name in wanted if name in unsure or (name not in table and name not in known)]
-    if whole:
-        asked += unsure.difference(asked)
+    after = copy_params(component.params)
+    not_covered = frozenset(_not_covered(component, fetched))
+    autopilot = component.autopilot
+
+    def sort_out() -> tuple[dict[str, Param], bool, set[str], set[str], list[str]]:
+        listed = {name: param for name, param in after.items() if param.index is not None}
+        table = {name: param for name, param in listed.items() if param.trust is not Trust.CACHED}
+        is_whole = fetched.complete and len(table) == len(listed)
+        hidden = silent
+        if is_whole and autopilot == "ardupilot":
+            hidden = silent | _in_no_hidden_group(table, wanted).difference(after)
+        missing = frozenset(fetched.missing)
+        given_up = {name for name, param in table.items() if param.index in missing}
+        heard = {name for name, param in before.items() if param.trust is Trust.LIVE}
+        unsure = given_up | heard.intersection(table, not_covered)
+        known = absent | hidden | shown.keys()
+        asked = [name for name in wanted if name in unsure or (name not in table and name not in known)]
+        if whole:
+            asked += unsure.difference(asked)
+        return table, is_whole, hidden, given_up, asked
+
+    table, is_whole, silent, given_up, asked = await run(sort_out)
     asked_for, not_told = await _ask(component, asked, given_up)
     found, unknown = shown | asked_for, silent.difference(table) | not_told
-    return Seen(
-        ParamSet.of(
+    system, number, identity, at = component.system, component.component, component.identity, time.time()
+
+    def take() -> ParamSet:
+        return ParamSet.of(
             (param for name, param in (table | found).items() if name not in unknown),
-            component=component.component,
-            system=component.system,
-            identity=component.identity,
-            at=time.time(),
-            source=f"vehicle {component.system}/{component.component}",
-        ),
+            component=number,
+            system=system,
+            identity=identity,
+            at=at,
+            source=f"vehicle {system}/{number}",
+        )
+
+    return Seen(
+        await run(take),
         is_whole,
         fetched.hash,
         (absent | unknown).difference(table),
@@ -194,47 +212,28 @@ async def prepare(
     include: str | Iterable[str] = (),
     info: Mapping[str, ParamInfo] | None = None,
     force: bool = False,
+    run: Runner = run_here,
 ) -> Plan:
     """Work out what `apply` would send to a vehicle, and in which order. Only reads.
 
     Args:
         component: the vehicle.
         wanted, include, info, force: as in `plan`.
+        run: runs what takes long: a plan of thousands of parameters takes a second.
 
     Raises:
         UsageError: as from `plan`.
         NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
-    return await prepare_aside(component, wanted, _here, include=include, info=info, force=force)
-
-
-async def prepare_aside(
-    component: Component,
-    wanted: ParamSet,
-    aside: Callable[[Callable[[], Plan]], Awaitable[Plan]],
-    *,
-    include: str | Iterable[str] = (),
-    info: Mapping[str, ParamInfo] | None = None,
-    force: bool = False,
-) -> Plan:
-    """The same for event loops that serve others: a plan of thousands of parameters takes a second.
-
-    Args:
-        component, wanted, include, info, force: as in `prepare`.
-        aside: works plans out, such as in a thread.
-
-    Raises:
-        UsageError, NoReply, LinkError: as `prepare`.
-    """
     check_component(wanted, component.component)
     given = (include,) if isinstance(include, str) else tuple(include)
     autopilot = component.autopilot
     # what cannot be right is told before the vehicle is asked
-    await aside(lambda: plan({}, wanted, include=given, autopilot=autopilot))
+    await run(lambda: plan({}, wanted, include=given, autopilot=autopilot))
     await identified(component)
-    seen = await look(component, wanted)
-    return await aside(lambda: plan_for(component, seen.table, wanted, given, info, force=force))
+    seen = await look(component, wanted, run=run)
+    return await run(lambda: plan_for(component, seen.table, wanted, given, info, force=force))
 
 
 async def verify(
@@ -274,11 +273,6 @@ def plan_for(
         encoding=component.encoding,
         force=force,
     )
-
-
-async def _here(work: Callable[[], Plan]) -> Plan:
-    """Work a plan out at once."""
-    return work()
 
 
 def _heard(component: Component, seen: Seen, found: Mapping[str, Param]) -> dict[str, WrittenParam]:

@@ -11,8 +11,10 @@ from itertools import islice
 from typing import TYPE_CHECKING, Final
 
 from paramclient.errors import NoReply, NotInCache, UnknownVehicle, UsageError, VehicleError
+from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param, Trust
+from paramclient.provision.runner import Runner, run_here
 from paramclient.provision.set_up import BEFORE_APPLY
 
 if TYPE_CHECKING:
@@ -59,7 +61,12 @@ class Taken:
 
 
 async def taken(
-    component: Component, result: FetchResult, *, source: str, timeout: float | None = None
+    component: Component,
+    result: FetchResult,
+    *,
+    source: str,
+    timeout: float | None = None,
+    run: Runner = run_here,
 ) -> Taken:
     """Take down what a fetch has brought.
 
@@ -72,30 +79,29 @@ async def taken(
         source: where it comes from, in words.
         timeout: seconds for the values that no hash covers, `REFRESH_PATIENCE` at most; what has not come
             then is missing.
+        run: runs what takes long for a large table.
 
     Raises:
         LinkError: the link failed.
     """
     with suppress(NoReply):  # what was not read afresh is missing below
         await component.refreshed(timeout=min(REFRESH_PATIENCE, math.inf if timeout is None else timeout))
-    known = [param for param in component.params.values() if param.trust is not Trust.CACHED]
-    stale = {
-        param.index: param.name
-        for param in component.params.values()
-        if param.trust is Trust.CACHED and param.index is not None
-    }
-    return Taken(
-        ParamSet.of(
-            known,
-            component=component.component,
-            system=component.system,
-            identity=component.identity,
-            at=time.time(),
-            source=source,
-        ),
-        known,
-        [stale.get(index, f"index {index}") for index in sorted({*result.missing, *stale})],
-    )
+    table = copy_params(component.params)
+    system, number, identity, at = component.system, component.component, component.identity, time.time()
+
+    def take() -> Taken:
+        params = list(table.values())
+        known = [param for param in params if param.trust is not Trust.CACHED]
+        stale = {
+            param.index: param.name
+            for param in params
+            if param.trust is Trust.CACHED and param.index is not None
+        }
+        missing = [stale.get(index, f"index {index}") for index in sorted({*result.missing, *stale})]
+        found = ParamSet.of(known, component=number, system=system, identity=identity, at=at, source=source)
+        return Taken(found, known, missing)
+
+    return await run(take)
 
 
 async def whole_set(
@@ -104,15 +110,20 @@ async def whole_set(
     source: str,
     timeout: float | None = None,
     progress: Callable[[Progress], None] | None = None,
+    run: Runner = run_here,
 ) -> Taken:
     """Bring a component's table up to date and take all of it down.
+
+    Args:
+        component, source, run: as in `taken`.
+        timeout, progress: as in `Component.fetch_all`.
 
     Raises:
         VehicleError: some parameters did not come; the text names them.
         ParamClientError: as from `Component.fetch_all`.
     """
     result = await component.fetch_all(timeout=timeout, progress=progress)
-    found = await taken(component, result, source=source)
+    found = await taken(component, result, source=source, run=run)
     if found.missing:
         raise incomplete(component, found.missing)
     return found

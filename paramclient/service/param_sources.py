@@ -14,11 +14,13 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from paramclient.documents.document import Body, InParts
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.files import FileForm, ParamFile, loads
+from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import is_pattern
 from paramclient.model.values import Trust, check_name
 from paramclient.provision.inspection import identified
-from paramclient.provision.vehicle_params import before_last_apply, cached_set, whole_set
+from paramclient.provision.runner import Runner
+from paramclient.provision.vehicle_params import Taken, before_last_apply, cached_set, whole_set
 from paramclient.service.problems import ServiceError
 from paramclient.service.reading import check_pieces
 from paramclient.service.request import LARGEST_UPLOAD
@@ -217,7 +219,8 @@ async def resolved(hub: Hub, target: Followed, source: Source) -> ParamSet:
     if source.component is not None:
         where = source.component
         other = hub.find(where.system, where.component, where.link)
-        return (await whole_set(other.component, source=f"link {other.line.name}")).set
+        found = await whole_set(other.component, source=f"link {other.line.name}", run=hub.read_aside)
+        return found.set
     if source.vehicle is not None:
         kept = source.vehicle
         if kept.snapshot is not None and kept.at is not None:
@@ -321,29 +324,33 @@ async def known_to(hub: Hub, look: Callable[[], Result]) -> Result:
         raise ServiceError(404, "unknown-state", str(error), error=type(error).__name__) from error
 
 
-def known_set(target: Followed) -> ParamSet:
+async def known_set(target: Followed, run: Runner) -> Taken:
     """The table of a component as it stands here, if all of it was heard or confirmed in this session.
+
+    Args:
+        target: the component.
+        run: runs what takes long for a large table.
 
     Raises:
         ServiceError: it was not; the vehicle has to be asked.
     """
     component = target.component
-    params = list(component.params.values())
-    unsure = sum(param.trust is Trust.CACHED for param in params)
-    count = component.count
-    listed = sum(param.index is not None for param in params)
-    if not params or unsure or count is None or listed < count:
-        told = f"{listed - unsure} of {'?' if count is None else count}"
-        what = f"{told} parameters were heard or confirmed in this session; fetch them first."
-        raise ServiceError(409, "incomplete", what)
-    return ParamSet.of(
-        params,
-        component=component.component,
-        system=component.system,
-        identity=component.identity,
-        at=time.time(),
-        source=f"link {target.line.name}",
-    )
+    table, count = copy_params(component.params), component.count
+    system, number, identity, at = component.system, component.component, component.identity, time.time()
+
+    def take() -> Taken:
+        params = list(table.values())
+        unsure = sum(param.trust is Trust.CACHED for param in params)
+        listed = sum(param.index is not None for param in params)
+        if not params or unsure or count is None or listed < count:
+            told = f"{listed - unsure} of {'?' if count is None else count}"
+            what = f"{told} parameters were heard or confirmed in this session; fetch them first."
+            raise ServiceError(409, "incomplete", what)
+        source = f"link {target.line.name}"
+        found = ParamSet.of(params, component=number, system=system, identity=identity, at=at, source=source)
+        return Taken(found, params, ())
+
+    return await run(take)
 
 
 def check_size(size: int, most: int) -> None:

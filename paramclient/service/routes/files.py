@@ -76,11 +76,11 @@ async def file(
                 raise UsageError("what differs from the defaults is known of the present table alone")
             return await attachment(hub, await state(hub, target, moment(source)), form)
         if source == "known":
-            whole, params = known_set(target), list(target.component.params.values())
+            found = await known_set(target, hub.aside)
         else:
-            found = await whole_set(target.component, source=f"link {target.line.name}")
-            whole, params = found.set, list(found.params)
-        return await attachment(hub, differing(whole, params) if changed else whole, form)
+            found = await whole_set(target.component, source=f"link {target.line.name}", run=hub.aside)
+        chosen = await hub.aside(lambda: differing(found.set, found.params)) if changed else found.set
+        return await attachment(hub, chosen, form)
 
     return await answered(request, work, target)
 

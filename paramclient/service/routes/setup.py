@@ -19,9 +19,8 @@ from paramclient.metadata import Metadata, MetadataStore
 from paramclient.model.comparison import compare, defaults_of
 from paramclient.model.paramset import ParamSet
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, apply, overlay, prepare, restore
-from paramclient.provision.inspection import prepare_aside
 from paramclient.provision.set_up import restored
-from paramclient.provision.vehicle_params import NO_DEFAULTS, whole_set
+from paramclient.provision.vehicle_params import NO_DEFAULTS, Taken, whole_set
 from paramclient.service.answering import document_answer
 from paramclient.service.followed_component import Followed
 from paramclient.service.hub import Hub
@@ -221,13 +220,16 @@ async def _diff(hub: Hub, target: Followed, body: Compared) -> Response:
     base = None
     if body.base is not None and not body.base.defaults:
         base = await resolved(hub, target, body.base)
-    right = await _present(target, body)
+    right = await _present(hub, target, body)
     if body.base is not None and body.base.defaults:
         base = await hub.read_aside(lambda: defaults_of(left, right))
         if not base:
             raise UsageError(NO_DEFAULTS)
     if body.partial:
-        right = replace(right, params={name: param for name, param in right.items() if name in left})
+        whole = right
+        right = await hub.read_aside(
+            lambda: replace(whole, params={name: each for name, each in whole.items() if name in left})
+        )
     sets = [left, right] if base is None else [left, right, base]
     found = [*await _described(hub, target, sets), None][:3]
 
@@ -238,13 +240,16 @@ async def _diff(hub: Hub, target: Followed, body: Compared) -> Response:
     return await document_answer(hub.read_aside, document)
 
 
-async def _present(target: Followed, body: Compared) -> ParamSet:
+async def _present(hub: Hub, target: Followed, body: Compared) -> ParamSet:
     """What the component has now."""
     if body.known:
-        return known_set(target)
+        return (await known_set(target, hub.read_aside)).set
     source = f"link {target.line.name}"
-    found = await _within(target, body.timeout_s, lambda: whole_set(target.component, source=source))
-    return found.set
+
+    async def work() -> Taken:
+        return await whole_set(target.component, source=source, run=hub.read_aside)
+
+    return (await _within(target, body.timeout_s, work)).set
 
 
 async def _described(hub: Hub, target: Followed, sets: list[ParamSet]) -> list[Metadata | None]:
@@ -270,8 +275,8 @@ async def _plan(hub: Hub, target: Followed, body: Wanted) -> Plan:
 
     async def work() -> Plan:
         include, info = body.include, target.metadata
-        return await prepare_aside(
-            target.component, wanted, hub.read_aside, include=include, info=info, force=body.force
+        return await prepare(
+            target.component, wanted, include=include, info=info, force=body.force, run=hub.read_aside
         )
 
     return await _within(target, body.timeout_s, work)
@@ -283,7 +288,9 @@ async def _plan_back(hub: Hub, target: Followed, body: Restored) -> Plan:
     async def work() -> Plan:
         include = (*await restored(target.component, earlier), *body.include)
         info = target.metadata
-        return await prepare(target.component, earlier, include=include, info=info, force=body.force)
+        return await prepare(
+            target.component, earlier, include=include, info=info, force=body.force, run=hub.read_aside
+        )
 
     return await _within(target, body.timeout_s, work)
 
