@@ -4,25 +4,49 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping
-from typing import Final
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Final, Protocol
 
 from paramclient.errors import NoReply, ParamClientError, UsageError
-from paramclient.model.identity import autopilot_name, reason_against_non_finite
+from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite
 from paramclient.model.params import parts_of
-from paramclient.model.values import Param, ParamType, Trust, Value, as_sent, encode, is_portable_name
-from paramclient.protocol import events
-from paramclient.protocol.events import ParamChanged
+from paramclient.model.values import (
+    Encoding,
+    Param,
+    ParamType,
+    Trust,
+    Value,
+    as_sent,
+    encode,
+    is_portable_name,
+)
+from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
+from paramclient.protocol.ftp import FileTransfers
+from paramclient.protocol.params.boot_values import StartValues
 from paramclient.protocol.params.change import Change
+from paramclient.protocol.params.change_origin import Authors
 from paramclient.protocol.params.fetch import Check, Fetch
-from paramclient.protocol.params.fetch_result import FetchResult, Policy, Sampled
-from paramclient.protocol.params.name_search import NameSearch
-from paramclient.protocol.params.reads import Key, Read
-from paramclient.protocol.params.value_check import LATER_CHANGE_TIME
-from paramclient.protocol.params.writes import Write
-from paramclient.protocol.parts import Parts
+from paramclient.protocol.params.fetch_queue import Fetches
+from paramclient.protocol.params.fetch_result import FetchResult, Means, Policy, Sampled
+from paramclient.protocol.params.foreign_list import Following
+from paramclient.protocol.params.name_search import NameSearch, NameSearches
+from paramclient.protocol.params.reads import Key, Read, Reads
+from paramclient.protocol.params.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
+from paramclient.protocol.params.sync_interval import CheckPace
+from paramclient.protocol.params.table import Room, Table
+from paramclient.protocol.params.value_check import LATER_CHANGE_TIME, ValueChecks
+from paramclient.protocol.params.volatile_values import Refresh
+from paramclient.protocol.params.writes import Write, Writes
+from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.scheduler import Turns
+from paramclient.protocol.stats.trace import Trace, silent
+from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
 from paramclient.protocol.vehicle.claims import Claim, Verdict
-from paramclient.protocol.vehicle.peers import Contest
+from paramclient.protocol.vehicle.commands import Commands
+from paramclient.protocol.vehicle.identification import Identification
+from paramclient.protocol.vehicle.metadata_location import Descriptions
+from paramclient.protocol.vehicle.peers import NO_PEER, ComponentPeers, Contest
+from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.vehicle.reboot import SAVING_TIME, Restart
 from paramclient.protocol.wire import (
     HASH_CHECK,
@@ -43,7 +67,7 @@ from paramclient.protocol.wire import (
     SystemTime,
 )
 
-__all__ = ["ComponentMachine"]
+__all__ = ["ComponentMachine", "ComponentObserver"]
 
 MOST_DOUBTED: Final = 256
 """Reads that may be open for a value to be asked for that changed twice: each takes its share of the link."""
@@ -56,7 +80,44 @@ FRESH_IDENTITY: Final = 1.0
 """Seconds for which an AUTOPILOT_VERSION needs no other."""
 
 
-class ComponentMachine(Parts):
+class ComponentObserver(Protocol):
+    """Is told what happens to components. `paramclient.protocol.events` makes events of it."""
+
+    def identified(self, machine: ComponentMachine) -> None:
+        """The identity is settled, as far as it ever will be; the cached table can be looked up."""
+
+    def lost(self, machine: ComponentMachine, silence: float) -> None:
+        """The heartbeat timeout has expired; `silence` is the time since the last message in s."""
+
+    def found(self, machine: ComponentMachine, silence: float) -> None:
+        """A lost component is heard again, after `silence` s."""
+
+    def rebooted(self, machine: ComponentMachine) -> None:
+        """The vehicle has started again."""
+
+    def replaced(self, machine: ComponentMachine) -> None:
+        """Another vehicle has the address: nothing that was known is about that one."""
+
+    def contested(self, machine: ComponentMachine, contest: Contest) -> None:
+        """Several vehicles have the address: nothing is taken from them or requested of them."""
+
+    def uncontested(self, machine: ComponentMachine) -> None:
+        """One vehicle alone has the address again, or the peers are proven to be one vehicle."""
+
+    def changed(self, machine: ComponentMachine, change: Change) -> None:
+        """A parameter appeared, changed or went away, and each change is to be told (`tells_changes`)."""
+
+    def moved(self, machine: ComponentMachine) -> None:
+        """Parameters have changed, and not each change is to be told."""
+
+    def fetched(self, machine: ComponentMachine, result: FetchResult) -> None:
+        """A fetch has ended with a result."""
+
+    def resynced(self, machine: ComponentMachine, changed: tuple[str, ...], confirmed: int | None) -> None:
+        """The table agrees with the vehicle's again; see `TableResynced`."""
+
+
+class ComponentMachine:
     """Everything about one component that needs no clock and no socket.
 
     Args:
@@ -64,7 +125,7 @@ class ComponentMachine(Parts):
         own: system and component that we send as.
         link: the link's canonical name, part of an identity without a hardware id.
         send: takes each message for it, in order.
-        emit: takes each event.
+        observer: is told what happens to the component.
         send_to: takes each message that is for one of its peers; None where there is only one.
         encoding: what the user said about its encoding, or None.
         upkeep: what is done for its table without being asked.
@@ -101,6 +162,272 @@ class ComponentMachine(Parts):
             wait.
         has_moved: whether an event says that something has changed; who hands it out sets this back.
     """
+
+    def __init__(
+        self,
+        system: int,
+        component: int,
+        *,
+        own: tuple[int, int],
+        link: str,
+        send: Callable[[Message], None],
+        observer: ComponentObserver,
+        send_to: Callable[[Message, Peer], None] | None = None,
+        encoding: Encoding | None = None,
+        upkeep: Upkeep | None = None,
+        is_link_busy: Callable[[], bool] = lambda: False,
+        vehicle: Callable[[], Iterable[ComponentMachine]] = lambda: (),
+        another: Callable[[float], None] | None = None,
+        read_clock: Callable[[float], None] = lambda now: None,
+        peer: Peer | None = None,
+        turns: Turns | None = None,
+        room: Room | None = None,
+        trace: Trace = silent,
+    ) -> None:
+        target = (system, component)
+        upkeep = upkeep or Upkeep()
+        self.system = system
+        self.component = component
+        self.address: Address = target if peer is None else PeerAddress(system, component, peer)
+        self.vehicle: tuple[int, Peer] = (system, peer)
+        self.version = 1
+        self.round_trip = RoundTrip()
+        self.who = Identification(
+            target, link, self.round_trip, send, encoding, may_ask=not upkeep.listens_only
+        )
+        self.table = Table(self.who.encoding, room)
+        self.turns = Turns() if turns is None else turns
+        self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share, trace)
+        self.writes = Writes(
+            target,
+            self.round_trip,
+            send,
+            self.reads,
+            self.table.params,
+            encoding=lambda: self.table.encoding,
+            is_certain=lambda: self.may_be_written,
+            trace=trace,
+        )
+        self.presence = Presence()
+        self.peers = ComponentPeers(target, self, may_ask=not upkeep.listens_only)
+        self.files = FileTransfers(
+            target,
+            own,
+            self.round_trip,
+            send,
+            keeps_session=lambda: self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA,
+        )
+        check_pace = CheckPace(upkeep.interval, is_chosen=upkeep.without_hash)
+        self.sync = Sync(
+            self.reads,
+            self.table,
+            upkeep,
+            check_pace,
+            is_px4=lambda: self.who.autopilot == MAV_AUTOPILOT_PX4,
+            is_writing=lambda: len(self.writes) > 0,
+            is_fetching=lambda: self.fetch is not None,
+            is_busy=is_link_busy,
+            may_use_file=lambda: self.fetches.may_use_file(),
+            file_is_in_use=self.files.is_in_use,
+            is_spared=lambda: self._is_spared,
+            is_doubted=lambda: self.who.is_doubted,
+            begin_fetch=lambda now, check: self.begin_fetch(now, refresh=check is not None, check=check),
+            end_fetch=self.end_fetch,
+            resynced=self._resynced,
+        )
+        self.descriptions = Descriptions(
+            target, own, self.round_trip, send, is_identifying=lambda: self.who.is_asking
+        )
+        self.commands = Commands(target, own, self.round_trip, send)
+        self.clock_requests = ClockRequests(
+            target,
+            self.presence,
+            send,
+            is_requesting=lambda: self.who.is_asking or self.descriptions.is_asking,
+            may_send=not upkeep.listens_only,
+        )
+        self.start_values = StartValues(
+            self.reads,
+            self.table,
+            is_wanted=lambda: self._may_read_start_values,
+            is_fetching=lambda: self.fetch is not None,
+            fetch_file=self.sync.fetch_quick_file,
+        )
+        self.restart: Restart | None = None
+        self.following = Following()
+        self.fetches = Fetches(
+            Means(
+                target,
+                self.round_trip,
+                send,
+                self.reads,
+                self.table,
+                self.turns,
+                self.files,
+                expects_hash=lambda: self.sync.expects_hash,
+                adds_defaults=lambda: self.who.adds_defaults,
+                changed=self._moved,
+                doubt=self._doubt_identity,
+                following=self.following,
+                trace=trace,
+            ),
+            self.sync,
+            upkeep,
+            check_pace,
+            says_file=lambda: self.who.says_file,
+            ended=self._fetched,
+        )
+        self.name_searches = NameSearches(
+            target,
+            self.round_trip,
+            self.reads,
+            send,
+            count=lambda: self.table.count,
+            is_listing=self._is_listing,
+        )
+        # where nothing is asked there are no reads: what others ask for is heard in their place
+        overheard = self.fetches.overheard
+        self._value_heard = self.reads.heard if overheard is None else overheard.heard
+        self._own = own
+        self._observer = observer
+        self._send_to = send_to or (lambda message, peer: send(message))
+        self._policy = upkeep.policy
+        self._is_kept_up = upkeep.interval < math.inf and upkeep.policy is Policy.AUTO
+        self._listens_only = upkeep.listens_only
+        self._another = another or self.become_another
+        self._read_clock = read_clock
+        self._vehicle = vehicle
+        self._known_as: str | None = None  # the key of the identity that was reported
+        self._saved_at = -math.inf  # when all that we have written will have been saved
+        self._authors = Authors()
+        self._checks = ValueChecks()
+        self.tells_changes = True
+        self.has_moved = False
+        self.writes.left_open = self._authors.foreign_set
+
+    @property
+    def peer_in_words(self) -> str:
+        """Where its messages come from, `127.0.0.1:14550`; "" while that is not known."""
+        if isinstance(self.address, PeerAddress):
+            return peer_in_words(self.address.peer)
+        return "" if self.peers.home is NO_PEER else peer_in_words(self.peers.home)
+
+    def address_in(self, system: int) -> Address:
+        """The address that it has under another system id."""
+        if isinstance(self.address, PeerAddress):
+            return PeerAddress(system, self.component, self.address.peer)
+        return system, self.component
+
+    @property
+    def identity(self) -> Identity:
+        """Who the vehicle is, as far as this component has said."""
+        return self.who.identity
+
+    @property
+    def may_be_written(self) -> bool:
+        """Whether it is certain whom a write reaches, and what it makes of it."""
+        home = self.peers.home
+        is_open = any(each.who.was_away or each.peers.is_rival(home) for each in self._autopilots())
+        return self.who.may_be_written and not is_open
+
+    @property
+    def state(self) -> str:
+        """The table's state in a word: new, cached, fetching, synced, partial, contested, lost."""
+        if self.presence.is_lost:
+            return "lost"
+        if self.peers.contest is not None:
+            return "contested"
+        if self.fetch is not None:
+            return "fetching"
+        if self.sync.synced:
+            return "synced"
+        if not self.table.params:
+            return "new"
+        return "cached" if self.table.complete else "partial"
+
+    def _autopilots(self) -> Iterator[ComponentMachine]:
+        """The autopilot that it belongs to, where that is another component."""
+        return (each for each in self._vehicle() if each is not self and each.who.is_autopilot)
+
+    @property
+    def is_restarting(self) -> bool:
+        """Whether it was told to start again, and that is awaited."""
+        return self.restart is not None and not self.restart.done
+
+    @property
+    def is_identified(self) -> bool:
+        """Whether it is settled who it is, and that is not being asked for."""
+        return self.who.settled and not self.who.is_asking
+
+    def read_clock(self, now: float) -> None:
+        """Have clocks in telemetry read for a while."""
+        self._read_clock(now)
+
+    def send_to(self, message: Message, peer: Peer) -> None:
+        """Send a message to one of the peers that speak for it."""
+        self._send_to(message, peer)
+
+    @property
+    def fetch(self) -> Fetch | None:
+        """The fetch under way, or None."""
+        return self.fetches.current
+
+    @property
+    def sync_state(self) -> SyncState:
+        """How the table stands to the vehicle's."""
+        return SyncState.LOST if self.presence.is_lost else self.sync.state
+
+    @property
+    def refresh(self) -> Refresh | None:
+        """The reading of volatile values under way after a hash hit, or None."""
+        return self.sync.refresh
+
+    @property
+    def can_hit(self) -> bool:
+        """Whether the vehicle's hash may confirm the table as it stands."""
+        return self.table.complete and self.table.hash is not None
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether anything is awaited: an answer, a fetch, a file, or who it is."""
+        return len(self.reads) > 0 or self.is_busy
+
+    @property
+    def is_busy(self) -> bool:
+        """Whether anything is awaited but the values that are read after the hash has agreed."""
+        in_background = 0 if self.refresh is None else self.refresh.in_flight
+        is_asked = len(self.reads) > in_background or len(self.writes) > 0 or not self.files.is_idle
+        is_asked = is_asked or len(self.commands) > 0 or self.restart is not None
+        is_asked = is_asked or self.descriptions.is_asking or len(self.name_searches) > 0
+        return is_asked or self.fetch is not None or self.who.is_asking
+
+    @property
+    def is_settling(self) -> bool:
+        """Whether a write is under way, or the hash after one has not come yet."""
+        return len(self.writes) > 0 or self.sync.is_settling
+
+    @property
+    def _is_spared(self) -> bool:
+        """Whether it is lost, or in a mode in which nothing is asked of it unasked."""
+        presence = self.presence
+        return presence.is_lost or presence.is_high_latency or self.reads.pace.gap >= LOW_BANDWIDTH_GAP
+
+    @property
+    def _may_read_start_values(self) -> bool:
+        """Whether what is measured at each start is to be read again without being asked."""
+        return self._is_kept_up and not self.sync.expects_hash and not self._is_spared
+
+    def _is_listing(self, now: float) -> bool:
+        """Whether a list comes, for us or for another station."""
+        reads = self.reads
+        is_ours = reads.list_runs_again or not reads.is_idle or now < reads.list_until
+        return is_ours or self.following.is_running(now)
+
+    def _is_known(self, key: Key) -> bool:
+        """Whether anything speaks for such a parameter."""
+        if isinstance(key, str):
+            return key in self.table.params
+        return self.table.count is None or key < self.table.count
 
     # what comes in
 
@@ -538,7 +865,7 @@ class ComponentMachine(Parts):
 
     def contest_began(self, contest: Contest, now: float) -> None:
         """Several vehicles have the address: whoever waits for one of them gets the error."""
-        self._emit(events.ComponentContested(self, contest))
+        self._observer.contested(self, contest)
         self.fail_all(contest.error, now)
         self._forget_companions(contest.error, now)
 
@@ -551,7 +878,7 @@ class ComponentMachine(Parts):
             self._forget_companions(NoReply(what, attempts=0, waited=0.0), now)
         else:
             self._replaced(now)
-        self._emit(events.ComponentUncontested(self))
+        self._observer.uncontested(self)
         self._known_as = None
         self.sync.check(now)
         self._take_claim(claim, now)
@@ -687,7 +1014,7 @@ class ComponentMachine(Parts):
     def become_another(self, now: float) -> None:
         """Another vehicle has taken this system id: nothing that is known is about it."""
         self._report(self.table.forget())
-        self._emit(events.ComponentReplaced(self))
+        self._observer.replaced(self)
         self.sync.forget()
         self.fetches.forget()
         self.following.forget()
@@ -734,7 +1061,7 @@ class ComponentMachine(Parts):
         """It is not heard any more. A fetch goes on for a while: it may only be starting again."""
         presence = self.presence
         presence.is_lost = True
-        self._emit(events.ComponentLost(self, now - presence.heard_at))
+        self._observer.lost(self, now - presence.heard_at)
         self.writes.lose(now)
         self.reads.lose(now)
         self.name_searches.lose(now)
@@ -768,7 +1095,7 @@ class ComponentMachine(Parts):
         if presence.is_lost:
             presence.is_lost = False
             self.reads.forgive()  # the silence of before says nothing of it
-            self._emit(events.ComponentFound(self, silence))
+            self._observer.found(self, silence)
             self.sync.check(now)
             self.who.doubt(now)
         elif presence.was_away(silence) and silence < math.inf:
@@ -785,7 +1112,7 @@ class ComponentMachine(Parts):
 
     def _rebooted(self, now: float, *, by_clock: bool = False) -> None:
         """The vehicle has started again: what it had not saved is gone, and its list begins anew."""
-        self._emit(events.ComponentRebooted(self))
+        self._observer.rebooted(self)
         self.fetches.interrupt(now)
         self.start_values.restarted(now, by_clock=by_clock)
         started_at = self.presence.started_at if by_clock else None
@@ -816,7 +1143,7 @@ class ComponentMachine(Parts):
             self.fetch.look(now)
         if self.who.settled and self._known_as != self.identity.key:
             self._known_as = self.identity.key
-            self._emit(events.ComponentIdentified(self))
+            self._observer.identified(self)
             if self.who.is_autopilot:
                 self.clock_requests.want_baseline(now)
         if self.writes.is_held and self.may_be_written:
@@ -852,10 +1179,10 @@ class ComponentMachine(Parts):
             self._checks.ask(write.name, now + LATER_CHANGE_TIME)
 
     def _resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
-        self._emit(events.TableResynced(self, changed, confirmed))
+        self._observer.resynced(self, changed, confirmed)
 
     def _fetched(self, result: FetchResult) -> None:
-        self._emit(events.Fetched(self, result))
+        self._observer.fetched(self, result)
 
     def _report(self, changes: list[Change]) -> None:
         for change in changes:
@@ -863,10 +1190,10 @@ class ComponentMachine(Parts):
 
     def _tell(self, change: Change) -> None:
         if self.tells_changes:
-            self._emit(ParamChanged(self, change))
+            self._observer.changed(self, change)
         elif not self.has_moved:
             self.has_moved = True
-            self._emit(events.ParamsMoved(self))
+            self._observer.moved(self)
 
 
 def _in_capitals(name: str) -> str:

@@ -1,16 +1,15 @@
-"""What happens on a link, for those who follow it."""
+"""Events of the components of a link, and the observer that makes them."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, NamedTuple, TypeAlias
+from typing import NamedTuple, TypeAlias
 
+from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.params.change import Change
-
-if TYPE_CHECKING:
-    from paramclient.protocol.component import ComponentMachine
-    from paramclient.protocol.params.fetch_result import FetchResult
-    from paramclient.protocol.vehicle.peers import Contest
+from paramclient.protocol.params.fetch_result import FetchResult
+from paramclient.protocol.vehicle.peers import Contest
 
 __all__ = [
     "ComponentContested",
@@ -23,6 +22,7 @@ __all__ = [
     "ComponentReplaced",
     "ComponentUncontested",
     "Event",
+    "EventMaker",
     "Fetched",
     "ParamChanged",
     "ParamsMoved",
@@ -150,3 +150,66 @@ Event: TypeAlias = (
     | Fetched
     | TableResynced
 )
+
+
+class EventMaker:
+    """Makes an event of everything that a component reports; see `ComponentObserver`.
+
+    Args:
+        emit: takes each event.
+    """
+
+    def __init__(self, emit: Callable[[Event], None]) -> None:
+        self._emit = emit
+
+    def heard(self, machine: ComponentMachine) -> None:
+        """Report a new component."""
+        self._emit(ComponentHeard(machine))
+
+    def forgotten(self, machine: ComponentMachine) -> None:
+        """Report that a component is not followed any more."""
+        self._emit(ComponentForgotten(machine))
+
+    def identified(self, machine: ComponentMachine) -> None:
+        """See `ComponentObserver`."""
+        self._emit(ComponentIdentified(machine))
+
+    def lost(self, machine: ComponentMachine, silence: float) -> None:
+        """See `ComponentObserver`."""
+        self._emit(ComponentLost(machine, silence))
+
+    def found(self, machine: ComponentMachine, silence: float) -> None:
+        """See `ComponentObserver`."""
+        self._emit(ComponentFound(machine, silence))
+
+    def rebooted(self, machine: ComponentMachine) -> None:
+        """See `ComponentObserver`."""
+        self._emit(ComponentRebooted(machine))
+
+    def replaced(self, machine: ComponentMachine) -> None:
+        """See `ComponentObserver`."""
+        self._emit(ComponentReplaced(machine))
+
+    def contested(self, machine: ComponentMachine, contest: Contest) -> None:
+        """See `ComponentObserver`."""
+        self._emit(ComponentContested(machine, contest))
+
+    def uncontested(self, machine: ComponentMachine) -> None:
+        """See `ComponentObserver`."""
+        self._emit(ComponentUncontested(machine))
+
+    def changed(self, machine: ComponentMachine, change: Change) -> None:
+        """See `ComponentObserver`."""
+        self._emit(ParamChanged(machine, change))
+
+    def moved(self, machine: ComponentMachine) -> None:
+        """See `ComponentObserver`."""
+        self._emit(ParamsMoved(machine))
+
+    def fetched(self, machine: ComponentMachine, result: FetchResult) -> None:
+        """See `ComponentObserver`."""
+        self._emit(Fetched(machine, result))
+
+    def resynced(self, machine: ComponentMachine, changed: tuple[str, ...], confirmed: int | None) -> None:
+        """See `ComponentObserver`."""
+        self._emit(TableResynced(machine, changed, confirmed))

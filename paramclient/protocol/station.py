@@ -14,7 +14,7 @@ from paramclient.model.identity import Identity
 from paramclient.model.values import Encoding
 from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_words
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import ComponentForgotten, ComponentHeard, Event
+from paramclient.protocol.events import Event, EventMaker
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.fetch_result import Policy
 from paramclient.protocol.params.list_download import present_of
@@ -155,6 +155,7 @@ class Station:
         self._framers: dict[Peer, Framer] = {}  # for streams
         self._outbox: list[tuple[bytes, Peer | None]] = []
         self._events: list[Event] = []
+        self._reporter = EventMaker(self._events.append)
         self._sequence = 0
         self._signer: Signer | None = None
         self._is_watched = counts_traffic  # one look in the hot path for both
@@ -663,7 +664,7 @@ class Station:
             own=self.own,
             link=f"{self.link}#{peer_in_words(peer)}" if self._splits else self.link,
             send=send,
-            emit=self._events.append,
+            observer=self._reporter,
             send_to=send_to,
             encoding=self._encoding,
             upkeep=self._upkeep,
@@ -678,7 +679,7 @@ class Station:
         )
         self.components[address] = machine
         self._of_vehicle.setdefault(vehicle, []).append(machine)
-        self._events.append(ComponentHeard(machine))
+        self._reporter.heard(machine)
         for request, station in self._early_requests:
             if _is_for(request, sender):
                 machine.foreign_file_request(request, station, now)
@@ -716,7 +717,7 @@ class Station:
         heapify(self._order)
         machine.reads.pace.idle()
         self._foreign += machine.peers.foreign
-        self._events.append(ComponentForgotten(machine))
+        self._reporter.forgotten(machine)
 
     def _become_another(self, vehicle: tuple[int, Peer], now: float) -> None:
         """Another vehicle has taken a system id, with all of its components."""

@@ -21,6 +21,7 @@ from paramclient.metadata import Metadata, MetadataStore, download, metadata_cac
 from paramclient.model.identity import Identity
 from paramclient.model.values import crc32_px4
 from paramclient.protocol.component import ComponentMachine
+from paramclient.protocol.events import EventMaker
 from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.vehicle.metadata_location import Descriptions
 from paramclient.protocol.wire import CommandAck, CommandLong, ComponentMetadata, FileTransfer
@@ -476,7 +477,9 @@ def test_it_is_asked_again_when_the_link_is_back() -> None:
     asked.machine.resume(0.5)
     assert len(asked.sent) == 2
     sent: list[Any] = []
-    machine = ComponentMachine(1, 1, own=(255, 190), link="link", send=sent.append, emit=lambda _: None)
+    machine = ComponentMachine(
+        1, 1, own=(255, 190), link="link", send=sent.append, observer=EventMaker(lambda _: None)
+    )
     machine.descriptions.ask(0.0)
     machine.resume(0.5)
     assert len(sent) == 2

@@ -19,7 +19,14 @@ from paramclient.errors import (
 )
 from paramclient.model.values import Encoding, Param, ParamType, Trust, Value, px4_hash
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import ComponentIdentified, Event, Fetched, ParamChanged, ParamsMoved
+from paramclient.protocol.events import (
+    ComponentIdentified,
+    Event,
+    EventMaker,
+    Fetched,
+    ParamChanged,
+    ParamsMoved,
+)
 from paramclient.protocol.params import table as table_room
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.change_origin import DOUBT, FOREIGN_SET_MEMORY, MOST_FOREIGN_SETS
@@ -60,7 +67,13 @@ class Desk:
         self.sent: list[Message] = []
         self.events: list[Event] = []
         self.machine = ComponentMachine(
-            1, 1, own=OWN, link="x", send=self.sent.append, emit=self.events.append, encoding=encoding
+            1,
+            1,
+            own=OWN,
+            link="x",
+            send=self.sent.append,
+            observer=EventMaker(self.events.append),
+            encoding=encoding,
         )
         self.machine.reads.is_idle = False
         if heartbeat is not None:

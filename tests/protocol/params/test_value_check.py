@@ -9,7 +9,7 @@ import pytest
 
 from paramclient.model.values import ParamType, Trust
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import Event, ParamChanged
+from paramclient.protocol.events import Event, EventMaker, ParamChanged
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.reads import BATCH_INTERVAL, Read
 from paramclient.protocol.params.sync import Upkeep
@@ -49,7 +49,13 @@ class Desk:
         self.sent: list[Message] = []
         self.events: list[Event] = []
         self.machine = ComponentMachine(
-            1, 1, own=(255, 190), link="x", send=self.sent.append, emit=self.events.append, upkeep=upkeep
+            1,
+            1,
+            own=(255, 190),
+            link="x",
+            send=self.sent.append,
+            observer=EventMaker(self.events.append),
+            upkeep=upkeep,
         )
         self.machine.reads.is_idle = False
         self.machine.receive(Heartbeat(2, autopilot), self.now)

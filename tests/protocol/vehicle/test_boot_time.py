@@ -10,7 +10,7 @@ import pytest
 from paramclient.model.values import ParamType
 from paramclient.protocol import wire
 from paramclient.protocol.component import ComponentMachine
-from paramclient.protocol.events import ComponentRebooted, Event
+from paramclient.protocol.events import ComponentRebooted, Event, EventMaker
 from paramclient.protocol.params.boot_values import MEASURING_TIME, YOUNG
 from paramclient.protocol.params.sync import Upkeep
 from paramclient.protocol.station import Station
@@ -175,7 +175,7 @@ class Desk:
             own=OWN,
             link="x",
             send=lambda message: self.sent.append((self.now, message)),
-            emit=self.events.append,
+            observer=EventMaker(self.events.append),
             upkeep=Upkeep(interval),
         )
         self.machine.reads.is_idle = False
