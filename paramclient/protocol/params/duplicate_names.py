@@ -19,6 +19,9 @@ MOST_TOLD: Final = 5
 """Names that a note gives one by one."""
 SHORTEST_WAIT: Final = 0.3
 """Seconds until the names are asked for, at the least: late answers to reads by index carry them too."""
+ANSWERS_PAUSE: Final = 0.15
+"""Seconds from an answer until the name is asked for again. Several late values of the name may come in one
+moment, and each would count as an answer to the next read otherwise."""
 ENOUGH_ANSWERS: Final = 3
 """Answers in a row that must say the same: a list that another station has asked for brings every value of
 the name."""
@@ -65,20 +68,19 @@ class Repeated(Operation[None]):
         self._table = table
         self._open: dict[str, Read] = {}
         self._answers: dict[str, list[int]] = {}
-        self._asked = sorted(names.keys() | table.passed_over.keys())
-        self._ask_at = now + max(round_trip.timeout, SHORTEST_WAIT)
+        first_at = now + max(round_trip.timeout, SHORTEST_WAIT)
+        self._ask_at = dict.fromkeys(sorted(names.keys() | table.passed_over.keys()), first_at)
         table.passed_over.clear()
 
     def tick(self, now: float) -> None:
         """Ask, once what was under way before is over."""
-        if self._ask_at <= now:
-            self._ask_at = math.inf
-            for name in self._asked:
-                self._ask(name, now)
+        for name in [name for name, at in self._ask_at.items() if at <= now]:
+            del self._ask_at[name]
+            self._ask(name, now)
 
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity. The reads have deadlines of their own."""
-        return self._ask_at
+        return min(self._ask_at.values(), default=math.inf)
 
     @property
     def note(self) -> str:
@@ -96,7 +98,7 @@ class Repeated(Operation[None]):
 
     def cancel(self) -> None:
         """Nobody waits any more."""
-        self._ask_at = math.inf
+        self._ask_at.clear()
         reads, self._open = self._open, {}
         for read in reads.values():
             self._reads.release(read)
@@ -114,6 +116,6 @@ class Repeated(Operation[None]):
             if answers[-ENOUGH_ANSWERS:] == [read.result.param_index] * ENOUGH_ANSWERS:
                 self._table.passed_over[name] = frozenset(self.names[name]) - {read.result.param_index}
             elif len(answers) < MOST_ANSWERS:
-                self._ask(name, read.ended_at)
-        if not self._open:
+                self._ask_at[name] = read.ended_at + ANSWERS_PAUSE
+        if not self._open and not self._ask_at:
             self.finish(None, read.ended_at)

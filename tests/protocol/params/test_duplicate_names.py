@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from paramclient import ParamClient
 from paramclient.model.values import ParamType
 from paramclient.protocol.params.duplicate_names import (
+    ANSWERS_PAUSE,
     ENOUGH_ANSWERS,
     MOST_ANSWERS,
     MOST_TOLD,
@@ -133,12 +135,35 @@ def repeated(desk: Desk, **names: tuple[int, ...]) -> tuple[Repeated, Table]:
     return asking, table
 
 
+def answer(desk: Desk, asking: Repeated, name: str, index: int) -> None:
+    """Answer the read, and pass the time until the next one."""
+    desk.hear(name, index=index)
+    if (next_at := asking.next_deadline()) < math.inf:
+        desk.now = next_at
+        asking.tick(next_at)
+
+
+def test_late_values_that_come_in_one_moment_are_one_answer() -> None:
+    desk = Desk("A")
+    asking, table = repeated(desk, A=(3, 5))
+    for _ in range(ENOUGH_ANSWERS):
+        desk.hear("A", index=5)
+    assert not asking.done
+    assert asking.next_deadline() == desk.now + ANSWERS_PAUSE
+    desk.now += ANSWERS_PAUSE
+    asking.tick(desk.now)
+    for _ in range(ENOUGH_ANSWERS):
+        answer(desk, asking, "A", 3)
+    assert asking.done
+    assert table.passed_over == {"A": {5}}
+
+
 def test_answers_that_never_agree_leave_it_open() -> None:
     desk = Desk("A")
     asking, table = repeated(desk, A=(3, 5))
     for number in range(MOST_ANSWERS):
         assert not asking.done
-        desk.hear("A", index=(3, 5)[number % 2])
+        answer(desk, asking, "A", (3, 5)[number % 2])
     assert asking.done
     assert table.passed_over == {}
 
@@ -147,7 +172,7 @@ def test_a_name_that_is_not_answered_leaves_it_open() -> None:
     desk = Desk("A", "B")
     asking, table = repeated(desk, A=(3, 5), B=(0, 1))
     for _ in range(ENOUGH_ANSWERS):
-        desk.hear("B", index=1)
+        answer(desk, asking, "B", 1)
     desk.pass_time()
     assert asking.done
     assert table.passed_over == {"B": {0}}
