@@ -24,7 +24,6 @@ from paramclient.protocol.addresses import Address, Peer, PeerAddress, peer_in_w
 from paramclient.protocol.ftp import FileTransfers
 from paramclient.protocol.params.boot_values import StartValues
 from paramclient.protocol.params.change import Change
-from paramclient.protocol.params.change_origin import Authors
 from paramclient.protocol.params.fetch import Check, Fetch
 from paramclient.protocol.params.fetch_queue import Fetches
 from paramclient.protocol.params.fetch_result import FetchResult, Means, Policy, Sampled
@@ -34,9 +33,10 @@ from paramclient.protocol.params.reads import Key, Read, Reads
 from paramclient.protocol.params.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
 from paramclient.protocol.params.sync_interval import CheckPace
 from paramclient.protocol.params.table import Room, Table
-from paramclient.protocol.params.value_check import LATER_CHANGE_TIME, ValueChecks
+from paramclient.protocol.params.value_check import Rereads
 from paramclient.protocol.params.volatile_values import Refresh
 from paramclient.protocol.params.writes import Write, Writes
+from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.scheduler import Turns
 from paramclient.protocol.stats.trace import Trace, silent
@@ -47,7 +47,7 @@ from paramclient.protocol.vehicle.identification import Identification
 from paramclient.protocol.vehicle.metadata_location import Descriptions
 from paramclient.protocol.vehicle.peers import NO_PEER, ComponentPeers, Contest
 from paramclient.protocol.vehicle.presence import Presence
-from paramclient.protocol.vehicle.reboot import SAVING_TIME, Restart
+from paramclient.protocol.vehicle.reboot import Restart, Restarts
 from paramclient.protocol.wire import (
     HASH_CHECK,
     MAV_AUTOPILOT_ARDUPILOTMEGA,
@@ -69,10 +69,6 @@ from paramclient.protocol.wire import (
 
 __all__ = ["ComponentMachine", "ComponentObserver"]
 
-MOST_DOUBTED: Final = 256
-"""Reads that may be open for a value to be asked for that changed twice: each takes its share of the link."""
-CHECK_PAUSE: Final = 0.1
-"""Seconds until a value is read again for which there is no room among the reads."""
 RESTART_SILENCE: Final = 0.25
 """Seconds of silence behind which a new numbering of frames has a fetch begun anew: an ArduPilot that starts
 again says nothing for that long at least (measured: 0.31 s with a station that talks to it, else 1.0 s)."""
@@ -155,7 +151,8 @@ class ComponentMachine:
         commands: what it is told to do.
         clock_requests: the requests for its time since boot.
         start_values: the reading of what it measures at each start.
-        restart: the restart that it was told to make and that is under way, or None.
+        restarts: the restart that it was told to make.
+        rereads: the values that are to be read again.
         fetches: what was and is being fetched.
         tells_changes: whether somebody wants to be told of each change. An event for each value of a long
             list takes a tenth of what the value takes, and the garbage collector goes through those that
@@ -253,7 +250,15 @@ class ComponentMachine:
             is_fetching=lambda: self.fetch is not None,
             fetch_file=self.sync.fetch_quick_file,
         )
-        self.restart: Restart | None = None
+        self.restarts = Restarts(
+            target,
+            self.commands,
+            self.who,
+            self.presence,
+            self.round_trip,
+            self.clock_requests,
+            self._restart_noticed,
+        )
         self.following = Following()
         self.fetches = Fetches(
             Means(
@@ -298,12 +303,19 @@ class ComponentMachine:
         self._read_clock = read_clock
         self._vehicle = vehicle
         self._known_as: str | None = None  # the key of the identity that was reported
-        self._saved_at = -math.inf  # when all that we have written will have been saved
-        self._authors = Authors()
-        self._checks = ValueChecks()
         self.tells_changes = True
         self.has_moved = False
+        self.rereads = Rereads(self.reads, self.table, self.sync, upkeep.policy)
+        self._authors = self.rereads.authors
+        self._checks = self.rereads.checks
         self.writes.left_open = self._authors.foreign_set
+        self._machines: tuple[Machine, ...] = (
+            *(self.reads, self.name_searches, self.sync, self.writes, self.files, self.commands),
+            *(self.restarts, self.fetches, self.who, self.descriptions, self.clock_requests),
+            *(self.start_values, self.rereads),
+        )
+        """Each stands behind those that it uses or tells. They end in the reverse order: a machine does not
+        take the end of what it uses for a result, and is told nothing after its own end."""
 
     @property
     def peer_in_words(self) -> str:
@@ -352,7 +364,7 @@ class ComponentMachine:
     @property
     def is_restarting(self) -> bool:
         """Whether it was told to start again, and that is awaited."""
-        return self.restart is not None and not self.restart.done
+        return self.restarts.is_under_way
 
     @property
     def is_identified(self) -> bool:
@@ -397,7 +409,7 @@ class ComponentMachine:
         """Whether anything is awaited but the values that are read after the hash has agreed."""
         in_background = 0 if self.refresh is None else self.refresh.in_flight
         is_asked = len(self.reads) > in_background or len(self.writes) > 0 or not self.files.is_idle
-        is_asked = is_asked or len(self.commands) > 0 or self.restart is not None
+        is_asked = is_asked or len(self.commands) > 0 or self.restarts.current is not None
         is_asked = is_asked or self.descriptions.is_asking or len(self.name_searches) > 0
         return is_asked or self.fetch is not None or self.who.is_asking
 
@@ -458,8 +470,7 @@ class ComponentMachine:
                 self._rebooted(now)
             elif state not in (None, message.system_status):
                 self.clock_requests.want(now)
-            self._authors.forget(now)
-            self._checks.forget(now)
+            self.rereads.forget_old(now)
             if self.fetches.overheard is not None:
                 self.fetches.overheard.file.tick(now)  # in a log nothing else tells the time
         elif isinstance(message, AutopilotVersion):
@@ -596,7 +607,7 @@ class ComponentMachine:
 
         A fetch that was held up meanwhile does not wait for that.
         """
-        if self.restart is not None and self.restart.numbering_began(now):
+        if self.restarts.numbering_began(now):
             return
         self.clock_requests.want(now)
         if now - silent_since >= RESTART_SILENCE and self.fetches.seems_restarted(silent_since, now):
@@ -756,32 +767,15 @@ class ComponentMachine:
         Raises:
             NoReply: the component is lost. Nothing was sent.
         """
-        if self.restart is None or self.restart.done:
+        if not self.restarts.is_under_way:
             self.check_present(f"the restart of {self.system}/{self.component}", now)
-            self.restart = Restart(
-                (self.system, self.component),
-                self.commands,
-                self.who,
-                self.presence,
-                self.round_trip,
-                self._saved_at,
-                self._restart_noticed,
-                self.clock_requests,
-                returns=returns,
-                now=now,
-            )
         self._read_clock(now)
         self.start_values.stop()
-        self.restart.waiters += 1
-        return self.restart
+        return self.restarts.begin(now, returns=returns)
 
     def end_restart(self, restart: Restart, now: float) -> None:
         """Wait for it no longer. The last one who waited ends it; whether it is obeyed is then not known."""
-        restart.waiters -= 1
-        if not restart.waiters:
-            restart.stop(now)
-            if self.restart is restart:
-                self.restart = None
+        self.restarts.end(restart, now)
 
     def begin_fetch(
         self,
@@ -916,60 +910,20 @@ class ComponentMachine:
             self._lose(now)
         if self.peers.contest is not None:
             return
-        self.reads.tick(now)
-        self.name_searches.tick(now)
-        self.writes.tick(now)
-        self.files.tick(now)
-        if self.fetches.overheard is not None:
-            self.fetches.overheard.file.tick(now)
-        self.commands.tick(now)
-        if self.restart is not None:
-            self.restart.tick(now)
-        if self.fetch is not None:
-            self.fetch.tick(now)
-        self.who.tick(now)
-        self.descriptions.tick(now)
+        for machine in self._machines:
+            machine.tick(now)
         self._follow_identity(now)
-        self.clock_requests.tick(now)
-        self.sync.tick(now)
-        self.start_values.tick(now)
-        for name in self._authors.doubted(now):
-            if self._policy is Policy.AUTO and len(self.reads) < MOST_DOUBTED:
-                self.reads.ask(name, now, urgent=False)
-        if self._checks.next_deadline() <= now:
-            self._check_values(now)
 
     def next_deadline(self) -> float:
-        """When `tick` has something to do, or infinity. Asked often: what is idle is not asked in turn."""
-        fetch = self.fetches.current
+        """When `tick` has something to do, or infinity."""
         first = min(self.presence.lost_at(), self.peers.next_deadline())
         if self.peers.contest is not None:
             return first
-        if fetch is not None:
-            first = min(first, fetch.next_deadline())
-        if self.restart is not None:
-            first = min(first, self.restart.next_deadline())
-        if len(self.reads):
-            first = min(first, self.reads.next_deadline())
-        if self.name_searches:
-            first = min(first, self.name_searches.next_deadline())
-        if self.writes.queues:
-            first = min(first, self.writes.next_deadline())
-        if len(self.commands):
-            first = min(first, self.commands.next_deadline())
-        if self.fetches.overheard is not None:
-            first = min(first, self.fetches.overheard.file.next_deadline())
-        return min(
-            first,
-            self.files.next_deadline(),
-            self.who.next_deadline(),
-            self.descriptions.next_deadline(),
-            self.clock_requests.next_deadline(),
-            self.sync.next_deadline(),
-            self.start_values.next_deadline(),
-            self._authors.next_deadline(),
-            self._checks.next_deadline(),
-        )
+        for machine in self._machines:
+            deadline = machine.next_deadline()
+            if deadline < first:
+                first = deadline
+        return first
 
     def resume(self, now: float) -> None:
         """The link was away and is back: whatever waits for an answer is asked for again."""
@@ -981,35 +935,13 @@ class ComponentMachine:
             elif self.identity.uid is not None:
                 self.who.doubt(now)  # it may be another one that was plugged in
             self._was_silent(silence, now)
-        self.reads.resume(now)
-        self.name_searches.resume(now)
-        self.writes.resume(now)
-        self.files.resume(now)
-        self.descriptions.resume(now)
-        self.commands.resume(now)
-        if self.fetch is not None:
-            self.fetch.resume(now)
+        for machine in self._machines:
+            machine.resume(now)
 
     def fail_all(self, error: ParamClientError, now: float) -> None:
         """The link is gone for good, or the address is contested: every operation ends with the error."""
-        if self.fetch is not None:
-            self.fetch.cancel(now)
-            self.fetch.fail(error, now)
-        if self.sync.refresh is not None:
-            self.sync.refresh.fail(error, now)
-        self.files.fail_all(error, now)
-        self.descriptions.fail_all(error, now)
-        if self.restart is not None:
-            self.restart.fail(error, now)
-        self.commands.fail_all(error, now)
-        self.clock_requests.stop()
-        self.start_values.stop()
-        self.writes.fail_all(error, now)
-        self.reads.fail_all(error, now)
-        self.name_searches.fail_all(error, now)
-        self.sync.stop()
-        self._authors.clear()
-        self._checks.clear()
+        for machine in reversed(self._machines):
+            machine.fail_all(error, now)
 
     def become_another(self, now: float) -> None:
         """Another vehicle has taken this system id: nothing that is known is about it."""
@@ -1020,8 +952,7 @@ class ComponentMachine:
         self.following.forget()
         self._checks.clear()
         self._known_as = None
-        if self.restart is not None:
-            self.restart.another(now)
+        self.restarts.another(now)
         self.commands.lose(now, ": another vehicle answers there now")
         self.name_searches.lose(now)
         what = f"writes to {self.system}/{self.component}: another vehicle answers there now"
@@ -1062,30 +993,9 @@ class ComponentMachine:
         presence = self.presence
         presence.is_lost = True
         self._observer.lost(self, now - presence.heard_at)
-        self.writes.lose(now)
-        self.reads.lose(now)
-        self.name_searches.lose(now)
-        self.files.lose(now)
-        self.descriptions.lose(now)
-        self.commands.lose(now)
-        self.start_values.stop()
-        self.who.lose()
-        self.fetches.interrupt(now)
+        for machine in reversed(self._machines):
+            machine.lose(now)
         self._doubt()
-
-    def _check_values(self, now: float) -> None:
-        """Read again what is due; by the vehicle's hash alone, as far as that proves it."""
-        names = self._checks.due(now)
-        if self.who.autopilot == MAV_AUTOPILOT_PX4 and self.sync.may_resync and self.table.is_provable:
-            names = [name for name in names if not self.table.is_hashed(name)]
-            self.sync.ask(now)
-        for name in names:
-            if self._policy is not Policy.AUTO:
-                self.table.doubt_value(name)
-            elif len(self.reads) < MOST_DOUBTED:
-                self.reads.ask(name, now, urgent=False)
-            else:
-                self._checks.ask(name, now + CHECK_PAUSE)
 
     def _was_silent(self, silence: float, now: float) -> None:
         """It is heard again. After a while, who it is and its hash are asked for before anything counts."""
@@ -1100,8 +1010,7 @@ class ComponentMachine:
             self.who.doubt(now)
         elif presence.was_away(silence) and silence < math.inf:
             self.who.doubt(now)
-        if self.restart is not None:
-            self.restart.silent(silence, now)
+        self.restarts.silent(silence, now)
         if presence.has_beaten:  # else nothing says when it should have been heard
             self.sync.silence(now)
 
@@ -1120,12 +1029,10 @@ class ComponentMachine:
         if not is_of_this_run:
             self._doubt()
         self.following.forget()
-        self._authors.clear()
-        self._checks.clear()
+        self.rereads.clear()
         self.sync.check(now)
         self.who.doubt(now)
-        if self.restart is not None:
-            self.restart.rebooted(now)
+        self.restarts.rebooted(now)
         if not by_clock:
             self.clock_requests.want(now)
         if self.fetch is not None and self.fetch.is_under_way and not is_of_this_run:
@@ -1138,7 +1045,7 @@ class ComponentMachine:
         self.reads.pace.is_batched = autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
         name = autopilot_name(MAV_AUTOPILOT_PX4 if autopilot is None else autopilot)  # it may be one
         self.writes.against_non_finite = reason_against_non_finite(name)
-        self.writes.is_px4 = autopilot == MAV_AUTOPILOT_PX4
+        self.writes.is_px4 = self.rereads.is_px4 = autopilot == MAV_AUTOPILOT_PX4
         if self.fetch is not None:
             self.fetch.look(now)
         if self.who.settled and self._known_as != self.identity.key:
@@ -1172,11 +1079,9 @@ class ComponentMachine:
 
     def _write_ended(self, write: Write) -> None:
         now = write.ended_at
-        self._saved_at = now + SAVING_TIME
+        self.restarts.write_ended(now)
         self.sync.write_ended(now)
-        is_px4 = self.who.autopilot == MAV_AUTOPILOT_PX4
-        if is_px4 and write.result is not None and self._policy is Policy.AUTO and not write.settle:
-            self._checks.ask(write.name, now + LATER_CHANGE_TIME)
+        self.rereads.write_ended(write, now)
 
     def _resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
         self._observer.resynced(self, changed, confirmed)

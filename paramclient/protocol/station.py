@@ -630,7 +630,7 @@ class Station:
         if machine.who.has_parameters and not machine.peers.hears_clock(number, boot_ms, peer, now):
             return
         machine.boot_clock(number, boot_ms, now)
-        if machine.restart is None and not machine.peers.wants_clocks:
+        if machine.restarts.current is None and not machine.peers.wants_clocks:
             self._clock_sampling.sampled(machine.address, now)
 
     def _take_clocks(self, takes: bool) -> None:

@@ -15,6 +15,7 @@ from paramclient.errors import FileErrorCode, NoReply, UsageError
 from paramclient.protocol.ftp.file_read import LARGEST_FILE, FileRead
 from paramclient.protocol.ftp.operations import Job, Line
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.wire import FileTransfer, Message
 
@@ -139,7 +140,7 @@ class FileChecksum(Job[int]):
             self.finish(int.from_bytes(packet.data[:4], "little"), now)
 
 
-class FileTransfers:
+class FileTransfers(Machine):
     """All work with the files of one component, in the order in which it was asked for.
 
     Every call gives an `Operation` at once; it begins when what is before it has ended, ends with its result,

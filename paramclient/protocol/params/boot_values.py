@@ -11,6 +11,7 @@ from typing import Final
 
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.table import Table
+from paramclient.protocol.requests.machine import Machine
 
 __all__ = ["StartValues"]
 
@@ -35,7 +36,7 @@ _MEASURED = re.compile(
 start and later ones), and their kin of other sensors."""
 
 
-class StartValues:
+class StartValues(Machine):
     """Reads again what a vehicle without a hash measures at each start; see `MEASURING_TIME`.
 
     Where the whole table comes as a file in no time, that is fetched instead. A vehicle with a hash needs
@@ -99,6 +100,14 @@ class StartValues:
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity."""
         return self._read_at
+
+    def lose(self, now: float) -> None:
+        """Read nothing any more."""
+        self.stop()
+
+    def fail_all(self, error: Exception, now: float) -> None:
+        """Read nothing any more."""
+        self.stop()
 
     def stop(self) -> None:
         """Read nothing any more."""

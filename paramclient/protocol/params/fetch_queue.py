@@ -12,6 +12,7 @@ from paramclient.protocol.params.fetch_result import FetchResult, Means, Policy,
 from paramclient.protocol.params.passive import Overheard, Overhearing
 from paramclient.protocol.params.sync import Sync, Upkeep
 from paramclient.protocol.params.sync_interval import CheckPace
+from paramclient.protocol.requests.machine import Machine
 
 __all__ = ["Fetches"]
 
@@ -20,7 +21,7 @@ EARLY: Final = 0.25
 long on their way."""
 
 
-class Fetches:
+class Fetches(Machine):
     """What was fetched, is being fetched, and can be.
 
     Args:
@@ -134,6 +135,34 @@ class Fetches:
             fetch.cancel(now)
             if self.current is fetch:
                 self.current = None
+
+    def tick(self, now: float) -> None:
+        """Do what is due of the fetch in progress, and of the files that others read."""
+        if self.overheard is not None:
+            self.overheard.file.tick(now)
+        if self.current is not None:
+            self.current.tick(now)
+
+    def next_deadline(self) -> float:
+        """See `Machine`."""
+        first = math.inf if self.current is None else self.current.next_deadline()
+        return first if self.overheard is None else min(first, self.overheard.file.next_deadline())
+
+    def resume(self, now: float) -> None:
+        """See `Machine`."""
+        if self.current is not None:
+            self.current.resume(now)
+
+    def lose(self, now: float) -> None:
+        """End the files that others read. A fetch goes on: the component may only be rebooting."""
+        self.interrupt(now)
+
+    def fail_all(self, error: Exception, now: float) -> None:
+        """See `Machine`."""
+        if self.current is not None:
+            fetch = self.current
+            fetch.cancel(now)
+            fetch.fail(error, now)
 
     def interrupt(self, now: float) -> None:
         """The component is lost, or starts again: nothing more comes of the files that others read."""

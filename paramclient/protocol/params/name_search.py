@@ -9,6 +9,7 @@ from typing import Final
 
 from paramclient.errors import NoReply
 from paramclient.protocol.params.reads import BATCH_INTERVAL, Reads
+from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
@@ -61,7 +62,7 @@ class NameSearch(Operation[None]):
             self.passes.pop(name, None)
 
 
-class NameSearches:
+class NameSearches(Machine):
     """Every search of one component, one after the other.
 
     PX4 up to 1.17 and ArduPilot say nothing to a name that they do not have. Both serve requests in order, so

@@ -7,7 +7,15 @@ from collections import deque
 from collections.abc import Callable
 from typing import Final, TypeAlias
 
-from paramclient.errors import NoReply, ParamErrorCode, Refused, TypeMismatch, UnknownParameter, VehicleError
+from paramclient.errors import (
+    NoReply,
+    ParamErrorCode,
+    Refused,
+    TypeMismatch,
+    UnknownParameter,
+    VehicleError,
+)
+from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.pacing import Pace, Share
 from paramclient.protocol.requests.round_trip import (
@@ -77,7 +85,7 @@ class Read(Operation[ParamValue]):
         self.controls = 0
 
 
-class Reads:
+class Reads(Machine):
     """Every read of one component: as fast as it serves them, single ones before a download's.
 
     Silence is not an answer: PX4 up to 1.17 and ArduPilot say nothing to what they do not have. What stays

@@ -19,6 +19,7 @@ from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.sync_interval import CheckPace
 from paramclient.protocol.params.table import MOST_NAMES, Table
 from paramclient.protocol.params.volatile_values import Refresh
+from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.wire import HASH_CHECK, ParamValue
 
 __all__ = ["Sync", "SyncState", "Upkeep"]
@@ -119,7 +120,7 @@ class Upkeep:
         return cls(interval or math.inf, without_hash=True, policy=policy)
 
 
-class Sync:
+class Sync(Machine):
     """Follows the hashes that one component announces, and asks for them when there is a reason to.
 
     Reasons are a write of ours, which moves the hash; values that others have changed, of which the vehicle
@@ -368,6 +369,12 @@ class Sync:
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity."""
         return min(self._settle_at, self._foreign_check_at, self._check_at)
+
+    def fail_all(self, error: Exception, now: float) -> None:
+        """End the reading of volatile values with the error, and request nothing any more."""
+        if self.refresh is not None:
+            self.refresh.fail(error, now)
+        self.stop()
 
     def stop(self) -> None:
         """Ask for nothing any more, unless there is a new reason to."""

@@ -5,9 +5,16 @@ from __future__ import annotations
 import math
 from typing import Final
 
+from paramclient.protocol.params.change_origin import Authors
+from paramclient.protocol.params.fetch_result import Policy
+from paramclient.protocol.params.reads import Reads
+from paramclient.protocol.params.sync import Sync
+from paramclient.protocol.params.table import Table
+from paramclient.protocol.params.writes import Write
+from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.wire import ParamValue
 
-__all__ = ["LATER_CHANGE_TIME", "ValueChecks"]
+__all__ = ["LATER_CHANGE_TIME", "Rereads", "ValueChecks"]
 
 DISTRUST_TIME: Final = 0.3
 """Seconds after a change in which a PARAM_VALUE with the value before it is no observation: ArduPilot takes
@@ -17,8 +24,80 @@ LATER_CHANGE_TIME: Final = 1.2
 815 ms after it, and set others up to 1 s after it (measured)."""
 LATE_ANSWER_TIME: Final = 1.0
 """Seconds after a request was sent in which its answer may still come."""
+READS_MAX: Final = 256
+"""Open reads of a component beyond which no value is read again: each takes its share of the link."""
+READS_PAUSE: Final = 0.1
+"""Seconds until a value is read again for which there is no room among the reads."""
 REPLACED_MAX: Final = 4_096
 """Names whose replaced values are remembered, more than an autopilot has; the oldest is dropped first."""
+
+
+class Rereads(Machine):
+    """Reads again the values whose last observation may be older than a change, or may have been clamped.
+
+    Args:
+        reads, table, sync: the component's.
+        policy: whether reads are allowed.
+
+    Attributes:
+        authors: who changed which value.
+        checks: the values that were just replaced, and those that are to be read again.
+        is_px4: whether the component is a PX4, which proves unchanged values by its hash.
+    """
+
+    def __init__(self, reads: Reads, table: Table, sync: Sync, policy: Policy) -> None:
+        self.authors = Authors()
+        self.checks = ValueChecks()
+        self.is_px4 = False
+        self._reads = reads
+        self._table = table
+        self._sync = sync
+        self._policy = policy
+
+    def write_ended(self, write: Write, now: float) -> None:
+        """Plan to read a value after a write, where the vehicle may change it without telling."""
+        if self.is_px4 and write.result is not None and self._policy is Policy.AUTO and not write.settle:
+            self.checks.ask(write.name, now + LATER_CHANGE_TIME)
+
+    def forget_old(self, now: float) -> None:
+        """Drop what is too old to matter; once a second is enough."""
+        self.authors.forget(now)
+        self.checks.forget(now)
+
+    def clear(self) -> None:
+        """Drop everything: the vehicle has started again."""
+        self.authors.clear()
+        self.checks.clear()
+
+    def tick(self, now: float) -> None:
+        """Read what is due."""
+        for name in self.authors.doubted(now):
+            if self._policy is Policy.AUTO and len(self._reads) < READS_MAX:
+                self._reads.ask(name, now, urgent=False)
+        if self.checks.next_deadline() <= now:
+            self._read_due(now)
+
+    def next_deadline(self) -> float:
+        """See `Machine`."""
+        return min(self.authors.next_deadline(), self.checks.next_deadline())
+
+    def fail_all(self, error: Exception, now: float) -> None:
+        """Read nothing any more."""
+        self.clear()
+
+    def _read_due(self, now: float) -> None:
+        """Read again what is due; by the vehicle's hash alone, as far as that proves it."""
+        names = self.checks.due(now)
+        if self.is_px4 and self._sync.may_resync and self._table.is_provable:
+            names = [name for name in names if not self._table.is_hashed(name)]
+            self._sync.ask(now)
+        for name in names:
+            if self._policy is not Policy.AUTO:
+                self._table.doubt_value(name)
+            elif len(self._reads) < READS_MAX:
+                self._reads.ask(name, now, urgent=False)
+            else:
+                self.checks.ask(name, now + READS_PAUSE)
 
 
 class ValueChecks:

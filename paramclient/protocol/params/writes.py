@@ -7,7 +7,13 @@ from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from paramclient.errors import NoReply, ParamErrorCode, TypeMismatch, UsageError, ValueNotApplied
+from paramclient.errors import (
+    NoReply,
+    ParamErrorCode,
+    TypeMismatch,
+    UsageError,
+    ValueNotApplied,
+)
 from paramclient.model.values import (
     Encoding,
     Param,
@@ -22,6 +28,7 @@ from paramclient.model.values import (
 from paramclient.protocol.params.change_origin import by_us
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.write_resolution import note_on_small_change
+from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.stats.trace import Trace, silent
@@ -103,7 +110,7 @@ class Write(Operation[SetResult]):
         self.was_retyped = False
 
 
-class Writes:
+class Writes(Machine):
     """Every write to one component: those to one name in order, those to different names side by side.
 
     How a write goes: learn the type (unless it was heard or verified on this link), send exactly that type,

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Final
 
+from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import (
     MAV_CMD_REQUEST_MESSAGE,
@@ -29,7 +30,7 @@ SLOW_PACE: Final = 1.0
 baseline. Nobody waits for it, and where 250 lists come at once, the answers stand behind the values."""
 
 
-class ClockRequests:
+class ClockRequests(Machine):
     """Requests the time since boot once a component is identified, and where it may have started again.
 
     ArduCopter sends neither SYSTEM_TIME nor another message with a clock unless a ground station has asked
@@ -90,6 +91,10 @@ class ClockRequests:
         """Request nothing any more."""
         self._request_at = math.inf
         self._is_following = False
+
+    def fail_all(self, error: Exception, now: float) -> None:
+        """Request nothing any more."""
+        self.stop()
 
     def tick(self, now: float) -> None:
         """Send a request that is due."""

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Final
 
 from paramclient.errors import CommandRefused, CommandResult, NoReply
+from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.wire import CommandAck, CommandLong, Message
@@ -42,7 +43,7 @@ class Command(Operation[None]):
         self.progress_at: float | None = None
 
 
-class Commands:
+class Commands(Machine):
     """Every command to one component.
 
     An answer names the command and nothing else, so those of one number are done one after the other, and

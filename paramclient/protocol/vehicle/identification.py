@@ -9,6 +9,7 @@ from typing import Final
 
 from paramclient.model.identity import Identity
 from paramclient.model.values import Encoding
+from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
@@ -90,7 +91,7 @@ def judge_encoding(
     return Encoding.BYTEWISE, "the standard's encoding, as nothing says otherwise"
 
 
-class Identification:
+class Identification(Machine):
     """Follows a component's heartbeat, asks for its AUTOPILOT_VERSION, and draws the conclusions.
 
     Attributes:
@@ -293,7 +294,7 @@ class Identification:
             self.attempts = 0
             self._ask(now)
 
-    def lose(self) -> None:
+    def lose(self, now: float) -> None:
         """It is not heard any more. Who has said it before is asked again when it is; others are asked on."""
         if self.settled:
             self._is_asking = False

@@ -10,7 +10,8 @@ import math
 from collections.abc import Callable
 from typing import Final
 
-from paramclient.errors import CommandResult, NoReply, ParamClientError
+from paramclient.errors import CommandResult, NoReply
+from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.wire import (
@@ -40,7 +41,7 @@ class DescriptionAsk(Operation[ComponentMetadata | None]):
         self.attempts = 0
 
 
-class Descriptions:
+class Descriptions(Machine):
     """Asks a component for its COMPONENT_METADATA, again in time, until there is an answer or no hope of one.
 
     Args:
@@ -127,7 +128,7 @@ class Descriptions:
         if self._asks:
             self._request(now)
 
-    def fail_all(self, error: ParamClientError, now: float) -> None:
+    def fail_all(self, error: Exception, now: float) -> None:
         """No answer can come any more."""
         asks, self._asks = self._asks, []
         for ask in asks:

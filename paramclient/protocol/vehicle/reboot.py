@@ -8,6 +8,7 @@ from typing import Final
 
 from paramclient.errors import AnotherVehicle, NoReply
 from paramclient.model.identity import Identity
+from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
@@ -16,7 +17,7 @@ from paramclient.protocol.vehicle.identification import Identification
 from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN
 
-__all__ = ["SAVING_TIME", "Restart"]
+__all__ = ["Restart", "Restarts"]
 
 SAVING_TIME: Final = 2.5
 """Seconds from a write until it outlives a restart: PX4 saves changed parameters up to two seconds later
@@ -44,6 +45,113 @@ UNNOTICED: Final = 10.0
 without a gap, tells no clock, and does not say that it boots."""
 ASKING_PACE: Final = 1.0
 """Seconds between two rounds of questions to a component that is back and does not say who it is."""
+
+
+class Restarts(Machine):
+    """The restart on command of one component: at most one at a time, which all callers share.
+
+    Args:
+        target: the component.
+        commands, who, presence, round_trip, clock_requests: the component's.
+        restarted: is told when the component has started again and nobody else has noticed; calls `rebooted`.
+
+    Attributes:
+        current: the restart in progress or just ended, or None.
+        saved_at: the time at which all that was written is saved.
+    """
+
+    def __init__(
+        self,
+        target: tuple[int, int],
+        commands: Commands,
+        who: Identification,
+        presence: Presence,
+        round_trip: RoundTrip,
+        clock_requests: ClockRequests,
+        restarted: Callable[[float], None],
+    ) -> None:
+        self.current: Restart | None = None
+        self.saved_at = -math.inf
+        self._target = target
+        self._commands = commands
+        self._who = who
+        self._presence = presence
+        self._round_trip = round_trip
+        self._clock_requests = clock_requests
+        self._restarted = restarted
+
+    @property
+    def is_under_way(self) -> bool:
+        """Whether the component was told to start again, and that is awaited."""
+        return self.current is not None and not self.current.done
+
+    def begin(self, now: float, *, returns: bool) -> Restart:
+        """Begin a restart, or join the one in progress; give it back with `end`.
+
+        Args:
+            now: the time.
+            returns: as in `Restart`.
+        """
+        if self.current is None or self.current.done:
+            self.current = Restart(
+                self._target,
+                self._commands,
+                self._who,
+                self._presence,
+                self._round_trip,
+                self.saved_at,
+                self._restarted,
+                self._clock_requests,
+                returns=returns,
+                now=now,
+            )
+        self.current.waiters += 1
+        return self.current
+
+    def end(self, restart: Restart, now: float) -> None:
+        """Wait for it no longer. The last waiter ends it; whether it is obeyed is then not known."""
+        restart.waiters -= 1
+        if not restart.waiters:
+            restart.stop(now)
+            if self.current is restart:
+                self.current = None
+
+    def write_ended(self, now: float) -> None:
+        """Take that a write has ended: the vehicle saves the value `SAVING_TIME` later at most."""
+        self.saved_at = now + SAVING_TIME
+
+    def tick(self, now: float) -> None:
+        """See `Machine`."""
+        if self.current is not None:
+            self.current.tick(now)
+
+    def next_deadline(self) -> float:
+        """See `Machine`."""
+        return math.inf if self.current is None else self.current.next_deadline()
+
+    def fail_all(self, error: Exception, now: float) -> None:
+        """See `Machine`."""
+        if self.current is not None:
+            self.current.fail(error, now)
+
+    def rebooted(self, now: float) -> None:
+        """See `Restart.rebooted`."""
+        if self.current is not None:
+            self.current.rebooted(now)
+
+    def numbering_began(self, now: float) -> bool:
+        """See `Restart.numbering_began`."""
+        return self.current is not None and self.current.numbering_began(now)
+
+    def silent(self, silence: float, now: float) -> None:
+        """See `Restart.silent`."""
+        if self.current is not None:
+            self.current.silent(silence, now)
+
+    def another(self, now: float) -> None:
+        """See `Restart.another`."""
+        if self.current is not None:
+            self.current.another(now)
 
 
 class Restart(Operation[None]):

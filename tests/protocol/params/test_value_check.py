@@ -242,7 +242,7 @@ def test_a_set_back_is_not_proven_by_a_late_answer() -> None:
 def test_a_restart_makes_the_old_values_possible_again() -> None:
     desk = Desk()
     desk.set(2.0)
-    desk.machine.restart = None
+    desk.machine.restarts.current = None
     desk.machine._rebooted(desk.now)
     desk.hear("A", 1.0)
     assert desk.value == 1.0

@@ -402,7 +402,7 @@ async def test_cancelling_leaves_nothing(make: Make, after: float) -> None:
         assert call.cancelled() or call.done()
         assert residue(component) == []
         assert len(component._machine.commands) == 0
-        assert component._machine.restart is None
+        assert component._machine.restarts.current is None
         assert tasks_beside() == tasks
         await asyncio.sleep(5.0)
         assert await component.reboot() is component
