@@ -20,6 +20,7 @@ PACKAGE = ROOT / "paramclient"
 LOW = {"errors", "version"}
 CORE = {"errors", "model", "protocol.wire"}
 MACHINES = CORE | {
+    "protocol.stats",
     *("protocol.addresses", "protocol.requests"),
     *("protocol.ftp", "protocol.ftp.packets", "protocol.ftp.param_pck"),
 }
@@ -38,13 +39,13 @@ MAY_IMPORT = {
     "model": {"errors"},
     "protocol.wire": {"errors", "model"},
     "protocol.addresses": set[str](),
-    "protocol.requests": {"errors"},
+    "protocol.requests": CORE | {"protocol.stats"},
     "protocol.scheduler": {"protocol.requests"},
     "protocol.ftp.packets": {"errors", "model"},
     "protocol.ftp.param_pck": {"errors", "model"},
     "protocol.ftp": MACHINES,
     "protocol.stats": CORE,
-    "protocol.params": MACHINES | {"protocol.scheduler", "protocol.stats"},
+    "protocol.params": MACHINES | {"protocol.scheduler", "protocol.vehicle"},
     "protocol.vehicle": CORE | {"protocol.requests", "protocol.addresses"},
     "protocol": PROTOCOL,
     "sim": CORE | {"protocol.ftp.packets", "protocol.ftp.param_pck"},

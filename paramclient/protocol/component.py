@@ -30,14 +30,14 @@ from paramclient.protocol.params.fetch_result import FetchResult, Means, Policy,
 from paramclient.protocol.params.foreign_list import Following
 from paramclient.protocol.params.name_search import NameSearch, NameSearches
 from paramclient.protocol.params.reads import Key, Read, Reads
-from paramclient.protocol.params.sync import LOW_BANDWIDTH_GAP, Sync, SyncState, Upkeep
+from paramclient.protocol.params.sync import Sync, SyncState, Upkeep
 from paramclient.protocol.params.sync_interval import CheckPace
 from paramclient.protocol.params.table import Room, Table
 from paramclient.protocol.params.value_check import Rereads
 from paramclient.protocol.params.volatile_values import Refresh
 from paramclient.protocol.params.writes import Write, Writes
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
-from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.scheduler import Turns
 from paramclient.protocol.stats.trace import Trace, silent
 from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
@@ -188,108 +188,40 @@ class ComponentMachine:
         self.address: Address = target if peer is None else PeerAddress(system, component, peer)
         self.vehicle: tuple[int, Peer] = (system, peer)
         self.version = 1
-        self.round_trip = RoundTrip()
-        self.who = Identification(
-            target, link, self.round_trip, send, encoding, may_ask=not upkeep.listens_only
-        )
+        context = Context(target, send, own, trace=trace, may_send=not upkeep.listens_only)
+        self.round_trip = context.round_trip
+        self.who = Identification(context, link, encoding)
         self.table = Table(self.who.encoding, room)
         self.turns = Turns() if turns is None else turns
-        self.reads = Reads(target, self.round_trip, send, self._is_known, self.turns.share, trace)
-        self.writes = Writes(
-            target,
-            self.round_trip,
-            send,
-            self.reads,
-            self.table.params,
-            encoding=lambda: self.table.encoding,
-            is_certain=lambda: self.may_be_written,
-            trace=trace,
-        )
+        self.reads = Reads(context, self.table, self.turns.share)
+        self.writes = Writes(context, self.reads, self.table, permission=self)
         self.presence = Presence()
-        self.peers = ComponentPeers(target, self, may_ask=not upkeep.listens_only)
-        self.files = FileTransfers(
-            target,
-            own,
-            self.round_trip,
-            send,
-            keeps_session=lambda: self.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA,
-        )
+        self.peers = ComponentPeers(target, self, may_ask=context.may_send)
+        self.files = FileTransfers(context)
         check_pace = CheckPace(upkeep.interval, is_chosen=upkeep.without_hash)
         self.sync = Sync(
-            self.reads,
-            self.table,
-            upkeep,
-            check_pace,
-            is_px4=lambda: self.who.autopilot == MAV_AUTOPILOT_PX4,
-            is_writing=lambda: len(self.writes) > 0,
-            is_fetching=lambda: self.fetch is not None,
-            is_busy=is_link_busy,
-            may_use_file=lambda: self.fetches.may_use_file(),
-            file_is_in_use=self.files.is_in_use,
-            is_spared=lambda: self._is_spared,
-            is_doubted=lambda: self.who.is_doubted,
-            begin_fetch=lambda now, check: self.begin_fetch(now, refresh=check is not None, check=check),
-            end_fetch=self.end_fetch,
-            resynced=self._resynced,
+            context, self.reads, self.table, upkeep, check_pace, self.presence, self.files, host=self
         )
-        self.descriptions = Descriptions(
-            target, own, self.round_trip, send, is_identifying=lambda: self.who.is_asking
-        )
-        self.commands = Commands(target, own, self.round_trip, send)
-        self.clock_requests = ClockRequests(
-            target,
-            self.presence,
-            send,
-            is_requesting=lambda: self.who.is_asking or self.descriptions.is_asking,
-            may_send=not upkeep.listens_only,
-        )
-        self.start_values = StartValues(
-            self.reads,
-            self.table,
-            is_wanted=lambda: self._may_read_start_values,
-            is_fetching=lambda: self.fetch is not None,
-            fetch_file=self.sync.fetch_quick_file,
-        )
+        self.descriptions = Descriptions(context)
+        self.commands = Commands(context)
+        self.clock_requests = ClockRequests(context, self.presence)
+        self.start_values = StartValues(context, self.reads, self.table, self.sync)
         self.restarts = Restarts(
-            target,
-            self.commands,
-            self.who,
-            self.presence,
-            self.round_trip,
-            self.clock_requests,
-            self._restart_noticed,
+            context, self.commands, self.who, self.presence, self.clock_requests, self._restart_noticed
         )
         self.following = Following()
-        self.fetches = Fetches(
-            Means(
-                target,
-                self.round_trip,
-                send,
-                self.reads,
-                self.table,
-                self.turns,
-                self.files,
-                expects_hash=lambda: self.sync.expects_hash,
-                adds_defaults=lambda: self.who.adds_defaults,
-                changed=self._moved,
-                doubt=self._doubt_identity,
-                following=self.following,
-                trace=trace,
-            ),
-            self.sync,
-            upkeep,
-            check_pace,
-            says_file=lambda: self.who.says_file,
-            ended=self._fetched,
-        )
-        self.name_searches = NameSearches(
-            target,
-            self.round_trip,
+        means = Means(
+            context,
             self.reads,
-            send,
-            count=lambda: self.table.count,
-            is_listing=self._is_listing,
+            self.table,
+            self.turns,
+            self.files,
+            changed=self._moved,
+            doubt=self._doubt_identity,
+            following=self.following,
         )
+        self.fetches = Fetches(means, self.sync, upkeep, check_pace, ended=self._fetched)
+        self.name_searches = NameSearches(context, self.reads, self.table, self.following)
         # where nothing is asked there are no reads: what others ask for is heard in their place
         overheard = self.fetches.overheard
         self._value_heard = self.reads.heard if overheard is None else overheard.heard
@@ -297,7 +229,7 @@ class ComponentMachine:
         self._observer = observer
         self._send_to = send_to or (lambda message, peer: send(message))
         self._policy = upkeep.policy
-        self._is_kept_up = upkeep.interval < math.inf and upkeep.policy is Policy.AUTO
+        self._is_link_busy = is_link_busy
         self._listens_only = upkeep.listens_only
         self._another = another or self.become_another
         self._read_clock = read_clock
@@ -305,7 +237,7 @@ class ComponentMachine:
         self._known_as: str | None = None  # the key of the identity that was reported
         self.tells_changes = True
         self.has_moved = False
-        self.rereads = Rereads(self.reads, self.table, self.sync, upkeep.policy)
+        self.rereads = Rereads(context, self.reads, self.table, self.sync, upkeep.policy)
         self._authors = self.rereads.authors
         self._checks = self.rereads.checks
         self.writes.left_open = self._authors.foreign_set
@@ -341,6 +273,16 @@ class ComponentMachine:
         home = self.peers.home
         is_open = any(each.who.was_away or each.peers.is_rival(home) for each in self._autopilots())
         return self.who.may_be_written and not is_open
+
+    @property
+    def may_use_file(self) -> bool:
+        """Whether the table is worth requesting as a file."""
+        return self.fetches.may_use_file()
+
+    @property
+    def is_link_busy(self) -> bool:
+        """Whether anything is requested on the link."""
+        return self._is_link_busy()
 
     @property
     def state(self) -> str:
@@ -417,29 +359,6 @@ class ComponentMachine:
     def is_settling(self) -> bool:
         """Whether a write is under way, or the hash after one has not come yet."""
         return len(self.writes) > 0 or self.sync.is_settling
-
-    @property
-    def _is_spared(self) -> bool:
-        """Whether it is lost, or in a mode in which nothing is asked of it unasked."""
-        presence = self.presence
-        return presence.is_lost or presence.is_high_latency or self.reads.pace.gap >= LOW_BANDWIDTH_GAP
-
-    @property
-    def _may_read_start_values(self) -> bool:
-        """Whether what is measured at each start is to be read again without being asked."""
-        return self._is_kept_up and not self.sync.expects_hash and not self._is_spared
-
-    def _is_listing(self, now: float) -> bool:
-        """Whether a list comes, for us or for another station."""
-        reads = self.reads
-        is_ours = reads.list_runs_again or not reads.is_idle or now < reads.list_until
-        return is_ours or self.following.is_running(now)
-
-    def _is_known(self, key: Key) -> bool:
-        """Whether anything speaks for such a parameter."""
-        if isinstance(key, str):
-            return key in self.table.params
-        return self.table.count is None or key < self.table.count
 
     # what comes in
 
@@ -1045,7 +964,6 @@ class ComponentMachine:
         self.reads.pace.is_batched = autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
         name = autopilot_name(MAV_AUTOPILOT_PX4 if autopilot is None else autopilot)  # it may be one
         self.writes.against_non_finite = reason_against_non_finite(name)
-        self.writes.is_px4 = self.rereads.is_px4 = autopilot == MAV_AUTOPILOT_PX4
         if self.fetch is not None:
             self.fetch.look(now)
         if self.who.settled and self._known_as != self.identity.key:
@@ -1083,7 +1001,8 @@ class ComponentMachine:
         self.sync.write_ended(now)
         self.rereads.write_ended(write, now)
 
-    def _resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
+    def resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
+        """Report that the table agrees with the vehicle's again."""
         self._observer.resynced(self, changed, confirmed)
 
     def _fetched(self, result: FetchResult) -> None:

@@ -206,7 +206,7 @@ def test_whether_anything_is_awaited_is_asked_of_one(monkeypatch: pytest.MonkeyP
         hear(station, system, 0.0)
     for system in range(1, MANY):
         station.components[system, 1].who.settled = True
-        station.components[system, 1].who._is_asking = False
+        station.components[system, 1].who._context.is_identifying = False
     assert station.is_waiting
     asked.clear()
     assert station.is_waiting

@@ -20,7 +20,8 @@ from paramclient.protocol import wire
 from paramclient.protocol.params.fetch import Fetch
 from paramclient.protocol.params.foreign_list import ENOUGH_TO_FOLLOW, Following
 from paramclient.protocol.params.reads import Reads
-from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.params.table import Table
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.station import Station
 from paramclient.protocol.wire import ParamRequestList
 from paramclient.sim import Air, OtherStation, PX4Vehicle, SimParam, Vehicle
@@ -150,7 +151,7 @@ def test_a_list_is_over_at_its_end_and_when_it_falls_quiet() -> None:
     assert following.is_running(0.2)
     assert following.is_running(0.6)  # ArduPilot pauses for up to 400 ms while it answers reads (measured)
     assert not following.is_running(0.75)
-    reads = Reads((1, 1), RoundTrip(), lambda message: None, lambda key: True)
+    reads = Reads(Context((1, 1), lambda message: None), Table())
     names, count = following.hand_over(reads)
     assert (len(names), count) == (20, 21)
     assert reads.pace.gap == pytest.approx(0.01)

@@ -22,7 +22,7 @@ from paramclient.model.identity import Identity
 from paramclient.model.values import crc32_px4
 from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import EventMaker
-from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.vehicle.metadata_location import Descriptions
 from paramclient.protocol.wire import CommandAck, CommandLong, ComponentMetadata, FileTransfer
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle
@@ -409,10 +409,8 @@ class Asked:
 
     def __init__(self) -> None:
         self.sent: list[Any] = []
-        self.is_identifying = False
-        self.machine = Descriptions(
-            (1, 1), (255, 190), RoundTrip(), self.sent.append, is_identifying=lambda: self.is_identifying
-        )
+        self.context = Context((1, 1), self.sent.append)
+        self.machine = Descriptions(self.context)
 
 
 def test_the_question_and_its_answers() -> None:
@@ -444,10 +442,10 @@ def test_the_refusal_of_another_question_is_none() -> None:
     ask = asked.machine.ask(0.0)
     asked.machine.acknowledged(CommandAck(511, 3, 255, 190), 0.1)
     asked.machine.acknowledged(CommandAck(512, 3, 254, 190), 0.1)  # another station's
-    asked.is_identifying = True
+    asked.context.is_identifying = True
     asked.machine.acknowledged(CommandAck(512, 3, 255, 190), 0.1)  # perhaps of AUTOPILOT_VERSION
     assert not ask.done
-    asked.is_identifying = False
+    asked.context.is_identifying = False
     asked.machine.acknowledged(CommandAck(512, 3), 0.1)  # MAVLink 1 does not say whom it is for
     assert ask.done
 

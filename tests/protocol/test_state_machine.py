@@ -679,7 +679,7 @@ class Sessions(RuleBasedStateMachine):
                 continue
             machine = self.machine_of(subject)
             is_looked_after = machine.sync.expects_hash or upkeep.without_hash
-            if machine.sync._was_synced and is_looked_after and not machine._is_spared:
+            if machine.sync._was_synced and is_looked_after and not machine.sync.is_spared:
                 assert machine.sync.synced, machine
                 self.compare_table(subject, machine.table.params, is_volatile_old=machine.sync.expects_hash)
 

@@ -146,7 +146,7 @@ class FileRead(Job[bytes]):
         # where the round trip is not measured, what waits for an answer may wait for several timeouts
         is_worth_it = round_trip.smoothed is None or round_trip.seen_loss < COPY_RISK
         # MAVSDK's server closes the file when a request with another number comes (measured)
-        if is_worth_it and self._line.keeps_session():
+        if is_worth_it and self._line.keeps_session:
             self._begin_early(now)
         else:
             self._open_file(Opcode.OPEN_FILE_RO, self._opened, now)

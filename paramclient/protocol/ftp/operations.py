@@ -9,9 +9,10 @@ from typing import Final, TypeVar
 
 from paramclient.errors import FileErrorCode, FileTransferError, NoReply, UsageError
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import LONGEST_SILENCE, RoundTrip
-from paramclient.protocol.wire import FileTransfer, Message
+from paramclient.protocol.requests.round_trip import LONGEST_SILENCE
+from paramclient.protocol.wire import FileTransfer
 
 __all__ = ["BUSY", "SESSION_LOST", "Job", "Line", "path_bytes"]
 
@@ -72,27 +73,27 @@ class Line:
         target: system and component.
         round_trip: the component's; requests feed it, and it says when to repeat them.
         heard_at: when the server sent us anything last.
-        keeps_session: whether the server is known to give a session the number that its open asked for.
     """
 
     def __init__(
         self,
-        target: tuple[int, int],
-        round_trip: RoundTrip,
-        send: Callable[[Message], None],
+        context: Context,
         now: float,
-        *,
-        keeps_session: Callable[[], bool],
     ) -> None:
-        self.keeps_session = keeps_session
-        self.target = target
-        self.round_trip = round_trip
+        self.target = context.target
+        self.round_trip = context.round_trip
         self.heard_at = -math.inf
-        self._send = send
+        self._context = context
+        self._send = context.send
         # Where the numbers begin differs from one program to the next: a server gives its last answer once
         # more to a request that has the number of the one before.
         self._sequence = int(now * 1000) & 0xFFFF
         self._session = self._sequence % 255
+
+    @property
+    def keeps_session(self) -> bool:
+        """Whether the server gives a session the number that its open requested, as ArduPilot does."""
+        return self._context.is_ardupilot
 
     def send(self, packet: Packet) -> None:
         self._send(FileTransfer(0, *self.target, packet.pack()))

@@ -15,9 +15,9 @@ from paramclient.errors import FileErrorCode, NoReply, UsageError
 from paramclient.protocol.ftp.file_read import LARGEST_FILE, FileRead
 from paramclient.protocol.ftp.operations import Job, Line
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
-from paramclient.protocol.requests.round_trip import RoundTrip
-from paramclient.protocol.wire import FileTransfer, Message
+from paramclient.protocol.wire import FileTransfer
 
 __all__ = ["DirectoryEntry", "FileChecksum", "FileList", "FileRead", "FileTransfers", "FileWrite"]
 
@@ -148,12 +148,7 @@ class FileTransfers(Machine):
     gives it back with `release`. However it ends, its session on board is closed.
 
     Args:
-        target: system and component of the server.
-        own: ours; what the server sends to others is passed over.
-        round_trip: the component's.
-        send: takes what is to be sent.
-        keeps_session: whether the server is known to give a session the number that its open asked for, as
-            ArduPilot does.
+        context: the component's. What the server sends to other stations is passed over.
 
     Attributes:
         on_closed: called once, in order, with the time, when the session of a job that has ended is closed.
@@ -162,18 +157,12 @@ class FileTransfers(Machine):
 
     def __init__(
         self,
-        target: tuple[int, int],
-        own: tuple[int, int],
-        round_trip: RoundTrip,
-        send: Callable[[Message], None],
-        *,
-        keeps_session: Callable[[], bool],
+        context: Context,
     ) -> None:
-        self._keeps_session = keeps_session
-        self._target = target
-        self._own = own
-        self._round_trip = round_trip
-        self._send = send
+        self._context = context
+        self._target = context.target
+        self._own = context.own
+        self._round_trip = context.round_trip
         self._line: Line | None = None
         self._job: Job[Any] | None = None
         self._waiting: deque[Job[Any]] = deque()
@@ -311,9 +300,7 @@ class FileTransfers(Machine):
 
     def _line_at(self, now: float) -> Line:
         if self._line is None:
-            self._line = Line(
-                self._target, self._round_trip, self._send, now, keeps_session=self._keeps_session
-            )
+            self._line = Line(self._context, now)
         return self._line
 
     def _begin(self, job: AnyJob, now: float) -> AnyJob:

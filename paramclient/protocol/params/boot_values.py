@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 import re
 from collections import deque
-from collections.abc import Callable
 from functools import partial
 from typing import Final
 
 from paramclient.protocol.params.reads import Read, Reads
+from paramclient.protocol.params.sync import Sync
 from paramclient.protocol.params.table import Table
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 
 __all__ = ["StartValues"]
@@ -43,26 +44,20 @@ class StartValues(Machine):
     neither: its hash shows what has moved.
 
     Args:
-        reads, table: the component's.
-        is_wanted: whether the table is to be kept up to date, and nothing else does that.
-        is_fetching: whether a fetch of the component is under way.
-        fetch_file: fetches the table where that is cheap; gives whether it is.
+        context, reads, table, sync: the component's.
     """
 
     def __init__(
         self,
+        context: Context,
         reads: Reads,
         table: Table,
-        *,
-        is_wanted: Callable[[], bool],
-        is_fetching: Callable[[], bool],
-        fetch_file: Callable[[float], bool],
+        sync: Sync,
     ) -> None:
+        self._context = context
         self._reads = reads
         self._table = table
-        self._is_wanted = is_wanted
-        self._is_fetching = is_fetching
-        self._fetch_file = fetch_file
+        self._sync = sync
         self._read_at = math.inf
         self._has_clock = False  # whether its clock has been told since its start, or since it is heard
         self._waiting: deque[str] = deque()
@@ -89,11 +84,11 @@ class StartValues(Machine):
         """Read what is due."""
         if self._read_at > now:
             return
-        if self._is_fetching():
+        if self._context.is_fetching:
             self._read_at = now + RETRY_PAUSE
             return
         self._read_at = math.inf
-        if self._is_wanted() and not self._fetch_file(now):
+        if self._sync.wants_start_values and not self._sync.fetch_quick_file(now):
             self._waiting = deque(name for name in self._table.params if _MEASURED.fullmatch(name))
             self._ask(now)
 

@@ -119,11 +119,11 @@ class Fetch(Operation[FetchResult]):
     ) -> None:
         super().__init__(now)
         self._means = means
-        self._target = means.target
-        self._round_trip = means.round_trip
+        self._context = means.context
+        self._target = means.context.target
+        self._round_trip = means.context.round_trip
         self._reads = means.reads
         table = self._table = means.table
-        self._expects_hash = means.expects_hash
         self._may_use_file = may_use_file
         self._present: Mapping[int, str] | None = None  # with what a list would go on
         self._list_pace: ListPace | None = None  # while another station has a file open
@@ -154,7 +154,7 @@ class Fetch(Operation[FetchResult]):
         self._left_out_before = table.left_out
         if policy is Policy.CACHE_ONLY or refresh or listed:
             self._begin_download(now)
-        elif sampled is not None and table.complete and table.count and not self._expects_hash():
+        elif sampled is not None and table.complete and table.count and not self._context.expects_hash:
             self._sample(sampled, table.count, now)
         elif table.hash is None or not table.complete:
             self._begin_or_resume(announced, now)
@@ -185,7 +185,7 @@ class Fetch(Operation[FetchResult]):
                 self.first_value_at = now
             download.heard(message, now)
             is_unheard = self._proof.before is None and not self._was_asked_meanwhile
-            if is_unheard and self._expects_hash() and not self.done:
+            if is_unheard and self._context.expects_hash and not self.done:
                 # the one at the head of the list was lost; asked for now, it need not be waited for later
                 self._was_asked_meanwhile = True
                 self._ask_hash(self._hash_came_meanwhile, now)
@@ -395,7 +395,7 @@ class Fetch(Operation[FetchResult]):
     def _compare(self, announcement: Announcement, now: float) -> None:
         table = self._table
         known = "none" if table.hash is None else f"{table.hash:08x}"
-        self._means.trace("%s/%s: hash %08x announced, %s here", *self._target, announcement.hash, known)
+        self._context.trace("%s/%s: hash %08x announced, %s here", *self._target, announcement.hash, known)
         if announcement.hash != table.hash or announcement.count != table.size:
             self._proof.before = announcement
             self._begin_download(now)
@@ -411,7 +411,7 @@ class Fetch(Operation[FetchResult]):
         """Go on with what is there, if that is enough and the vehicle's count is still the same."""
         if not present_of(self._table, self._reads):
             self._begin_download(now)
-        elif not self._expects_hash():
+        elif not self._context.expects_hash:
             self._resume(now)
         elif announced is not None and announced.is_fresh(now):
             self._resume_under(announced, now)
@@ -450,17 +450,17 @@ class Fetch(Operation[FetchResult]):
         if self._listed or self._by_list or self._had_no_file or not may_use_file:
             self._begin_list(now)
             return
-        means.trace("%s/%s: the file is wanted, %s there", *self._target, len(present or ()))
-        if self._expects_hash():
+        self._context.trace("%s/%s: the file is wanted, %s there", *self._target, len(present or ()))
+        if self._context.expects_hash:
             # once, and before the file: so the answer is of the time before it
-            means.send(ParamRequestRead(*self._target, HASH_CHECK, -1))
+            self._context.send(ParamRequestRead(*self._target, HASH_CHECK, -1))
         file = self.file = PackFetch(
             means.files,
             means.turns,
             means.table,
             means.changed,
             now,
-            adds_defaults=means.adds_defaults,
+            context=self._context,
             yields=self.check is not None,
         )
         file.on_done.append(partial(self._file_ended, file))
@@ -502,7 +502,7 @@ class Fetch(Operation[FetchResult]):
         if file is None or file.blocked_until is None or self.download is not None:
             return
         file_takes = file.blocked_until - now + max(QUICK_FILE, FILE_SHARE * list_takes)
-        self._means.trace(
+        self._context.trace(
             "%s/%s: another station has a file open; the list takes %.1f s and the file %.1f s",
             *self._target,
             list_takes,
@@ -520,16 +520,14 @@ class Fetch(Operation[FetchResult]):
 
     def _begin_list(self, now: float) -> None:
         means, present = self._means, self._present
-        means.trace("%s/%s: the list is wanted, %s there", *self._target, len(present or ()))
+        self._context.trace("%s/%s: the list is wanted, %s there", *self._target, len(present or ()))
         count, following = self._table.count, means.following
         if not self._listed and following.is_running(now):
             # another station has asked for it: to ask again would begin it anew for both
             followed, of = following.hand_over(means.reads)
             present, count = {**(present or {}), **followed} if of == count else followed, of
         download = self.download = Download(
-            means.target,
-            means.round_trip,
-            means.send,
+            self._context,
             means.reads,
             means.turns,
             now,
@@ -542,7 +540,7 @@ class Fetch(Operation[FetchResult]):
             self._download_ended(download)
             return
         download.on_done.append(partial(self._download_ended, download))
-        if self._proof.before is None and self._expects_hash() and not self._was_asked_meanwhile:
+        if self._proof.before is None and self._context.expects_hash and not self._was_asked_meanwhile:
             # beside the list, so that a lost request of either kind shows at once
             self._was_asked_meanwhile = True
             self._ask_hash(self._hash_came_meanwhile, now)
@@ -562,7 +560,7 @@ class Fetch(Operation[FetchResult]):
                 return
             self._table.complete = True
             is_proven = self._proof.is_given(file.count or 0)
-            if not is_proven and self._expects_hash() and not self._is_hash_unknown:
+            if not is_proven and self._context.expects_hash and not self._is_hash_unknown:
                 self._ask_hash(partial(self._hash_came_after_file, file), now)
                 return
             if not is_proven:
@@ -631,7 +629,7 @@ class Fetch(Operation[FetchResult]):
         now = download.ended_at if self._repeated is None else self._repeated.ended_at
         if self._is_proven(download):
             self._finish_download(download, now, ())
-        elif self._expects_hash() and not (self._is_hash_unknown or download.missing):
+        elif self._context.expects_hash and not (self._is_hash_unknown or download.missing):
             self._ask_hash(lambda read: self._settle(download, read, read.ended_at), now)
         else:
             self._settle(download, None, now)

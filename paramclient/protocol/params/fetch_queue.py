@@ -29,11 +29,9 @@ class Fetches(Machine):
         sync: the component's.
         upkeep: what may be asked.
         check_pace: is told how long fetches take.
-        says_file: whether the component serves its table as a file, as far as it has said.
         ended: is told of each result in which the vehicle has said something of its table.
 
     Attributes:
-        current: the fetch under way, or None.
         last: the result of the last one that ended, or None.
         file_works: whether this vehicle, with this firmware, gives its table as a file: None while unknown.
         is_same_firmware: whether what the cache knows is of this very vehicle with this very firmware.
@@ -47,10 +45,9 @@ class Fetches(Machine):
         upkeep: Upkeep,
         check_pace: CheckPace,
         *,
-        says_file: Callable[[], bool],
         ended: Callable[[FetchResult], None],
     ) -> None:
-        self.current: Fetch | None = None
+        self._current: Fetch | None = None
         self.last: FetchResult | None = None
         self.file_works: bool | None = None
         self.is_same_firmware = False
@@ -60,10 +57,19 @@ class Fetches(Machine):
         self.overheard: Overheard | None = None
         if upkeep.listens_only:
             self.overheard = Overheard(means, sync, whole=self._overheard_whole, is_log=upkeep.is_log)
-        self._says_file = says_file
         self._ended = ended
         self._check_pace = check_pace
         self._begun_anew_at = -math.inf  # of the last one
+
+    @property
+    def current(self) -> Fetch | None:
+        """The fetch in progress, or None."""
+        return self._current
+
+    @current.setter
+    def current(self, fetch: Fetch | None) -> None:
+        self._current = fetch
+        self._means.context.is_fetching = fetch is not None
 
     @property
     def notes(self) -> tuple[str, ...]:
@@ -72,7 +78,7 @@ class Fetches(Machine):
 
     def may_use_file(self) -> bool:
         """Whether the table is worth asking for as a file: it has come as one, or the component says so."""
-        return self._says_file() if self.file_works is None else self.file_works
+        return self._means.context.serves_file if self.file_works is None else self.file_works
 
     def begin(
         self,
@@ -219,7 +225,7 @@ class Fetches(Machine):
 
     def _fetch_ended(self, fetch: Fetch) -> None:
         self.current = None
-        self._means.trace("%s/%s: %r", *self._means.target, fetch.result or fetch.error)
+        self._means.context.trace("%s/%s: %r", *self._means.context.target, fetch.result or fetch.error)
         if fetch.file_failed is not None:
             self.file_works = not fetch.file_failed
         result = fetch.result

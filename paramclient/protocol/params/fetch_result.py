@@ -15,10 +15,9 @@ from paramclient.protocol.params.foreign_list import Following
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.sampling import Sample
 from paramclient.protocol.params.table import Table
-from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.scheduler import Turns
-from paramclient.protocol.stats.trace import Trace, silent
-from paramclient.protocol.wire import Message, ParamValue
+from paramclient.protocol.wire import ParamValue
 
 __all__ = ["Announcement", "FetchResult", "Means", "Policy", "Progress", "Sampled"]
 
@@ -47,29 +46,20 @@ class Means:
     """What a fetch works with; all of it is the component's.
 
     Attributes:
-        target: system and component.
-        round_trip, send, reads, table, turns, files: as their names say.
-        expects_hash: whether it has a hash, as far as is known.
-        adds_defaults: whether it is known to serve the parameter file with the defaults, if it serves it.
+        context, reads, table, turns, files: as their names say.
         changed: is told of changes that no PARAM_VALUE brought.
         doubt: is told that a table has turned out not to be what it was.
         following: the list that another station may be having sent.
-        trace: is told of each step.
     """
 
-    target: tuple[int, int]
-    round_trip: RoundTrip
-    send: Callable[[Message], None]
+    context: Context
     reads: Reads
     table: Table
     turns: Turns
     files: FileTransfers
-    expects_hash: Callable[[], bool]
-    adds_defaults: Callable[[], bool]
     changed: Callable[[list[Change]], None]
     doubt: Callable[[float], None]
     following: Following
-    trace: Trace = silent
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ from paramclient.protocol.ftp.param_pck import LARGEST_FILE, Pack, decode, total
 from paramclient.protocol.params.change import Change
 from paramclient.protocol.params.fetch_result import Progress
 from paramclient.protocol.params.table import Table
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.scheduler import Seen, Turns
 from paramclient.protocol.wire import MOST_PARAMETERS, ParamValue
@@ -45,7 +46,7 @@ class PackFetch(Operation[None]):
         table: where the parameters go.
         changed: is told of the changes.
         now: the time.
-        adds_defaults: whether the component is known to serve the file with the defaults, if it serves it.
+        context: the component's.
             Else it is asked for without them where there is none with them.
         yields: whether to give up at once when another station has a file open.
 
@@ -66,11 +67,11 @@ class PackFetch(Operation[None]):
         changed: Callable[[list[Change]], None],
         now: float,
         *,
-        adds_defaults: Callable[[], bool],
+        context: Context,
         yields: bool = False,
     ) -> None:
         super().__init__(now)
-        self._adds_defaults = adds_defaults
+        self._context = context
         self._yields = yields
         self._files = files
         self._turns = turns
@@ -175,7 +176,7 @@ class PackFetch(Operation[None]):
     def look(self, now: float) -> None:
         """See whether the component has said meanwhile that it has no file without the defaults either."""
         error, job = self._not_found, self._job
-        if error is not None and job is not None and not self.is_served and self._adds_defaults():
+        if error is not None and job is not None and not self.is_served and self._context.adds_defaults:
             self._job = None
             self._files.release(job, now, is_served=False)
             self._fails(error, now)
@@ -205,7 +206,7 @@ class PackFetch(Operation[None]):
         now = job.ended_at
         if job.result is None:
             may_be_the_query = isinstance(job.error, FileTransferError) and job.error.is_not_found
-            if may_be_the_query and self._query and not self._adds_defaults():
+            if may_be_the_query and self._query and not self._context.adds_defaults:
                 assert isinstance(job.error, FileTransferError)
                 self._not_found = job.error
                 self._query = ""

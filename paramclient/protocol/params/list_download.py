@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Final
 
 from paramclient.errors import NoReply
 from paramclient.protocol.params.list_stream import LONGEST_JUMP, REORDER_DEPTH, SHORTEST_QUIET, ListStream
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.table import Table
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import LONGEST_SILENCE, RoundTrip
+from paramclient.protocol.requests.round_trip import LONGEST_SILENCE
 from paramclient.protocol.scheduler import Seen, Turns
-from paramclient.protocol.wire import MOST_PARAMETERS, NO_INDEX, Message, ParamRequestList, ParamValue
+from paramclient.protocol.wire import MOST_PARAMETERS, NO_INDEX, ParamRequestList, ParamValue
 
 __all__ = ["Download", "present_of"]
 
@@ -112,9 +113,7 @@ class Download(Operation[None]):
 
     def __init__(
         self,
-        target: tuple[int, int],
-        round_trip: RoundTrip,
-        send: Callable[[Message], None],
+        context: Context,
         reads: Reads,
         turns: Turns,
         now: float,
@@ -125,9 +124,9 @@ class Download(Operation[None]):
         beside_file: bool = False,
     ) -> None:
         super().__init__(now)
-        self._target = target
-        self._round_trip = round_trip
-        self._send = send
+        self._target = context.target
+        self._round_trip = context.round_trip
+        self._send = context.send
         self._reads = reads
         self._turns = turns
         self.count = count if present else None
@@ -165,7 +164,7 @@ class Download(Operation[None]):
         self._patient_since = now
         if listed:
             self.lists = 1
-            self._list_wait = round_trip.repeat_timeout(1) + LIST_DELAY
+            self._list_wait = self._round_trip.repeat_timeout(1) + LIST_DELAY
             self._list_asked = 1
             self._silent_at = now + self._list_wait
             turns.has_begun(self)

@@ -8,11 +8,12 @@ from collections.abc import Callable, Iterable
 from typing import Final
 
 from paramclient.errors import NoReply
-from paramclient.protocol.params.reads import BATCH_INTERVAL, Reads
+from paramclient.protocol.params.foreign_list import Following
+from paramclient.protocol.params.reads import BATCH_INTERVAL, KnownParams, Reads
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import RoundTrip
-from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamValue
+from paramclient.protocol.wire import ParamError, ParamRequestRead, ParamValue
 
 __all__ = ["NameSearch", "NameSearches"]
 
@@ -74,29 +75,23 @@ class NameSearches(Machine):
     A value that comes goes into the table as any other does.
 
     Args:
-        target: the component.
-        round_trip, reads: the component's.
-        send: takes each message.
-        count: how many parameters it has, as far as known.
-        is_listing: whether a list comes, by which an index may come without having been requested.
+        context, reads, table: the component's.
+        following: the list that another station may be having sent.
     """
 
     def __init__(
         self,
-        target: tuple[int, int],
-        round_trip: RoundTrip,
+        context: Context,
         reads: Reads,
-        send: Callable[[Message], None],
-        *,
-        count: Callable[[], int | None],
-        is_listing: Callable[[float], bool],
+        table: KnownParams,
+        following: Following,
     ) -> None:
-        self._target = target
-        self._round_trip = round_trip
+        self._target = context.target
+        self._round_trip = context.round_trip
         self._reads = reads
-        self._send = send
-        self._count = count
-        self._is_listing = is_listing
+        self._send = context.send
+        self._table = table
+        self._following = following
         self._searches: deque[NameSearch] = deque()
         self._waiting: deque[str] = deque()  # for this pass
         self._silent: list[str] = []  # for the next one
@@ -108,6 +103,12 @@ class NameSearches(Machine):
 
     def __len__(self) -> int:
         return len(self._searches)
+
+    def _is_listing(self, now: float) -> bool:
+        """Whether a list comes, for us or for another station: then an index comes without a request."""
+        reads = self._reads
+        is_ours = reads.list_runs_again or not reads.is_idle or now < reads.list_until
+        return is_ours or self._following.is_running(now)
 
     def begin(self, names: Iterable[str], now: float) -> NameSearch:
         """Search for names, behind the searches that are open.
@@ -256,7 +257,7 @@ class NameSearches(Machine):
         They fall, as rising ones would look like a list that another station has requested.
         """
         self._controls_sent += 1
-        count = self._count()
+        count = self._table.count
         control = -self._controls_sent % count if count else self._reads.control
         self._controls.add(control)
         self._send(ParamRequestRead(*self._target, "", control))

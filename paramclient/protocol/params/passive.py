@@ -173,7 +173,7 @@ class Overheard:
     ) -> FetchResult:
         count = (self.count if self.names else self._table.count) or 0
         return FetchResult(
-            *self._means.target,
+            *self._means.context.target,
             self._table.params.copy(),
             source,
             count,

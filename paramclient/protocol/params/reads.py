@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable
-from typing import Final, TypeAlias
+from collections.abc import Container
+from typing import Final, Protocol, TypeAlias
 
 from paramclient.errors import (
     NoReply,
@@ -15,6 +15,7 @@ from paramclient.errors import (
     UnknownParameter,
     VehicleError,
 )
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.pacing import Pace, Share
@@ -23,10 +24,8 @@ from paramclient.protocol.requests.round_trip import (
     LONGEST_SILENCE,
     MEMORY,
     MOST_TRIES,
-    RoundTrip,
 )
-from paramclient.protocol.stats.trace import Trace, silent
-from paramclient.protocol.wire import MOST_PARAMETERS, Message, ParamError, ParamRequestRead, ParamValue
+from paramclient.protocol.wire import MOST_PARAMETERS, ParamError, ParamRequestRead, ParamValue
 
 __all__ = ["Key", "Read", "Reads"]
 
@@ -85,6 +84,18 @@ class Read(Operation[ParamValue]):
         self.controls = 0
 
 
+class KnownParams(Protocol):
+    """What reads need of a table, to tell a parameter that is unknown from an answer that was lost."""
+
+    @property
+    def params(self) -> Container[str]:
+        """The names that are known."""
+
+    @property
+    def count(self) -> int | None:
+        """The number of parameters in the list, None while it is unknown."""
+
+
 class Reads(Machine):
     """Every read of one component: as fast as it serves them, single ones before a download's.
 
@@ -92,6 +103,10 @@ class Reads(Machine):
     silent is therefore asked for together with an index that it has. When that
     keeps being answered, and a name that nobody has heard of or an index that is not below the count does
     not, the link is not the reason: the parameter is unknown.
+
+    Args:
+        context, table: the component's.
+        share: what all reads of the link may take of it together; None for a link of its own.
 
     Attributes:
         pace: how fast requests may go out.
@@ -108,20 +123,17 @@ class Reads(Machine):
 
     def __init__(
         self,
-        target: tuple[int, int],
-        round_trip: RoundTrip,
-        send: Callable[[Message], None],
-        is_known: Callable[[Key], bool],
+        context: Context,
+        table: KnownParams,
         share: Share | None = None,
-        trace: Trace = silent,
     ) -> None:
-        self._target = target
-        self._round_trip = round_trip
-        self._send = send
-        self._is_known = is_known
-        self._trace = trace
+        self._target = context.target
+        self._round_trip = context.round_trip
+        self._send = context.send
+        self._table = table
+        self._trace = context.trace
         self.asked = self.retries = 0
-        self.pace = Pace(round_trip, share)
+        self.pace = Pace(context.round_trip, share)
         self._open: dict[Key, Read] = {}
         self._flying: dict[Key, Read] = {}
         self._again: deque[Read] = deque()
@@ -145,6 +157,12 @@ class Reads(Machine):
 
     def __contains__(self, key: Key) -> bool:
         return key in self._open
+
+    def _is_known(self, key: Key) -> bool:
+        """Whether anything speaks for such a parameter."""
+        if isinstance(key, str):
+            return key in self._table.params
+        return self._table.count is None or key < self._table.count
 
     def awaits(self, message: ParamValue) -> bool:
         """Whether this is the answer to a read under way."""

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
-from typing import Final
+from typing import Final, Protocol
 
 from paramclient.errors import FileTransferError, UnknownParameter, UsageError
 from paramclient.model.values import Trust
-from paramclient.protocol.ftp import BUSY
+from paramclient.protocol.ftp import BUSY, FileTransfers
 from paramclient.protocol.params.change_origin import is_ours
 from paramclient.protocol.params.fetch import Check, Fetch
 from paramclient.protocol.params.fetch_result import Announcement, FetchResult, Policy
@@ -19,7 +18,9 @@ from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.sync_interval import CheckPace
 from paramclient.protocol.params.table import MOST_NAMES, Table
 from paramclient.protocol.params.volatile_values import Refresh
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
+from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import HASH_CHECK, ParamValue
 
 __all__ = ["Sync", "SyncState", "Upkeep"]
@@ -120,6 +121,27 @@ class Upkeep:
         return cls(interval or math.inf, without_hash=True, policy=policy)
 
 
+class SyncHost(Protocol):
+    """What the watch of a table needs of its component."""
+
+    @property
+    def is_link_busy(self) -> bool:
+        """Whether anything is requested on the link."""
+
+    @property
+    def may_use_file(self) -> bool:
+        """Whether the component says that it serves its table as a file, or has done so."""
+
+    def begin_fetch(self, now: float, *, refresh: bool, check: Check | None) -> Fetch:
+        """Begin a fetch (with a check, of everything); give it back with `end_fetch`."""
+
+    def end_fetch(self, fetch: Fetch, now: float) -> None:
+        """Wait for it no longer."""
+
+    def resynced(self, changed: tuple[str, ...], confirmed: int | None) -> None:
+        """Take that the table agrees with the vehicle's again, what had moved, and the hash."""
+
+
 class Sync(Machine):
     """Follows the hashes that one component announces, and asks for them when there is a reason to.
 
@@ -133,20 +155,10 @@ class Sync(Machine):
     file, or the list, is fetched, as often as `check_pace` says.
 
     Args:
-        reads, table: the component's.
+        context, reads, table, presence, files: the component's.
         upkeep: what is done without being asked.
         check_pace: how often a table without a hash is fetched again.
-        is_px4: whether its heartbeat says that it has a hash.
-        is_writing: whether a write of ours is under way.
-        is_fetching: whether a fetch of the component is under way.
-        is_busy: whether anything at all is, on the link.
-        may_use_file: whether the component says that it serves its table as a file, or has done so.
-        file_is_in_use: whether another station may have a file open.
-        is_spared: whether the component is in a mode in which it is asked for nothing.
-        is_doubted: whether it is open who it is.
-        begin_fetch: begins a fetch (with a check, of everything), which `end_fetch` gives back.
-        end_fetch: as it says.
-        resynced: is told when the table agrees with the vehicle's again, of what had moved, and its hash.
+        host: the component itself.
 
     Attributes:
         announced: the last hash that was heard, or None.
@@ -157,44 +169,28 @@ class Sync(Machine):
 
     def __init__(
         self,
+        context: Context,
         reads: Reads,
         table: Table,
         upkeep: Upkeep,
         check_pace: CheckPace,
-        *,
-        is_px4: Callable[[], bool],
-        is_writing: Callable[[], bool],
-        is_fetching: Callable[[], bool],
-        is_busy: Callable[[], bool],
-        may_use_file: Callable[[], bool],
-        file_is_in_use: Callable[[float], bool],
-        is_spared: Callable[[], bool],
-        is_doubted: Callable[[], bool],
-        begin_fetch: Callable[[float, Check | None], Fetch],
-        end_fetch: Callable[[Fetch, float], None],
-        resynced: Callable[[tuple[str, ...], int | None], None],
+        presence: Presence,
+        files: FileTransfers,
+        host: SyncHost,
     ) -> None:
+        self._context = context
         self._reads = reads
         self._table = table
         self._upkeep = upkeep
         self._check_pace = check_pace
-        self._is_px4 = is_px4
-        self._is_writing = is_writing
-        self._is_fetching = is_fetching
-        self._is_busy = is_busy
-        self._may_use_file = may_use_file
-        self._file_is_in_use = file_is_in_use
-        self._is_spared = is_spared
-        self._is_doubted = is_doubted
-        self._begin_fetch = begin_fetch
-        self._end_fetch = end_fetch
-        self._resynced = resynced
+        self._presence = presence
+        self._files = files
+        self._host = host
         self.announced: Announcement | None = None
         self.synced = False
         self.refresh: Refresh | None = None
         self.holds = 0
         self._was_synced = False  # at any time on this link: only then is there something to keep up
-        self._has_no_hash = False
         self._moved_by_us_alone = False
         self._settle_at = math.inf  # when to ask for the hash after our writes
         self._foreign_check_at = math.inf  # when to ask for the hash after changes by others
@@ -220,12 +216,12 @@ class Sync(Machine):
     @property
     def expects_hash(self) -> bool:
         """Whether the component has a hash, as far as is known."""
-        return not self._has_no_hash and (self.announced is not None or self._is_px4())
+        return self._context.expects_hash
 
     @property
     def is_doubted(self) -> bool:
         """Whether it is open who the component is."""
-        return self._is_doubted()
+        return self._context.is_doubted
 
     @property
     def is_settling(self) -> bool:
@@ -237,7 +233,7 @@ class Sync(Machine):
     def hash_heard(self, message: ParamValue, now: float) -> Announcement:
         """A `_HASH_CHECK` has come."""
         self.announced = Announcement.of(message, now)
-        self._has_no_hash = False
+        self._context.has_hash = True
         return self.announced
 
     def changed(self, name: str, by: str, now: float | None = None) -> None:
@@ -324,7 +320,8 @@ class Sync(Machine):
     def forget(self) -> None:
         """Another vehicle has taken the address: nothing that is known is about it."""
         self.announced = None
-        self.synced = self._was_synced = self._has_no_hash = self._moved_by_us_alone = False
+        self._context.has_hash = None
+        self.synced = self._was_synced = self._moved_by_us_alone = False
         self._has_fallen = False
         self.stop()
 
@@ -338,7 +335,7 @@ class Sync(Machine):
 
     def fetch_quick_file(self, now: float) -> bool:
         """Fetch the table anew where it comes as a file in no time; false where it does not, or may not."""
-        may_fetch = self._is_kept_up and not self._is_spared() and not self._file_is_in_use(now)
+        may_fetch = self._is_kept_up and not self.is_spared and not self._files.is_in_use(now)
         if not may_fetch or not self._check_pace.file_is_quick:
             return False
         self._begin_resync(now, Check(may_list=True))
@@ -382,9 +379,22 @@ class Sync(Machine):
         self._is_checking = self._reads_volatile = False
 
     @property
+    def is_spared(self) -> bool:
+        """Whether the component is lost, or in a mode in which nothing is requested unasked."""
+        presence = self._presence
+        return presence.is_lost or presence.is_high_latency or self._reads.pace.gap >= LOW_BANDWIDTH_GAP
+
+    @property
+    def wants_start_values(self) -> bool:
+        """Whether what is measured at each start is to be read again unasked, as no hash shows it."""
+        upkeep = self._upkeep
+        is_kept_up = upkeep.interval < math.inf and upkeep.policy is Policy.AUTO
+        return is_kept_up and not self.expects_hash and not self.is_spared
+
+    @property
     def may_resync(self) -> bool:
         """Whether a hash that is not the table's leads to a new fetch."""
-        return self._is_kept_up and not self._is_spared()
+        return self._is_kept_up and not self.is_spared
 
     # private
 
@@ -409,7 +419,7 @@ class Sync(Machine):
         """Read what the hash says nothing about; `again` is as in `Refresh`."""
         if self._upkeep.policy is not Policy.AUTO:
             return
-        refresh = Refresh(self._reads, self._table, confirmed, self._is_writing, now, again=again)
+        refresh = Refresh(self._reads, self._table, confirmed, self._context, now, again=again)
         if not refresh.done:
             self.refresh = refresh
             refresh.on_done.append(partial(self._refresh_ended, refresh))
@@ -422,29 +432,29 @@ class Sync(Machine):
 
     def _foreign_changed(self, now: float) -> None:
         """The vehicle or another station has changed a value. A fetch under way brings the others too."""
-        if self._is_kept_up and self.expects_hash and not self._is_fetching():
+        if self._is_kept_up and self.expects_hash and not self._context.is_fetching:
             earliest = self._foreign_checked_at + FOREIGN_CHECK_INTERVAL
             self._foreign_check_at = max(now + FOREIGN_SETTLING_TIME, earliest)
 
     def _check_after_foreign(self, now: float) -> None:
         """Values of others have stopped: ask for the hash where it can prove the present values."""
-        if self._table.is_provable and not (self._is_fetching() or self._is_spared()):
+        if self._table.is_provable and not (self._context.is_fetching or self.is_spared):
             self._foreign_checked_at = now
             self.ask(now)
 
     def _check(self, now: float) -> None:
         """See whether the table still is the vehicle's, if there is room for that on the link."""
-        if self.holds or self._is_busy():
+        if self.holds or self._host.is_link_busy:
             self._check_at = now + BUSY_WAIT
             return
         self._plan_check(now, now)
-        if self._is_spared():
+        if self.is_spared:
             self._is_checking = False
         elif self.expects_hash:
             self._reads_volatile = self._is_kept_up
             self.ask(now)
         elif self._check_at < math.inf:
-            if self._file_is_in_use(now):
+            if self._files.is_in_use(now):
                 self._check_at = min(self._check_at, now + SKIPPED_TURN_WAIT)
             else:
                 self._begin_resync(now, Check(may_list=self._check_pace.may_list))
@@ -458,7 +468,7 @@ class Sync(Machine):
             if self.expects_hash:
                 self._check_at = max(known_at + pace.hash_interval, now)
             else:
-                interval = pace.interval(may_use_file=self._may_use_file())
+                interval = pace.interval(may_use_file=self._host.may_use_file)
                 self._check_at = max(known_at + interval, now + pace.shortest_pause)
 
     def _hash_came(self, read: Read) -> None:
@@ -466,12 +476,16 @@ class Sync(Machine):
         table, now = self._table, read.ended_at
         reads_volatile, self._reads_volatile = self._reads_volatile, False
         if read.result is None:
-            self._has_no_hash = isinstance(read.error, UnknownParameter) and self.announced is None
+            has_none = isinstance(read.error, UnknownParameter) and self.announced is None
+            if has_none:
+                self._context.has_hash = False
+            elif self._context.has_hash is False:
+                self._context.has_hash = None
             self._is_checking = False
-            if self._has_no_hash and self._is_kept_up:
+            if has_none and self._is_kept_up:
                 self._check_at = now  # in the way of those without one
             return
-        if self._is_doubted():
+        if self._context.is_doubted:
             self._check_at = now  # again, when it is known whose it is
             return
         announced = int.from_bytes(read.result.raw, "little")
@@ -482,7 +496,7 @@ class Sync(Machine):
             if reads_volatile and now >= self._volatile_at:
                 self._read_unhashed(announced, now, again=True)
             self._settled(now, now)
-        elif self._is_writing() or self._is_fetching():
+        elif self._context.is_writing or self._context.is_fetching:
             return
         elif table.hash is None and self._moved_by_us_alone and not self._is_kept_up:
             # it cannot be computed here: what moved it may be our doing alone, or something unheard too
@@ -490,15 +504,15 @@ class Sync(Machine):
         else:
             self._not_confirmed()
             self._is_checking = False
-            if self._is_kept_up and not self._is_spared():
+            if self._is_kept_up and not self.is_spared:
                 self._begin_resync(now, None)
 
     def _begin_resync(self, now: float, check: Check | None) -> None:
-        fetch = self._resync = self._begin_fetch(now, check)
+        fetch = self._resync = self._host.begin_fetch(now, refresh=check is not None, check=check)
 
         def ended() -> None:
             self._resync = None
-            self._end_fetch(fetch, fetch.ended_at)
+            self._host.end_fetch(fetch, fetch.ended_at)
             if isinstance(fetch.error, FileTransferError) and fetch.error.code in BUSY:
                 self._check_at = min(self._check_at, fetch.ended_at + SKIPPED_TURN_WAIT)
 
@@ -519,6 +533,6 @@ class Sync(Machine):
         if not self.synced:
             return
         if self._has_fallen or self._moved:
-            self._resynced(tuple(self._moved), self._table.hash)
+            self._host.resynced(tuple(self._moved), self._table.hash)
         self._has_fallen = False
         self._moved.clear()

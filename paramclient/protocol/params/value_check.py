@@ -11,6 +11,7 @@ from paramclient.protocol.params.reads import Reads
 from paramclient.protocol.params.sync import Sync
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.params.writes import Write
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.wire import ParamValue
 
@@ -36,19 +37,18 @@ class Rereads(Machine):
     """Reads again the values whose last observation may be older than a change, or may have been clamped.
 
     Args:
-        reads, table, sync: the component's.
+        context, reads, table, sync: the component's.
         policy: whether reads are allowed.
 
     Attributes:
         authors: who changed which value.
         checks: the values that were just replaced, and those that are to be read again.
-        is_px4: whether the component is a PX4, which proves unchanged values by its hash.
     """
 
-    def __init__(self, reads: Reads, table: Table, sync: Sync, policy: Policy) -> None:
+    def __init__(self, context: Context, reads: Reads, table: Table, sync: Sync, policy: Policy) -> None:
+        self._context = context
         self.authors = Authors()
         self.checks = ValueChecks()
-        self.is_px4 = False
         self._reads = reads
         self._table = table
         self._sync = sync
@@ -56,7 +56,12 @@ class Rereads(Machine):
 
     def write_ended(self, write: Write, now: float) -> None:
         """Plan to read a value after a write, where the vehicle may change it without telling."""
-        if self.is_px4 and write.result is not None and self._policy is Policy.AUTO and not write.settle:
+        if (
+            self._context.is_px4
+            and write.result is not None
+            and self._policy is Policy.AUTO
+            and not write.settle
+        ):
             self.checks.ask(write.name, now + LATER_CHANGE_TIME)
 
     def forget_old(self, now: float) -> None:
@@ -88,7 +93,7 @@ class Rereads(Machine):
     def _read_due(self, now: float) -> None:
         """Read again what is due; by the vehicle's hash alone, as far as that proves it."""
         names = self.checks.due(now)
-        if self.is_px4 and self._sync.may_resync and self._table.is_provable:
+        if self._context.is_px4 and self._sync.may_resync and self._table.is_provable:
             names = [name for name in names if not self._table.is_hashed(name)]
             self._sync.ask(now)
         for name in names:

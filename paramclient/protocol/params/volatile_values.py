@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable
 from functools import partial
 from typing import Final
 
@@ -12,6 +11,7 @@ from paramclient.model.values import Trust
 from paramclient.protocol.params.hash_exclusions import find_volatile
 from paramclient.protocol.params.reads import Read, Reads
 from paramclient.protocol.params.table import Table
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.wire import HASH_CHECK
 
@@ -35,7 +35,7 @@ class Refresh(Operation[None]):
         confirmed: the hash that the vehicle has just announced for the table.
         again: whether to read all that count as volatile once more, also those heard on this link, and to
             learn nothing from it.
-        is_writing: whether a write of ours is under way, which moves the table too.
+        context: the component's; a write in progress moves the table too.
         now: the time.
 
     Attributes:
@@ -47,7 +47,7 @@ class Refresh(Operation[None]):
         reads: Reads,
         table: Table,
         confirmed: int,
-        is_writing: Callable[[], bool],
+        context: Context,
         now: float,
         *,
         again: bool = False,
@@ -56,7 +56,7 @@ class Refresh(Operation[None]):
         self._reads = reads
         self._table = table
         self._confirmed = confirmed
-        self._is_writing = is_writing
+        self._context = context
         params = table.params
         self._again = again
         names = [name for name in (table.volatile if again else table.unhashed()) if name in params]
@@ -92,7 +92,11 @@ class Refresh(Operation[None]):
     def _learn(self, read: Read) -> None:
         table = self._table
         answer = read.result
-        if answer is None or int.from_bytes(answer.raw, "little") != self._confirmed or self._is_writing():
+        if (
+            answer is None
+            or int.from_bytes(answer.raw, "little") != self._confirmed
+            or self._context.is_writing
+        ):
             return
         listed = table.listed_bits()
         if answer.param_count != len(listed) or not table.complete:

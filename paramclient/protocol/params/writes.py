@@ -6,6 +6,7 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 from paramclient.errors import (
     NoReply,
@@ -15,7 +16,6 @@ from paramclient.errors import (
     ValueNotApplied,
 )
 from paramclient.model.values import (
-    Encoding,
     Param,
     ParamType,
     Trust,
@@ -27,12 +27,12 @@ from paramclient.model.values import (
 )
 from paramclient.protocol.params.change_origin import by_us
 from paramclient.protocol.params.reads import Read, Reads
+from paramclient.protocol.params.table import Table
 from paramclient.protocol.params.write_resolution import note_on_small_change
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import RoundTrip
-from paramclient.protocol.stats.trace import Trace, silent
-from paramclient.protocol.wire import Message, ParamError, ParamSet, ParamValue
+from paramclient.protocol.wire import ParamError, ParamSet, ParamValue
 
 __all__ = ["SetResult", "Write", "Writes"]
 
@@ -110,6 +110,18 @@ class Write(Operation[SetResult]):
         self.was_retyped = False
 
 
+class WritePermission(Protocol):
+    """Says whether anything may be written.
+
+    It is asked before each PARAM_SET, and not set on the context: it depends on other components of the
+    vehicle, and an old answer could send a write to another vehicle.
+    """
+
+    @property
+    def may_be_written(self) -> bool:
+        """Whether it is certain whom a write reaches, and in which encoding."""
+
+
 class Writes(Machine):
     """Every write to one component: those to one name in order, those to different names side by side.
 
@@ -127,39 +139,38 @@ class Writes(Machine):
     Nothing is sent before it is certain how the component writes values: an integer in the wrong encoding
     would be taken as another number.
 
+    Args:
+        context, reads, table: the component's.
+        permission: says whether anything may be written.
+
     Attributes:
         queues: by name, those that are open, the one under way first; no name has an empty one.
         is_held: whether one waits for that.
         asked, retries: writes so far, and PARAM_SETs that were sent for another time.
         against_non_finite: why the vehicle must not be sent NaN and infinity; "" where it may be.
-        is_px4: whether it is a PX4, which does not keep small changes.
         left_open: is told the name and the author of a write of which nobody learns any more whether the
             vehicle takes it.
     """
 
     def __init__(
         self,
-        target: tuple[int, int],
-        round_trip: RoundTrip,
-        send: Callable[[Message], None],
+        context: Context,
         reads: Reads,
-        params: Mapping[str, Param],
-        encoding: Callable[[], Encoding],
-        is_certain: Callable[[], bool],
-        trace: Trace = silent,
+        table: Table,
+        permission: WritePermission,
     ) -> None:
-        self._target = target
-        self._round_trip = round_trip
-        self._send = send
+        self._context = context
+        self._target = context.target
+        self._round_trip = context.round_trip
+        self._send = context.send
         self._reads = reads
-        self._params = params
-        self._encoding = encoding
-        self._is_certain = is_certain
-        self._trace = trace
+        self._table = table
+        self._params: Mapping[str, Param] = table.params
+        self._permission = permission
+        self._trace = context.trace
         self.asked = self.retries = 0
         self.is_held = False
         self.against_non_finite = ""
-        self.is_px4 = False
         self.queues: dict[str, deque[Write]] = {}
         self.left_open: Callable[[str, str, float], None] = _nobody
 
@@ -186,6 +197,7 @@ class Writes(Machine):
         self.asked += 1
         queue = self.queues.setdefault(name, deque())
         queue.append(write)
+        self._context.is_writing = True
         if len(queue) == 1:
             self._start(write, now)
         return write
@@ -226,14 +238,14 @@ class Writes(Machine):
         wanted = None if write is None else write.wanted
         if wanted is None or wanted.type != message.param_type:
             return False
-        return wanted.bits == decode(message.raw, message.param_type, self._encoding())[1]
+        return wanted.bits == decode(message.raw, message.param_type, self._table.encoding)[1]
 
     def heard(self, message: ParamValue, now: float) -> None:
         """Every PARAM_VALUE of the component passes here after it went into the table."""
         write = self._active(message.param_id)
         if write is None:
             return
-        value, bits = decode(message.raw, message.param_type, self._encoding())
+        value, bits = decode(message.raw, message.param_type, self._table.encoding)
         heard = Param(write.name, value, message.param_type, None, bits)
         if message.param_type != write.number:
             if write.was_retyped:
@@ -278,7 +290,7 @@ class Writes(Machine):
 
     def tick(self, now: float) -> None:
         """Verify, send again, give up; but nothing while it is open who would get it."""
-        if not self._is_certain():
+        if not self._permission.may_be_written:
             return
         timeout = self._round_trip.timeout
         for queue in list(self.queues.values()):
@@ -302,7 +314,7 @@ class Writes(Machine):
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity."""
         earliest = math.inf
-        if not self.queues or not self._is_certain():
+        if not self.queues or not self._permission.may_be_written:
             return earliest
         timeout = self._round_trip.timeout
         for queue in self.queues.values():
@@ -316,7 +328,7 @@ class Writes(Machine):
         """The link is back: what was under way goes on at once."""
         for queue in list(self.queues.values()):
             if queue and self._awaits_answer(queue[0]):
-                if self._is_certain():
+                if self._permission.may_be_written:
                     queue[0].attempts -= 1
                 self._transmit(queue[0], now)
 
@@ -330,6 +342,7 @@ class Writes(Machine):
 
     def _end_all(self, error_of: Callable[[Write], Exception], now: float) -> None:
         queues, self.queues = self.queues, {}
+        self._context.is_writing = False
         for queue in queues.values():
             for write in queue:
                 if write.read is not None:
@@ -353,7 +366,7 @@ class Writes(Machine):
 
     def _start(self, write: Write, now: float) -> None:
         known = self._params.get(write.name)
-        if not self._is_certain():
+        if not self._permission.may_be_written:
             self.is_held = True
             return
         if known is not None and known.trust is not Trust.CACHED:
@@ -367,14 +380,14 @@ class Writes(Machine):
         self._transmit(write, now)
 
     def _transmit(self, write: Write, now: float) -> None:
-        if not self._is_certain():
+        if not self._permission.may_be_written:
             # whoever may be there now is not meant: as soon as it is known, it is begun, or overdue
             self.is_held = True
             write.sent_at = -math.inf
             write.is_answered = False
             write.verify_at = math.inf
             return
-        encoding = self._encoding()
+        encoding = self._table.encoding
         try:
             raw = encode(write.value, write.number, encoding)
         except UsageError as error:
@@ -435,7 +448,7 @@ class Writes(Machine):
         if exact and actual.type != ParamType.REAL32 and not isinstance(write.value, bytes):
             exact = actual.value == write.value
         status = "accepted" if exact else "adjusted"
-        before = write.before if self.is_px4 else None
+        before = write.before if self._context.is_px4 else None
         note = "" if before is None else note_on_small_change(before, actual)
         result = SetResult(write.name, status, write.value, actual.value, actual, write.attempts, note)
         self._trace("%s/%s %s: %s after try %s", *self._target, write.name, status, write.attempts)
@@ -478,6 +491,7 @@ class Writes(Machine):
             self._start(queue[0], now)
         else:
             del self.queues[write.name]
+            self._context.is_writing = bool(self.queues)
 
     def _no_reply(self, write: Write, now: float, why: str = "") -> Exception:
         what = f"PARAM_SET {write.name} to {self._target[0]}/{self._target[1]}{why}"

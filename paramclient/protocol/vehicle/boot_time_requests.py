@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Final
 
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.vehicle.presence import Presence
 from paramclient.protocol.wire import (
     MAV_CMD_REQUEST_MESSAGE,
     SYSTEM_TIME_ID,
     CommandLong,
-    Message,
 )
 
 __all__ = ["ClockRequests"]
@@ -38,27 +37,19 @@ class ClockRequests(Machine):
     COMMAND_ACK names MAV_CMD_REQUEST_MESSAGE and not the message.
 
     Args:
-        target: the component.
+        context: the component's.
         presence: the component's; its `clock_at` says when it told its clock.
-        send: takes each message.
-        is_requesting: whether another message is requested of the component.
-        may_send: whether anything may be sent at all.
     """
 
     def __init__(
         self,
-        target: tuple[int, int],
+        context: Context,
         presence: Presence,
-        send: Callable[[Message], None],
-        *,
-        is_requesting: Callable[[], bool],
-        may_send: bool = True,
     ) -> None:
-        self._target = target
+        self._context = context
+        self._target = context.target
         self._presence = presence
-        self._send = send
-        self._is_requesting = is_requesting
-        self._may_send = may_send
+        self._send = context.send
         self._wanted_after = -math.inf  # a clock that was told later is what is wanted
         self._begun_at = -math.inf
         self._request_at = math.inf
@@ -116,10 +107,11 @@ class ClockRequests(Machine):
 
     def next_deadline(self) -> float:
         """When `tick` has something to do, or infinity."""
-        return math.inf if self._is_requesting() else self._request_at
+        is_requesting = self._context.is_identifying or self._context.is_locating_metadata
+        return math.inf if is_requesting else self._request_at
 
     def _begin(self, wanted_after: float, at: float) -> None:
-        if self._may_send:
+        if self._context.may_send:
             self._wanted_after = wanted_after
             self._begun_at = at
             self._request_at = at

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from typing import Final
 
 from paramclient.errors import CommandRefused, CommandResult, NoReply
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import RoundTrip
-from paramclient.protocol.wire import CommandAck, CommandLong, Message
+from paramclient.protocol.wire import CommandAck, CommandLong
 
 __all__ = ["Command", "Commands"]
 
@@ -59,15 +59,12 @@ class Commands(Machine):
 
     def __init__(
         self,
-        target: tuple[int, int],
-        own: tuple[int, int],
-        round_trip: RoundTrip,
-        send: Callable[[Message], None],
+        context: Context,
     ) -> None:
-        self._target = target
-        self._addressees = (own, (0, 0))  # MAVLink 1 and older firmware name nobody
-        self._round_trip = round_trip
-        self._send = send
+        self._target = context.target
+        self._addressees = (context.own, (0, 0))  # MAVLink 1 and older firmware name nobody
+        self._round_trip = context.round_trip
+        self._send = context.send
         self._queues: dict[int, deque[Command]] = {}
 
     def __len__(self) -> int:

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 from typing import Final
 
 from paramclient.model.identity import Identity
 from paramclient.model.values import Encoding
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
-from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.wire import (
     AUTOPILOT_VERSION_ID,
     CAPABILITY_FTP,
@@ -28,7 +27,6 @@ from paramclient.protocol.wire import (
     CommandLong,
     Heartbeat,
     HighLatency2,
-    Message,
 )
 
 __all__ = ["Identification", "judge_encoding"]
@@ -101,44 +99,47 @@ class Identification(Machine):
         doubted_at: since when that is; minus infinity where it was not open but at the beginning.
         settled: whether `identity` is as good as it gets: the version came, or it never will.
         autopilot, vehicle_type: of the heartbeat; None before one came.
-        was_away: whether another vehicle may have taken its place since it said who it is; true as well while
-            one that has is being asked.
         encoding, encoding_reason: how it writes values, and why that is believed.
     """
 
     def __init__(
         self,
-        target: tuple[int, int],
+        context: Context,
         link: str,
-        round_trip: RoundTrip,
-        send: Callable[[Message], None],
         chosen: Encoding | None,
-        *,
-        may_ask: bool = True,
     ) -> None:
-        self._target = target
-        self._round_trip = round_trip
-        self._send = send
+        self._context = context
+        self._target = context.target
+        self._round_trip = context.round_trip
+        self._send = context.send
         self._chosen = chosen
-        self._may_ask = may_ask
-        self.identity = Identity(target[0], link)
+        self._may_ask = context.may_send
+        self.identity = Identity(context.target[0], link)
         self.settled = False
-        self.was_away = False
         self.known_at = -math.inf
         self.autopilot: int | None = None
         self.vehicle_type: int | None = None
         self.capabilities: int | None = None
-        self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
         self.attempts = 0
         self.doubted_at = -math.inf
         self._asked_at = -math.inf
-        self._is_asking = False
         self._asks_until = -math.inf  # however often that is
         self._denied_at = math.inf  # when the last way of asking was refused
         self._lost_at = math.inf  # when the answer counts as lost, as the request was acknowledged
         self._beat_awaited_until = math.inf  # while a heartbeat may still tell the encoding
         self._heard_at = -math.inf
         self._was_doubted = False  # since the last version
+        self.encoding, self.encoding_reason = judge_encoding(chosen, None, None)
+        self._judge()
+
+    @property
+    def was_away(self) -> bool:
+        """Whether another vehicle may have taken its place since it was identified, or has, and is asked."""
+        return self._context.may_be_another
+
+    @was_away.setter
+    def was_away(self, was_away: bool) -> None:
+        self._context.may_be_another = was_away
 
     @property
     def has_parameters(self) -> bool:
@@ -178,12 +179,12 @@ class Identification(Machine):
     @property
     def is_doubted(self) -> bool:
         """Whether another vehicle may have taken its place, and the answer is awaited."""
-        return self.was_away and self._is_asking
+        return self._context.is_doubted
 
     @property
     def is_unconfirmed(self) -> bool:
         """Whether another vehicle may have taken its place, and it was asked in vain."""
-        return self.was_away and not self._is_asking and self._may_ask
+        return self.was_away and not self._context.is_identifying and self._may_ask
 
     @property
     def may_be_written(self) -> bool:
@@ -203,7 +204,7 @@ class Identification(Machine):
     @property
     def is_asking(self) -> bool:
         """Whether its AUTOPILOT_VERSION is awaited."""
-        return self._is_asking
+        return self._context.is_identifying
 
     def heartbeat(self, message: Heartbeat | HighLatency2) -> bool:
         """Take a heartbeat, or what stands for it; true when it shows another kind than was known."""
@@ -258,9 +259,9 @@ class Identification(Machine):
         with any where it was open for a while who speaks.
         """
         was_unconfirmed = self.is_unconfirmed
-        if self._is_asking:
+        if self._context.is_identifying:
             self._round_trip.answered(self._asked_at, now, self.attempts)
-        self._is_asking = self.was_away = False
+        self._context.is_identifying = self.was_away = False
         system, _ = self._target
         before = self.identity
         self.identity = Identity.from_version(
@@ -290,14 +291,14 @@ class Identification(Machine):
 
     def ask_again(self, now: float) -> None:
         """Another vehicle may have taken the address: ask, if it has ever been said who it is."""
-        if self.identity.uid is not None and not self._is_asking:
+        if self.identity.uid is not None and not self._context.is_identifying:
             self.attempts = 0
             self._ask(now)
 
     def lose(self, now: float) -> None:
         """It is not heard any more. Who has said it before is asked again when it is; others are asked on."""
         if self.settled:
-            self._is_asking = False
+            self._context.is_identifying = False
 
     def acknowledged(self, message: CommandAck, now: float) -> None:
         """Take a COMMAND_ACK: a refusal of one way to ask leads to the other at once.
@@ -305,7 +306,7 @@ class Identification(Machine):
         What is accepted comes with the acknowledgement, or was lost.
         """
         asked = (MAV_CMD_REQUEST_MESSAGE, MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES)
-        if self._is_asking and message.command in asked:
+        if self._context.is_identifying and message.command in asked:
             if message.result != MAV_RESULT_ACCEPTED:
                 self._denied_at = now
             else:
@@ -326,7 +327,7 @@ class Identification(Machine):
         """When to ask again, or infinity; that follows what other answers tell of the link."""
         if self.is_unconfirmed:
             return self._asked_at + LATER_PACE if self._heard_at > self._asked_at else math.inf
-        if not self._is_asking:
+        if not self._context.is_identifying:
             return math.inf
         pause = self._round_trip.repeat_timeout(self.attempts)
         if self.attempts >= self._tries and self._asked_at < self._asks_until:
@@ -345,13 +346,13 @@ class Identification(Machine):
             self._request(now, _WAYS)
             return
         if self.attempts >= self._tries and now >= self._asks_until:
-            self._is_asking = False
+            self._context.is_identifying = False
             self.settled = True
             self.was_away = self.was_away and self.identity.uid is not None
             return
         was_refused = self._denied_at < math.inf
         self.attempts += 1
-        self._is_asking = True
+        self._context.is_identifying = True
         ways: tuple[tuple[int, float], ...] = _WAYS
         if was_refused:
             ways = (_WAYS[(self.attempts + 1) % 2],)
@@ -366,4 +367,9 @@ class Identification(Machine):
             self._send(CommandLong(*self._target, command, (first, *[0.0] * 6)))
 
     def _judge(self) -> None:
+        """Draw the conclusions of what the component has said of itself."""
+        context = self._context
+        context.autopilot = self.autopilot
+        context.serves_file = self.says_file
+        context.adds_defaults = self.adds_defaults
         self.encoding, self.encoding_reason = judge_encoding(self._chosen, self.capabilities, self.autopilot)

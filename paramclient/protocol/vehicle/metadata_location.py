@@ -7,20 +7,18 @@ MAV_CMD_REQUEST_MESSAGE asks for COMPONENT_METADATA, which names a general file;
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Final
 
 from paramclient.errors import CommandResult, NoReply
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.wire import (
     COMPONENT_METADATA_ID,
     MAV_CMD_REQUEST_MESSAGE,
     CommandAck,
     CommandLong,
     ComponentMetadata,
-    Message,
 )
 
 __all__ = ["DescriptionAsk", "Descriptions"]
@@ -45,28 +43,19 @@ class Descriptions(Machine):
     """Asks a component for its COMPONENT_METADATA, again in time, until there is an answer or no hope of one.
 
     Args:
-        target: its system and component.
-        own: ours.
-        round_trip: of the component.
-        send: takes each message for it.
-        is_identifying: whether it is being asked for AUTOPILOT_VERSION with the same command: a refusal is
-            then none of this.
+        context: the component's. While AUTOPILOT_VERSION is requested with the same command, a refusal is
+            not taken for one of COMPONENT_METADATA.
     """
 
     def __init__(
         self,
-        target: tuple[int, int],
-        own: tuple[int, int],
-        round_trip: RoundTrip,
-        send: Callable[[Message], None],
-        *,
-        is_identifying: Callable[[], bool],
+        context: Context,
     ) -> None:
-        self._target = target
-        self._own = own
-        self._round_trip = round_trip
-        self._send = send
-        self._is_identifying = is_identifying
+        self._context = context
+        self._target = context.target
+        self._own = context.own
+        self._round_trip = context.round_trip
+        self._send = context.send
         self._asks: list[DescriptionAsk] = []
         self._asked_at = -math.inf
 
@@ -79,6 +68,7 @@ class Descriptions(Machine):
         """Ask; give it back with `release`. Those who ask at the same time share the answer."""
         ask = DescriptionAsk(now)
         self._asks.append(ask)
+        self._context.is_locating_metadata = True
         if len(self._asks) == 1:
             self._request(now)
         else:
@@ -89,6 +79,7 @@ class Descriptions(Machine):
         """Wait for it no longer."""
         if ask in self._asks:
             self._asks.remove(ask)
+            self._context.is_locating_metadata = self.is_asking
 
     def heard(self, message: ComponentMetadata, now: float) -> None:
         """The answer has come; an empty address means none."""
@@ -99,7 +90,7 @@ class Descriptions(Machine):
     def acknowledged(self, message: CommandAck, now: float) -> None:
         """Take a COMMAND_ACK: a refusal is an answer too."""
         is_ours = (message.target_system, message.target_component) in (self._own, (0, 0))
-        is_meant = message.command == MAV_CMD_REQUEST_MESSAGE and is_ours and not self._is_identifying()
+        is_meant = message.command == MAV_CMD_REQUEST_MESSAGE and is_ours and not self._context.is_identifying
         if self._asks and is_meant and message.result in NONE_THERE:
             self._round_trip.answered(self._asked_at, now, self._asks[0].attempts)
             self._finish(None, now)
@@ -131,12 +122,14 @@ class Descriptions(Machine):
     def fail_all(self, error: Exception, now: float) -> None:
         """No answer can come any more."""
         asks, self._asks = self._asks, []
+        self._context.is_locating_metadata = False
         for ask in asks:
             ask.fail(error, now)
 
     def _give_up(self, why: str, now: float) -> None:
         what = f"COMPONENT_METADATA of {self._target[0]}/{self._target[1]}{why}"
         asks, self._asks = self._asks, []
+        self._context.is_locating_metadata = False
         for ask in asks:
             ask.fail(NoReply(what, attempts=ask.attempts, waited=now - ask.begun_at), now)
 
@@ -149,5 +142,6 @@ class Descriptions(Machine):
 
     def _finish(self, result: ComponentMetadata | None, now: float) -> None:
         asks, self._asks = self._asks, []
+        self._context.is_locating_metadata = False
         for ask in asks:
             ask.finish(result, now)

@@ -8,9 +8,9 @@ from typing import Final
 
 from paramclient.errors import AnotherVehicle, NoReply
 from paramclient.model.identity import Identity
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.machine import Machine
 from paramclient.protocol.requests.operation import Operation
-from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.vehicle.boot_time_requests import ClockRequests
 from paramclient.protocol.vehicle.commands import Command, Commands
 from paramclient.protocol.vehicle.identification import Identification
@@ -51,8 +51,7 @@ class Restarts(Machine):
     """The restart on command of one component: at most one at a time, which all callers share.
 
     Args:
-        target: the component.
-        commands, who, presence, round_trip, clock_requests: the component's.
+        context, commands, who, presence, clock_requests: the component's.
         restarted: is told when the component has started again and nobody else has noticed; calls `rebooted`.
 
     Attributes:
@@ -62,21 +61,19 @@ class Restarts(Machine):
 
     def __init__(
         self,
-        target: tuple[int, int],
+        context: Context,
         commands: Commands,
         who: Identification,
         presence: Presence,
-        round_trip: RoundTrip,
         clock_requests: ClockRequests,
         restarted: Callable[[float], None],
     ) -> None:
         self.current: Restart | None = None
         self.saved_at = -math.inf
-        self._target = target
+        self._context = context
         self._commands = commands
         self._who = who
         self._presence = presence
-        self._round_trip = round_trip
         self._clock_requests = clock_requests
         self._restarted = restarted
 
@@ -94,11 +91,10 @@ class Restarts(Machine):
         """
         if self.current is None or self.current.done:
             self.current = Restart(
-                self._target,
+                self._context,
                 self._commands,
                 self._who,
                 self._presence,
-                self._round_trip,
                 self.saved_at,
                 self._restarted,
                 self._clock_requests,
@@ -165,8 +161,7 @@ class Restart(Operation[None]):
     has no time limit of its own.
 
     Args:
-        target: the component.
-        commands, who, presence, round_trip: the component's.
+        context, commands, who, presence: the component's.
         saved_at: when all that was written is saved.
         restarted: is told when the component has started again and nobody else has noticed; calls `rebooted`.
         clock_requests: the component's.
@@ -180,11 +175,10 @@ class Restart(Operation[None]):
 
     def __init__(
         self,
-        target: tuple[int, int],
+        context: Context,
         commands: Commands,
         who: Identification,
         presence: Presence,
-        round_trip: RoundTrip,
         saved_at: float,
         restarted: Callable[[float], None],
         clock_requests: ClockRequests,
@@ -193,11 +187,11 @@ class Restart(Operation[None]):
         now: float,
     ) -> None:
         super().__init__(now)
-        self._target = target
+        self._target = context.target
         self._commands = commands
         self._who = who
         self._presence = presence
-        self._round_trip = round_trip
+        self._round_trip = context.round_trip
         self._saved_at = saved_at
         self._restarted = restarted
         self._clock_requests = clock_requests

@@ -18,6 +18,7 @@ from paramclient.protocol.ftp.file_read import MOST_RESTARTS, SMALLEST_WINDOW
 from paramclient.protocol.ftp.operations import BUSY_PATIENCE, MOST_FAILURES, MOST_OPENINGS, QUIET_TIME
 from paramclient.protocol.ftp.packets import MOST_DATA, Opcode, Packet
 from paramclient.protocol.ftp.param_pck import PackedParam
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.operation import Operation
 from paramclient.protocol.requests.round_trip import FEWEST_TRIES, MOST_TRIES, RoundTrip
 from paramclient.protocol.wire import FileTransfer, Message
@@ -38,12 +39,11 @@ class Desk:
 
     def __init__(self, *, keeps_session: bool = True) -> None:
         self.now = 5.0
-        self.keeps_session = keeps_session
         self.round_trip = RoundTrip()
         self.sent: list[Packet] = []
-        self.transfers = FileTransfers(
-            (1, 1), OWN, self.round_trip, self._send, keeps_session=lambda: self.keeps_session
-        )
+        autopilot = wire.MAV_AUTOPILOT_ARDUPILOTMEGA if keeps_session else None
+        self.context = Context((1, 1), self._send, OWN, self.round_trip, autopilot=autopilot)
+        self.transfers = FileTransfers(self.context)
 
     def _send(self, message: Message) -> None:
         assert isinstance(message, FileTransfer)
@@ -1229,12 +1229,10 @@ class Ground:
         self.requests = 0
         self._outbox: list[Message] = []
         self._framer = wire.Framer(wire.UNDERSTOOD, stream=False)
+        is_ardupilot = isinstance(vehicle, ArduPilotVehicle)
+        autopilot = wire.MAV_AUTOPILOT_ARDUPILOTMEGA if is_ardupilot else None
         self.transfers = FileTransfers(
-            (1, 1),
-            OWN,
-            self.round_trip,
-            self._outbox.append,
-            keeps_session=lambda: isinstance(vehicle, ArduPilotVehicle),
+            Context((1, 1), self._outbox.append, OWN, self.round_trip, autopilot=autopilot)
         )
         self.air.tick(self.now)
 

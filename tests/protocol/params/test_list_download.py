@@ -22,6 +22,8 @@ from paramclient.protocol.params.list_download import (
 )
 from paramclient.protocol.params.list_stream import LONGEST_JUMP, REORDER_DEPTH
 from paramclient.protocol.params.reads import CONTROL, Reads
+from paramclient.protocol.params.table import Table
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.pacing import REQUEST_SIZE, UPSTREAM_SHARE, VALUE_SIZE
 from paramclient.protocol.requests.round_trip import FIRST_TIMEOUT, RoundTrip
 from paramclient.protocol.scheduler import Turns
@@ -48,11 +50,10 @@ class Desk:
         self.trip = RoundTrip()
         for _ in range(100 if round_trip is not None else 0):
             self.trip.answered(0.0, round_trip or 0.0, 1)
-        self.reads = Reads((1, 1), self.trip, self.sent.append, lambda key: True)
+        context = Context((1, 1), self.sent.append, round_trip=self.trip)
+        self.reads = Reads(context, Table())
         self.turns = Turns()
-        self.download = Download(
-            (1, 1), self.trip, self.sent.append, self.reads, self.turns, 0.0, listed=listed
-        )
+        self.download = Download(context, self.reads, self.turns, 0.0, listed=listed)
 
     def hear(self, index: int, *, count: int = 100, name: str | None = None) -> None:
         message = param_value(f"P{index}" if name is None else name, index=index, count=count)

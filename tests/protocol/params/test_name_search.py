@@ -9,6 +9,7 @@ from functools import partial
 import pytest
 
 from paramclient.errors import LinkError, NoReply
+from paramclient.protocol.params.foreign_list import Following
 from paramclient.protocol.params.name_search import (
     CONTROL_RISK,
     CONTROLS_LOST_MAX,
@@ -19,6 +20,7 @@ from paramclient.protocol.params.name_search import (
     NameSearches,
 )
 from paramclient.protocol.params.reads import Reads
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, PX4Vehicle
@@ -35,19 +37,13 @@ class Desk:
         self.now = 0.0
         self.sent: list[str | int] = []
         self.count: int | None = COUNT
-        self.is_listing = False
         self.round_trip = RoundTrip()
         for _ in range(60):
             self.round_trip.answered(0.0, 0.02, 1)
-        self.reads = Reads((1, 1), self.round_trip, self._send, lambda key: True)
-        self.searches = NameSearches(
-            (1, 1),
-            self.round_trip,
-            self.reads,
-            self._send,
-            count=lambda: self.count,
-            is_listing=lambda now: self.is_listing,
-        )
+        self.params: set[str] = set()
+        context = Context((1, 1), self._send, round_trip=self.round_trip)
+        self.reads = Reads(context, self)
+        self.searches = NameSearches(context, self.reads, self, Following())
 
     def _send(self, message: Message) -> None:
         assert isinstance(message, ParamRequestRead)
@@ -166,12 +162,12 @@ def test_without_its_control_a_window_is_sent_again_and_given_up_in_the_end() ->
 
 def test_while_a_list_comes_an_index_is_no_answer_to_a_control() -> None:
     desk = Desk()
-    desk.is_listing = True
+    desk.reads.is_idle = False
     search = desk.searches.begin(["A"], 0.0)
     for _ in range(PASSES_MIN):
         desk.answer()
     assert not search.done
-    desk.is_listing = False
+    desk.reads.is_idle = True
     desk.wait()
     for _ in range(10 * PASSES_MIN):
         desk.answer()

@@ -15,6 +15,7 @@ from paramclient.errors import (
     UnknownParameter,
 )
 from paramclient.protocol.params.reads import CONTROL, ENOUGH_CONTROLS, MOST_COPIES, Key, Read, Reads
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.pacing import FIRST_RATE, SMALLEST_BURST
 from paramclient.protocol.requests.round_trip import (
     FEWEST_TRIES,
@@ -38,18 +39,15 @@ class Desk:
         self.now = 0.0
         self.round_trip = RoundTrip()
         self.sent: list[Key] = []
-        self.known = set(known)
+        self.params = set(known)
         self.count = count
-        self.reads = Reads((1, 1), self.round_trip, self._send, self._is_known)
+        self.reads = Reads(Context((1, 1), self._send, round_trip=self.round_trip), self)
 
     def _send(self, message: Message) -> None:
         assert isinstance(message, ParamRequestRead)
         assert (message.target_system, message.target_component) == (1, 1)
         assert (message.param_id == "") == (message.param_index >= 0)
         self.sent.append(message.param_id if message.param_index < 0 else message.param_index)
-
-    def _is_known(self, key: Key) -> bool:
-        return key in self.known if isinstance(key, str) else key < self.count
 
     def ask(self, key: Key, *, urgent: bool = True) -> Read:
         return self.reads.ask(key, self.now, urgent=urgent)

@@ -22,6 +22,7 @@ from paramclient.model.values import Encoding, ParamType, Trust, Value, decode
 from paramclient.protocol.params.reads import Reads
 from paramclient.protocol.params.table import Table
 from paramclient.protocol.params.writes import Write, Writes
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.round_trip import FEWEST_TRIES, INITIAL_TIMEOUT, RoundTrip
 from paramclient.protocol.wire import Message, ParamError, ParamRequestRead, ParamSet, ParamValue
 from tests.simulation import is_so, known, param_value
@@ -36,21 +37,14 @@ class Desk:
     def __init__(self, encoding: Encoding = Encoding.BYTEWISE) -> None:
         self.now = 0.0
         self.encoding = encoding
-        self.is_certain = True
+        self.may_be_written = True
         self.sent: list[Message] = []
         self.table = Table(encoding)
         self.round_trip = RoundTrip()
-        self.reads = Reads((1, 1), self.round_trip, self.sent.append, self.table.params.__contains__)
+        self.context = Context((1, 1), self.sent.append, round_trip=self.round_trip)
+        self.reads = Reads(self.context, self.table)
         self.reads.is_idle = False
-        self.writes = Writes(
-            (1, 1),
-            self.round_trip,
-            self.sent.append,
-            self.reads,
-            self.table.params,
-            encoding=lambda: self.table.encoding,
-            is_certain=lambda: self.is_certain,
-        )
+        self.writes = Writes(self.context, self.reads, self.table, permission=self)
 
     def set(self, name: str, value: Value, asker: str | None = None) -> Write:
         return self.writes.set(name, value, self.now, asker)
@@ -158,16 +152,16 @@ def test_what_has_to_wait_says_so_until_it_is_begun(is_known: bool) -> None:
     desk = Desk()
     if is_known:
         desk.knows("A", 1.0)
-        desk.is_certain = False
+        desk.may_be_written = False
         desk.set("A", 2.5)
     else:  # it becomes uncertain while the type is asked for
         desk.set("A", 2.5)
         assert desk.take() == ["read A"]
-        desk.is_certain = False
+        desk.may_be_written = False
         desk.hear("A", 1.0, at=0.1)
     assert desk.take() == []
     assert desk.writes.is_held
-    desk.is_certain = True
+    desk.may_be_written = True
     desk.writes.proceed(0.2)
     assert desk.take() == ["set A 2.5 REAL32"]
     assert not desk.writes.is_held
@@ -177,21 +171,21 @@ def test_a_value_that_comes_while_nothing_may_be_sent_again_leaves_the_time_outs
     desk = Desk()
     desk.knows("A", 1.0)
     write = desk.set("A", 2.5)
-    desk.is_certain = False
+    desk.may_be_written = False
     desk.writes.resume(3.0)
     desk.hear("A", 2.5, at=4.0)
     assert write.done
     assert desk.round_trip.smoothed is None
 
 
-def test_nothing_is_sent_before_the_encoding_is_certain() -> None:
+def test_nothing_is_sent_before_the_encoding_may_be_written() -> None:
     desk = Desk()
     desk.knows("A", 1, INT32)
-    desk.is_certain = False
+    desk.may_be_written = False
     first, second = desk.set("A", 2), desk.set("B", 3)
     desk.pass_time(10.0)
     assert desk.take() == []
-    desk.is_certain = True
+    desk.may_be_written = True
     desk.table.use_encoding(Encoding.C_CAST)
     desk.writes.proceed(desk.now)
     assert desk.take() == ["set A 2 INT32", "read B"]

@@ -13,6 +13,7 @@ from paramclient.protocol.component import ComponentMachine
 from paramclient.protocol.events import ComponentRebooted, Event, EventMaker
 from paramclient.protocol.params.boot_values import MEASURING_TIME, YOUNG
 from paramclient.protocol.params.sync import Upkeep
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.station import Station
 from paramclient.protocol.vehicle.boot_time_requests import (
     BASELINE_DELAY,
@@ -54,22 +55,20 @@ class Requests:
 
     Attributes:
         sent: when each request went out.
-        is_requesting: whether another message is requested.
+        context: of the component.
     """
 
     def __init__(self, *, may_send: bool = True) -> None:
         self.now = 0.0
         self.sent: list[float] = []
-        self.is_requesting = False
         self.presence = Presence()
 
         def send(message: Message) -> None:
             assert message == CLOCK_REQUEST
             self.sent.append(self.now)
 
-        self.requests = ClockRequests(
-            (1, 1), self.presence, send, is_requesting=lambda: self.is_requesting, may_send=may_send
-        )
+        self.context = Context((1, 1), send, may_send=may_send)
+        self.requests = ClockRequests(self.context, self.presence)
 
     def run(self, until: float) -> list[float]:
         """Give the requests that are sent until then."""
@@ -139,10 +138,10 @@ def test_after_the_command_to_restart_it_is_asked_until_it_is_back() -> None:
 
 def test_another_message_that_is_requested_goes_first() -> None:
     desk = Requests()
-    desk.is_requesting = True
+    desk.context.is_identifying = True
     desk.requests.want(desk.now)
     assert desk.run(1.0) == []
-    desk.is_requesting = False
+    desk.context.is_identifying = False
     assert desk.run(1.1) == [1.0]
 
 

@@ -7,6 +7,7 @@ import math
 import pytest
 
 from paramclient import CommandRefused, CommandResult, LinkError, NoReply, Refused
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.round_trip import RoundTrip
 from paramclient.protocol.vehicle.commands import PROGRESS_PATIENCE, Command, Commands
 from paramclient.protocol.wire import CommandAck, CommandLong, Message
@@ -24,7 +25,7 @@ class Desk:
         self.sent: list[CommandLong] = []
         self.round_trip = RoundTrip()
         self.round_trip.heard_at = 0.0
-        self.commands = Commands((1, 1), OWN, self.round_trip, self.take)
+        self.commands = Commands(Context((1, 1), self.take, OWN, self.round_trip))
 
     def take(self, message: Message) -> None:
         assert isinstance(message, CommandLong)

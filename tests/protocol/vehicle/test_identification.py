@@ -8,6 +8,7 @@ from itertools import pairwise
 import pytest
 
 from paramclient.model.values import Encoding
+from paramclient.protocol.requests.context import Context
 from paramclient.protocol.requests.round_trip import FIRST_TIMEOUT, RoundTrip
 from paramclient.protocol.vehicle.identification import (
     DOUBT_PACE,
@@ -51,7 +52,7 @@ class Desk:
     def __init__(self, chosen: Encoding | None = None) -> None:
         self.sent: list[Message] = []
         self.trip = RoundTrip()
-        self.who = Identification((1, 1), "udpin:x", self.trip, self.sent.append, chosen)
+        self.who = Identification(Context((1, 1), self.sent.append, round_trip=self.trip), "udpin:x", chosen)
 
     def beat(self, heartbeat: Heartbeat, now: float = 0.0) -> None:
         self.who.heartbeat(heartbeat)

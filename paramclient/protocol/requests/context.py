@@ -1,0 +1,79 @@
+"""What the machines of one component share: the way to the component, and the facts about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Final
+
+from paramclient.protocol.requests.round_trip import RoundTrip
+from paramclient.protocol.stats.trace import Trace, silent
+from paramclient.protocol.wire import MAV_AUTOPILOT_ARDUPILOTMEGA, MAV_AUTOPILOT_PX4, Message
+
+__all__ = ["Context"]
+
+OWN_ADDRESS: Final = (255, 190)
+"""System and component that a ground station usually has: MAV_COMP_ID_MISSIONPLANNER of system 255."""
+
+
+@dataclass(slots=True, eq=False)
+class Context:
+    """The way to one component, and the facts about it that several of its machines need.
+
+    One machine learns a fact and sets it when it changes; the others read it.
+
+    Attributes:
+        target: system and component.
+        send: takes each message for the component, in order.
+        own: system and component that requests are sent as.
+        round_trip: the measured round-trip time and loss of its responses.
+        trace: takes a line for each step.
+        may_send: whether requests may be sent to it; false for links that are only listened to.
+        autopilot: MAV_AUTOPILOT of its heartbeat, None before the first one. Set by `Identification`.
+        is_identifying: whether AUTOPILOT_VERSION is requested. Set by `Identification`.
+        may_be_another: whether another vehicle may have taken its place since it was identified, or has, and
+            is being identified. Set by `Identification`.
+        serves_file: whether it serves its table as a file over MAVFTP, as far as it has said. Set by
+            `Identification`.
+        adds_defaults: whether it is known to serve that file with defaults. Set by `Identification`.
+        is_locating_metadata: whether COMPONENT_METADATA is requested. Set by `Descriptions`.
+        has_hash: whether it has a `_HASH_CHECK`; None while that is unknown. Set by `Sync`.
+        is_writing: whether a write is in progress. Set by `Writes`.
+        is_fetching: whether a fetch is in progress. Set by `Fetches`.
+    """
+
+    target: tuple[int, int]
+    send: Callable[[Message], None]
+    own: tuple[int, int] = OWN_ADDRESS
+    round_trip: RoundTrip = field(default_factory=RoundTrip)
+    trace: Trace = silent
+    may_send: bool = True
+    autopilot: int | None = None
+    is_identifying: bool = False
+    may_be_another: bool = False
+    serves_file: bool = False
+    adds_defaults: bool = False
+    is_locating_metadata: bool = False
+    has_hash: bool | None = None
+    is_writing: bool = False
+    is_fetching: bool = False
+
+    @property
+    def is_px4(self) -> bool:
+        """Whether the heartbeat names a PX4."""
+        return self.autopilot == MAV_AUTOPILOT_PX4
+
+    @property
+    def is_ardupilot(self) -> bool:
+        """Whether the heartbeat names an ArduPilot."""
+        return self.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA
+
+    @property
+    def is_doubted(self) -> bool:
+        """Whether another vehicle may have taken its place, and the answer is awaited."""
+        return self.may_be_another and self.is_identifying
+
+    @property
+    def expects_hash(self) -> bool:
+        """Whether it has a hash, as far as is known: every PX4 has one until it answers otherwise."""
+        return self.is_px4 if self.has_hash is None else self.has_hash
