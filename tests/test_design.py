@@ -82,7 +82,7 @@ CLOCKS = {"datetime.now", "datetime.today", "datetime.utcnow", "date.today"}
 
 COMMAND = ("cli", "__main__")
 SERVICE = "service"
-SERVICE_LIBRARIES = {"fastapi", "starlette", "uvicorn", "websockets"}
+SERVICE_LIBRARIES = {"fastapi", "prometheus_client", "starlette", "uvicorn", "websockets"}
 COMMAND_LIBRARIES = {"rich", "cyclopts"}
 
 
@@ -344,6 +344,7 @@ def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
     ]
     unwanted += ["paramclient.sim", "paramclient.testing", "paramclient.cli", "paramclient.provision"]
     unwanted += ["paramclient.documents", "paramclient.service", "fastapi", "starlette", "uvicorn", "httpx"]
+    unwanted += ["prometheus_client"]
     unwanted += ["paramclient.remote"]
     program = f"import sys, paramclient; print([name for name in {unwanted!r} if name in sys.modules])"
     run = subprocess.run(
