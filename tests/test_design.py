@@ -83,7 +83,7 @@ CLOCKS = {"datetime.now", "datetime.today", "datetime.utcnow", "date.today"}
 
 COMMAND = ("cli", "__main__")
 SERVICE = "service"
-SERVICE_LIBRARIES = {"fastapi", "starlette", "uvicorn", "websockets"}
+SERVICE_LIBRARIES = {"fastapi", "prometheus_client", "starlette", "uvicorn", "websockets"}
 COMMAND_LIBRARIES = {"rich", "cyclopts"}
 
 
@@ -211,7 +211,7 @@ def test_only_the_command_and_the_ports_of_windows_know_asyncio() -> None:
 def test_only_the_remote_client_knows_httpx() -> None:
     for module in MODULES:
         if not module.startswith("paramclient.remote"):
-            assert "httpx" not in {each.top for each in imports_of(module)}, module
+            assert not {"httpx", "httpx_sse"} & {each.top for each in imports_of(module)}, module
 
 
 def test_only_the_client_chooses_the_remote_one() -> None:
@@ -345,6 +345,7 @@ def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
     ]
     unwanted += ["paramclient.sim", "paramclient.testing", "paramclient.cli", "paramclient.provision"]
     unwanted += ["paramclient.documents", "paramclient.service", "fastapi", "starlette", "uvicorn", "httpx"]
+    unwanted += ["filelock", "prometheus_client", "httpx_sse"]
     unwanted += ["paramclient.remote"]
     program = f"import sys, paramclient; print([name for name in {unwanted!r} if name in sys.modules])"
     run = subprocess.run(

@@ -22,7 +22,7 @@ from paramclient.errors import UsageError
 
 __all__ = ["serve"]
 
-LIBRARIES: Final = ("fastapi", "uvicorn", "websockets")
+LIBRARIES: Final = ("fastapi", "prometheus_client", "uvicorn", "websockets")
 """What the extra `service` installs."""
 _UNSIGNED: Final = SigningOptions()
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)

@@ -10,8 +10,10 @@ from importlib.util import find_spec
 
 from paramclient.errors import UsageError
 
-if find_spec("httpx") is None:
-    raise UsageError("a service in the place of a link needs httpx: pip install 'paramclient[remote]'")
+if missing := [name for name in ("httpx", "httpx_sse") if find_spec(name) is None]:
+    raise UsageError(
+        f"a service in the place of a link needs {' and '.join(missing)}: pip install 'paramclient[remote]'"
+    )
 
 from paramclient.remote.client import RemoteClient
 from paramclient.remote.component import RemoteComponent

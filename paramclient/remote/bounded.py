@@ -7,6 +7,8 @@ import zlib
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
+from httpx_sse._decoders import SSEDecoder  # EventSource, which is offered, reads lines of any length
+
 __all__ = ["EventReader", "Pace", "checked_document", "decoder_of"]
 
 MOST_ANSWER: Final = 32 << 20
@@ -83,7 +85,10 @@ class Pace:
 
 
 class EventReader:
-    """Server-sent events (WHATWG HTML, "Server-sent events") to the data of each; their ids stand in it.
+    """Parses server-sent events (WHATWG HTML, "Server-sent events") of bounded size into the data of each.
+
+    Lines are split here, because those of httpx-sse may grow without end; their fields are read by its
+    decoder. An event without data, or with empty data, is left out.
 
     Attributes:
         size: bytes of the event that has begun and not ended.
@@ -92,10 +97,10 @@ class EventReader:
     def __init__(self) -> None:
         self.size = 0
         self._line = bytearray()
-        self._data: list[bytes] = []
+        self._decoder = SSEDecoder()
 
     def receive(self, chunk: bytes) -> list[bytes]:
-        """The data of the events that end with this chunk.
+        """Return the data of the events that end with this chunk.
 
         Raises:
             ValueError: one is too long.
@@ -106,15 +111,13 @@ class EventReader:
             self._line += chunk[begin:end]
             self.size += end + 1 - begin
             begin = end + 1
-            line, self._line = bytes(self._line.removesuffix(b"\r")), bytearray()
-            field, _, value = line.partition(b":")
-            if field == b"data":
-                self._data.append(value.removeprefix(b" "))
-            elif not line:
+            # Latin-1 keeps each byte as one character; the JSON parser decodes UTF-8, and rejects damage
+            line, self._line = self._line.removesuffix(b"\r").decode("latin-1"), bytearray()
+            if not line:
                 self.size = 0
-                if self._data:
-                    events.append(b"\n".join(self._data))
-                    self._data = []
+            event = self._decoder.decode(line)
+            if event is not None and event.data:
+                events.append(event.data.encode("latin-1"))
             if self.size > MOST_EVENT:
                 break
         self._line += chunk[begin:]

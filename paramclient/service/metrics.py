@@ -1,9 +1,14 @@
-"""Numbers for Prometheus, in its text format 0.0.4 (Prometheus documentation, "Exposition formats")."""
+"""Metrics of the service for Prometheus, rendered by prometheus_client in the text format 0.0.4."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Final
+
+from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
+from prometheus_client.metrics_core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
 
 from paramclient.version import __version__
 
@@ -12,7 +17,7 @@ if TYPE_CHECKING:
 
 __all__ = ["MEDIA_TYPE", "metrics_text"]
 
-MEDIA_TYPE: Final = "text/plain; version=0.0.4; charset=utf-8"
+MEDIA_TYPE: Final = CONTENT_TYPE_PLAIN_0_0_4
 
 _COUNTERS: Final = {
     "bytes_received": "Bytes that have come over the link.",
@@ -30,91 +35,78 @@ _COUNTERS: Final = {
     "downloads": "Fetches that brought a whole table.",
     "cache_hits": "Fetches that the cache settled.",
 }
+_COMPONENT_GAUGES: Final = {
+    "up": "1 while the component is heard, and its link is open.",
+    "synced": "1 while its table is known to be the vehicle's.",
+    "parameters": "Parameters that are known.",
+    "round_trip_seconds": "The measured round trip, smoothed.",
+}
 _STATES: Final = ("opening", "open", "away", "failed", "ended")
 
 
-def metrics_text(hub: Hub) -> str:
-    """All of them, as they are now."""
-    lines: list[str] = []
-
-    def add(name: str, kind: str, help_: str, samples: Iterable[tuple[Mapping[str, object], float]]) -> None:
-        full = f"paramclient_{name}"
-        lines.extend((f"# HELP {full} {help_}", f"# TYPE {full} {kind}"))
-        lines.extend(f"{full}{_labels(labels)} {value}" for labels, value in samples)
-
-    held = list(hub.lines.values())
-    add("info", "gauge", "The version.", [({"version": __version__}, 1)])
-    add("uptime_seconds", "gauge", "Seconds since the service began.", [({}, round(hub.age, 3))])
-    add("events_total", "counter", "Events that were told.", [({}, hub.feed.seq)])
-    add("listeners", "gauge", "Streams of events that are open.", [({}, hub.feed.listeners)])
-    running = sum(job.state == "running" for job in hub.jobs.all)
-    add("jobs_running", "gauge", "Fetches and set-ups under way.", [({}, running)])
-    add(
-        "link_state",
-        "gauge",
-        "1 for the state that the link is in.",
-        [
-            ({"link": line.name, "state": state}, int(line.state == state))
-            for line in held
-            for state in _STATES
-        ],
-    )
-    add(
-        "link_openings_total",
-        "counter",
-        "How often the link was opened with nothing known of it.",
-        [({"link": line.name}, line.openings) for line in held],
-    )
-    counted = [(line.name, line.client.stats) for line in held if line.client is not None]
-    for name, help_ in _COUNTERS.items():
-        samples = [({"link": link}, getattr(stats, name)) for link, stats in counted]
-        add(f"link_{name}_total", "counter", help_, [each for each in samples if each[1] is not None])
-    everyone = [({"link": each.line.name, **_address(each.address)}, each) for each in hub.followed]
-    add(
-        "component_up",
-        "gauge",
-        "1 while the component is heard, and its link is open.",
-        [
-            (labels, int(each.line.state == "open" and each.component.state != "lost"))
-            for labels, each in everyone
-        ],
-    )
-    add(
-        "component_synced",
-        "gauge",
-        "1 while its table is known to be the vehicle's.",
-        [
-            (labels, int(each.line.state == "open" and each.component.sync_state == "synced"))
-            for labels, each in everyone
-        ],
-    )
-    add(
-        "component_parameters",
-        "gauge",
-        "Parameters that are known.",
-        [(labels, len(each.component.params)) for labels, each in everyone],
-    )
-    add(
-        "component_round_trip_seconds",
-        "gauge",
-        "The measured round trip, smoothed.",
-        [
-            (labels, each.component.round_trip)
-            for labels, each in everyone
-            if each.component.round_trip is not None
-        ],
-    )
-    return "\n".join(lines) + "\n"
+def metrics_text(hub: Hub) -> bytes:
+    """Return the metrics of the service as they are now."""
+    registry = CollectorRegistry()  # not the library's global one, which has metrics of the process
+    registry.register(_HubMetrics(hub))
+    return generate_latest(registry)
 
 
-def _address(address: tuple[int, int]) -> dict[str, object]:
-    return {"system": address[0], "component": address[1]}
+class _HubMetrics(Collector):
+    """Reads the metrics from a hub when Prometheus asks for them."""
 
+    def __init__(self, hub: Hub) -> None:
+        self._hub = hub
 
-def _labels(labels: Mapping[str, object]) -> str:
-    told = ",".join(f'{name}="{_escaped(str(value))}"' for name, value in labels.items())
-    return f"{{{told}}}" if told else ""
+    def collect(self) -> Iterator[Metric]:
+        hub = self._hub
+        info = GaugeMetricFamily("paramclient_info", "The version.", labels=["version"])
+        info.add_metric([__version__], 1)
+        yield info
+        uptime = round(hub.age, 3)
+        yield GaugeMetricFamily("paramclient_uptime_seconds", "Seconds since the service began.", uptime)
+        yield CounterMetricFamily("paramclient_events_total", "Events that were told.", hub.feed.seq)
+        listeners = hub.feed.listeners
+        yield GaugeMetricFamily("paramclient_listeners", "Streams of events that are open.", listeners)
+        running = sum(job.state == "running" for job in hub.jobs.all)
+        yield GaugeMetricFamily("paramclient_jobs_running", "Fetches and set-ups under way.", running)
+        yield from self._link_metrics()
+        yield from self._component_metrics()
 
+    def _link_metrics(self) -> Iterator[Metric]:
+        held = list(self._hub.lines.values())
+        states = GaugeMetricFamily(
+            "paramclient_link_state", "1 for the state that the link is in.", labels=["link", "state"]
+        )
+        openings = CounterMetricFamily(
+            "paramclient_link_openings_total",
+            "How often the link was opened with nothing known of it.",
+            labels=["link"],
+        )
+        for line in held:
+            openings.add_metric([line.name], line.openings)
+            for state in _STATES:
+                states.add_metric([line.name, state], line.state == state)
+        yield states
+        yield openings
+        counted = [(line.name, line.client.stats) for line in held if line.client is not None]
+        for name, help_ in _COUNTERS.items():
+            counter = CounterMetricFamily(f"paramclient_link_{name}_total", help_, labels=["link"])
+            for link, stats in counted:
+                if (count := getattr(stats, name)) is not None:
+                    counter.add_metric([link], count)
+            yield counter
 
-def _escaped(text: str) -> str:
-    return text.replace("\\", "\\\\").replace('"', '\\"').replace("\n", "\\n")
+    def _component_metrics(self) -> Iterator[Metric]:
+        up, synced, parameters, round_trip = families = [
+            GaugeMetricFamily(f"paramclient_component_{name}", help_, labels=["link", "system", "component"])
+            for name, help_ in _COMPONENT_GAUGES.items()
+        ]
+        for each in self._hub.followed:
+            labels = [each.line.name, *map(str, each.address)]
+            component, is_open = each.component, each.line.state == "open"
+            up.add_metric(labels, is_open and component.state != "lost")
+            synced.add_metric(labels, is_open and component.sync_state == "synced")
+            parameters.add_metric(labels, len(component.params))
+            if component.round_trip is not None:
+                round_trip.add_metric(labels, component.round_trip)
+        yield from families

@@ -65,8 +65,8 @@ async def test_a_component_behind_a_link_that_is_away_is_not_up() -> None:
             await asyncio.sleep(8)
             told = (await browser.get("/metrics")).text
             for name in ("up", "synced"):
-                sample = f'paramclient_component_{name}{{link="{link.name}",system="1",component="1"}}'
-                assert f"{sample} {int(is_here)}\n" in told
+                sample = f'paramclient_component_{name}{{component="1",link="{link.name}",system="1"}}'
+                assert f"{sample} {float(is_here)}\n" in told
 
 
 @swiftly

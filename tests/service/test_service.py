@@ -564,7 +564,8 @@ async def test_its_numbers_are_in_the_format_of_prometheus() -> None:
                 numbers[line.rpartition(" ")[0]] = float(line.rpartition(" ")[2])
         link = r'{link="sim:\"odd\\one\""}'
         assert numbers[f"paramclient_link_downloads_total{link}"] == 1
-        assert numbers[f'paramclient_component_parameters{link[:-1]},system="1",component="1"}}'] == 25
+        labels = r'component="1",link="sim:\"odd\\one\"",system="1"'
+        assert numbers[f"paramclient_component_parameters{{{labels}}}"] == 25
 
 
 @swiftly
