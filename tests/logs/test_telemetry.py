@@ -24,8 +24,8 @@ from paramclient.cache import BY_US, StoredParam, TableUpdate
 from paramclient.cache.tables import HISTORY_LINES
 from paramclient.cli import run
 from paramclient.links import LinkKind, ReplayLink, create_link, parse_link
-from paramclient.links.replay import LONGEST_PAUSE
-from paramclient.links.tlog import FIRST_WITHIN
+from paramclient.links.replay import PAUSE_MAX
+from paramclient.links.tlog import FIRST_FRAME_OFFSET_MAX
 from paramclient.logs.telemetry import ImportedTable, import_log
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param
@@ -80,7 +80,7 @@ async def test_a_file_that_is_no_log(tmp_path: Path) -> None:
             raise AssertionError("it was opened")
     for content in (b"", b"FRAME_CLASS 1\n" * 50):
         (tmp_path / "other.txt").write_bytes(content)
-        with pytest.raises(LinkError, match="is no telemetry log"):
+        with pytest.raises(LinkError, match="is not a telemetry log"):
             async with a_replay(tmp_path / "other.txt"):
                 raise AssertionError("it was opened")
     with pytest.raises(LinkError, match="Is a directory"):
@@ -88,24 +88,24 @@ async def test_a_file_that_is_no_log(tmp_path: Path) -> None:
             raise AssertionError("it was opened")
     os.mkfifo(tmp_path / "pipe")
     for endless in ("/dev/zero", tmp_path / "pipe"):
-        with pytest.raises(LinkError, match="is no regular file"):
+        with pytest.raises(LinkError, match="is not a regular file"):
             async with a_replay(endless):
                 raise AssertionError("it was opened")
 
 
-@pytest.mark.parametrize("before", [FIRST_WITHIN - 100, FIRST_WITHIN])
+@pytest.mark.parametrize("before", [FIRST_FRAME_OFFSET_MAX - 100, FIRST_FRAME_OFFSET_MAX])
 @swiftly
 async def test_a_log_begins_within_its_first_bytes(before: int, tmp_path: Path) -> None:
     """Whatever stands before its first frame; what has none there may be a disk image."""
     path = tmp_path / "flight.tlog"
     path.write_bytes(bytes(before) + whole(A=1).data)
-    if before < FIRST_WITHIN:
+    if before < FIRST_FRAME_OFFSET_MAX:
         async with a_replay(path) as client:
             assert (await (await client.component()).fetch_all()).complete
         return
     with path.open("r+b") as file:
         file.truncate(1 << 40)
-    with pytest.raises(LinkError, match="is no telemetry log"):
+    with pytest.raises(LinkError, match="is not a telemetry log"):
         async with a_replay(path):
             raise AssertionError("it was opened")
 
@@ -152,7 +152,7 @@ async def test_long_pauses_and_clocks_that_go_back(tmp_path: Path) -> None:
         component = await client.component()
         with pytest.raises(NoReply):
             await component.fetch_all()
-        assert anyio.current_time() - began == pytest.approx(LONGEST_PAUSE, abs=0.1)
+        assert anyio.current_time() - began == pytest.approx(PAUSE_MAX, abs=0.1)
 
 
 @swiftly
@@ -477,7 +477,7 @@ def test_the_command_imports_logs(tmp_path: Path, capsys: pytest.CaptureFixture[
     told = capsys.readouterr()
     [table] = json.loads(told.out)["tables"]
     assert (table["file"], table["key"], table["params"], table["complete"]) == (str(good), KEY, 2, True)
-    assert "bad.tlog is no telemetry log" in told.err
+    assert "bad.tlog is not a telemetry log" in told.err
     assert "empty.tlog holds no parameters" in told.err
     assert run(["import", str(good), "--cache", str(cache)]) == 0
     assert "flight.tlog  1/1        generic         2  yes" in capsys.readouterr().out
