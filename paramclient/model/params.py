@@ -26,7 +26,7 @@ __all__ = [
     "held_of",
     "is_listed",
     "iter_parts",
-    "kept",
+    "as_params",
     "number_of",
     "param_of",
     "parts_of",
@@ -157,7 +157,7 @@ class _Items(ItemsView[str, Param]):
         return zip(self._mapping.held, self._mapping.values(), strict=True)
 
 
-def kept(params: Mapping[str, Param]) -> Params:
+def as_params(params: Mapping[str, Param]) -> Params:
     """Return parameters as a `Params`: the argument or the table behind a `ParamMap`, otherwise a copy."""
     shown = params._params if isinstance(params, ParamMap) else params
     if isinstance(shown, Params):

@@ -15,9 +15,9 @@ from paramclient.model.params import (
     NOWHERE,
     ParamMap,
     Params,
+    as_params,
     held_of,
     is_listed,
-    kept,
     param_of,
     placed,
     same_held,
@@ -96,8 +96,8 @@ def test_the_compact_form_loses_nothing(
     assert list(params.items()) == [("NAME", param)]
     assert params == {"NAME": param}
     assert repr(params) == f"Params({{'NAME': {param!r}}})"
-    assert kept(ParamMap(params)) is params
-    assert kept({"NAME": param}) == params
+    assert as_params(ParamMap(params)) is params
+    assert as_params({"NAME": param}) == params
     assert is_listed(params.held["NAME"]) == (index is not None)
 
 

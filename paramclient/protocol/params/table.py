@@ -14,8 +14,8 @@ from paramclient.model.params import (
     VERIFIED,
     Held,
     Params,
+    as_params,
     is_listed,
-    kept,
     number_of,
     param_of,
     parts_of,
@@ -418,7 +418,7 @@ class Table:
             complete, volatile, volatile_known: as the attributes.
             moments: as in `fill`.
         """
-        known = kept(params)
+        known = as_params(params)
         if any(is_listed(held) and not is_portable_name(name) for name, held in known.held.items()):
             complete = placed = False
         changes = self.fill(known, are_placed=placed and self.count in (None, count), moments=moments)
@@ -456,7 +456,7 @@ class Table:
         """
         seen = {} if moments is None else moments
         changes = []
-        known = kept(params)
+        known = as_params(params)
         for name, cached in known.held.items():
             old = self._held.get(name)
             default = known.defaults.get(name)
@@ -485,7 +485,7 @@ class Table:
         """
         seen = {} if moments is None else moments
         changes = []
-        for name, cached in kept(params).held.items():
+        for name, cached in as_params(params).held.items():
             old = self._held.get(name)
             if old is None or trust_of(old) != CACHED or name in self.dirty or same_held(old, cached):
                 continue
