@@ -30,7 +30,7 @@ __all__ = [
     "number_of",
     "param_of",
     "parts_of",
-    "placed",
+    "with_index",
     "same_held",
     "to_hold",
     "trust_of",
@@ -207,7 +207,7 @@ def is_listed(held: Held) -> bool:
     return held[_INDEX_AT:] != _NO_INDEX
 
 
-def placed(held: Held, place: int) -> Held:
+def with_index(held: Held, place: int) -> Held:
     """Return a compact parameter with another index."""
     return held[:_INDEX_AT] + place.to_bytes(4, "little", signed=True)
 

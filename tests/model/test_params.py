@@ -19,10 +19,10 @@ from paramclient.model.params import (
     held_of,
     is_listed,
     param_of,
-    placed,
     same_held,
     to_hold,
     trusted,
+    with_index,
 )
 from paramclient.model.values import Encoding, Param, ParamType, Trust, decode, known_type
 from paramclient.protocol.params.change import Change
@@ -120,10 +120,10 @@ def test_params_can_be_changed_and_copied() -> None:
 def test_setting_index_or_trust_changes_nothing_else() -> None:
     param = Param("A", -5, ParamType.INT16, 300, 0xFFFB, Trust.VERIFIED)
     held = held_of(param)
-    assert param_of("A", placed(held, 7)) == Param("A", -5, ParamType.INT16, 7, 0xFFFB, Trust.VERIFIED)
-    assert param_of("A", placed(held, NOWHERE)).index is None
+    assert param_of("A", with_index(held, 7)) == Param("A", -5, ParamType.INT16, 7, 0xFFFB, Trust.VERIFIED)
+    assert param_of("A", with_index(held, NOWHERE)).index is None
     assert param_of("A", trusted(held, CACHED)) == param.with_trust(Trust.CACHED)
-    assert same_held(held, trusted(placed(held, 9), CACHED))
+    assert same_held(held, trusted(with_index(held, 9), CACHED))
 
 
 @given(

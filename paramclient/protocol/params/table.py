@@ -19,11 +19,11 @@ from paramclient.model.params import (
     number_of,
     param_of,
     parts_of,
-    placed,
     same_held,
     to_hold,
     trust_of,
     trusted,
+    with_index,
 )
 from paramclient.model.values import (
     Encoding,
@@ -260,8 +260,8 @@ class Table:
         name, _, _, count, given = message
         held = self._held[name]
         is_index = given < count <= MOST_PARAMETERS and given not in self.passed_over.get(name, ())
-        if is_index and placed(held, given) != held:
-            self._held[name] = placed(held, given)
+        if is_index and with_index(held, given) != held:
+            self._held[name] = with_index(held, given)
             self.dirty.setdefault(name, "vehicle")
 
     def _hear_again(
@@ -276,7 +276,7 @@ class Table:
         self._moments[name] = moment
         is_same_type = old_number == number
         if is_same_type and self._wire.get(name) == raw and not is_exact:
-            if placed(old, place) != old:
+            if with_index(old, place) != old:
                 self._held[name] = to_hold(old_bits, number, old_is_raw, LIVE, place)
                 self.dirty.setdefault(name, by)
             return None
@@ -289,7 +289,7 @@ class Table:
         new = self._held[name] = to_hold(bits, number, is_raw, LIVE, place)
         self._wire[name] = raw
         if same_held(old, new):
-            if placed(old, place) != old:
+            if with_index(old, place) != old:
                 self.dirty.setdefault(name, by)
             return None
         self._news(name, old, by, before, seen_at)
@@ -332,7 +332,7 @@ class Table:
         if is_older and old is not None and not (is_same_type and self._wire.get(name) == raw):
             if is_same_type:  # else it is the default of something else
                 self._set_default(name, initial)
-            self._held[name] = placed(old, index)
+            self._held[name] = with_index(old, index)
             self.dirty.setdefault(name, "vehicle")
             return None
         self._set_default(name, initial)
@@ -343,7 +343,7 @@ class Table:
         new = self._held[name] = to_hold(bits, number, is_raw, LIVE, index)
         self._wire[name] = raw
         self._filed.add(name)
-        if old is None or placed(old, index) != old or initial != before:
+        if old is None or with_index(old, index) != old or initial != before:
             self.dirty.setdefault(name, "vehicle")
         if old is not None and same_held(old, new):
             return None
@@ -492,7 +492,7 @@ class Table:
             _, number, _, _, place = parts_of(old)
             is_same_type = parts_of(cached)[1] == number
             before = self._defaults.get(name) if is_same_type else self._defaults.pop(name, None)
-            new = self._held[name] = placed(trusted(cached, CACHED), place)
+            new = self._held[name] = with_index(trusted(cached, CACHED), place)
             if name in seen:
                 self._moments[name] = seen[name]
             self._wire.pop(name, None)  # should the vehicle say that again, it is a change
@@ -525,7 +525,7 @@ class Table:
             held = everything.get(name)
             if held is None or (passed_over and index in passed_over.get(name, ())):
                 continue
-            now = placed(held, index)
+            now = with_index(held, index)
             if now != held:
                 everything[name] = now
                 self.dirty.setdefault(name, "vehicle")
@@ -778,7 +778,7 @@ class Table:
 
     def _displaced(self, name: str, held: Held) -> Held:
         self.displaced.add(name)
-        return placed(held, NOWHERE)
+        return with_index(held, NOWHERE)
 
     def _moved(self, name: str) -> None:
         if name in self.volatile:
