@@ -34,7 +34,7 @@ __all__ = [
     "same_held",
     "to_hold",
     "trust_of",
-    "trusted",
+    "with_trust_number",
 ]
 
 Held: TypeAlias = bytes
@@ -197,7 +197,7 @@ def trust_of(held: Held) -> int:
     return held[_TRUST_AT]
 
 
-def trusted(held: Held, trust: int) -> Held:
+def with_trust_number(held: Held, trust: int) -> Held:
     """Return a compact parameter with another trust."""
     return held[:_TRUST_AT] + bytes((trust,)) + held[_INDEX_AT:]
 

@@ -21,8 +21,8 @@ from paramclient.model.params import (
     param_of,
     same_held,
     to_hold,
-    trusted,
     with_index,
+    with_trust_number,
 )
 from paramclient.model.values import Encoding, Param, ParamType, Trust, decode, known_type
 from paramclient.protocol.params.change import Change
@@ -122,8 +122,8 @@ def test_setting_index_or_trust_changes_nothing_else() -> None:
     held = held_of(param)
     assert param_of("A", with_index(held, 7)) == Param("A", -5, ParamType.INT16, 7, 0xFFFB, Trust.VERIFIED)
     assert param_of("A", with_index(held, NOWHERE)).index is None
-    assert param_of("A", trusted(held, CACHED)) == param.with_trust(Trust.CACHED)
-    assert same_held(held, trusted(with_index(held, 9), CACHED))
+    assert param_of("A", with_trust_number(held, CACHED)) == param.with_trust(Trust.CACHED)
+    assert same_held(held, with_trust_number(with_index(held, 9), CACHED))
 
 
 @given(

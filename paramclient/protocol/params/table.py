@@ -22,8 +22,8 @@ from paramclient.model.params import (
     same_held,
     to_hold,
     trust_of,
-    trusted,
     with_index,
+    with_trust_number,
 )
 from paramclient.model.values import (
     Encoding,
@@ -465,7 +465,7 @@ class Table:
                     changes += self._complement(name, old, cached, default)
             elif is_portable_name(name) and self._room.has_some(len(self._held)):
                 self._room.taken += 1
-                new = trusted(cached, CACHED)
+                new = with_trust_number(cached, CACHED)
                 if not are_placed and is_listed(new):
                     new = self._displaced(name, new)
                 self._held[name] = new
@@ -492,7 +492,7 @@ class Table:
             _, number, _, _, place = parts_of(old)
             is_same_type = parts_of(cached)[1] == number
             before = self._defaults.get(name) if is_same_type else self._defaults.pop(name, None)
-            new = self._held[name] = with_index(trusted(cached, CACHED), place)
+            new = self._held[name] = with_index(with_trust_number(cached, CACHED), place)
             if name in seen:
                 self._moments[name] = seen[name]
             self._wire.pop(name, None)  # should the vehicle say that again, it is a change
@@ -559,7 +559,7 @@ class Table:
             return  # the hash may say nothing of any of them
         for name, held in self._held.items():
             if trust_of(held) == CACHED and is_listed(held) and name not in self.volatile:
-                self._held[name] = trusted(held, VERIFIED)
+                self._held[name] = with_trust_number(held, VERIFIED)
 
     def doubt(self, *trusts: Trust) -> None:
         """It may have moved unheard: what was trusted like this is no more than *cached*."""
@@ -568,14 +568,14 @@ class Table:
         for name, held in self._held.items():
             if trust_of(held) in doubted:
                 self._wire.pop(name, None)  # the next value counts, also if it is the same
-                self._held[name] = trusted(held, CACHED)
+                self._held[name] = with_trust_number(held, CACHED)
 
     def doubt_value(self, name: str) -> None:
         """One value may have changed unheard: it is no more than *cached*."""
         held = self._held.get(name)
         if held is not None:
             self._wire.pop(name, None)  # the next value counts, also if it is the same
-            self._held[name] = trusted(held, CACHED)
+            self._held[name] = with_trust_number(held, CACHED)
 
     def remove(self, condition: Callable[[Param], bool]) -> list[Change]:
         """Take out the parameters that meet a condition."""
