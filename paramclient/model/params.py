@@ -32,13 +32,13 @@ __all__ = [
     "parts_of",
     "with_index",
     "same_held",
-    "to_hold",
+    "pack_fields",
     "trust_of",
     "with_trust_number",
 ]
 
 Held: TypeAlias = bytes
-"""A parameter in compact form, without name and default: packed by `to_hold`, unpacked by `parts_of`."""
+"""A parameter in compact form, without name and default: packed by `pack_fields`, unpacked by `parts_of`."""
 
 LIVE: Final = 0
 """`Trust.LIVE` in the compact form."""
@@ -50,10 +50,10 @@ NOWHERE: Final = -1
 """The index, in the compact form, of a parameter without an index."""
 
 _LAYOUT = struct.Struct("<QBBBi")
-to_hold = _LAYOUT.pack
+pack_fields = _LAYOUT.pack
 """Pack bits, the number of the type, whether the value is raw bytes, the number of the trust, the index."""
 parts_of = _LAYOUT.unpack
-"""Unpack the fields that `to_hold` takes."""
+"""Unpack the fields that `pack_fields` takes."""
 iter_parts = _LAYOUT.iter_unpack
 """Iterate over the fields of several compact parameters that are joined into one `bytes`."""
 _TRUST_AT: Final = 10
@@ -176,7 +176,7 @@ def copy_params(params: Mapping[str, Param]) -> Mapping[str, Param]:
 def held_of(param: Param) -> Held:
     """Return a parameter in compact form."""
     index = NOWHERE if param.index is None else param.index
-    return to_hold(param.bits, param.type, isinstance(param.value, bytes), number_of(param.trust), index)
+    return pack_fields(param.bits, param.type, isinstance(param.value, bytes), number_of(param.trust), index)
 
 
 def number_of(trust: Trust) -> int:

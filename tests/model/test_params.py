@@ -18,9 +18,9 @@ from paramclient.model.params import (
     as_params,
     held_of,
     is_listed,
+    pack_fields,
     param_of,
     same_held,
-    to_hold,
     with_index,
     with_trust_number,
 )
@@ -136,7 +136,7 @@ def test_same_held_agrees_with_same_value_of_params(
     number: int, one: int, other: int, raw: tuple[bool, bool]
 ) -> None:
     one, other = (each & ((1 << 8 * min(ParamType(number).size, 4)) - 1) for each in (one, other))
-    first, second = to_hold(one, number, raw[0], 0, 1), to_hold(other, number, raw[1], 1, 2)
+    first, second = pack_fields(one, number, raw[0], 0, 1), pack_fields(other, number, raw[1], 1, 2)
     assert same_held(first, second) == param_of("A", first).same_value(param_of("A", second))
 
 

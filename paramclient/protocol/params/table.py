@@ -17,10 +17,10 @@ from paramclient.model.params import (
     as_params,
     is_listed,
     number_of,
+    pack_fields,
     param_of,
     parts_of,
     same_held,
-    to_hold,
     trust_of,
     with_index,
     with_trust_number,
@@ -224,7 +224,7 @@ class Table:
             room.taken += 1
             place = NOWHERE if given >= count or count > MOST_PARAMETERS else given
             bits, is_raw = bits_of_wire(raw, number, self._encoding)
-            new = everything[name] = to_hold(bits, number, is_raw, LIVE, place)
+            new = everything[name] = pack_fields(bits, number, is_raw, LIVE, place)
             self._wire[name] = raw
             self._moments[name] = moment
             self.dirty[name] = by
@@ -277,7 +277,7 @@ class Table:
         is_same_type = old_number == number
         if is_same_type and self._wire.get(name) == raw and not is_exact:
             if with_index(old, place) != old:
-                self._held[name] = to_hold(old_bits, number, old_is_raw, LIVE, place)
+                self._held[name] = pack_fields(old_bits, number, old_is_raw, LIVE, place)
                 self.dirty.setdefault(name, by)
             return None
         if is_same_type and not is_exact and self._rounds(old, raw):
@@ -286,7 +286,7 @@ class Table:
             bits, is_raw = bits_of_wire(raw, number, self._encoding)
             self._filed.discard(name)
         before = self._defaults.get(name) if is_same_type else self._defaults.pop(name, None)
-        new = self._held[name] = to_hold(bits, number, is_raw, LIVE, place)
+        new = self._held[name] = pack_fields(bits, number, is_raw, LIVE, place)
         self._wire[name] = raw
         if same_held(old, new):
             if with_index(old, place) != old:
@@ -340,7 +340,7 @@ class Table:
         seen_at = self._moments.get(name, moment)
         self._moments[name] = max(moment, seen_at)
         self._latest = max(self._latest, moment)
-        new = self._held[name] = to_hold(bits, number, is_raw, LIVE, index)
+        new = self._held[name] = pack_fields(bits, number, is_raw, LIVE, index)
         self._wire[name] = raw
         self._filed.add(name)
         if old is None or with_index(old, index) != old or initial != before:
@@ -387,7 +387,7 @@ class Table:
                 self._wire[name] = as_sent(bits, number, encoding)
                 continue
             bits, is_raw = bits_of_wire(raw, number, encoding)
-            new = self._held[name] = to_hold(bits, number, is_raw, trust, place)
+            new = self._held[name] = pack_fields(bits, number, is_raw, trust, place)
             if not same_held(old, new):
                 self.dirty.setdefault(name, "vehicle")
                 changes.append(self._change(name, old, new))
@@ -762,7 +762,7 @@ class Table:
         if default is not None and name not in self._defaults:
             self._defaults[name] = default
             self.dirty.setdefault(name, "vehicle")
-        new = self._held[name] = to_hold(bits, number, is_raw, trust, place)
+        new = self._held[name] = pack_fields(bits, number, is_raw, trust, place)
         if same_held(heard, new):
             return []
         self.dirty.setdefault(name, "vehicle")
