@@ -9,7 +9,7 @@ from typing import Any, overload
 
 from paramclient.cache.records import BY_VEHICLE, StoredParam
 from paramclient.cache.rows import Row, signed, time_cell
-from paramclient.model.params import NOWHERE, Params, iter_parts, parts_of
+from paramclient.model.params import NOWHERE, Params, iter_parts, unpack_fields
 from paramclient.model.values import bits_of
 
 __all__ = ["FirstRows", "HeardParams", "UnixTimes"]
@@ -155,7 +155,7 @@ class FirstRows(Mapping[str, Row]):
         return iter(self._params)
 
     def __getitem__(self, name: str) -> Row:
-        bits, number, is_raw, _, place = parts_of(self._params.held[name])
+        bits, number, is_raw, _, place = unpack_fields(self._params.held[name])
         default = self._params.defaults.get(name)
         initial = None if default is None else signed(bits_of(default, number))
         index = None if place == NOWHERE else place

@@ -29,7 +29,7 @@ __all__ = [
     "as_params",
     "number_of",
     "param_of",
-    "parts_of",
+    "unpack_fields",
     "with_index",
     "same_held",
     "pack_fields",
@@ -38,7 +38,7 @@ __all__ = [
 ]
 
 Held: TypeAlias = bytes
-"""A parameter in compact form, without name and default: packed by `pack_fields`, unpacked by `parts_of`."""
+"""A parameter in compact form, without name and default; see `pack_fields` and `unpack_fields`."""
 
 LIVE: Final = 0
 """`Trust.LIVE` in the compact form."""
@@ -52,7 +52,7 @@ NOWHERE: Final = -1
 _LAYOUT = struct.Struct("<QBBBi")
 pack_fields = _LAYOUT.pack
 """Pack bits, the number of the type, whether the value is raw bytes, the number of the trust, the index."""
-parts_of = _LAYOUT.unpack
+unpack_fields = _LAYOUT.unpack
 """Unpack the fields that `pack_fields` takes."""
 iter_parts = _LAYOUT.iter_unpack
 """Iterate over the fields of several compact parameters that are joined into one `bytes`."""
@@ -186,7 +186,7 @@ def number_of(trust: Trust) -> int:
 
 def param_of(name: str, held: Held, default: Value | None = None) -> Param:
     """Return the `Param` of a compact parameter."""
-    bits, number, is_raw, trust, place = parts_of(held)
+    bits, number, is_raw, trust, place = unpack_fields(held)
     value = from_bits(bits, number, is_raw=is_raw)
     index = None if place == NOWHERE else place
     return Param(name, value, _KNOWN_TYPES[number], index, bits, _TRUSTS[trust], default)
@@ -216,8 +216,8 @@ def same_held(one: Held, other: Held) -> bool:
     """Return whether both have the same value in the same type, as `Param.same_value` defines it."""
     if one[:_TRUST_AT] == other[:_TRUST_AT]:
         return True
-    bits, number, is_raw, *_ = parts_of(one)
-    bits2, number2, is_raw2, *_ = parts_of(other)
+    bits, number, is_raw, *_ = unpack_fields(one)
+    bits2, number2, is_raw2, *_ = unpack_fields(other)
     return (number, is_raw) == (number2, is_raw2) and same_bits(number, bits, bits2)
 
 

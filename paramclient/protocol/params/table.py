@@ -19,9 +19,9 @@ from paramclient.model.params import (
     number_of,
     pack_fields,
     param_of,
-    parts_of,
     same_held,
     trust_of,
+    unpack_fields,
     with_index,
     with_trust_number,
 )
@@ -245,7 +245,7 @@ class Table:
         held = self._held.get(name)
         if held is None:
             return message
-        _, number, _, trust, _ = parts_of(held)
+        _, number, _, trust, _ = unpack_fields(held)
         if trust == CACHED and name not in self._wire:
             return message
         known = known_type(number)
@@ -269,7 +269,7 @@ class Table:
     ) -> Change | None:
         """Take a PARAM_VALUE of a parameter that is known."""
         _, raw, number, count, given = message
-        old_bits, old_number, old_is_raw, _, place = parts_of(old)
+        old_bits, old_number, old_is_raw, _, place = unpack_fields(old)
         if given != NO_INDEX:
             place = NOWHERE if given >= count or count > MOST_PARAMETERS else given
         seen_at = self._moments.get(name, moment)
@@ -328,7 +328,7 @@ class Table:
             self._room.taken += 1
         raw = as_sent(bits, number, self._encoding)
         before = self._defaults.get(name)
-        is_same_type = old is None or parts_of(old)[1] == number
+        is_same_type = old is None or unpack_fields(old)[1] == number
         if is_older and old is not None and not (is_same_type and self._wire.get(name) == raw):
             if is_same_type:  # else it is the default of something else
                 self._set_default(name, initial)
@@ -382,7 +382,7 @@ class Table:
         changes = []
         for name, raw in self._wire.items():
             old = self._held[name]
-            bits, number, _, trust, place = parts_of(old)
+            bits, number, _, trust, place = unpack_fields(old)
             if name in self._filed:
                 self._wire[name] = as_sent(bits, number, encoding)
                 continue
@@ -461,7 +461,7 @@ class Table:
             old = self._held.get(name)
             default = known.defaults.get(name)
             if old is not None:
-                if parts_of(old)[1] == parts_of(cached)[1] and name not in self._filed:
+                if unpack_fields(old)[1] == unpack_fields(cached)[1] and name not in self._filed:
                     changes += self._complement(name, old, cached, default)
             elif is_portable_name(name) and self._room.has_some(len(self._held)):
                 self._room.taken += 1
@@ -489,8 +489,8 @@ class Table:
             old = self._held.get(name)
             if old is None or trust_of(old) != CACHED or name in self.dirty or same_held(old, cached):
                 continue
-            _, number, _, _, place = parts_of(old)
-            is_same_type = parts_of(cached)[1] == number
+            _, number, _, _, place = unpack_fields(old)
+            is_same_type = unpack_fields(cached)[1] == number
             before = self._defaults.get(name) if is_same_type else self._defaults.pop(name, None)
             new = self._held[name] = with_index(with_trust_number(cached, CACHED), place)
             if name in seen:
@@ -547,7 +547,7 @@ class Table:
         names: dict[int, str] = {}
         twice = set()
         for name, held in self._held.items():
-            index = parts_of(held)[4]
+            index = unpack_fields(held)[4]
             if index != NOWHERE and names.setdefault(index, name) != name:
                 twice.add(index)
         count = self.count or 0
@@ -607,7 +607,7 @@ class Table:
 
     def listed_bits(self) -> dict[str, int]:
         """The bits of those that have an index, which the count and the hash are about, by name."""
-        return {name: parts_of(held)[0] for name, held in self._held.items() if is_listed(held)}
+        return {name: unpack_fields(held)[0] for name, held in self._held.items() if is_listed(held)}
 
     @property
     def size(self) -> int:
@@ -621,7 +621,7 @@ class Table:
 
     def gaps(self) -> tuple[int, tuple[int, ...]]:
         """How many parameters there should be, and the indices of those that are not known."""
-        present = {parts_of(held)[4] for held in self._held.values()}
+        present = {unpack_fields(held)[4] for held in self._held.values()}
         present.discard(NOWHERE)
         count = len(present) if self.count is None else self.count
         return count, tuple(index for index in range(count) if index not in present)
@@ -756,9 +756,9 @@ class Table:
 
     def _complement(self, name: str, heard: Held, cached: Held, default: Value | None) -> list[Change]:
         """Add to what was heard what its message does not say."""
-        bits, number, is_raw, trust, place = parts_of(heard)
+        bits, number, is_raw, trust, place = unpack_fields(heard)
         if self._rounds(cached, self._wire.get(name, b"")):
-            bits, _, is_raw, *_ = parts_of(cached)
+            bits, _, is_raw, *_ = unpack_fields(cached)
         if default is not None and name not in self._defaults:
             self._defaults[name] = default
             self.dirty.setdefault(name, "vehicle")
@@ -772,7 +772,7 @@ class Table:
         """Whether a message rounds what is known exactly: an integer beyond the 24 bits of a float32."""
         if self._encoding is not Encoding.C_CAST:
             return False
-        bits, number, is_raw, *_ = parts_of(known)
+        bits, number, is_raw, *_ = unpack_fields(known)
         value = from_bits(bits, number, is_raw=is_raw)
         return isinstance(value, int) and abs(value) > _EXACT and as_sent(bits, number, self._encoding) == raw
 
