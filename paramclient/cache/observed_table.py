@@ -9,7 +9,7 @@ from typing import Any, overload
 
 from paramclient.cache.records import BY_VEHICLE, StoredParam
 from paramclient.cache.rows import Row, signed, time_cell
-from paramclient.model.params import NOWHERE, Params, iter_parts, unpack_fields
+from paramclient.model.params import NOWHERE, Params, iter_unpack_fields, unpack_fields
 from paramclient.model.values import bits_of
 
 __all__ = ["FirstRows", "HeardParams", "UnixTimes"]
@@ -167,7 +167,7 @@ class FirstRows(Mapping[str, Row]):
     def columns(self) -> tuple[Sequence[str], list[Sequence[Any]]]:
         """The names, and the cells of all rows in the order of `Row`."""
         held, defaults = self._params.held, self._params.defaults
-        bits, types, is_raw, _, places = zip(*iter_parts(b"".join(held.values())), strict=True)
+        bits, types, is_raw, _, places = zip(*iter_unpack_fields(b"".join(held.values())), strict=True)
         initial: Sequence[int | None] = (None,) * len(held)
         if defaults:
             initial = [
