@@ -46,6 +46,8 @@ def read_file(path: str | os.PathLike[str], *, form: FileForm | str | None = Non
     form = None if form is None else as_form(form)
     try:
         data = _read(source)
+    except FileError:
+        raise  # is a ValueError too, and has its path already
     except OSError as error:
         raise FileError(f"cannot be read: {error.strerror}", source=source) from error
     except ValueError as error:  # a NUL in the path
@@ -78,6 +80,8 @@ def write_file(
     data = dumps(content, form=form, target=source)
     try:
         _replace(Path(os.path.realpath(source)), data, source)
+    except FileError:
+        raise  # is a ValueError too, and has its path already
     except OSError as error:
         raise FileError(f"cannot be written: {error.strerror}", source=source) from error
     except ValueError as error:  # a NUL in the path

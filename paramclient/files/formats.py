@@ -176,7 +176,7 @@ def _check(sets: list[ParamSet]) -> None:
                 raise UsageError(f"systems and components have ids from 1 to 255, not {number}")
         for param in each.values():
             check_name(param.name)
-        whose = (each.system, each.component or AUTOPILOT)
-        if whose in seen:
+        ids = (each.system, each.component or AUTOPILOT)
+        if ids in seen:
             raise UsageError(f"two sets have the same component, {address(each)}")
-        seen.add(whose)
+        seen.add(ids)

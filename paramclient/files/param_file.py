@@ -45,6 +45,7 @@ ENDINGS: Final = {
     ".yaml": FileForm.YAML,
     ".yml": FileForm.YAML,
 }
+"""Formats by file extension, in lower case."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -224,8 +224,8 @@ def test_an_unreadable_file_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_pat
 def test_opening_a_pipe_does_not_block(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe.param"
     os.mkfifo(pipe)
-    assert "not a regular file" in str(refused(lambda: read_file(pipe)))
-    assert "not a regular file" in str(refused(lambda: write_file(pipe, PARAMS)))
+    assert str(refused(lambda: read_file(pipe))) == f"{pipe}: cannot be read: not a regular file"
+    assert str(refused(lambda: write_file(pipe, PARAMS))) == f"{pipe}: cannot be written: not a regular file"
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
