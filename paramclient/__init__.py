@@ -1,4 +1,4 @@
-"""The ground-station side of MAVLink's parameter protocol for asyncio programs, with a cache."""
+"""Client for MAVLink's parameter protocol, for asyncio and trio programs, with a parameter cache."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command `paramclient`, also as `python -m paramclient`."""
+"""Entry point of the command line `paramclient` and of `python -m paramclient`."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from typing import Final, NoReturn
 __all__ = ["main"]
 
 LIBRARIES: Final = ("cyclopts", "rich")
-"""What the extra `cli` installs."""
+"""Libraries that the extra `cli` installs."""
 SIGPIPE: Final = 13
-"""Windows has no such signal, and the exit code is the same there."""
+"""Number of the signal, for the exit code. Windows has no SIGPIPE but uses the same exit code."""
 
 
 def main() -> NoReturn:
-    """Run the command with the arguments of the process, and leave with its exit code.
+    """Run the command line with the arguments of the process, and exit with its exit code.
 
-    130 after Ctrl-C, 143 after SIGTERM and 141 when nobody reads the output any more, as for programs that
-    die of these signals; the other codes stand in `paramclient.cli.exit_codes`.
+    Exits with 130 after Ctrl-C, 143 after SIGTERM and 141 when the output's reader has closed it, like
+    programs killed by these signals; `paramclient.cli.exit_codes` lists the other codes.
     """
     if missing := [name for name in LIBRARIES if find_spec(name) is None]:
         print(
@@ -30,14 +30,14 @@ def main() -> NoReturn:
         )
         sys.exit(2)
     try:
-        from paramclient.cli import run  # only here: needs the extra
+        from paramclient.cli import run  # imported here because it needs the extra
 
-        gc.freeze()  # what is loaded by now stays: full collections need not go through it, 10 ms and more
+        gc.freeze()  # modules stay loaded: excluding them saves 10 ms and more per full collection
         code = run(sys.argv[1:])
     except KeyboardInterrupt:
         code = 128 + signal.SIGINT
     except BrokenPipeError:
-        # what is still in the buffers must not fail once more when the interpreter ends
+        # flushing the buffers at interpreter exit would raise BrokenPipeError again
         nowhere = os.open(os.devnull, os.O_WRONLY)
         for stream in (sys.stdout, sys.stderr):
             os.dup2(nowhere, stream.fileno())

@@ -1,33 +1,33 @@
-"""Every exception of paramclient.
+"""Exceptions of paramclient.
 
-The tree says who is to blame::
+The tree shows the cause of each error::
 
     ParamClientError
-    ├── UsageError(ValueError)        the caller: a name, value, link name or argument that cannot be right
+    ├── UsageError(ValueError)        the caller: an invalid name, value, link name or argument
     │   ├── FileError                 a parameter file that cannot be read or written
-    │   ├── InvalidParameters         values that are to be set, and cannot be right
-    │   ├── MetadataError             a description of parameters that is none
-    │   ├── UnknownVehicle            no vehicle in the cache has the name that was given
-    │   └── AmbiguousVehicle          several vehicles fit, on the link or in the cache, and one must be named
-    ├── VehicleError                  the vehicle answered, and the answer is no
-    │   ├── UnknownParameter          it has no parameter of that name or index
-    │   ├── Refused                   it gave a reason: PARAM_ERROR, or ArduPilot's text
-    │   │   └── CommandRefused        the same for a command: MAV_RESULT
-    │   ├── TypeMismatch              it holds the parameter in a type that the value cannot take
-    │   ├── ValueNotApplied           it kept another value and gave no reason
-    │   ├── VehicleArmed              it is armed, and nothing is set then unless told otherwise
-    │   ├── FileTransferError         it did not do what was asked with a file
-    │   ├── AnotherVehicle            it is not the one that was meant
-    │   └── ContestedAddress          several vehicles have its address, and none of them is asked
-    ├── NoReply(TimeoutError)         nobody answered in time
-    ├── LinkError(OSError)            the socket or the device
-    │   └── ClientClosed              the client was closed while a call waited, or is not open
-    ├── PackError                     a packed parameter file that is none
+    │   ├── InvalidParameters         invalid values for a set-up
+    │   ├── MetadataError             invalid or inaccessible parameter metadata
+    │   ├── UnknownVehicle            no vehicle in the cache matches the given name
+    │   └── AmbiguousVehicle          several vehicles match, on the link or in the cache
+    ├── VehicleError                  the vehicle responded with an error or another value
+    │   ├── UnknownParameter          the vehicle has no parameter of that name or index
+    │   ├── Refused                   the vehicle gave a reason: PARAM_ERROR, or ArduPilot's text
+    │   │   └── CommandRefused        the vehicle refused a command: MAV_RESULT
+    │   ├── TypeMismatch              the parameter has a type that cannot hold the value
+    │   ├── ValueNotApplied           the vehicle kept another value and gave no reason
+    │   ├── VehicleArmed              the vehicle is armed, and setting while armed was not allowed
+    │   ├── FileTransferError         the vehicle refused an operation on a file
+    │   ├── AnotherVehicle            another vehicle than the expected one responded
+    │   └── ContestedAddress          several vehicles have the same address; no requests are sent to them
+    ├── NoReply(TimeoutError)         no response before the deadline
+    ├── LinkError(OSError)            the socket or the device failed
+    │   └── ClientClosed              the client was closed during a call, or is not open
+    ├── PackError                     an invalid packed parameter file
     └── CacheError                    the cache on disk
-        ├── NotInCache                it can be read, and does not have what was asked for
-        └── NotDurable                the vehicle has taken a value, and the disk has not
+        ├── NotInCache                the cache has no such table, snapshot or state
+        └── NotDurable                the vehicle accepted a value, and the disk did not
 
-Each carries what is known as attributes, so that a program need not read its text.
+Each exception has its data as attributes, so that programs need not parse its text.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ __all__ = [
 
 
 class ParamErrorCode(IntEnum):
-    """MAV_PARAM_ERROR: the reasons that a PARAM_ERROR message can give (MAVLink common message set)."""
+    """MAV_PARAM_ERROR: the reasons in a PARAM_ERROR message (MAVLink common message set)."""
 
     NO_ERROR = 0
     DOES_NOT_EXIST = 1
@@ -81,7 +81,7 @@ class ParamErrorCode(IntEnum):
 
     @staticmethod
     def name_of(code: int) -> str:
-        """The code in words; a code that this version does not know is kept as its number."""
+        """Return the code in words; an unknown code as its number."""
         try:
             return ParamErrorCode(code).name.lower().replace("_", " ")
         except ValueError:
@@ -89,7 +89,7 @@ class ParamErrorCode(IntEnum):
 
 
 class CommandResult(IntEnum):
-    """MAV_RESULT: what a COMMAND_ACK can say (MAVLink common message set)."""
+    """MAV_RESULT: the results in a COMMAND_ACK (MAVLink common message set)."""
 
     ACCEPTED = 0
     TEMPORARILY_REJECTED = 1
@@ -105,7 +105,7 @@ class CommandResult(IntEnum):
 
     @staticmethod
     def name_of(code: int) -> str:
-        """The result in words; one that this version does not know is kept as its number."""
+        """Return the result in words; an unknown result as its number."""
         try:
             return CommandResult(code).name.lower().replace("_", " ")
         except ValueError:
@@ -113,7 +113,7 @@ class CommandResult(IntEnum):
 
 
 class FileErrorCode(IntEnum):
-    """MAV_FTP_ERR: the reasons that a NAK of MAVFTP can give (MAVLink guide, "File Transfer Protocol")."""
+    """MAV_FTP_ERR: the reasons in a NAK of MAVFTP (MAVLink guide, "File Transfer Protocol")."""
 
     NONE = 0
     FAIL = 1
@@ -129,7 +129,7 @@ class FileErrorCode(IntEnum):
 
     @staticmethod
     def name_of(code: int) -> str:
-        """The code in words; a code that this version does not know is kept as its number."""
+        """Return the code in words; an unknown code as its number."""
         try:
             return FileErrorCode(code).name.lower().replace("_", " ")
         except ValueError:
@@ -137,36 +137,36 @@ class FileErrorCode(IntEnum):
 
 
 class ParamClientError(Exception):
-    """The base of everything that paramclient raises on purpose."""
+    """Base class of all exceptions that paramclient raises."""
 
 
 class UsageError(ParamClientError, ValueError):
-    """The caller asked for something that cannot be right. Nothing was sent."""
+    """The caller gave an invalid argument. Nothing was sent."""
 
 
 class InvalidParameters(UsageError):
-    """Values that are to be set cannot be right.
+    """Some values for a set-up are invalid. Nothing was sent.
 
     Attributes:
-        problems: by parameter name, what is wrong with its value, as a sentence.
+        problems: by parameter name, the problem with its value, as a sentence.
     """
 
     def __init__(self, problems: Mapping[str, str]) -> None:
         lines = [f"{name}: {problem}" for name, problem in problems.items()]
-        super().__init__("nothing was sent, as values cannot be right:\n" + "\n".join(lines))
+        super().__init__("nothing was sent, because of invalid values:\n" + "\n".join(lines))
         self.problems = problems
 
 
 class FileError(UsageError):
-    """A parameter file cannot be read or written; a file that was to be replaced is as it was before.
+    """A parameter file cannot be read or written. An existing file at the target path is unchanged.
 
-    Its text has a line for each bad line of the file, `quad.param:17: expected …, found …`.
+    The text has one line for each bad line of the file, `quad.param:17: expected …, found …`.
 
     Attributes:
-        source: the file's name as it was given; "" for bytes without one.
-        line: the first bad line, from 1; None where it is not about a line.
-        expected: what should have stood there, in words; None where it is not about a line.
-        reason: the first of its lines, without the place.
+        source: the file's name as given; "" for bytes without a name.
+        line: the first bad line, from 1; None if the error concerns no single line.
+        expected: the expected content of the line, in words; None if the error concerns no single line.
+        reason: the first line of the text, without the file's name and line number.
     """
 
     def __init__(
@@ -190,16 +190,16 @@ class FileError(UsageError):
         self._more = more
 
     def with_more(self, text: str) -> FileError:
-        """The same with another line of text."""
+        """Return a copy of the error with another line of text."""
         more = (*self._more, text)
         return FileError(self.reason, source=self.source, line=self.line, expected=self.expected, more=more)
 
 
 class MetadataError(UsageError):
-    """A file that should describe parameters does not, or lies where it is not fetched from.
+    """Parameter metadata is invalid, or is at an address from which metadata is not downloaded.
 
     Attributes:
-        source: the file or the place, in words.
+        source: the file or the address, in words.
     """
 
     def __init__(self, message: str, *, source: str) -> None:
@@ -208,10 +208,10 @@ class MetadataError(UsageError):
 
 
 class UnknownVehicle(UsageError):
-    """No vehicle in the cache has the name, system id or component that was given. Nothing was done.
+    """No vehicle in the cache matches the given name, system id or component. Nothing was done.
 
     Attributes:
-        vehicles: the vehicles that the cache holds, in words.
+        vehicles: the vehicles in the cache, in words.
     """
 
     def __init__(self, message: str, *, vehicles: Sequence[str]) -> None:
@@ -220,13 +220,13 @@ class UnknownVehicle(UsageError):
 
 
 class AmbiguousVehicle(UsageError):
-    """Several vehicles fit, on the link or in the cache, and none of them was chosen. Nothing was done.
+    """Several vehicles match, on the link or in the cache. Nothing was done.
 
     Attributes:
-        vehicles: the vehicles that fit, in words: `1/1 PX4 quadrotor` on a link.
-        choose_by: the argument that chooses one of them, "system", "component" or "peer"; "link" where only
-            the link of a service tells them apart; "" for vehicles in the cache, which have keys.
-        summary: the text of the error without what to do next.
+        vehicles: the matching vehicles, in words: `1/1 PX4 quadrotor` on a link.
+        choose_by: the argument that selects one of them, "system", "component" or "peer"; "link" if only
+            the link of a service distinguishes them; "" for vehicles in the cache, which have keys.
+        summary: the text of the error without the advice.
     """
 
     def __init__(self, message: str, *, vehicles: Sequence[str], choose_by: str = "") -> None:
@@ -241,12 +241,12 @@ class AmbiguousVehicle(UsageError):
 
 
 class VehicleError(ParamClientError):
-    """The vehicle answered, and the answer is no.
+    """The vehicle responded with an error, or with another value than requested.
 
     Attributes:
-        system, component: who answered.
-        name: the parameter, or None where it was asked for by index.
-        index: the index that was asked for, or None.
+        system, component: the component that responded.
+        name: the parameter, or None if the request was by index.
+        index: the requested index, or None.
     """
 
     def __init__(
@@ -260,16 +260,16 @@ class VehicleError(ParamClientError):
 
 
 class UnknownParameter(VehicleError):
-    """The vehicle has no such parameter: it said so, or kept silent on it while it answered other reads."""
+    """The vehicle has no such parameter: it said so, or left this read unanswered and answered others."""
 
 
 class Refused(VehicleError):
-    """The vehicle gave a reason for not doing it.
+    """The vehicle refused a request and gave a reason.
 
     Attributes:
-        code: the number in PARAM_ERROR, to compare with `ParamErrorCode`; READ_ONLY for ArduPilot's
+        code: the number in PARAM_ERROR, comparable with `ParamErrorCode`; READ_ONLY for ArduPilot's
             "Param write denied" text.
-        reason: the same in words.
+        reason: the code in words.
     """
 
     def __init__(
@@ -288,31 +288,31 @@ class Refused(VehicleError):
 
 
 class CommandRefused(Refused):
-    """The vehicle does not obey a command, and says so.
+    """The vehicle refused a command with a COMMAND_ACK.
 
     Attributes:
         command: MAV_CMD.
-        code: the number in its COMMAND_ACK, to compare with `CommandResult`.
-        reason: the same in words.
+        code: the number in COMMAND_ACK, comparable with `CommandResult`.
+        reason: the code in words.
     """
 
     def __init__(self, system: int, component: int, command: int, code: int) -> None:
         reason = CommandResult.name_of(code)
-        message = f"command {command} was refused by {system}/{component}: {reason}"
+        message = f"{system}/{component} refused command MAV_CMD {command}: {reason}"
         super().__init__(message, system=system, component=component, code=code)
         self.command = command
         self.reason = reason
 
 
 class TypeMismatch(VehicleError):
-    """The vehicle holds the parameter in another type than the one that was sent."""
+    """The vehicle's parameter has another type than PARAM_SET had."""
 
 
 class ValueNotApplied(VehicleError):
-    """The vehicle was asked, answers, and keeps another value without a reason.
+    """The vehicle responded to a write with another value and no reason.
 
     Attributes:
-        requested: the value that was to be written.
+        requested: the value of the write.
         actual: the value that the vehicle reports.
     """
 
@@ -332,16 +332,16 @@ class ValueNotApplied(VehicleError):
 
 
 class VehicleArmed(VehicleError):
-    """The vehicle is armed, or does not say that it is not. Nothing is set then unless told otherwise."""
+    """The vehicle is armed or its state is unknown, and setting parameters while armed was not allowed."""
 
 
 class FileTransferError(VehicleError):
-    """The vehicle did not do what was asked with a file.
+    """The vehicle refused an operation on a file.
 
     Attributes:
         path: the file or directory.
-        code: the number in its NAK, to compare with `FileErrorCode`.
-        errno: the error number of the vehicle's own system, where it gave one; else 0.
+        code: the number in the NAK, comparable with `FileErrorCode`.
+        errno: the error number of the vehicle's operating system, or 0 if the NAK has none.
         reason: the code in words.
     """
 
@@ -356,35 +356,35 @@ class FileTransferError(VehicleError):
 
     @property
     def is_not_found(self) -> bool:
-        """Whether there is no such file; servers say so in two ways (ENOENT is 2 on all of them)."""
+        """Whether the file does not exist; servers use two codes for it (ENOENT is 2 on all of them)."""
         return self.code == FileErrorCode.FILE_NOT_FOUND or (
             self.code == FileErrorCode.FAIL_ERRNO and self.errno == 2
         )
 
 
 class AnotherVehicle(VehicleError):
-    """Another vehicle than the one that was meant answers under the system id.
+    """Another vehicle than the expected one responded with the system id.
 
     Attributes:
-        expected, found: the two vehicles, in words: the hardware id where there is one.
+        expected, found: the two vehicles, in words, with the hardware id if known.
     """
 
     def __init__(self, system: int, component: int, expected: str, found: str) -> None:
-        message = f"another vehicle answers as {system}/{component}: it is {found}, and was to be {expected}"
+        message = f"another vehicle answers as {system}/{component}: expected {expected}, found {found}"
         super().__init__(message, system=system, component=component)
         self.expected = expected
         self.found = found
 
 
 class ContestedAddress(VehicleError):
-    """Several vehicles have the system and component id, and it is open which one would be meant.
+    """Several vehicles have the same system and component id, so a request has no definite receiver.
 
-    Nothing is read from them or written to them until all but one have been silent for the heartbeat timeout.
-    What was sent before that is not known to have been taken.
+    The client neither reads from them nor writes to them until all but one have been silent for the heartbeat
+    timeout. Whether earlier writes took effect is unknown.
 
     Attributes:
-        claimants: the peers with the address, in words, and what each says.
-        difference: what tells them apart, in words.
+        claimants: the peers with the address, each with its description, in words.
+        difference: the difference between them, in words.
     """
 
     def __init__(self, system: int, component: int, claimants: Sequence[str], difference: str) -> None:
@@ -399,11 +399,11 @@ class ContestedAddress(VehicleError):
 
 
 class NoReply(ParamClientError, TimeoutError):
-    """Nobody answered in time.
+    """No response arrived before the deadline.
 
     Attributes:
-        awaited: what was awaited, in words.
-        attempts: how many times it was asked for (0 where there was nothing to ask).
+        awaited: the expected response, in words.
+        attempts: the number of requests sent (0 if there is no request for it).
         waited: seconds from the first request to giving up.
     """
 
@@ -416,10 +416,10 @@ class NoReply(ParamClientError, TimeoutError):
 
 
 class LinkError(ParamClientError, OSError):
-    """The link failed; `__cause__` is the operating system's error where there is one.
+    """The link failed. `__cause__` is the operating system's error, if there is one.
 
     Attributes:
-        link: the link's name as it was given.
+        link: the link's name as given.
     """
 
     def __init__(self, message: str, *, link: str) -> None:
@@ -428,14 +428,14 @@ class LinkError(ParamClientError, OSError):
 
 
 class ClientClosed(LinkError):
-    """The client was closed while the call waited, or had not been opened."""
+    """The client was closed during the call, or has not been opened."""
 
 
 class PackError(ParamClientError):
-    """Bytes that should be a packed parameter file (param.pck) are none.
+    """Bytes are not a valid packed parameter file (param.pck).
 
     Attributes:
-        offset: the byte at which that showed.
+        offset: the position of the first invalid byte.
     """
 
     def __init__(self, message: str, *, offset: int) -> None:
@@ -444,12 +444,12 @@ class PackError(ParamClientError):
 
 
 class CacheError(ParamClientError):
-    """The cache on disk could not do what was asked of it."""
+    """Reading or writing the cache on disk failed."""
 
 
 class NotInCache(CacheError):
-    """The cache can be read, and does not have the table, the snapshot or the state that was asked for."""
+    """The cache does not contain the requested table, snapshot or state."""
 
 
 class NotDurable(CacheError):
-    """The vehicle has taken what was written with `durable`, and the disk has not: a crash may lose it."""
+    """The vehicle accepted a write with `durable`, but it is not on disk: a crash may lose it."""

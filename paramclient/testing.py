@@ -1,10 +1,10 @@
-"""Simulated vehicles for the tests of a program, each with a radio of its own.
+"""Simulated vehicles for the tests of other programs, each with its own simulated radio.
 
-The fixtures of the pytest plugin give these functions; they serve any other test runner as well::
+The fixtures of the pytest plugin return these functions; other test runners can call them directly::
 
     px4 = sim_px4(loss=0.05, delay=0.1, seed=1)
-    await your_program(px4)                        # in the place of a link's name
-    assert px4.vehicle.values["MC_ROLL_P"] == 6.5  # what is on board
+    await your_program(px4)                        # in place of a link's name
+    assert px4.vehicle.values["MC_ROLL_P"] == 6.5  # the value on board
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ __all__ = ["MakeArduPilot", "MakePX4", "SimVehicle", "sim_ardupilot", "sim_px4"]
 
 V = TypeVar("V", bound=Vehicle)
 
-GO: Final = 0.02
-"""Seconds between two goes of a list at most, where a pace is asked for that gives each more than a value."""
+LIST_PERIOD_MAX: Final = 0.02
+"""Longest time between two bursts of a list, in seconds, for a pace that sends several values per burst."""
 
 
 class SimVehicle(Generic[V]):
-    """A simulated vehicle and the air around it; an `Endpoint`, to be given to a program in a link's place.
+    """A simulated vehicle behind a faulty link. An `Endpoint`, to be given to a program in place of a link.
 
     Args:
         vehicle: the vehicle.
-        seed: of the air's random numbers; the same ones for the same seed.
-        faults: those of `paramclient.sim.FaultyLink`, in both directions; `delay` is for one way.
+        seed: of the faulty link's random numbers; equal seeds give equal sequences.
+        faults: as in `paramclient.sim.FaultyLink`, in both directions; `delay` is one-way.
 
     Attributes:
-        vehicle: what is on board: `params`, `values` and `set_param`, and the `requests` that it got.
-        air: what lies between: what was sent and lost, `air.uplink` and `air.downlink`.
+        vehicle: the simulated vehicle: `params`, `values` and `set_param`, and the received `requests`.
+        air: the simulated radio: sent and lost bytes, `air.uplink` and `air.downlink`.
 
     Raises:
-        UsageError: a fault is outside its range.
+        UsageError: a fault is out of range.
     """
 
     def __init__(self, vehicle: V, *, seed: int = 0, **faults: Unpack[Faults]) -> None:
@@ -49,7 +49,7 @@ class SimVehicle(Generic[V]):
         return f"<SimVehicle {type(self.vehicle).__name__} {self.vehicle.system}/{self.vehicle.component}>"
 
     def receive(self, data: bytes, now: float) -> None:
-        """See `Endpoint`, as of the other three."""
+        """Take bytes from the program. See `Endpoint` for this and the next three methods."""
         self.air.receive(data, now)
 
     def tick(self, now: float) -> None:
@@ -63,17 +63,17 @@ class SimVehicle(Generic[V]):
 
 
 def sim_px4(*, pace: float | None = None, seed: int = 0, **options: Any) -> SimVehicle[PX4Vehicle]:
-    """A PX4 vehicle, behind a radio without faults unless some are asked for.
+    """Return a simulated PX4 vehicle; its link has no faults by default.
 
     Args:
-        pace: values of a list per second; None for that of a real one on UDP, about 1000. On a telemetry
-            radio of 57600 baud it is about 40.
-        seed: of the radio's random numbers.
-        options: the faults of `paramclient.sim.FaultyLink` (`loss`, `delay`, `rate`, …), and all that
-            `paramclient.sim.PX4Vehicle` takes (`table`, `system`, `hash_check`, …).
+        pace: list values per second; None for the rate of a real vehicle on UDP, about 1000. A telemetry
+            radio of 57600 baud carries about 40.
+        seed: of the faulty link's random numbers.
+        options: the faults of `paramclient.sim.FaultyLink` (`loss`, `delay`, `rate`, …), and the arguments
+            of `paramclient.sim.PX4Vehicle` (`table`, `system`, `hash_check`, …).
 
     Raises:
-        UsageError: an argument cannot be.
+        UsageError: an argument is invalid.
         TypeError: there is no such argument.
     """
     return _make(PX4Vehicle, pace, seed, options)
@@ -82,9 +82,10 @@ def sim_px4(*, pace: float | None = None, seed: int = 0, **options: Any) -> SimV
 def sim_ardupilot(
     *, pace: float | None = None, seed: int = 0, **options: Any
 ) -> SimVehicle[ArduPilotVehicle]:
-    """An ArduPilot vehicle; as `sim_px4`, with what `paramclient.sim.ArduPilotVehicle` takes.
+    """Return a simulated ArduPilot vehicle. Takes the arguments of `paramclient.sim.ArduPilotVehicle`.
 
-    Its list comes at about 1700 values per second on UDP. `ftp=False` makes a client fetch by the list.
+    Like `sim_px4`. Sends a list at about 1700 values per second on UDP. With `ftp=False`, a client uses the
+    list download.
     """
     return _make(ArduPilotVehicle, pace, seed, options)
 
@@ -94,12 +95,12 @@ MakeArduPilot: TypeAlias = Callable[..., SimVehicle[ArduPilotVehicle]]
 
 
 def _make(kind: Callable[..., V], pace: float | None, seed: int, options: dict[str, Any]) -> SimVehicle[V]:
-    faults: Faults = {name: options.pop(name) for name in Faults.__annotations__ if name in options}  # type: ignore[assignment]  # by its own names
+    faults: Faults = {name: options.pop(name) for name in Faults.__annotations__ if name in options}  # type: ignore[assignment]  # exactly the keys of Faults
     if pace is not None:
         if not (math.isfinite(pace) and pace > 0.0):
             raise UsageError(f"pace is a number of values per second above 0, not {pace}")
         if options.keys() & {"burst", "period"}:
-            raise UsageError("pace stands for burst and period: give one or the others")
-        burst = max(1, int(pace * GO))
+            raise UsageError("pace replaces burst and period: give either pace or these two")
+        burst = max(1, int(pace * LIST_PERIOD_MAX))
         options |= {"burst": burst, "period": burst / pace}
     return SimVehicle(kind(**options), seed=seed, **faults)

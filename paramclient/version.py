@@ -1,3 +1,3 @@
-"""The one place where the version stands; packaging, the command and the documents read it here."""
+"""The version number, read by packaging, the command line and the documentation."""
 
 __version__ = "0.1.0"

@@ -1,4 +1,4 @@
-"""Telemetry logs to be written: a vehicle, ground stations, and the files that these read over MAVFTP."""
+"""Writer of telemetry logs: a vehicle, ground stations, and files that they read over MAVFTP."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ KEY = f"uid:{UID}"
 
 
 class Log:
-    """A log to be written: a vehicle with a table of INT32, and a ground station.
+    """Writes a log of a vehicle with a table of INT32, and of a ground station.
 
     Attributes:
-        at: when the next frame comes.
+        at: the time of the next frame.
     """
 
     def __init__(self, at: float = NOW) -> None:
@@ -73,12 +73,12 @@ class Log:
 
 
 STATION = (255, 230)
-"""Who MAVProxy is."""
+"""System and component id of MAVProxy."""
 BLOCK = 239
 
 
 class FileLog(Log):
-    """A log with an ArduPilot vehicle, in which ground stations read files.
+    """Writes a log of an ArduPilot vehicle, in which ground stations read files.
 
     Attributes:
         sequence: of the next request of any station.
@@ -93,7 +93,7 @@ class FileLog(Log):
         return self
 
     def ask(self, opcode: int, *, session: int, station: tuple[int, int] = STATION, **fields: object) -> int:
-        """A request; gives its sequence number."""
+        """Add a request; return its sequence number."""
         packet = Packet(self.sequence, session, opcode, **fields)  # type: ignore[arg-type]  # any
         self.say(wire.FileTransfer(0, 1, 1, packet.pack()), system=station[0], component=station[1])
         self.sequence = (self.sequence + 1) & 0xFFFF
@@ -102,7 +102,7 @@ class FileLog(Log):
     def reply(
         self, to: int, requested: int, *, session: int, station: tuple[int, int] = STATION, **fields: object
     ) -> Self:
-        """A reply to the request with this sequence number, or to one of a burst behind it."""
+        """Add a response to the request with this sequence number, or to one of a burst after it."""
         fields = {"opcode": Opcode.ACK} | fields
         packet = Packet((to + 1) & 0xFFFF, session, requested=requested, **fields)  # type: ignore[arg-type]  # any
         self.say(wire.FileTransfer(0, *station, packet.pack()))
@@ -115,7 +115,7 @@ class FileLog(Log):
         session: int = 11,
         station: tuple[int, int] = STATION,
     ) -> Self:
-        """The open request and its reply, with a size that is an estimate."""
+        """Add the open request and its response, with an estimated size."""
         to = self.ask(Opcode.OPEN_FILE_RO, session=session, station=station, data=path.encode())
         size = (16_284).to_bytes(4, "little")
         return self.reply(to, Opcode.OPEN_FILE_RO, session=session, station=station, data=size)
@@ -130,7 +130,7 @@ class FileLog(Log):
         is_ended: bool = True,
         gap: float = 0.006,
     ) -> Self:
-        """A burst of the blocks with these numbers, None for all, with the NAK at the end of the file."""
+        """Add a burst of the blocks with these numbers, None for all, with the NAK at the end of the file."""
         to = self.ask(Opcode.BURST_READ_FILE, session=session, station=station, size=BLOCK)
         count = -(-len(data) // BLOCK)
         for number in range(count) if blocks is None else blocks:
@@ -141,7 +141,7 @@ class FileLog(Log):
         return self
 
     def read(self, data: bytes, at: int, *, session: int = 11, station: tuple[int, int] = STATION) -> Self:
-        """A single read of one block."""
+        """Add a single read of one block."""
         to = self.ask(Opcode.READ_FILE, session=session, station=station, size=BLOCK, offset=at)
         return self.reply_block(to, Opcode.READ_FILE, data, at, session, station)
 
@@ -152,7 +152,7 @@ class FileLog(Log):
         return self.reply(to, requested, session=session, station=station, data=block, offset=at)
 
     def end(self, to: int, at: int, *, session: int = 11, station: tuple[int, int] = STATION) -> Self:
-        """The NAK of a burst at the end of the file."""
+        """Add the NAK of a burst at the end of the file."""
         data = bytes([FileErrorCode.EOF])
         return self.reply(
             to,
@@ -165,18 +165,18 @@ class FileLog(Log):
         )
 
     def close(self, *, session: int = 11, station: tuple[int, int] = STATION) -> Self:
-        """The end of a session."""
+        """Add the end of a session."""
         to = self.ask(Opcode.TERMINATE_SESSION, session=session, station=station)
         return self.reply(to, Opcode.TERMINATE_SESSION, session=session, station=station)
 
     def value(self, name: str, value: float, *, count: int, kind: ParamType = ParamType.INT16) -> Self:
-        """An unasked PARAM_VALUE, as ArduPilot sends it."""
+        """Add an unsolicited PARAM_VALUE of ArduPilot."""
         raw = encode(value, kind, Encoding.C_CAST)
         self.say(wire.ParamValue(name, raw, kind, count, wire.NO_INDEX))
         return self
 
     def made_up(self, values: Sequence[tuple[str, float]]) -> Self:
-        """What MAVProxy writes when it has read the file: not from the vehicle, all REAL32, at one time."""
+        """Add MAVProxy's record of a file that it has read: not from the vehicle, all REAL32, at one time."""
         for index, (name, value) in enumerate(values):
             raw = encode(float(value), ParamType.REAL32, Encoding.C_CAST)
             self.say(wire.ParamValue(name, raw, ParamType.REAL32, len(values), index), component=190)

@@ -1,4 +1,4 @@
-"""The exception tree: what catches what, what each carries, and how it reads."""
+"""Exceptions: base classes, attributes, and message texts."""
 
 from __future__ import annotations
 
@@ -49,25 +49,25 @@ from paramclient.errors import (
         (CacheError, ParamClientError),
     ],
 )
-def test_each_error_is_caught_as_what_it_is(kind: type[Exception], base: type[Exception]) -> None:
+def test_base_classes_of_errors(kind: type[Exception], base: type[Exception]) -> None:
     assert issubclass(kind, base)
     assert issubclass(kind, ParamClientError)
 
 
-def test_what_the_vehicle_says_is_not_what_the_link_or_the_caller_did() -> None:
+def test_vehicle_errors_are_neither_link_nor_usage_errors() -> None:
     assert not issubclass(VehicleError, OSError | ValueError)
     assert not issubclass(NoReply, LinkError | VehicleError)
 
 
-def test_every_error_of_the_module_is_offered() -> None:
+def test_all_lists_every_error() -> None:
     defined = {
         name for name, thing in vars(errors).items() if getattr(thing, "__module__", "") == errors.__name__
     }
     assert defined == set(errors.__all__)
 
 
-def test_codes_are_mavlinks() -> None:
-    """As far as pymavlink's dialect knows them: 6 to 8 are newer."""
+def test_param_error_codes_match_pymavlink() -> None:
+    """Codes 6 to 8 are newer than pymavlink's dialect."""
     names = {
         name.removeprefix("MAV_PARAM_ERROR_"): value
         for name, value in vars(dialect).items()
@@ -80,7 +80,7 @@ def test_codes_are_mavlinks() -> None:
 @pytest.mark.parametrize(
     ("code", "words"), [(5, "read only"), (2, "value out of range"), (99, "error code 99")]
 )
-def test_codes_in_words(code: int, words: str) -> None:
+def test_param_error_code_names(code: int, words: str) -> None:
     assert ParamErrorCode.name_of(code) == words
     refused = Refused("no", system=1, component=2, code=code, name="A", index=3)
     assert (refused.code, refused.reason) == (code, words)
@@ -88,7 +88,7 @@ def test_codes_in_words(code: int, words: str) -> None:
     assert str(refused) == "no"
 
 
-def test_codes_of_files_are_mavlinks() -> None:
+def test_file_error_codes_match_pymavlink() -> None:
     names = {
         name.removeprefix("MAV_FTP_ERR_"): value
         for name, value in vars(dialect).items()
@@ -108,14 +108,14 @@ def test_codes_of_files_are_mavlinks() -> None:
         (99, 0, "error code 99", False),
     ],
 )
-def test_what_a_vehicle_says_of_a_file(code: int, errno: int, words: str, not_found: bool) -> None:
+def test_attributes_of_a_file_transfer_error(code: int, errno: int, words: str, not_found: bool) -> None:
     error = FileTransferError("no", system=1, component=2, path="a.txt", code=code, errno=errno)
     assert (error.system, error.component, error.name, error.path) == (1, 2, None, "a.txt")
     assert (error.code, error.errno, error.reason) == (code, errno, words)
     assert error.is_not_found is not_found
 
 
-def test_a_file_that_is_none_says_where_that_showed() -> None:
+def test_a_pack_error_has_the_offset() -> None:
     error = PackError("it is cut off", offset=7)
     assert str(error) == "it is cut off (byte 7)"
     assert error.offset == 7
@@ -130,13 +130,13 @@ def test_a_file_that_is_none_says_where_that_showed() -> None:
         ("", None, "expected A"),
     ],
 )
-def test_a_file_error_begins_with_its_place(source: str, line: int | None, text: str) -> None:
+def test_a_file_error_starts_with_file_and_line(source: str, line: int | None, text: str) -> None:
     error = FileError("expected A", source=source, line=line, expected="A", more=("and more",))
     assert str(error) == f"{text}\nand more"
     assert (error.source, error.line, error.expected) == (source, line, "A")
 
 
-def test_a_value_that_was_not_applied_carries_both_values() -> None:
+def test_value_not_applied_has_both_values() -> None:
     error = ValueNotApplied("kept", system=1, component=1, name="A", requested=2.0, actual=1.0)
     assert (error.name, error.requested, error.actual, error.index) == ("A", 2.0, 1.0, None)
 
@@ -149,13 +149,13 @@ def test_a_value_that_was_not_applied_carries_both_values() -> None:
         (4, "no reply: A after 4 tries in 1.5 s"),
     ],
 )
-def test_no_reply_says_what_was_tried(attempts: int, text: str) -> None:
+def test_no_reply_has_attempts_and_duration(attempts: int, text: str) -> None:
     error = NoReply("A", attempts=attempts, waited=1.49)
     assert str(error) == text
     assert (error.awaited, error.attempts, error.waited) == ("A", attempts, 1.49)
 
 
-def test_a_link_error_names_its_link() -> None:
+def test_a_link_error_has_the_links_name() -> None:
     error = ClientClosed("the client was closed", link="udpin:0.0.0.0:14550")
     assert str(error) == "the client was closed"
     assert error.link == "udpin:0.0.0.0:14550"

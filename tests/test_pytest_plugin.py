@@ -1,4 +1,4 @@
-"""The pytest plugin: its fixtures under every runner, what they keep away from, and what it costs others."""
+"""The pytest plugin: fixtures under every runner, isolation from the user's cache, and import cost."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ Suite = Callable[..., pytest.RunResult]
 
 @pytest.fixture
 def suite(pytester: pytest.Pytester, monkeypatch: pytest.MonkeyPatch) -> Suite:
-    """Runs tests, given as text, with the plugin in a process of their own; no warning may be left."""
+    """Runs tests, given as text, with the plugin in a separate process; warnings are errors."""
     monkeypatch.setenv("PYTHONPATH", str(ROOT))
     monkeypatch.setenv("XDG_CACHE_HOME", str(pytester.path / "user"))
 
@@ -112,8 +112,8 @@ def test_now_it_is(sim_px4):
 """
 
 
-def test_the_fixtures_serve_every_runner(suite: Suite) -> None:
-    """With pytest-asyncio, with anyio's plugin and with neither; the programs of the page among them."""
+def test_fixtures_work_with_every_runner(suite: Suite) -> None:
+    """With pytest-asyncio, with anyio's plugin and with neither; includes the documentation's programs."""
     page = (ROOT / "docs/testing.md").read_text(encoding="utf-8")
     programs = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     modules = {f"test_of_page_{number}": program for number, program in enumerate(programs)}
@@ -124,8 +124,8 @@ def test_the_fixtures_serve_every_runner(suite: Suite) -> None:
     suite(**modules).assert_outcomes(passed=sum(map(len, tests)))
 
 
-def test_the_package_loads_with_the_first_test_that_asks(suite: Suite) -> None:
-    """A suite that uses nothing of it does not wait for it, and coverage begins before it."""
+def test_the_package_loads_with_the_first_test_that_uses_a_fixture(suite: Suite) -> None:
+    """A suite without the fixtures does not pay for the import, and coverage starts before it."""
     result = suite("--cov=paramclient.version", "--cov-report=term-missing", test_late=LATE)
     result.assert_outcomes(passed=2)
     result.stdout.re_match_lines([r".*paramclient/version\.py +\d+ +0 .*100%"])
@@ -166,7 +166,7 @@ async def test_a_pace_is_that_of_the_list(make: Callable[..., SimVehicle[Vehicle
 
 
 @pytest.mark.parametrize("make", [sim_px4, sim_ardupilot])
-def test_the_same_seed_loses_the_same(make: Callable[..., SimVehicle[Vehicle]]) -> None:
+def test_equal_seeds_lose_the_same_packets(make: Callable[..., SimVehicle[Vehicle]]) -> None:
     def losses(seed: int) -> list[int]:
         vehicle = make(table=TABLE, loss=0.5, seed=seed)
         lost = []
@@ -185,27 +185,27 @@ def test_the_same_seed_loses_the_same(make: Callable[..., SimVehicle[Vehicle]]) 
         ({"loss": 2.0}, "loss is a share"),
         ({"pace": 0.0}, "pace is a number of values per second"),
         ({"pace": float("nan")}, "pace is a number of values per second"),
-        ({"pace": 40.0, "burst": 3}, "pace stands for burst and period"),
+        ({"pace": 40.0, "burst": 3}, "pace replaces burst and period"),
         ({"system": 0}, "system is a number from 1 to 255"),
     ],
 )
-def test_what_cannot_be_is_said(arguments: dict[str, Any], problem: str) -> None:
+def test_invalid_arguments_are_rejected(arguments: dict[str, Any], problem: str) -> None:
     with pytest.raises(UsageError, match=problem):
         sim_px4(**arguments)
 
 
-def test_there_are_no_arguments_that_nobody_reads() -> None:
+def test_unknown_arguments_are_rejected() -> None:
     with pytest.raises(TypeError, match="los"):
         sim_px4(los=0.1)
 
 
-def test_a_vehicle_says_what_it_is() -> None:
+def test_repr_of_a_sim_vehicle() -> None:
     assert repr(sim_ardupilot(system=7, table={})) == "<SimVehicle ArduPilotVehicle 7/1>"
 
 
 @swiftly
 async def test_several_share_a_channel() -> None:
-    """Each behind its own radio, and all of them endpoints of one `Air`."""
+    """Each behind its own faulty link, and all of them endpoints of one `Air`."""
     vehicles: list[Endpoint] = [sim_px4(system=1, table=TABLE), sim_ardupilot(system=2, table={})]
     async with ParamClient(Air(vehicles), cache=False) as client:
         await client.fetch_all()

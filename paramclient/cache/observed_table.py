@@ -9,7 +9,7 @@ from typing import Any, overload
 
 from paramclient.cache.records import BY_VEHICLE, StoredParam
 from paramclient.cache.rows import Row, signed, time_cell
-from paramclient.model.params import NOWHERE, Params, iter_parts, parts_of
+from paramclient.model.params import NOWHERE, Params, iter_unpack_fields, unpack_fields
 from paramclient.model.values import bits_of
 
 __all__ = ["FirstRows", "HeardParams", "UnixTimes"]
@@ -155,7 +155,7 @@ class FirstRows(Mapping[str, Row]):
         return iter(self._params)
 
     def __getitem__(self, name: str) -> Row:
-        bits, number, is_raw, _, place = parts_of(self._params.held[name])
+        bits, number, is_raw, _, place = unpack_fields(self._params.held[name])
         default = self._params.defaults.get(name)
         initial = None if default is None else signed(bits_of(default, number))
         index = None if place == NOWHERE else place
@@ -167,7 +167,7 @@ class FirstRows(Mapping[str, Row]):
     def columns(self) -> tuple[Sequence[str], list[Sequence[Any]]]:
         """The names, and the cells of all rows in the order of `Row`."""
         held, defaults = self._params.held, self._params.defaults
-        bits, types, is_raw, _, places = zip(*iter_parts(b"".join(held.values())), strict=True)
+        bits, types, is_raw, _, places = zip(*iter_unpack_fields(b"".join(held.values())), strict=True)
         initial: Sequence[int | None] = (None,) * len(held)
         if defaults:
             initial = [

@@ -11,7 +11,7 @@ from typing import Any, Final, NamedTuple
 
 from paramclient.errors import UsageError
 from paramclient.model.identity import Identity
-from paramclient.model.params import CACHED, NOWHERE, Params, to_hold
+from paramclient.model.params import CACHED, NOWHERE, Params, pack_fields
 from paramclient.model.values import Param, ParamType, Trust, Value, bits_of, from_bits, known_type, same_bits
 
 __all__ = [
@@ -188,7 +188,7 @@ def read_cells(cells_: Iterable[tuple[str, int, int, int, int | None, int | None
             raise Damaged(f"{bits} is not a value of type {number}")
         place = NOWHERE if index is None else index
         try:
-            held[name] = to_hold(bits, number, bool(is_raw), CACHED, place)
+            held[name] = pack_fields(bits, number, bool(is_raw), CACHED, place)
         except struct.error as error:
             raise Damaged(f"an index is {place}: {error}") from error
         if default_bits is not None:

@@ -1,4 +1,4 @@
-"""Parameter files of every ground station: QGroundControl, MAVProxy, Mission Planner, packed, our own."""
+"""Parameter files: formats of QGroundControl, MAVProxy, Mission Planner and PX4, packed files, JSON, YAML."""
 
 from paramclient.files.disk import read_file, write_file
 from paramclient.files.formats import LARGEST_FILE, dumps, loads

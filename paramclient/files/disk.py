@@ -1,4 +1,4 @@
-"""Parameter files on disk: read whole, and replaced whole or not at all."""
+"""Reading parameter files from disk, and replacing them atomically."""
 
 from __future__ import annotations
 
@@ -18,36 +18,39 @@ from paramclient.files.param_file import FileForm, ParamFile, as_form, form_of_n
 __all__ = ["read_file", "write_file"]
 
 if sys.platform == "win32":
-    _HOW: Final = os.O_BINARY | os.O_NOINHERIT  # else its runtime would change the ends of lines
+    _OPEN_FLAGS: Final = os.O_BINARY | os.O_NOINHERIT  # text mode would convert line ends
 else:
-    _HOW: Final = os.O_NONBLOCK | os.O_CLOEXEC
+    _OPEN_FLAGS: Final = os.O_NONBLOCK | os.O_CLOEXEC
 
-_NEW_MODE: Final = 0o666
-"""Of a file that was not there, less what the user's umask takes away."""
+_NEW_FILE_MODE: Final = 0o666
+"""Mode of a new file, before the user's umask."""
 
 
 def read_file(path: str | os.PathLike[str], *, form: FileForm | str | None = None) -> ParamFile:
-    """Read a parameter file of any ground station. It blocks for as long as the disk does.
+    """Read a parameter file of any supported format. Blocks until the disk has delivered it.
 
-    A list of MAVProxy's or Mission Planner's form may include others with `@include FILE`, by a path that is
-    relative to its folder: files in that folder, beside it, or below either. Their lines count in its place.
+    A list in MAVProxy's or Mission Planner's format may include others with `@include FILE`. The path is
+    relative to the file's folder, and the included file must be in that folder, beside it, or below either.
+    Its lines replace the `@include` line.
 
     Args:
         path: the file.
-        form: the form that it has; None to tell by its content (see `loads`).
+        form: the format; None to detect it from the content (see `loads`).
 
     Raises:
-        FileError: it cannot be read, is too large to be one, has none of the forms or is damaged. Nothing of
-            it is given then, and up to 20 bad lines are named.
-        UsageError: no such form.
+        FileError: the file cannot be read, is too large, has no known format or is damaged. Nothing is
+            returned then; the error names up to 20 bad lines.
+        UsageError: unknown format.
     """
     source = os.fspath(path)
     form = None if form is None else as_form(form)
     try:
         data = _read(source)
+    except FileError:
+        raise  # is a ValueError too, and has its path already
     except OSError as error:
         raise FileError(f"cannot be read: {error.strerror}", source=source) from error
-    except ValueError as error:  # a NUL in the name
+    except ValueError as error:  # a NUL in the path
         raise FileError(f"cannot be read: {error}", source=source) from error
     return loads(data, source=source, form=form, includes=Includes.of(source, _read, size_max=LARGEST_FILE))
 
@@ -55,41 +58,43 @@ def read_file(path: str | os.PathLike[str], *, form: FileForm | str | None = Non
 def write_file(
     path: str | os.PathLike[str], content: Content, *, form: FileForm | str | None = None
 ) -> FileForm:
-    """Write a parameter file, in place of one that is there. It blocks for as long as the disk does.
+    """Write a parameter file, and replace an existing one atomically. Blocks until the file is on disk.
 
-    Until all of it is on the disk, the old file is there as it was; so it is when anything fails. Its mode is
-    kept, and where the path is a symbolic link, the link stays and its target is replaced.
+    The old file stays unchanged until the new one is completely on disk, and also if writing fails. The mode
+    is kept. If the path is a symbolic link, the link stays and its target is replaced.
 
     Args:
         path: the file.
-        content: a file as it was read, the parameters of one component, or of several.
-        form: the form; None to go by the ending of the name.
+        content: a file as read, the parameters of one component, or of several.
+        form: the format; None to choose it by the file extension.
 
     Returns:
-        The form in which it was written.
+        The format of the written file.
 
     Raises:
-        FileError: the form cannot say it, the ending stands for none, or the disk cannot take it.
-        UsageError: no such form.
+        FileError: the format cannot express the content, the extension is unknown, or writing failed.
+        UsageError: unknown format.
     """
     source = os.fspath(path)
     form = form_of_name(source) if form is None else as_form(form)
     data = dumps(content, form=form, target=source)
     try:
         _replace(Path(os.path.realpath(source)), data, source)
+    except FileError:
+        raise  # is a ValueError too, and has its path already
     except OSError as error:
         raise FileError(f"cannot be written: {error.strerror}", source=source) from error
-    except ValueError as error:  # a NUL in the name
+    except ValueError as error:  # a NUL in the path
         raise FileError(f"cannot be written: {error}", source=source) from error
     return form
 
 
 def _read(source: str) -> bytes:
-    # a pipe that nobody writes to must not hold anyone up
-    descriptor = os.open(source, os.O_RDONLY | _HOW)
+    # With O_NONBLOCK, opening a pipe without a writer does not block.
+    descriptor = os.open(source, os.O_RDONLY | _OPEN_FLAGS)
     try:
         if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-            raise FileError("cannot be read: it is no regular file", source=source)
+            raise FileError("cannot be read: not a regular file", source=source)
         with os.fdopen(descriptor, "rb", closefd=False) as file:
             return file.read(LARGEST_FILE + 1)
     finally:
@@ -97,16 +102,16 @@ def _read(source: str) -> bytes:
 
 
 def _replace(target: Path, data: bytes, source: str) -> None:
-    """Put a file with this content in the place of another, or leave that as it is."""
+    """Replace a file by one with this content; on failure, leave the old file unchanged."""
     try:
         mode = target.stat().st_mode
     except FileNotFoundError:
         mode = None
     if mode is not None and not stat.S_ISREG(mode):
-        raise FileError("cannot be written: it is no regular file", source=source)
-    beside = target.with_name(f".{target.name[:200]}.{secrets.token_hex(8)}.tmp")
-    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _HOW
-    descriptor = os.open(beside, flags, _NEW_MODE)
+        raise FileError("cannot be written: not a regular file", source=source)
+    temporary = target.with_name(f".{target.name[:200]}.{secrets.token_hex(8)}.tmp")
+    flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | _OPEN_FLAGS
+    descriptor = os.open(temporary, flags, _NEW_FILE_MODE)
     try:
         with os.fdopen(descriptor, "wb") as file:
             if mode is not None and sys.platform != "win32":
@@ -114,17 +119,17 @@ def _replace(target: Path, data: bytes, source: str) -> None:
             file.write(data)
             file.flush()
             os.fsync(descriptor)
-        beside.replace(target)
+        temporary.replace(target)
     except BaseException:
         with suppress(OSError):
-            beside.unlink()
+            temporary.unlink()
         raise
     _sync_folder(target.parent)
 
 
 def _sync_folder(folder: Path) -> None:
-    """Have the new name on the disk too. The file is in its place by then, so a failure is not told."""
-    if sys.platform != "win32":  # where a folder cannot be opened
+    """Flush the new directory entry to disk. Ignores errors, as the file has been replaced already."""
+    if sys.platform != "win32":  # Windows cannot open a folder
         with suppress(OSError):
             descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
             try:

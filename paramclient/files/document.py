@@ -1,12 +1,12 @@
-"""paramclient's own document, as JSON and as YAML: everything that is known, exactly.
+"""paramclient's own file format, as JSON and as YAML: all fields of every parameter, exactly.
 
     {"paramclient": 1, "header": [...], "sets": [
       {"system": 1, "component": 1, "at": "2026-01-31T12:00:00Z", "identity": {...}, "params": {
         "RTL_ALT": {"value": 1500, "type": "INT32", "bits": "000005dc", "default": 1500}}}]}
 
-`value` is the shortest number that gives the same value in this type; "NaN", "Infinity" and "-Infinity" are
-written as text, and so are four raw bytes ("0x0000002a"). `bits` are as in `Param.bits`: where they stand
-they must agree with the value, as who changes only one of the two has made a mistake. A parameter is a line.
+`value` is the shortest number that gives the same value in this type. "NaN", "Infinity" and "-Infinity" are
+text, as are four raw bytes ("0x0000002a"). `bits` are as in `Param.bits` and must agree with the value: an
+edit of only one of the two is an error. Each parameter is one line.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ from typing import Any, Final, NoReturn
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.param_file import FileForm, ParamFile
-from paramclient.files.text import is_plain, shown, time_of
+from paramclient.files.text import excerpt, is_plain, time_of
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, Value, format_value, shortest_float, type_name
 
 __all__ = ["is_document", "read_json", "read_yaml", "write_json", "write_yaml"]
 
 VERSION: Final = 1
-"""Of what a document holds; one that is read has this."""
+"""Version of the format, written to documents and required in documents that are read."""
 
-LONGEST_PROBLEM: Final = 300
-"""Characters in which an error tells of one field, whatever stands in it."""
+PROBLEM_LENGTH_MAX: Final = 300
+"""Characters of one problem in an error, so that a long field does not make the error unreadable."""
 
 _first_key: Final = re.compile(r"""["']?paramclient["']?[ \t]*:""").match
 _plain_key: Final = re.compile(r"[A-Za-z_][A-Za-z0-9_]*").fullmatch
 _YAML_WORDS: Final = frozenset({"y", "n", "yes", "no", "on", "off", "true", "false", "null"})
-"""What YAML takes for something else than text where it stands without quotes, in any case."""
+"""Words, in any case, that YAML does not parse as text unless quoted."""
 _exponent: Final = re.compile(r"^(-?[0-9]+)(e[+-][0-9]+)$")
 _beyond_ascii: Final = re.compile(r"[^\x20-\x7e]")
 
 
 def is_document(first: str) -> bool:
-    """Whether the first line that says something is that of a document in YAML."""
+    """Return whether this first line with content starts a document in YAML."""
     return _first_key(first) is not None or first == "---"
 
 
@@ -50,7 +50,7 @@ def read_json(text: str, source: str) -> ParamFile:
     """Read a document in JSON.
 
     Raises:
-        FileError: it is no JSON, names a key twice, or is not such a document.
+        FileError: invalid JSON, a repeated key, or not a valid document.
     """
     try:
         content = json.loads(
@@ -68,7 +68,7 @@ def read_json(text: str, source: str) -> ParamFile:
             expected="JSON",
         ) from None
     except RecursionError:
-        raise FileError("no document is nested that deep", source=source) from None
+        raise FileError("the document is nested too deep", source=source) from None
     except ValueError as error:
         line = _line_of(text, error.args[1], last=True) if len(error.args) > 1 else None
         raise FileError(str(error.args[0]), source=source, line=line) from None
@@ -78,28 +78,28 @@ def read_json(text: str, source: str) -> ParamFile:
 def read_yaml(text: str, source: str) -> ParamFile:
     """Read a document in YAML.
 
-    Words and numbers mean what they mean in JSON: NO is text and not false, 010 is not 8, 1:30 not 90.
-    Anchors, aliases and tags are refused.
+    Words and numbers have the same meaning as in JSON: NO is text and not false, 010 is not 8, 1:30 is not
+    90. Anchors, aliases and tags are rejected.
 
     Raises:
-        FileError: it is no YAML, names a key twice, or is not such a document; or PyYAML is not installed.
+        FileError: invalid YAML, a repeated key, or not a valid document; or PyYAML is not installed.
     """
     if find_spec("yaml") is None:
         raise FileError("YAML is read with PyYAML: pip install 'paramclient[yaml]'", source=source)
-    from paramclient.files.yamltext import NotYaml, load  # only here: needs the extra
+    from paramclient.files.yamltext import InvalidYaml, load  # imported here because it needs the extra
 
     try:
         content = load(text)
-    except NotYaml as error:
+    except InvalidYaml as error:
         raise FileError(f"expected YAML: {error}", source=source, line=error.line, expected="YAML") from None
     return _file(content, FileForm.YAML, source, text)
 
 
 def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
-    """The lines of a document in JSON.
+    """Generate the lines of a document in JSON.
 
     Raises:
-        UsageError: a NaN with bits of its own has no type to say which.
+        UsageError: a NaN with payload bits has no type.
     """
     header = _header(around)
     yield "{"
@@ -109,7 +109,7 @@ def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
     yield '  "sets": ['
     for place, each in enumerate(sets):
         yield "    {"
-        for key, content in _about(each).items():
+        for key, content in _set_fields(each).items():
             yield f"      {_json(key)}: {_json(content)},"
         yield '      "params": {'
         last = len(each) - 1
@@ -122,7 +122,7 @@ def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
 
 
 def write_yaml(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
-    """The lines of the same document in YAML, which needs no library. A value is written as in JSON.
+    """Generate the lines of a document in YAML, without PyYAML. Values are written as in JSON.
 
     Raises:
         UsageError: as `write_json`.
@@ -135,7 +135,7 @@ def write_yaml(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
     yield "sets:"
     for each in sets:
         mark = "-"
-        for key, content in _about(each).items():
+        for key, content in _set_fields(each).items():
             yield f"  {mark} {key}: {_flow(content)}"
             mark = " "
         yield f"  {mark} params:"
@@ -144,37 +144,38 @@ def write_yaml(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
 
 
 def _file(content: object, form: FileForm, source: str, text: str) -> ParamFile:
-    from paramclient.files.document_schema import Wrong, parse  # only here: loads pydantic
+    from paramclient.files.document_schema import InvalidDocument, parse  # imported here: loads pydantic
 
     try:
         sets, header = parse(content, source)
-    except Wrong as error:
+    except InvalidDocument as error:
         problems = [_problem(place, what, text) for place, what in error.problems]
-        more = [": ".join(filter(None, (_at(source, line), what))) for line, what in problems[1:]]
+        more = [": ".join(filter(None, (_prefix(source, line), what))) for line, what in problems[1:]]
         if error.count > len(problems):
             more.append(f"and {error.count - len(problems)} more")
         line, what = problems[0]
         raise FileError(what, source=source, line=line, more=tuple(more)) from None
     if not any(sets):
-        raise FileError("the file holds no parameter", source=source)
+        raise FileError("the file contains no parameters", source=source)
     return ParamFile(sets, form, source, header)
 
 
 def _problem(place: Sequence[str | int], what: str, text: str) -> tuple[int | None, str]:
-    """The line of what is wrong, where that is certain, and the words for it."""
+    """Return the line of a problem, if certain, and its description."""
     line = None
     if len(place) > 3 and place[2] == "params":
         line = _line_of(text, str(place[3]))
-    told = f"{'.'.join(map(str, place)) or 'the document'}: {what}"
-    return line, told if len(told) <= LONGEST_PROBLEM else f"{told[:LONGEST_PROBLEM]}…"
+    described = f"{'.'.join(map(str, place)) or 'the document'}: {what}"
+    is_short = len(described) <= PROBLEM_LENGTH_MAX
+    return line, described if is_short else f"{described[:PROBLEM_LENGTH_MAX]}…"
 
 
-def _at(source: str, line: int | None) -> str:
+def _prefix(source: str, line: int | None) -> str:
     return source if line is None else f"{source}:{line}" if source else f"line {line}"
 
 
 def _line_of(text: str, key: str, *, last: bool = False) -> int | None:
-    """The line in which a key stands, if there is one of this name alone, or the last one is meant."""
+    """Return the line of a key, if the key occurs once or the last occurrence is meant."""
     found = [match.start() for match in re.finditer(rf"""["']?{re.escape(key)}["']?[ \t]*:""", text)]
     return text.count("\n", 0, found[-1]) + 1 if found and (last or len(found) == 1) else None
 
@@ -183,35 +184,35 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     content: dict[str, Any] = {}
     for key, value in pairs:
         if key in content:
-            raise ValueError(f"{shown(key)} stands twice", key)
+            raise ValueError(f"{excerpt(key)} occurs twice", key)
         content[key] = value
     return content
 
 
 def _no_constant(word: str) -> NoReturn:
-    raise ValueError(f"{word} is no JSON; as text it can stand: {json.dumps(word)}")
+    raise ValueError(f"{word} is not valid JSON; write it as text: {json.dumps(word)}")
 
 
 def _finite(text: str) -> float:
     number = float(text)
     if math.isinf(number):
-        raise ValueError(f"{shown(text)} is beyond the range of a double")
+        raise ValueError(f"{excerpt(text)} is beyond the range of a double")
     return number
 
 
 def _whole(text: str) -> int:
     try:
         return int(text)
-    except ValueError:  # Python converts no more than some thousand digits
-        raise ValueError(f"{shown(text)} is beyond the range of every type") from None
+    except ValueError:  # Python limits the digits of an int
+        raise ValueError(f"{excerpt(text)} is beyond the range of every type") from None
 
 
 def _header(around: ParamFile) -> list[str]:
     return [_encodable(line) for line in (*around.header, *around.footer)]
 
 
-def _about(params: ParamSet) -> dict[str, Any]:
-    """What a document says of a set but for its parameters."""
+def _set_fields(params: ParamSet) -> dict[str, Any]:
+    """Return the fields of a set, without its parameters."""
     identity = None if params.identity is None else asdict(params.identity)
     about = {
         "system": params.system,
@@ -224,14 +225,14 @@ def _about(params: ParamSet) -> dict[str, Any]:
 
 
 def _fields(param: WrittenParam) -> dict[str, Any]:
-    """What a document says of a parameter."""
+    """Return the fields of a parameter."""
     fields: dict[str, Any] = {"value": _scalar(param.value, param.type)}
     if param.type is not None:
         is_wide = isinstance(param.type, ParamType) and param.type.size == 8
         fields["type"] = type_name(param.type)
         fields["bits"] = f"{param.bits_as(param.type):0{16 if is_wide else 8}x}"
     elif isinstance(param.value, float) and not is_plain(param.value):
-        raise UsageError(f"{param.name} is a NaN with bits of its own, and has no type to say which")
+        raise UsageError(f"{param.name} is a NaN with payload bits, and has no type for them")
     if param.default is not None:
         fields["default"] = _scalar(param.default, param.type)
     if param.comment:
@@ -249,7 +250,7 @@ def _scalar(value: Value, kind: ParamType | int | None) -> int | float | str:
 
 
 def _encodable(text: str) -> str:
-    """Text without halves of characters, which a file's name may have and a document may not."""
+    """Return text without lone surrogates, which a file name may have and a document may not."""
     return text.encode("utf-8", "backslashreplace").decode("utf-8")
 
 
@@ -258,13 +259,13 @@ def _json(content: object) -> str:
 
 
 def _flow(content: object) -> str:
-    """A value in YAML, on one line."""
+    """Return a value in YAML, on one line."""
     if isinstance(content, dict):
         return f"{{{', '.join(f'{_key(key)}: {_flow(each)}' for key, each in content.items())}}}"
     if isinstance(content, str):
         return _beyond_ascii.sub(_escaped, json.dumps(content, ensure_ascii=False))
     text = _json(content)
-    # older YAML takes a number with an exponent and no point for text
+    # YAML 1.1 parses a number with an exponent and no point as text.
     return _exponent.sub(r"\1.0\2", text)
 
 

@@ -1,4 +1,4 @@
-"""What the document of paramclient may hold, guarded field by field; only reading one loads this room."""
+"""Schema and validation of paramclient's own file format. Loads pydantic; only reading imports it."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from paramclient.errors import UsageError
-from paramclient.files.text import MOST_PROBLEMS, as_type
+from paramclient.files.text import PROBLEMS_MAX, as_type
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, Value, check_name, from_bits, known_type
 
-__all__ = ["Place", "Wrong", "parse"]
+__all__ = ["InvalidDocument", "Place", "parse"]
 
 Place = tuple[str | int, ...]
-"""Where in a document something stands: keys and positions from the top."""
+"""Position in a document: keys and list indices from the top."""
 
-_A_NUMBER = "expected a number (or NaN, Infinity, 0x and 8 digits for raw bytes)"
+_NUMBER_EXPECTED = "expected a number (or NaN, Infinity, 0x and 8 digits for raw bytes)"
 _WORDS = {"NaN": float("nan"), "Infinity": float("inf"), "-Infinity": float("-inf")}
 _raw = re.compile(r"0x([0-9a-fA-F]{8})").fullmatch
 _type_number = re.compile(r"TYPE_([0-9]{1,3})").fullmatch
@@ -31,13 +31,13 @@ _bits = re.compile(r"[0-9a-fA-F]{8}(?:[0-9a-fA-F]{8})?").fullmatch
 
 
 def parse(content: object, source: str) -> tuple[tuple[ParamSet, ...], tuple[str, ...]]:
-    """The sets and the header of a document that was read as JSON or YAML.
+    """Return the sets and the header of a document that was parsed from JSON or YAML.
 
-    Sets and parameters are validated one by one: pydantic would keep an error for each bad one, which is many
-    times as large as what it is about, and would let no other thread run meanwhile.
+    Validates sets and parameters one by one: for a whole document, pydantic would keep an error for each bad
+    parameter, each error many times larger than the parameter, and would block all other threads.
 
     Raises:
-        Wrong: it is not one.
+        InvalidDocument: the content is not a valid document.
     """
     faults = _Faults()
     document = faults.checked(_Document, content, ())
@@ -47,18 +47,18 @@ def parse(content: object, source: str) -> tuple[tuple[ParamSet, ...], tuple[str
         for number, each in enumerate(raw_sets if isinstance(raw_sets, list) else ())
     ]
     faults.raise_if_any()
-    assert document is not None, "else there is a fault"
+    assert document is not None, "otherwise raise_if_any has raised"
     sets = [each.params(source, faults) for each in found]
     faults.raise_if_any()
     return tuple(sets), tuple(document.header)
 
 
-class Wrong(Exception):
-    """A document is not as it should be.
+class InvalidDocument(Exception):
+    """A document does not follow the schema.
 
     Attributes:
-        problems: the first places in it, and what is wrong there.
-        count: how many there are.
+        problems: the first positions with a problem, each with its description.
+        count: the number of all problems.
     """
 
     def __init__(self, problems: list[tuple[Place, str]], count: int) -> None:
@@ -68,41 +68,41 @@ class Wrong(Exception):
 
 
 class _Faults:
-    """What is wrong with a document: the first few in words, the others by their number."""
+    """Problems of a document: a description of the first ones, and their total number."""
 
     def __init__(self) -> None:
         self._problems: list[tuple[Place, str]] = []
         self._count = 0
 
-    def add(self, place: Place, told: Callable[[], str]) -> None:
-        """One more."""
+    def add(self, place: Place, describe: Callable[[], str]) -> None:
+        """Add a problem."""
         self._count += 1
-        if self._count <= MOST_PROBLEMS:
-            self._problems.append((place, told()))
+        if self._count <= PROBLEMS_MAX:
+            self._problems.append((place, describe()))
 
     def checked(self, model: type[_Known], content: object, place: Place) -> _Known | None:
-        """The content as this model has it; None where it is wrong."""
+        """Return the content as an instance of the model; None if it is invalid."""
         found = None
         try:
             found = model.model_validate(content)
         except ValidationError as error:
             for each in error.errors(include_url=False):
-                self.add((*place, *each["loc"]), partial(_told, each))
+                self.add((*place, *each["loc"]), partial(_description, each))
         if isinstance(content, dict):
             for name in content:
                 if name not in model.model_fields:
-                    self.add((*place, name), lambda: "no such field is known")
+                    self.add((*place, name), lambda: "unknown field")
         return found
 
     def raise_if_any(self) -> None:
-        """Raise Wrong for all of it, if there is anything."""
+        """Raise InvalidDocument if there is a problem."""
         if self._count:
-            raise Wrong(self._problems, self._count)
+            raise InvalidDocument(self._problems, self._count)
 
 
 @dataclass(frozen=True, slots=True)
 class _Written:
-    """A set as it is written."""
+    """One set of a document, with its fields validated one by one."""
 
     place: Place
     set: _Set | None
@@ -111,7 +111,7 @@ class _Written:
 
     @classmethod
     def of(cls, content: object, place: Place, faults: _Faults) -> _Written:
-        """The set that stands at a place."""
+        """Validate the set at a position of the document."""
         found = faults.checked(_Set, content, place)
         fields = content if isinstance(content, dict) else {}
         identity = fields.get("identity")
@@ -125,8 +125,8 @@ class _Written:
         return cls(place, found, who, written)
 
     def params(self, source: str, faults: _Faults) -> ParamSet:
-        """Its parameters, where the fields of each agree."""
-        assert self.set is not None, "else there was a fault"
+        """Return the parameter set; add a problem for each parameter with contradictory fields."""
+        assert self.set is not None, "otherwise the caller has raised its problem"
         params = {}
         for name, written in self.written.items():
             try:
@@ -163,7 +163,7 @@ class _Identity(_Model):
 
 def _is_scalar(content: object) -> object:
     if isinstance(content, bool) or not isinstance(content, int | float | str):
-        raise ValueError(_A_NUMBER)
+        raise ValueError(_NUMBER_EXPECTED)
     return content
 
 
@@ -178,7 +178,7 @@ class _Param(_Model):
     comment: str = ""
 
     def param(self, name: str) -> WrittenParam:
-        """The parameter; UsageError where its fields contradict each other."""
+        """Return the parameter; raise UsageError if its fields contradict each other."""
         kind = None if self.type is None else _kind(self.type)
         value = _value(self.value)
         default = None if self.default is None else _value(self.default)
@@ -201,7 +201,7 @@ class _Set(_Model):
     @model_validator(mode="before")
     @classmethod
     def _time_is_text(cls, content: Any) -> Any:
-        """A bare number could be seconds or milliseconds."""
+        """Reject a number: it could be seconds or milliseconds."""
         at = content.get("at") if isinstance(content, dict) else None
         if at is not None and not (isinstance(at, str) and _date(at)):
             raise ValueError("the time `at` is written as 2026-01-31T12:00:00Z")
@@ -227,7 +227,7 @@ def _kind(text: str) -> ParamType | int:
         number = int(match[1])
         if number <= 255 and not isinstance(known_type(number), ParamType):
             return number
-    raise UsageError(f"no type is called {text!r}; types are {', '.join(ParamType.__members__)}")
+    raise UsageError(f"unknown type {text!r}; the types are {', '.join(ParamType.__members__)}")
 
 
 def _value(written: int | float | str) -> Value:
@@ -237,19 +237,19 @@ def _value(written: int | float | str) -> Value:
         return _WORDS[written]
     if match := _raw(written):
         return int(match[1], 16).to_bytes(4, "little")
-    raise UsageError(f"{_A_NUMBER}, found {written!r}")
+    raise UsageError(f"{_NUMBER_EXPECTED}, found {written!r}")
 
 
 def _with_bits(value: Value, kind: ParamType | int | None, text: str) -> Value:
-    """The value that the bits say, if that is the value which stands beside them."""
+    """Return the value of the bits, if it agrees with the given value; else raise UsageError."""
     if kind is None:
-        raise UsageError("bits say nothing without a type")
+        raise UsageError("bits need a type")
     if not _bits(text):
         raise UsageError(f"bits are 8 or 16 hexadecimal digits, not {text!r}")
     bits = int(text, 16)
     size = kind.size if isinstance(kind, ParamType) and not isinstance(value, bytes) else 4
     if bits >= 1 << 8 * size:
-        raise UsageError(f"bits {text} are more than the type has")
+        raise UsageError(f"bits {text} exceed the size of the type")
     exact = from_bits(bits, kind, is_raw=isinstance(value, bytes))
     both_nan = value != value and exact != exact
     if exact != value and not both_nan:
@@ -257,8 +257,8 @@ def _with_bits(value: Value, kind: ParamType | int | None, text: str) -> Value:
     return exact
 
 
-def _told(error: Any) -> str:
-    """What pydantic found, in a sentence."""
+def _description(error: Any) -> str:
+    """Return one of pydantic's errors as a sentence."""
     if error["type"] == "missing":
         return "the field is missing"
     found = error["input"]

@@ -1,4 +1,4 @@
-"""Which form a file has, and from its bytes to what it says and back."""
+"""Format detection, and conversion of parameter files from and to bytes."""
 
 from __future__ import annotations
 
@@ -18,35 +18,35 @@ from paramclient.model.values import check_name
 __all__ = ["LARGEST_FILE", "Content", "dumps", "loads"]
 
 LARGEST_FILE: Final = 16 * 1024 * 1024
-"""Bytes of the largest file that is looked at: 65,535 parameters, as many as an index can count, with names,
-bits, defaults and comments take less in the longest of the forms."""
+"""Largest parameter file, in bytes. 65,535 parameters, the most that an index can count, with names, bits,
+defaults and comments take less in the longest format."""
 
 Content: TypeAlias = ParamFile | ParamSet | Iterable[ParamSet]
-"""What can be written: a file as it was read, the parameters of one component, or of several."""
+"""Content to write: a file as read, the parameters of one component, or of several."""
 
 
 def loads(
     data: bytes, *, source: str = "", form: FileForm | str | None = None, includes: Includes | None = None
 ) -> ParamFile:
-    """Read a parameter file from its bytes.
+    """Parse a parameter file.
 
-    The form is told by what is in it. MAVProxy and Mission Planner read each other's lists, so there the
-    ending counts (`.parm`, `.param`); with another one a comma means Mission Planner. For a text whose first
-    line fits no form, the ending says what is expected.
+    Detects the format from the content. MAVProxy and Mission Planner read each other's lists, so the
+    extension decides between them (`.parm`, `.param`); with another extension, a comma means Mission
+    Planner. If the first line matches no format, the extension decides which format the error describes.
 
     Args:
-        data: all of it.
-        source: its name, for errors and `ParamSet.source`.
-        form: the form that it has; None to find out.
-        includes: follows the `@include` lines of a list; None refuses them, as bytes lie in no folder.
+        data: the complete file.
+        source: the file's name, for errors and `ParamSet.source`.
+        form: the format; None to detect it.
+        includes: reads the files of `@include` lines; None rejects such lines, as bytes have no folder.
 
     Raises:
-        FileError: it has none of the forms, is damaged, or holds no parameter. Up to 20 bad lines are named.
-        UsageError: no such form.
+        FileError: unknown format, damaged, or without parameters. The error names up to 20 bad lines.
+        UsageError: unknown format name.
     """
     form = None if form is None else as_form(form)
     if len(data) > LARGEST_FILE:
-        raise FileError(f"no parameter file has more than {LARGEST_FILE} bytes", source=source)
+        raise FileError(f"a parameter file has at most {LARGEST_FILE} bytes", source=source)
     if not data:
         raise FileError("the file is empty", source=source)
     if form is FileForm.PCK or (form is None and param_pck.is_packed(data)):
@@ -67,22 +67,23 @@ def loads(
 
 
 def dumps(content: Content, *, form: FileForm | str | None = None, target: str = "") -> bytes:
-    """The bytes of a parameter file.
+    """Return the bytes of a parameter file.
 
     Args:
-        content: what is to be in it. A `ParamFile` keeps its header, footer and comments, as far as the form
-            has such; others get a header that says whose parameters they are.
-        form: the form; None for that of a `ParamFile`.
-        target: the name of the file that it is for, for errors.
+        content: the content to write. A `ParamFile` keeps its header, footer and comments if the format
+            supports them; other content gets a header that names the vehicle.
+        form: the format; None for that of a `ParamFile`.
+        target: the name of the target file, for errors.
 
     Raises:
-        FileError: the form cannot say it (what each can is in the guide), or there is no parameter.
-        UsageError: no such form, or none is given.
+        FileError: the format cannot express the content (the guide lists what each can), or there are no
+            parameters.
+        UsageError: unknown format, or none given.
     """
     if form is None and isinstance(content, ParamFile):
         form = content.form
     if form is None:
-        raise UsageError("a form is needed to write parameters")
+        raise UsageError("give the format in which to write the parameters")
     form = as_form(form)
     try:
         around = _as_file(content, form)
@@ -94,16 +95,16 @@ def dumps(content: Content, *, form: FileForm | str | None = None, target: str =
 
 def _bytes(sets: list[ParamSet], form: FileForm, around: ParamFile) -> bytes:
     if not sets:
-        raise UsageError("there is no parameter to write")
+        raise UsageError("there are no parameters to write")
     if len(sets) > 1 and form in (FileForm.PARM, FileForm.MISSION_PLANNER, FileForm.PCK):
         held = ", ".join(map(address, sets))
-        raise UsageError(f"the form {form} holds one component, and there are {held}; choose one")
+        raise UsageError(f"the format {form} holds one component, and there are {held}; choose one")
     _check(sets)
     match form:
         case FileForm.PCK:
             return param_pck.write_packed(sets[0])
         case FileForm.PX4_SCRIPT:
-            raise UsageError("start scripts of PX4 are read and not written")
+            raise UsageError("PX4 start scripts can be read but not written")
         case FileForm.QGC:
             lines = line_formats.write_qgc(sets, around)
         case FileForm.JSON:
@@ -116,14 +117,14 @@ def _bytes(sets: list[ParamSet], form: FileForm, around: ParamFile) -> bytes:
 
 
 def _form_of(text: str, source: str) -> FileForm:
-    """The form of a text.
+    """Return the format of a text.
 
     Raises:
-        FileError: nothing in it says anything.
+        FileError: the text has no line with content.
     """
     first = next((line for line in lines_of(text) if line.text), None)
     if first is None:
-        raise FileError("the file holds no parameter", source=source)
+        raise FileError("the file contains no parameters", source=source)
     if first.text.startswith("{"):
         return FileForm.JSON
     if line_formats.is_qgc_row(first.text):
@@ -136,7 +137,7 @@ def _form_of(text: str, source: str) -> FileForm:
     if named in (FileForm.PARM, FileForm.MISSION_PLANNER):
         return named
     if named in (FileForm.QGC, FileForm.JSON, FileForm.YAML) and not line_formats.is_pair(first.text):
-        return named  # it is that or nothing, and the error says what was expected of it
+        return named  # no other format is possible, and reading gives the error for this one
     return FileForm.MISSION_PLANNER if "," in first.text else FileForm.PARM
 
 
@@ -145,12 +146,12 @@ def _as_file(content: Content, form: FileForm) -> ParamFile:
         return content
     sets = (content,) if isinstance(content, ParamSet) else tuple(content)
     if form in (FileForm.JSON, FileForm.YAML):
-        return ParamFile(sets, form)  # what a header would say stands in fields
-    return ParamFile(sets, form, header=tuple(line for each in sets for line in _about(each)))
+        return ParamFile(sets, form)  # the document has fields for the header's facts
+    return ParamFile(sets, form, header=tuple(line for each in sets for line in _header_lines(each)))
 
 
-def _about(params: ParamSet) -> Iterator[str]:
-    """What is known of a set, in lines for people."""
+def _header_lines(params: ParamSet) -> Iterator[str]:
+    """Generate a description of a set, for the header of a file."""
     who = params.identity
     kind = "" if who is None else f", {autopilot_name(who.autopilot)}"
     parameters = "parameter" if len(params) == 1 else "parameters"
@@ -167,7 +168,7 @@ def _about(params: ParamSet) -> Iterator[str]:
 
 
 def _check(sets: list[ParamSet]) -> None:
-    """Nobody could tell two sets of one component apart, nor use odd names or ids: UsageError."""
+    """Raise UsageError for invalid names or ids, or two sets of one component, which cannot be told apart."""
     seen = set()
     for each in sets:
         for number in (each.system, each.component):
@@ -175,7 +176,7 @@ def _check(sets: list[ParamSet]) -> None:
                 raise UsageError(f"systems and components have ids from 1 to 255, not {number}")
         for param in each.values():
             check_name(param.name)
-        whose = (each.system, each.component or AUTOPILOT)
-        if whose in seen:
-            raise UsageError(f"two sets are of one component, {address(each)}")
-        seen.add(whose)
+        ids = (each.system, each.component or AUTOPILOT)
+        if ids in seen:
+            raise UsageError(f"two sets have the same component, {address(each)}")
+        seen.add(ids)

@@ -1,7 +1,7 @@
-"""`@include FILE` in lists of parameters: which files it may name, and reading them.
+"""`@include FILE` in parameter lists: which files may be included, and reading them.
 
-ArduPilot's build tools put the named file in the place of the line (chibios_hwdef.py), its path relative to
-the file with the line. In ArduPilot's tree all of them name a file in a folder beside that of the file.
+ArduPilot's build tools replace the line with the named file (chibios_hwdef.py); its path is relative to the
+file with the line. In ArduPilot's tree, all such lines name a file in a folder next to that of the file.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from paramclient.files.text import decode_text
 __all__ = ["Include", "Includes"]
 
 DEPTH_MAX: Final = 8
-"""Files that may include each other in a row."""
+"""Largest depth of nested `@include` lines, so that a chain of files ends."""
 FILES_MAX: Final = 64
-"""Files that one file may bring in, in all: two lines in each of a few files would bring in thousands."""
+"""Files that one file may include in total. Two lines in each of a few files could include thousands."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,9 +28,9 @@ class Include:
     """An included file.
 
     Attributes:
-        text: what it holds.
-        source: its name, for errors.
-        includes: those of its own lines.
+        text: the content.
+        source: the file's name, for errors.
+        includes: reads the files that this file includes.
     """
 
     text: str
@@ -46,16 +46,16 @@ class _Budget:
 
 @dataclass(frozen=True, slots=True)
 class Includes:
-    """Follows the `@include` lines of one file.
+    """Reads the files of the `@include` lines of one file.
 
-    A path is relative to the folder of the file with the line. The file must lie in the folder of the first
-    file, beside that folder, or below either; symbolic links are followed before that is looked at.
+    A path is relative to the folder of the file with the line. The included file must be in the folder of the
+    first file, beside that folder, or below either; symbolic links are resolved before the check.
 
     Args:
-        source: the file's name as it was given.
-        read: reads a file; OSError where it cannot be read, FileError where it is not to be.
-        chain: the real paths of the files that include each other, from the first one to this one.
-        budget: what all of them together may still bring in.
+        source: the file's name as given.
+        read: reads a file; raises OSError if it cannot be read, FileError if it must not be.
+        chain: the real paths of the files that include each other, from the first file to this one.
+        budget: the files and bytes that all of them together may still include.
     """
 
     source: str
@@ -65,18 +65,18 @@ class Includes:
 
     @classmethod
     def of(cls, source: str, read: Callable[[str], bytes], *, size_max: int) -> Includes:
-        """Those of a file on the disk that nothing includes, of at most so many bytes in all."""
+        """Return the includes of a file on disk, limited to a total size in bytes."""
         return cls(source, read, (Path(os.path.realpath(source)),), _Budget(size_max))
 
     def follow(self, path: str) -> Include:
-        """Read the file that a line names.
+        """Read the file of an `@include` line.
 
         Raises:
-            UsageError: it is not to be included or cannot be read; the reason in words.
-            FileError: it is no text.
+            UsageError: the file must not be included or cannot be read; with the reason in words.
+            FileError: the file is not text.
         """
         if PurePath(path).is_absolute():
-            raise UsageError("an absolute path is not followed")
+            raise UsageError("absolute paths are not allowed")
         name = str(Path(self.source).parent / path)
         try:
             real = Path(os.path.realpath(name))
@@ -89,18 +89,18 @@ class Includes:
         self.budget.files -= 1
         self.budget.size -= len(data)
         if self.budget.size < 0:
-            raise UsageError("the files that are included are too large")
+            raise UsageError("the included files are too large together")
         includes = Includes(name, self.read, (*self.chain, real), self.budget)
         return Include(decode_text(data, name), name, includes)
 
     def _check(self, real: Path) -> None:
-        """Raise UsageError where this file is not to be included."""
+        """Raise UsageError if the file must not be included."""
         top = self.chain[0].parent.parent
         if not real.is_relative_to(top):
-            raise UsageError(f"it lies outside of {top}; files are included from there")
+            raise UsageError(f"it lies outside of {top}; only files below that folder can be included")
         if real in self.chain:
-            raise UsageError("the files include each other in a circle")
+            raise UsageError("the files include each other (circular @include)")
         if len(self.chain) > DEPTH_MAX:
-            raise UsageError(f"more than {DEPTH_MAX} files include each other in a row")
+            raise UsageError(f"@include is nested more than {DEPTH_MAX} files deep")
         if self.budget.files == 0:
             raise UsageError(f"more than {FILES_MAX} files are included")

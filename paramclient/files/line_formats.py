@@ -1,10 +1,10 @@
-"""The forms that have a parameter on each line: QGroundControl's, MAVProxy's, Mission Planner's.
+"""Line-based formats with one parameter per line: QGroundControl's, MAVProxy's, Mission Planner's.
 
-QGroundControl (user guide, "Parameter File Format"; ParameterManager.cc) splits a line at tabs, takes those
+QGroundControl (user guide, "Parameter File Format"; ParameterManager.cc) splits a line at tabs, accepts lines
 with five columns and skips those that begin with `#`. MAVProxy (pymavlink, mavparm.py) and ArduPilot
-(AP_Param.cpp) take a name and a value with spaces, tabs or a comma between them; `#` ends a line for the one,
-and the other looks at nothing behind the value. Mission Planner (ParamFile.cs) skips without a word every
-line that has more than these two. So comments are written on lines of their own, which all of them skip.
+(AP_Param.cpp) accept a name and a value separated by spaces, tabs or a comma; MAVProxy ends a line at `#`,
+ArduPilot ignores everything after the value. Mission Planner (ParamFile.cs) silently skips every line with
+more than these two. Comments are therefore written on separate lines, which all of them skip.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ from paramclient.files.text import (
     Problems,
     as_type,
     comment_lines,
+    excerpt,
     lines_of,
     parse_number,
-    shown,
     value_text,
 )
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -36,15 +36,15 @@ from paramclient.model.values import ParamType, Value, check_name
 __all__ = ["is_pair", "is_qgc_row", "read_pairs", "read_qgc", "write_pairs", "write_qgc"]
 
 DELETED_SHOWN_MAX: Final = 10
-"""Names that the note on one `@delete` line lists."""
+"""Names that the note on one `@delete` line lists, so that the note stays readable."""
 DELETES_MAX: Final = 256
-"""`@delete` lines of one file: each looks through all parameters above it."""
-DELETE_LOOKS_MAX: Final = 1_000_000
-"""Parameters that the `@delete` lines of one file look at, one after the other: half a second."""
+"""`@delete` lines of one file: each is compared with all parameters above it."""
+DELETE_COMPARISONS_MAX: Final = 1_000_000
+"""Comparisons of parameters with `@delete` lines in one file; takes half a second."""
 _QGC_COLUMNS: Final = "Vehicle-Id Component-Id Name Value Type"
 _QGC_ROW: Final = "vehicle, component, name, value and type, with tabs between them"
 _qgc_nan: Final = re.compile(r"--\.-+").fullmatch
-"""What QGroundControl writes for NaN (Fact.cc)."""
+"""QGroundControl's notation of NaN (Fact.cc)."""
 _include: Final = re.compile(r"@include[ \t]+(.*\S)").fullmatch
 _delete: Final = re.compile(r"@delete[ \t]+(\S{1,64})").fullmatch
 _blanks: Final = re.compile(r"[ \t]+")
@@ -56,50 +56,50 @@ _qgc_row: Final = re.compile(r"[0-9]+[ \t]+[0-9]+[ \t]+[^ \t]+[ \t]+[^ \t]+[ \t]
 
 @dataclass(slots=True)
 class _Lines:
-    """What the lines of one file say, with those of the files that it includes.
+    """The content of one file, with that of the files that it includes.
 
     Attributes:
-        params: the parameters in order, each with the place where it stands, for notes.
-        notes: what its `@delete` lines took out.
-        deletes: how many such lines it has.
-        looks: how many parameters these have looked at.
+        params: the parameters in order, each with its position, for notes.
+        notes: a note for each `@delete` line.
+        deletes: number of `@delete` lines.
+        comparisons: number of parameters that were compared with these lines.
     """
 
     params: list[tuple[WrittenParam, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     deletes: int = 0
-    looks: int = 0
+    comparisons: int = 0
 
     def delete(self, pattern: str, place: str) -> None:
-        """Take out the parameters so far whose names fit a glob."""
+        """Remove the parameters so far whose names match a glob."""
         self.deletes += 1
-        self.looks += len(self.params)
+        self.comparisons += len(self.params)
         names = {param.name for param, _ in self.params if fnmatchcase(param.name, pattern)}
         if not names:
-            self.notes.append(f"@delete {pattern} in {place} fits no parameter above it.")
+            self.notes.append(f"@delete {pattern} in {place} matches no parameter above it.")
             return
         self.params = [each for each in self.params if each[0].name not in names]
         listed = ", ".join(sorted(names)[:DELETED_SHOWN_MAX])
         listed += ", …" if len(names) > DELETED_SHOWN_MAX else ""
-        self.notes.append(f"@delete {pattern} in {place} takes out {listed}.")
+        self.notes.append(f"@delete {pattern} in {place} removes {listed}.")
 
 
 def read_pairs(text: str, form: FileForm, source: str, includes: Includes | None = None) -> ParamFile:
     """Read a file with a name and a value on each line.
 
-    A name is followed by a value, with spaces, tabs, a comma or `=` between them, and by nothing else but a
-    comment, or ArduPilot's `@READONLY`, which is kept as one. `@include FILE` stands for the lines of another
-    file; of its comments only those of its parameters are kept. `@delete GLOB` takes out the parameters above
-    it in its file, and in those included there, whose names fit; forks of ArduPilot have it.
+    Name and value are separated by spaces, tabs, a comma or `=`. After the value, only a comment may follow,
+    or ArduPilot's `@READONLY`, which is kept as a comment. `@include FILE` is replaced with the lines of
+    another file, of which only the comments of parameters are kept. `@delete GLOB` removes the parameters
+    above it in its file, and in the files included there, whose names match; forks of ArduPilot have it.
 
     Args:
-        text: what the file holds.
-        form: which of the two it is.
-        source: its name, for errors.
-        includes: follows its `@include` lines; None for bytes that are no file on a disk.
+        text: the content.
+        form: which of the two formats the file has.
+        source: the file's name, for errors.
+        includes: reads the files of `@include` lines; None for bytes without a file on disk.
 
     Raises:
-        FileError: for any line that is something else, also in an included file.
+        FileError: a line is something else, also in an included file.
     """
     problems = Problems(source)
     lines = _Lines()
@@ -120,13 +120,13 @@ def _read_lines(
     *,
     is_included: bool,
 ) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Add the parameters of one file to `lines`, and what is wrong with it to `problems`."""
+    """Add the parameters of one file to `lines`, and its bad lines to `problems`."""
     expected = "NAME,VALUE" if form is FileForm.MISSION_PLANNER else "NAME VALUE"
 
     def include(line: Line, path: str) -> None:
         try:
             if includes is None:
-                raise UsageError("only a file on the disk can include another one")
+                raise UsageError("only a file on disk can include another file")
             found = includes.follow(path)
             inner, problems_inside = _Lines(), Problems(found.source)
             _read_lines(found.text, form, inner, problems_inside, found.includes, is_included=True)
@@ -137,7 +137,7 @@ def _read_lines(
             here = f"{problems.source}:{line.number}: includes that file"
             raise error.with_more(here) from None
         except UsageError as error:
-            problems.add(line.number, f"@include with a file that can be read ({error})", shown(line.text))
+            problems.add(line.number, f"@include with a file that can be read ({error})", excerpt(line.text))
 
     def take(line: Line, comment: str) -> None:
         place = f"{problems.source}:{line.number}" if is_included else f"line {line.number}"
@@ -146,10 +146,10 @@ def _read_lines(
             return
         if match := _delete(line.text):
             if lines.deletes >= DELETES_MAX:
-                problems.add(line.number, f"at most {DELETES_MAX} lines with @delete", shown(line.text))
-            elif lines.looks + len(lines.params) > DELETE_LOOKS_MAX:
-                most = f"@delete lines that look at {DELETE_LOOKS_MAX:,} parameters together"
-                problems.add(line.number, f"at most {most}", shown(line.text))
+                problems.add(line.number, f"at most {DELETES_MAX} lines with @delete", excerpt(line.text))
+            elif lines.comparisons + len(lines.params) > DELETE_COMPARISONS_MAX:
+                most = f"at most {DELETE_COMPARISONS_MAX:,} comparisons of @delete lines with parameters"
+                problems.add(line.number, most, excerpt(line.text))
             else:
                 lines.delete(match[1], place)
             return
@@ -157,57 +157,57 @@ def _read_lines(
         if words[-1] == "@READONLY":
             comment = f"{comment}\n@READONLY" if comment else "@READONLY"
             words.pop()
-        problem = _wrong_with_pair(line.text, words, expected)
+        problem = _pair_problem(line.text, words, expected)
         if problem is not None:
-            problems.add(line.number, problem, shown(line.text))
+            problems.add(line.number, problem, excerpt(line.text))
             return
         value = parse_number(words[1])
         assert value is not None
         number = None if is_included else line.number
         lines.params.append((WrittenParam(words[0], value, comment=comment, line=number), place))
 
-    return _walk(text, take)
+    return _read_commented_lines(text, take)
 
 
 def write_pairs(sets: Sequence[ParamSet], form: FileForm, around: ParamFile) -> Iterator[str]:
-    """The lines of a file with a name and a value on each.
+    """Generate the lines of a file with a name and a value on each line.
 
     Args:
-        sets: one set; the form cannot say more.
-        form: with a comma for Mission Planner, else with a space.
-        around: for what stands on top and at the end.
+        sets: one set, as the format has no components.
+        form: decides the separator: a comma for Mission Planner, else a space.
+        around: for header and footer.
 
     Raises:
-        UsageError: the form cannot say it.
+        UsageError: the format cannot express a name or a value.
     """
     comma = "," if form is FileForm.MISSION_PLANNER else " "
     rows = ((param, f"{_pair_name(param)}{comma}{value_text(param)}") for param in sets[0].values())
-    yield from _framed(around.header, rows, around.footer)
+    yield from _with_comments(around.header, rows, around.footer)
 
 
 def is_qgc_row(text: str) -> bool:
-    """Whether a line could be one of QGroundControl's."""
+    """Return whether a line could be one of QGroundControl's."""
     return _qgc_row(text) is not None
 
 
 def is_pair(text: str) -> bool:
-    """Whether a line has a name and a number."""
+    """Return whether a line has a name and a number."""
     words = _between.split(text)
     return len(words) >= 2 and _name(words[0]) is not None and parse_number(words[1]) is not None
 
 
 def read_qgc(text: str, source: str) -> ParamFile:
-    """Read a file of QGroundControl. Spaces between its columns do for tabs, as others write it so.
+    """Read a file of QGroundControl. Columns may be separated by spaces too, as other programs write them.
 
     Raises:
-        FileError: for any line that is not five columns, or whose value does not fit its type.
+        FileError: a line does not have five columns, or its value does not fit its type.
     """
     builder = Builder(Problems(source))
 
     def take(line: Line, comment: str) -> None:
         columns = _blanks.split(line.text)
         if len(columns) != 5:
-            builder.problems.add(line.number, _QGC_ROW, shown(line.text))
+            builder.problems.add(line.number, _QGC_ROW, excerpt(line.text))
             return
         try:
             system, component = (_address(each) for each in columns[:2])
@@ -215,19 +215,19 @@ def read_qgc(text: str, source: str) -> ParamFile:
             name, value = _checked_name(columns[2]), _qgc_value(columns[3])
             param = WrittenParam(name, _fitting(value, kind), kind, comment=comment, line=line.number)
         except UsageError as error:
-            builder.problems.add(line.number, str(error), shown(line.text))
+            builder.problems.add(line.number, str(error), excerpt(line.text))
             return
         builder.add(param, system=system, component=component)
 
-    header, footer = _walk(text, take)
+    header, footer = _read_commented_lines(text, take)
     return ParamFile(builder.result(), FileForm.QGC, source, header, footer, tuple(builder.notes))
 
 
 def write_qgc(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
-    """The lines of a file of QGroundControl.
+    """Generate the lines of a file of QGroundControl.
 
     Raises:
-        UsageError: a set does not say its system, or a parameter its type; or a value is no number.
+        UsageError: a set has no system id, or a parameter has no type; or a value is not a number.
     """
     header = list(around.header)
     if _QGC_COLUMNS not in header:
@@ -235,13 +235,15 @@ def write_qgc(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
         header = [f"Onboard parameters for Vehicle {systems}", "", *header, *([""] if header else [])]
         header.append(_QGC_COLUMNS)
     rows = ((param, _qgc_line(params, param)) for params in sets for param in params.values())
-    yield from _framed(header, rows, around.footer)
+    yield from _with_comments(header, rows, around.footer)
 
 
-def _walk(text: str, take: Callable[[Line, str], None]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Give each line that says something, with the comments that belong to it; return header and footer.
+def _read_commented_lines(
+    text: str, take: Callable[[Line, str], None]
+) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Call `take` for each line with content, with its comments; return header and footer.
 
-    What stands before the first parameter is the header, up to the last empty line if there is one.
+    The header is the comments above the first parameter, up to the last empty line if there is one.
     """
     header: list[str] = []
     waiting: list[str] = []
@@ -264,10 +266,10 @@ def _walk(text: str, take: Callable[[Line, str], None]) -> tuple[tuple[str, ...]
     return tuple(header), tuple(waiting)
 
 
-def _framed(
+def _with_comments(
     header: Sequence[str], rows: Iterable[tuple[WrittenParam, str]], footer: Sequence[str]
 ) -> Iterator[str]:
-    """The lines of a file, so that `_walk` finds the same header, comments and footer in it."""
+    """Generate the lines of a file, so that reading it gives the same header, comments and footer."""
     yield from comment_lines(header)
     for place, (param, row) in enumerate(rows):
         if param.comment:
@@ -278,14 +280,14 @@ def _framed(
     yield from comment_lines(footer)
 
 
-def _wrong_with_pair(text: str, words: list[str], expected: str) -> str | None:
-    """What was expected of a line, or None where it is as it should be."""
+def _pair_problem(text: str, words: list[str], expected: str) -> str | None:
+    """Return the expected content of a line, or None if the line is valid."""
     if text.startswith("@"):
-        return f"{expected} (a line for ArduPilot's tools that is not known)"
+        return f"{expected} (an unknown instruction for ArduPilot's tools)"
     if _decimal_comma(text) and len(words) == 3:
         return f"{expected} with a decimal point (1.5, not 1,5)"
     if len(words) == 3 and parse_number(words[1]) is not None:
-        return f"{expected} and nothing behind it (no unit, no further column)"
+        return f"{expected} and nothing after it (no unit, no further column)"
     if len(words) != 2:
         return expected
     if parse_number(words[1]) is None:
@@ -300,23 +302,23 @@ def _wrong_with_pair(text: str, words: list[str], expected: str) -> str | None:
 
 
 def _pair_name(param: WrittenParam) -> str:
-    """The name, if a line can begin with it; else UsageError."""
+    """Return the name if a line can begin with it; else raise UsageError."""
     if _name(param.name) is None:
-        raise UsageError(
-            f"the name {param.name!r} cannot stand in a line of this form; json and yaml keep it"
-        )
+        raise UsageError(f"the name {param.name!r} cannot be written in this format; json and yaml keep it")
     return param.name
 
 
 def _qgc_line(params: ParamSet, param: WrittenParam) -> str:
     if params.system is None:
-        raise UsageError("this form names the system of each parameter, and the set has none: give it one")
+        raise UsageError(
+            "this format needs the system id of each parameter, and the set has none: give it one"
+        )
     if not isinstance(param.type, ParamType):
-        raise UsageError(f"{param.name} has no type that MAVLink defines, and this form needs one")
+        raise UsageError(f"{param.name} has no type that MAVLink defines, and this format needs one")
     component = AUTOPILOT if params.component is None else params.component
     text = value_text(param)
     if isinstance(param.value, float) and not math.isfinite(param.value):
-        text = text.lower().removesuffix("inity")  # as Qt reads it
+        text = text.lower().removesuffix("inity")  # Qt's notation
     return f"{params.system}\t{component}\t{_pair_name(param)}\t{text}\t{int(param.type)}"
 
 

@@ -1,4 +1,4 @@
-"""What a parameter file is, once it is read: its sets, its form, and what stands around them."""
+"""ParamFile, the content of a parameter file, and FileForm, the supported formats."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from paramclient.model.paramset import ParamSet
 __all__ = ["AUTOPILOT", "ENDINGS", "FileForm", "ParamFile", "address", "as_form", "form_of_name"]
 
 AUTOPILOT: Final = 1
-"""MAV_COMP_ID_AUTOPILOT1: whom a file means that names no component."""
+"""MAV_COMP_ID_AUTOPILOT1: the component of a file that names no component."""
 
 
 class FileForm(StrEnum):
-    """The forms in which ground stations and autopilots keep parameters."""
+    """Formats in which ground stations and autopilots store parameters."""
 
     QGC = "qgc"
     """QGroundControl, `.params`: system, component, name, value and type, in columns."""
@@ -27,13 +27,13 @@ class FileForm(StrEnum):
     MISSION_PLANNER = "mission-planner"
     """Mission Planner, `.param`: a name, a comma and a value."""
     PCK = "pck"
-    """`param.pck`, the packed file that vehicles give over MAVFTP."""
+    """`param.pck`, the packed file that vehicles serve over MAVFTP."""
     PX4_SCRIPT = "px4-script"
-    """Lines of a PX4 start script: `param set NAME VALUE`. It is only read."""
+    """Lines of a PX4 start script: `param set NAME VALUE`. Can only be read."""
     JSON = "json"
-    """The document of paramclient: all that is known of a parameter, exactly."""
+    """paramclient's own format: all fields of every parameter, exactly."""
     YAML = "yaml"
-    """The same document, for people to edit. Reading it needs PyYAML."""
+    """paramclient's own format as YAML, for editing by hand. Reading it needs PyYAML."""
 
 
 ENDINGS: Final = {
@@ -45,19 +45,20 @@ ENDINGS: Final = {
     ".yaml": FileForm.YAML,
     ".yml": FileForm.YAML,
 }
+"""Formats by file extension, in lower case."""
 
 
 @dataclass(frozen=True, slots=True)
 class ParamFile:
-    """A parameter file as it was read.
+    """The content of a parameter file.
 
     Attributes:
-        sets: its parameters, a set for each component, in the order in which they come.
-        form: the form it has.
-        source: its name, as it was given.
-        header: the lines of comment on top, without their marks.
-        footer: those behind the last parameter. All others stand with the parameter that follows them.
-        notes: what a reader may want to know, in sentences: lines that say the same twice, parts left out.
+        sets: the parameters, one set per component, in the order of the file.
+        form: the format.
+        source: the file's name, as given.
+        header: the comment lines at the top, without comment characters.
+        footer: the comment lines after the last parameter. All others belong to the parameter below them.
+        notes: remarks for the user, in sentences: repeated lines, parts left out.
     """
 
     sets: tuple[ParamSet, ...]
@@ -68,16 +69,16 @@ class ParamFile:
     notes: tuple[str, ...] = ()
 
     def choose(self, component: int | None = None, *, system: int | None = None) -> ParamSet:
-        """The set of a component.
+        """Return the set of a component.
 
-        A set that names no system or component fits every one that is asked for.
+        A set without system or component id matches every id.
 
         Args:
-            component: its id; None for the autopilot, or for the only one that there is.
-            system: its system id; None for the only one that fits.
+            component: component id; None for the autopilot, or for the only component.
+            system: system id; None for the only one that matches.
 
         Raises:
-            FileError: none fits, or more than one. It names what there is.
+            FileError: no set or several sets match. The error lists the sets.
         """
         fits = [each for each in self.sets if system is None or each.system in (None, system)]
         if component is not None:
@@ -89,8 +90,8 @@ class ParamFile:
         wanted = f"{'any system' if system is None else f'system {system}'}, "
         wanted += "the autopilot" if component is None else f"component {component}"
         there = ", ".join(map(address, self.sets))
-        many = "more than one fits" if fits else "none fits"
-        raise FileError(f"{many} ({wanted}); the file holds {there}", source=self.source)
+        many = "several sets match" if fits else "no set matches"
+        raise FileError(f"{many} ({wanted}); the file contains {there}", source=self.source)
 
     def __repr__(self) -> str:
         held = ", ".join(f"{address(each)}: {len(each)}" for each in self.sets)
@@ -98,34 +99,34 @@ class ParamFile:
 
 
 def address(params: ParamSet) -> str:
-    """Whose parameters these are: `1/100`, and a question mark for what is not said."""
+    """Return the system and component id of a set, `1/100`, with a question mark for an unknown id."""
     return "/".join("?" if each is None else str(each) for each in (params.system, params.component))
 
 
 def as_form(form: FileForm | str) -> FileForm:
-    """The form of this name.
+    """Return the format with this name.
 
     Raises:
-        UsageError: there is none.
+        UsageError: there is no such format.
     """
     try:
         return FileForm(form)
     except ValueError:
-        raise UsageError(f"no form of file is called {form!r}; there are {_listed(FileForm)}") from None
+        raise UsageError(f"unknown file format {form!r}; the formats are {_listed(FileForm)}") from None
 
 
 def form_of_name(name: str) -> FileForm:
-    """The form that the ending of a file's name stands for.
+    """Return the format for the extension of a file's name.
 
     Raises:
-        FileError: for none.
+        FileError: the extension is unknown.
     """
     ending = PurePath(name).suffix.lower()
     form = ENDINGS.get(ending)
     if form is None:
         raise FileError(
-            f"the ending {ending!r} stands for no form; name one ({_listed(FileForm)}), or end in one of "
-            f"{_listed(ENDINGS)}",
+            f"unknown file extension {ending!r}. Choose a format ({_listed(FileForm)}), or one of the "
+            f"extensions {_listed(ENDINGS)}",
             source=name,
         )
     return form

@@ -1,4 +1,4 @@
-"""param.pck as a parameter file: types, exact values and defaults, and nothing about whose they are."""
+"""param.pck as a parameter file: types, exact values and defaults, without vehicle and component."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ _MAGICS = (b"\x1b\x67", b"\x1c\x67")
 
 
 def is_packed(data: bytes) -> bool:
-    """Whether these bytes begin as such a file does."""
+    """Return whether these bytes begin like a packed parameter file."""
     return data.startswith(_MAGICS)
 
 
 def read_packed(data: bytes, source: str) -> ParamFile:
-    """Read a file as a vehicle gives it, or as it is written to one.
+    """Read a packed file in the format that a vehicle serves, or in the format that is uploaded to a vehicle.
 
     Raises:
-        FileError: it is none.
+        FileError: the file is invalid.
     """
     notes = []
     with_defaults = False
@@ -33,11 +33,11 @@ def read_packed(data: bytes, source: str) -> ParamFile:
             held = param_pck.decode(data)
             entries, with_defaults = held.entries, held.with_defaults
             if held.total > len(entries):
-                notes.append(f"The file holds {len(entries)} of the vehicle's {held.total} parameters.")
+                notes.append(f"The file contains {len(entries)} of the vehicle's {held.total} parameters.")
     except PackError as error:
-        raise FileError(f"no packed parameter file: {error}", source=source) from error
+        raise FileError(f"invalid packed parameter file: {error}", source=source) from error
     if not entries:
-        raise FileError("the file holds no parameter", source=source)
+        raise FileError("the file contains no parameters", source=source)
     params = {}
     for name, kind, bits, default in entries:
         value = from_bits(bits, kind)
@@ -49,10 +49,10 @@ def read_packed(data: bytes, source: str) -> ParamFile:
 
 
 def write_packed(params: ParamSet) -> bytes:
-    """The bytes of such a file. Defaults are in it where all of them are known.
+    """Return the bytes of a packed file, with defaults if all of them are known.
 
     Raises:
-        UsageError: the file cannot say it: it knows four types, and numbers only.
+        UsageError: the format cannot express a parameter: it has four types, and only numbers.
     """
     with_defaults = all(param.default is not None for param in params.values())
     entries = [_entry(param, with_defaults=with_defaults) for param in params.values()]
@@ -66,11 +66,11 @@ def _entry(param: WrittenParam, *, with_defaults: bool) -> param_pck.PackedParam
         has = "no type" if kind is None else f"the type {type_name(kind)}"
         raise UsageError(f"{param.name} has {has}, and a packed file holds {known}")
     if isinstance(param.value, bytes):
-        raise UsageError(f"{param.name} is no number; json and yaml can keep it")
+        raise UsageError(f"{param.name} is not a number; json and yaml can keep it")
     bits = param.bits_as(kind)
     default = None
     if with_defaults and param.default is not None:
         default = bits_of(param.default, kind)
         if same_bits(kind, bits, default):
-            default = None  # as vehicles write it: an entry without one has its default
+            default = None  # as vehicles write it: an entry without a default has its default value
     return param_pck.PackedParam(param.name, kind, bits, default)

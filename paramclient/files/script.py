@@ -1,9 +1,9 @@
-"""Lines of a PX4 start script that set parameters.
+"""Reading the parameters that a PX4 start script sets.
 
-A script is a program (PX4 guide, "System Startup"; the command `param`): what it sets may depend on what
-the vehicle has. Only what it sets in any case can be told from the file alone, so a `param set` that stands
-in an `if` or a loop, behind an `exit`, or with a variable is an error. What other scripts set that it calls
-is not in it.
+A script is a program (PX4 guide, "System Startup"; the command `param`): the parameters that it sets may
+depend on the vehicle. The file alone tells only which ones it sets in every case, so a `param set` inside an
+`if` or a loop, after an `exit`, or with a variable is an error. Parameters that called scripts set are not
+included.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ from typing import Final
 
 from paramclient.errors import UsageError
 from paramclient.files.param_file import FileForm, ParamFile
-from paramclient.files.text import Builder, Line, Problems, lines_of, parse_number, shown
+from paramclient.files.text import Builder, Line, Problems, excerpt, lines_of, parse_number
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import check_name
 
 __all__ = ["is_script_line", "read_script"]
 
-MOST_NOTED: Final = 5
-"""Lines that a note names."""
+SKIPPED_LISTED_MAX: Final = 5
+"""Line numbers that the note on skipped lines lists, so that the note stays readable."""
 
 _EXPECTED: Final = "param set NAME VALUE or param set-default NAME VALUE"
 _OPENING: Final = frozenset({"if", "while", "until", "for", "case"})
@@ -35,15 +35,15 @@ _sets: Final = re.compile(
 
 
 def is_script_line(text: str) -> bool:
-    """Whether a line could only be one of a script that sets parameters."""
+    """Return whether a line sets, resets or loads parameters, which only scripts do."""
     return _changes(text) is not None
 
 
 def read_script(text: str, source: str) -> ParamFile:
-    """Read what a script sets in any case. The default of `set-default` counts as a value.
+    """Read the parameters that a script sets in every case. The default of `set-default` is read as a value.
 
-    Of a name that is set twice the last value counts, but a value of `set` more than any of `set-default`: a
-    default that comes later does not replace a value.
+    If a name is set twice, the last value is used, but a value of `set` takes precedence over `set-default`:
+    a later default does not replace a value.
 
     Raises:
         FileError: a line sets, loads or resets parameters in a way that depends on more than the file.
@@ -66,7 +66,7 @@ def read_script(text: str, source: str) -> ParamFile:
         state.follow(line.text)
         if not _changes(line.text):
             left_out += 1
-            skipped += [line.number] if left_out <= MOST_NOTED else []
+            skipped += [line.number] if left_out <= SKIPPED_LISTED_MAX else []
             continue
         comments = [*waiting, *([line.comment] if line.comment else [])]
         waiting = []
@@ -82,15 +82,15 @@ def read_script(text: str, source: str) -> ParamFile:
             if not is_default:
                 assigned.add(param.name)
         except UsageError as error:
-            builder.problems.add(line.number, str(error), shown(line.text))
+            builder.problems.add(line.number, str(error), excerpt(line.text))
     sets = builder.result()
     if skipped:
-        builder.notes.append(_left_out(skipped, left_out))
+        builder.notes.append(_skipped_note(skipped, left_out))
     return ParamFile(sets, FileForm.PX4_SCRIPT, source, tuple(header), tuple(waiting), tuple(builder.notes))
 
 
 class _Flow:
-    """Whether a line is reached in any case."""
+    """Control flow of a script: whether the next line runs in every case."""
 
     def __init__(self) -> None:
         self._depth = 0
@@ -98,10 +98,10 @@ class _Flow:
 
     @property
     def obstacle(self) -> str:
-        """Why the next line may not be reached; "" where it is in any case."""
+        """Why the next line may not run; "" if it runs in every case."""
         if self._left:
-            return "behind an exit"
-        return "inside of a condition, loop or function" if self._depth else ""
+            return "after an exit"
+        return "inside a condition, loop or function" if self._depth else ""
 
     def follow(self, text: str) -> None:
         for command in re.split(r"[;&|]+", text):
@@ -116,7 +116,7 @@ class _Flow:
 
 
 def _param(line: Line, comment: str) -> tuple[WrittenParam, bool]:
-    """The parameter that a line sets, and whether only its default; UsageError says what was expected."""
+    """Return the parameter that a line sets, and whether the line is a `set-default`."""
     match = _sets(line.text)
     if match is None:
         raise UsageError(f"{_EXPECTED} and nothing else")
@@ -128,10 +128,10 @@ def _param(line: Line, comment: str) -> tuple[WrittenParam, bool]:
     return WrittenParam(check_name(name), value, comment=comment, line=line.number), match[1] is not None
 
 
-def _left_out(lines: list[int], count: int) -> str:
-    named = ", ".join(map(str, lines)) + (", …" if count > MOST_NOTED else "")
+def _skipped_note(lines: list[int], count: int) -> str:
+    named = ", ".join(map(str, lines)) + (", …" if count > SKIPPED_LISTED_MAX else "")
     one = count == 1
     return (
-        f"{'Line' if one else 'Lines'} {named} of the script {'sets' if one else 'set'} no parameter; "
-        f"what other scripts set that {'it calls' if one else 'they call'} is not in this."
+        f"{'Line' if one else 'Lines'} {named} of the script {'sets' if one else 'set'} no parameter. "
+        f"Parameters of other scripts that {'it calls' if one else 'they call'} are not included."
     )

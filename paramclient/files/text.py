@@ -1,4 +1,4 @@
-"""Text of a file: its encoding, lines, comments and numbers, and what is wrong with them."""
+"""Text of parameter files: encoding, lines, comments, numbers, and the list of bad lines."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, Value, bits_of, format_value, from_bits, type_name
 
 __all__ = [
-    "ANY_MARK",
+    "COMMENT_START",
     "Builder",
     "Line",
     "Problems",
     "as_type",
     "comment_lines",
     "decode_text",
+    "excerpt",
     "is_plain",
     "lines_of",
     "parse_number",
-    "shown",
     "time_of",
     "value_text",
 ]
 
-MOST_PROBLEMS: Final = 20
-"""Bad lines that an error lists; a file of another kind has nothing but such lines."""
-MOST_SHOWN: Final = 80
-"""Characters of a bad line that an error shows."""
-LONGEST_NUMBER: Final = 400
-"""Characters of a number: the longest decimal form of a double that is not padded has fewer."""
+PROBLEMS_MAX: Final = 20
+"""Bad lines that an error lists: in a file of another kind, every line is bad."""
+EXCERPT_LENGTH_MAX: Final = 80
+"""Characters of a bad line that an error shows, so that the error stays readable."""
+NUMBER_LENGTH_MAX: Final = 400
+"""Characters of a number: the longest decimal form of a double without padding has fewer."""
 
 _BOMS: Final = (
     (codecs.BOM_UTF8, "utf-8"),
@@ -48,15 +48,15 @@ _whole: Final = re.compile(r"[+-]?[0-9]+").fullmatch
 _hexadecimal: Final = re.compile(r"0[xX][0-9a-fA-F]+").fullmatch
 _fraction: Final = re.compile(r"[+-]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][+-]?[0-9]+)?").fullmatch
 _word: Final = re.compile(r"([+-]?)(?:(nan)|inf(?:inity)?)", re.IGNORECASE).fullmatch
-ANY_MARK: Final = re.compile(r"(?<![0-9]\.)#|#(?!INF|IND|[QS]?NAN)|(?:(?<=[ \t])|^)(?://|;)")
-"""What begins a comment in a list of parameters: nothing in these can begin with `//` or `;`. The `#` of
-`1.#INF` and `-1.#IND`, which older C libraries of Windows print for what is no number, begins none."""
+COMMENT_START: Final = re.compile(r"(?<![0-9]\.)#|#(?!INF|IND|[QS]?NAN)|(?:(?<=[ \t])|^)(?://|;)")
+"""Start of a comment in a parameter list: no name or value can begin with `//` or `;`. The `#` of `1.#INF`
+and `-1.#IND`, which older C libraries of Windows print for infinity and NaN, does not start a comment."""
 _control: Final = re.compile(r"[\x00-\x08\x0e-\x1f\x7f]")
 _PLAIN_NAN: Final = struct.pack("<d", math.nan)
 
 
 class Line(NamedTuple):
-    """One line: what it says, and its comment without the mark (None for a line without one)."""
+    """One line: its content, and its comment without the comment character (None without a comment)."""
 
     number: int
     text: str
@@ -65,7 +65,7 @@ class Line(NamedTuple):
 
 @dataclass(slots=True)
 class Problems:
-    """What is wrong with a file, collected so that all of it is told at once.
+    """The bad lines of a file, collected for one error.
 
     Args:
         source: the file's name.
@@ -76,21 +76,21 @@ class Problems:
     count: int = 0
 
     def add(self, line: int, expected: str, found: str) -> None:
-        """A line that is not what was expected. Few are kept, as in a file of another kind all are so."""
+        """Add a bad line. Keeps only the first lines: in a file of another kind, every line is bad."""
         self.count += 1
-        if self.count <= MOST_PROBLEMS:
+        if self.count <= PROBLEMS_MAX:
             self.found.append((line, expected, found))
 
     def raise_if_any(self) -> None:
-        """Raise one FileError for all of it, if there is anything."""
+        """Raise one FileError for all bad lines, if there are any."""
         if not self.found:
             return
         place = f"{self.source}:" if self.source else "line "
         more = [
             f"{place}{line}: expected {expected}, found {found}" for line, expected, found in self.found[1:]
         ]
-        if self.count > MOST_PROBLEMS:
-            more.append(f"and {self.count - MOST_PROBLEMS} more bad lines")
+        if self.count > PROBLEMS_MAX:
+            more.append(f"and {self.count - PROBLEMS_MAX} more bad lines")
         line, expected, found = self.found[0]
         raise FileError(
             f"expected {expected}, found {found}",
@@ -103,13 +103,13 @@ class Problems:
 
 @dataclass(slots=True)
 class Builder:
-    """Gathers the parameters of a file into sets, one for each component.
+    """Collects the parameters of a file into sets, one per component.
 
-    Of a name that comes twice the last value counts, as it does for ground stations and autopilots, which set
-    one after the other. A note tells.
+    If a name occurs twice, the last value is used, as in ground stations and autopilots, which set one value
+    after the other. A note reports the repetition.
 
     Args:
-        problems: what is wrong with the file.
+        problems: the bad lines of the file.
     """
 
     problems: Problems
@@ -126,12 +126,12 @@ class Builder:
         component: int | None = None,
         place: str = "",
     ) -> None:
-        """Take a parameter in, in the place of one that has its name.
+        """Add a parameter; it replaces an earlier one with the same name.
 
         Args:
             param: the parameter.
-            system, component: whose it is.
-            place: where it stands, in words; "" for its line.
+            system, component: the ids of the set.
+            place: its position in the file, in words; "" for its line.
         """
         params = self.sets.setdefault((system, component), {})
         before = params.get(param.name)
@@ -143,31 +143,31 @@ class Builder:
         self._places[key] = place
 
     def place_of(self, name: str) -> str:
-        """Where the value stands that counts, for a file that names no components."""
+        """Return the position of the value in use, for a file without component ids."""
         return self._places[None, None, name]
 
     def note_repeated(self, param: WrittenParam, place: str, other: WrittenParam, elsewhere: str) -> None:
-        """Tell that a name comes twice, and which value counts."""
+        """Add a note about a repeated name that says which value is used."""
         self.repeated += 1
-        if self.repeated > MOST_PROBLEMS:
+        if self.repeated > PROBLEMS_MAX:
             return
         if _same(other, param):
-            self.notes.append(f"{param.name} stands with one value in {elsewhere} and {place}.")
+            self.notes.append(f"{param.name} occurs twice with the same value, in {elsewhere} and {place}.")
         else:
-            counts, not_this = f"{_told(param)} in {place}", f"{_told(other)} in {elsewhere}"
-            self.notes.append(f"{param.name} stands twice: {counts} counts, not {not_this}.")
+            used, ignored = f"{_value_and_type(param)} in {place}", f"{_value_and_type(other)} in {elsewhere}"
+            self.notes.append(f"{param.name} occurs twice: {used} is used, not {ignored}.")
 
     def result(self) -> tuple[ParamSet, ...]:
-        """The sets.
+        """Return the sets.
 
         Raises:
-            FileError: something is wrong with the file, or there is nothing in it.
+            FileError: the file has bad lines, or no parameters.
         """
         self.problems.raise_if_any()
         if not self.sets:
-            raise FileError("the file holds no parameter", source=self.problems.source)
-        if self.repeated > MOST_PROBLEMS:
-            more = self.repeated - MOST_PROBLEMS
+            raise FileError("the file contains no parameters", source=self.problems.source)
+        if self.repeated > PROBLEMS_MAX:
+            more = self.repeated - PROBLEMS_MAX
             self.notes.append(f"{more} more {'line repeats' if more == 1 else 'lines repeat'} a name.")
         return tuple(
             ParamSet(params, component, system, source=self.problems.source)
@@ -176,10 +176,10 @@ class Builder:
 
 
 def decode_text(data: bytes, source: str) -> str:
-    """The text of a file: UTF-8, or UTF-16 where a byte order mark says so.
+    """Return the text of a file: UTF-8, or UTF-16 with a byte order mark.
 
     Raises:
-        FileError: it is in another encoding, or not text.
+        FileError: the file has another encoding, or is not text.
     """
     encoding = "utf-8"
     for mark, name in _BOMS:
@@ -200,7 +200,7 @@ def decode_text(data: bytes, source: str) -> str:
         line = text.count("\n", 0, control.start()) + 1
         found = f"the character 0x{ord(control[0]):02x}"
         raise FileError(
-            f"expected text, found {found}: no parameter file of a known form",
+            f"expected text, found {found}: unknown file format",
             source=source,
             line=line,
             expected="text",
@@ -208,8 +208,8 @@ def decode_text(data: bytes, source: str) -> str:
     return text
 
 
-def lines_of(text: str, mark: re.Pattern[str] = ANY_MARK) -> Iterator[Line]:
-    """All lines, also the empty ones, with the comments that this mark begins."""
+def lines_of(text: str, mark: re.Pattern[str] = COMMENT_START) -> Iterator[Line]:
+    """Generate all lines, empty ones included, with the comments that `mark` starts."""
     for number, line in enumerate(_split(text), start=1):
         found = mark.search(line)
         if found is None:
@@ -220,7 +220,7 @@ def lines_of(text: str, mark: re.Pattern[str] = ANY_MARK) -> Iterator[Line]:
 
 
 def comment_lines(comments: Iterable[str]) -> Iterator[str]:
-    """The same as lines of a file, with their marks. What breaks a line begins another comment."""
+    """Generate the lines of comments, with comment characters. A line break starts another comment line."""
     for comment in comments:
         for piece in comment.split("\n"):
             for line in piece.splitlines() or [""]:
@@ -229,12 +229,12 @@ def comment_lines(comments: Iterable[str]) -> Iterator[str]:
 
 
 def parse_number(text: str) -> int | float | None:
-    """A number as the forms write it, or None: decimal, hexadecimal (`0x1F`), nan, inf.
+    """Return a number in the notation of parameter files, or None: decimal, hexadecimal (`0x1F`), nan, inf.
 
-    A number without point and exponent is an int, all others are floats. A decimal comma, units, digits of
-    other scripts and numbers beyond the range of a double are no numbers.
+    A number without point and exponent is an int, all others are floats. Decimal commas, units, non-ASCII
+    digits and numbers beyond the range of a double give None.
     """
-    if len(text) > LONGEST_NUMBER:
+    if len(text) > NUMBER_LENGTH_MAX:
         return None
     if _whole(text):
         return int(text)
@@ -245,58 +245,58 @@ def parse_number(text: str) -> int | float | None:
         return value if math.isfinite(value) else None
     if word := _word(text):
         if word[2]:
-            return None if word[1] == "-" else math.nan  # which bits a negative one has, nobody says
+            return None if word[1] == "-" else math.nan  # the bits of a negative NaN are not defined
         return -math.inf if word[1] == "-" else math.inf
     return None
 
 
 def as_type(value: Value, kind: ParamType | int) -> Value:
-    """The value as a parameter of this type holds it: a float32 for REAL32, an int for 6.0 as INT32.
+    """Return the value in a parameter's type: a float32 for REAL32, an int for 6.0 as INT32.
 
     Raises:
-        UsageError: it does not fit.
+        UsageError: the value does not fit.
     """
     return value if isinstance(value, bytes) else from_bits(bits_of(value, kind), kind)
 
 
 def value_text(param: WrittenParam) -> str:
-    """The shortest number that reads back as the same value.
+    """Return the shortest number that parses to the same value.
 
     Raises:
-        UsageError: no text says this value: raw bytes, or a NaN that is not the plain one.
+        UsageError: no text expresses the value: raw bytes, or a NaN with payload bits.
     """
     value = param.value
     if isinstance(value, bytes):
-        shown_value = format_value(value)
-        raise UsageError(f"{param.name} is {shown_value}, which is no number; json and yaml can keep it")
+        raw = format_value(value)
+        raise UsageError(f"{param.name} is {raw}, which is not a number; json and yaml can keep it")
     if isinstance(value, float) and not math.isfinite(value):
         if not is_plain(value):
-            raise UsageError(f"{param.name} is a NaN with bits of its own; json and yaml can keep them")
+            raise UsageError(f"{param.name} is a NaN with payload bits; json and yaml can keep them")
         return "NaN" if math.isnan(value) else "Infinity" if value > 0 else "-Infinity"
     return format_value(value, ParamType.REAL64 if param.type is None else param.type)
 
 
 def time_of(at: float, digits: str = "auto") -> str:
-    """A unix time in ISO 8601, UTC.
+    """Return a Unix time in ISO 8601, UTC.
 
     Raises:
-        UsageError: no calendar has it.
+        UsageError: the time is outside the range of the calendar.
     """
     try:
         moment = datetime.fromtimestamp(at, UTC)
     except (ArithmeticError, OSError, ValueError):
-        raise UsageError(f"{at!r} is no time in unix seconds") from None
+        raise UsageError(f"{at!r} is not a valid Unix time in seconds") from None
     return moment.isoformat(timespec=digits).replace("+00:00", "Z")
 
 
 def is_plain(value: float) -> bool:
-    """Whether the value is no NaN, or the one that the word stands for."""
+    """Return whether the value is not a NaN, or is the NaN without payload bits."""
     return not math.isnan(value) or struct.pack("<d", value) == _PLAIN_NAN
 
 
-def shown(text: str) -> str:
-    """A piece of a file as an error shows it: quoted, and not all of a long one."""
-    return repr(text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}…")
+def excerpt(text: str) -> str:
+    """Return a piece of a file for an error: quoted, and shortened if it is long."""
+    return repr(text if len(text) <= EXCERPT_LENGTH_MAX else f"{text[:EXCERPT_LENGTH_MAX]}…")
 
 
 def _split(text: str) -> Iterator[str]:
@@ -307,13 +307,13 @@ def _split(text: str) -> Iterator[str]:
     yield text[start:]
 
 
-def _told(param: WrittenParam) -> str:
+def _value_and_type(param: WrittenParam) -> str:
     kind = "" if param.type is None else f" ({type_name(param.type)})"
     return format_value(param.value, ParamType.REAL64) + kind
 
 
 def _same(a: WrittenParam, b: WrittenParam) -> bool:
-    """Whether both say the same. 1 and 1.0 do, −0.0 and 0.0 do not."""
+    """Return whether two values are equal as written: 1 and 1.0 are, −0.0 and 0.0 are not."""
     if a.type != b.type or isinstance(a.value, bytes) or isinstance(b.value, bytes):
         return a.type == b.type and a.value == b.value
     if math.isnan(a.value) or math.isnan(b.value):

@@ -1,4 +1,4 @@
-"""YAML text to plain objects, with JSON's idea of words and numbers; only reading YAML loads this room."""
+"""YAML parser with JSON's rules for words and numbers. Needs PyYAML; only reading YAML imports it."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import Any, Final
 
 import yaml
 
-from paramclient.files.text import shown
+from paramclient.files.text import excerpt
 
-__all__ = ["NotYaml", "load"]
+__all__ = ["InvalidYaml", "load"]
 
-DEEPEST: Final = 20
-"""Levels of nesting; our document has six, and the parser calls itself for each."""
+NESTING_MAX: Final = 20
+"""Levels of nesting; a document has six, and the parser recurses for each level."""
 
 
-class NotYaml(Exception):
-    """The text is no YAML, or has in it what is not read.
+class InvalidYaml(Exception):
+    """The text is not valid YAML, or uses an unsupported feature of YAML.
 
     Attributes:
-        line: where that showed, from 1, or None.
+        line: the line of the problem, from 1, or None.
     """
 
     def __init__(self, message: str, line: int | None) -> None:
@@ -29,27 +29,26 @@ class NotYaml(Exception):
 
 
 def load(text: str) -> Any:
-    """The content of one YAML document: dicts, lists, strings, numbers, booleans and None.
+    """Return the content of one YAML document: dicts, lists, strings, numbers, booleans and None.
 
-    It is built from the parser's events, without the nodes that PyYAML makes of them: those take a kilobyte
-    for each value.
+    Builds the content from the parser's events, because PyYAML's nodes take a kilobyte for each value.
 
     Raises:
-        NotYaml: see there.
+        InvalidYaml: the text is not valid YAML, or uses an unsupported feature.
     """
     try:
         return _content(yaml.parse(text, _Parser))
     except yaml.MarkedYAMLError as error:
         mark = error.problem_mark
-        raise NotYaml(error.problem or str(error), None if mark is None else mark.line + 1) from None
+        raise InvalidYaml(error.problem or str(error), None if mark is None else mark.line + 1) from None
     except yaml.YAMLError as error:
-        raise NotYaml(str(error).splitlines()[0], None) from None
+        raise InvalidYaml(str(error).splitlines()[0], None) from None
 
 
 def _content(events: Iterator[Any]) -> Any:
-    """What stands in the one document that there is.
+    """Return the content of the only document.
 
-    It follows no references, trusts no tags, and nests no deeper than any document of ours.
+    Rejects aliases, anchors, tags, and nesting deeper than `NESTING_MAX`.
     """
     whole: list[Any] = []
     above: list[_Collection] = [_Collection(whole)]
@@ -59,19 +58,19 @@ def _content(events: Iterator[Any]) -> Any:
             case yaml.DocumentStartEvent():
                 documents += 1
                 if documents > 1:
-                    raise _refused(event, "expected a single document in the stream, found another document")
+                    raise _error_at(event, "expected a single document in the stream, found another document")
             case yaml.AliasEvent():
-                raise _refused(event, "found an alias (*), which is not followed")
+                raise _error_at(event, "found an alias (*); aliases are not supported")
             case yaml.CollectionEndEvent():
                 above.pop()
             case yaml.ScalarEvent() | yaml.CollectionStartEvent():
                 if event.anchor is not None or event.tag is not None:
-                    raise _refused(event, "found an anchor or a tag (&, !), which are not read")
+                    raise _error_at(event, "found an anchor or a tag (&, !); these are not supported")
                 if isinstance(event, yaml.ScalarEvent):
                     above[-1].add(event, _scalar(event))
                     continue
-                if len(above) > DEEPEST:
-                    raise _refused(event, f"found more than {DEEPEST} levels")
+                if len(above) > NESTING_MAX:
+                    raise _error_at(event, f"found more than {NESTING_MAX} levels")
                 inner = _Collection({} if isinstance(event, yaml.MappingStartEvent) else [])
                 above[-1].add(event, inner.content)
                 above.append(inner)
@@ -79,29 +78,29 @@ def _content(events: Iterator[Any]) -> Any:
 
 
 class _Collection:
-    """A list or a mapping that is being read."""
+    """A list or a mapping during parsing."""
 
     def __init__(self, content: list[Any] | dict[str, Any]) -> None:
         self.content = content
         self._key: str | None = None
 
     def add(self, event: Any, value: Any) -> None:
-        """Take a value in, or the key of the next one."""
+        """Add a value, or the key of the next value."""
         if isinstance(self.content, list):
             self.content.append(value)
         elif self._key is not None:
             self.content[self._key] = value
             self._key = None
         elif not isinstance(value, str):
-            raise _refused(event, "found a key that is no text")
+            raise _error_at(event, "found a key that is not text")
         elif value in self.content:
-            raise _refused(event, f"{shown(value)} stands twice")
+            raise _error_at(event, f"{excerpt(value)} occurs twice")
         else:
             self._key = value
 
 
 def _scalar(event: Any) -> str | int | float | bool | None:
-    """What a scalar means; without quotes and marks it may be more than text."""
+    """Return the value of a scalar; only a plain scalar can be other than text."""
     text: str = event.value
     if not event.implicit[0]:
         return text
@@ -110,17 +109,17 @@ def _scalar(event: Any) -> str | int | float | bool | None:
     if _whole(text):
         try:
             return int(text)
-        except ValueError:  # Python converts no more than some thousand digits
-            raise _refused(event, f"{shown(text)} is beyond the range of every type") from None
+        except ValueError:  # Python limits the digits of an int
+            raise _error_at(event, f"{excerpt(text)} is beyond the range of every type") from None
     return float(text) if _fraction(text) else text
 
 
-def _refused(at: Any, problem: str) -> yaml.MarkedYAMLError:
+def _error_at(at: Any, problem: str) -> yaml.MarkedYAMLError:
     return yaml.MarkedYAMLError(problem=problem, problem_mark=at.start_mark)
 
 
 _Parser: Final = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-"""The parser in C is not everywhere."""
+"""The parser in C, where it is installed; otherwise PyYAML's Python parser."""
 _WORDS: Final = {"~": None, "null": None, "": None, "true": True, "false": False}
 _whole: Final = re.compile(r"-?(?:0|[1-9][0-9]*)").fullmatch
 _fraction: Final = re.compile(r"-?(?:0|[1-9][0-9]*)(?:\.[0-9]+)?(?:[eE][-+]?[0-9]+)?").fullmatch

@@ -1,7 +1,7 @@
-"""Bytes in and out: UDP, TCP, serial ports, simulated vehicles in this process, and telemetry logs.
+"""Links: UDP, TCP, serial ports, simulated vehicles in this process, and telemetry logs.
 
-A link is named as in pymavlink, MAVProxy and MAVSDK; `parse_link` reads the name, `create_link` makes the
-link. Every kind offers the same five things, see `Link`; a program can bring one of its own.
+Link names follow pymavlink, MAVProxy and MAVSDK. `parse_link` parses a name, `create_link` makes the link.
+All links implement `Link`; a program can provide its own implementation.
 """
 
 from __future__ import annotations
@@ -42,11 +42,12 @@ def create_link(link: str | LinkSpec | Link | Endpoint) -> Link:
     """Make a link, not yet opened.
 
     Args:
-        link: a name, a name already read, an endpoint of `paramclient.sim` (see `SimLink`), or a link,
-            which is given back as it is.
+        link: a name, a parsed name, an endpoint of `paramclient.sim` (see `SimLink`), or a link, which is
+            returned unchanged.
 
     Raises:
-        UsageError: it is none of these, or a serial link, and the extra `serial` is not installed.
+        UsageError: the argument is none of these; or it is a serial link, and the extra `serial` is not
+            installed.
     """
     if isinstance(link, str):
         link = parse_link(link)
@@ -56,7 +57,7 @@ def create_link(link: str | LinkSpec | Link | Endpoint) -> Link:
         return link
     if hasattr(link, "data_to_send"):
         return SimLink(link)
-    raise UsageError(f"a link is given by its name, not by {type(link).__name__}; accepted forms:\n{FORMS}")
+    raise UsageError(f"a link is given as a name, not as {type(link).__name__}; accepted forms:\n{FORMS}")
 
 
 _MAKERS: dict[LinkKind, Callable[[LinkSpec], Link]] = {

@@ -1,4 +1,4 @@
-"""Two clocks, and the difference between them."""
+"""The offset between two clocks."""
 
 from __future__ import annotations
 
@@ -8,26 +8,26 @@ from typing import Final
 
 __all__ = ["seconds_ahead"]
 
-LONGEST_LOOK: Final = 20e-6
-"""Seconds between two looks at one clock within which the other one was looked at without an interruption."""
-MOST_LOOKS: Final = 8
-"""Looks at two clocks, after which the least interrupted one counts."""
+CLOCK_READ_TIME_MAX: Final = 20e-6
+"""Seconds between two reads of one clock within which the read of the other was not interrupted."""
+CLOCK_READS_MAX: Final = 8
+"""Reads of both clocks, after which the least interrupted one is used."""
 
 
 def seconds_ahead(clock: Callable[[], float], other: Callable[[], float]) -> float:
-    """Return for how many seconds a clock is ahead of another one.
+    """Return the seconds by which a clock is ahead of another.
 
-    On a busy machine the system may take the processor away between a look at one clock and a look at the
-    other, for tens of milliseconds.
+    On a busy machine, the operating system may suspend the process between the reads of the two clocks for
+    tens of milliseconds.
 
     Args:
-        clock, other: what gives the time.
+        clock, other: functions that return the time in seconds.
     """
     shortest, ahead = math.inf, 0.0
-    for _ in range(MOST_LOOKS):
+    for _ in range(CLOCK_READS_MAX):
         before, at, after = other(), clock(), other()
         if after - before < shortest:
             shortest, ahead = after - before, at - (before + after) / 2
-        if shortest <= LONGEST_LOOK:
+        if shortest <= CLOCK_READ_TIME_MAX:
             break
     return ahead

@@ -1,8 +1,8 @@
-"""What every link offers, and what all links over sockets share.
+"""The interface of links, and the base class of links over sockets.
 
-The sockets are plain non-blocking ones with `anyio.wait_readable`: anyio's own UDP socket keeps 100
-datagrams and drops the rest without a word. `close` then takes effect at once: it wakes who waits and
-frees the port before it returns, and there is no transport, task or thread that could outlive it.
+The sockets are non-blocking and used with `anyio.wait_readable`, because anyio's own UDP socket keeps 100
+datagrams and drops all others silently. `close` takes effect immediately: it wakes waiting tasks and frees
+the port before it returns, and no transport, task or thread outlives it.
 """
 
 from __future__ import annotations
@@ -23,67 +23,68 @@ from paramclient.links.names import LinkSpec
 __all__ = ["Address", "Link", "Peer", "SocketLink", "claim", "close_socket", "reason"]
 
 Peer: TypeAlias = Hashable
-"""Who sent something: an address on UDP, a connection on TCP, a constant on links with one far end."""
+"""The sender of data: an address on UDP, a connection on TCP, a constant on links with one remote end."""
 
 Address: TypeAlias = tuple[Any, ...]
 """A socket address: (host, port), with two more numbers for IPv6."""
 
 OPEN_TIMEOUT: Final = 5.0
-"""Seconds for finding a name and connecting. A TCP connection on a slow radio takes about one."""
+"""Seconds for resolving a name and connecting. A TCP connection on a slow radio takes about 1 s."""
 
 
 @runtime_checkable
 class Link(Protocol):
-    """Bytes in and out.
+    """A link: receives and sends bytes.
 
-    One task may wait in `receive` and one in `send` at a time; `open` and `close` may come from a third.
-    Every call may be cancelled: what had arrived by then stays for the next `receive`.
+    One task may wait in `receive` and one in `send` at a time; a third may call `open` and `close`. Every
+    call may be cancelled: data that had arrived by then stays for the next `receive`.
 
-    A link whose system tells when something arrived has an attribute `arrived_at` too: when each item of the
-    last `receive` did, in their order, by the event loop's clock; an empty list where that is open.
+    If the operating system reports arrival times, the link also has an attribute `arrived_at`: the arrival
+    time of each item of the last `receive`, in their order, on the event loop's clock; an empty list if
+    unknown.
     """
 
     @property
     def name(self) -> str:
-        """The canonical name; the same for every link that was made from the same spelling."""
+        """The canonical name; equal for all spellings of the same link."""
 
     @property
     def is_stream(self) -> bool:
-        """Whether bytes come as a stream; otherwise as datagrams, which are never joined."""
+        """Whether the link is a byte stream; otherwise it delivers datagrams, which are never joined."""
 
     @property
     def reconnects(self) -> bool:
-        """Whether `open` may bring the link back after a LinkError of `receive` or `send`."""
+        """Whether `open` may restore the link after a LinkError of `receive` or `send`."""
 
     async def open(self) -> None:
-        """Make the link ready. LinkError when it cannot be; its cause is the operating system's error."""
+        """Open the link. LinkError if that fails; its cause is the operating system's error."""
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
-        """Wait for bytes; give what is there, in order of arrival, and from whom.
+        """Wait for data; return all received data with its peers, in order of arrival.
 
-        An empty bytes object says that a peer has left (streams only), and an empty list that nothing more
-        will ever come, as at the end of a log: the next call then waits for `close`. LinkError: the link
-        dropped, was closed, or is not open.
+        Empty bytes mean that the peer has disconnected (streams only). An empty list means that there will be
+        no more data, as at the end of a log: the next call waits for `close`. LinkError: the link dropped,
+        was closed, or is not open.
         """
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
-        """Send to a peer, or with None to every peer that is known now.
+        """Send to a peer, or with None to all known peers.
 
-        Nothing happens when that is nobody, or a peer that has gone. LinkError: the link dropped or is not
-        open.
+        Does nothing if there is no known peer, or the peer has disconnected. LinkError: the link dropped or
+        is not open.
         """
 
     async def close(self) -> None:
-        """End it and leave nothing behind. A waiting `receive` raises LinkError. Twice is as good as once."""
+        """Close the link and release its resources. A waiting `receive` raises LinkError. Idempotent."""
 
 
 class SocketLink(ABC):
-    """What the links over sockets share: their life, their name, and their errors.
+    """Base class of the links over sockets: opening and closing, name, and errors.
 
     Attributes:
         name: the canonical name.
-        address: where the link is bound, host and port, while it is open; else None. This tells the port
-            that the system chose for port 0.
+        address: the local host and port while the link is open, else None. With port 0, shows the port that
+            the operating system chose.
     """
 
     def __init__(self, spec: LinkSpec) -> None:
@@ -105,7 +106,7 @@ class SocketLink(ABC):
         return f"<{type(self).__name__} {self.name} {'closed' if self._socket is None else 'open'}>"
 
     async def open(self) -> None:
-        """See `Link.open`; a link that is open is closed first."""
+        """See `Link.open`; an open link is closed first."""
         self._discard()
         opening = self._openings
         try:
@@ -124,10 +125,10 @@ class SocketLink(ABC):
 
     @abstractmethod
     async def _open(self, opening: int) -> None:
-        """Make the sockets; an OSError becomes a LinkError. `opening` is for `_adopt` and `_check`."""
+        """Make the sockets; an OSError becomes a LinkError. Pass `opening` to `_adopt` and `_check`."""
 
     def _adopt(self, sock: socket.socket, opening: int) -> None:
-        """Hold a new socket in place of one that failed, unless the link was closed while it was opened."""
+        """Replace the current socket, unless the link was closed while the new socket was opened."""
         if opening != self._openings:
             sock.close()
         self._check(opening)
@@ -136,7 +137,7 @@ class SocketLink(ABC):
         self._socket = sock
 
     def _discard(self) -> None:
-        """Close what is open and wake who waits for it. From here on an `open` under way comes too late."""
+        """Close the socket and wake waiting tasks. An `open` in progress fails from now on."""
         self._openings += 1
         self._end = ("closed", None)
         if self._socket is not None:
@@ -144,7 +145,7 @@ class SocketLink(ABC):
             self._socket = None
 
     def _fail(self, problem: str, cause: OSError | None = None) -> NoReturn:
-        """Close the link because of a fault; who waits elsewhere gets the same LinkError."""
+        """Close the link because of an error; tasks that wait elsewhere get the same LinkError."""
         self._discard()
         self._end = (problem, cause)
         raise self._error(problem) from cause
@@ -155,14 +156,14 @@ class SocketLink(ABC):
         return self._socket
 
     async def _readable(self, waitable: socket.socket | int) -> None:
-        """Wait until there is something to read; LinkError when the link is closed meanwhile."""
+        """Wait until there is data to read; LinkError if the link is closed meanwhile."""
         opening = self._openings
         with suppress(anyio.ClosedResourceError):
             await anyio.wait_readable(waitable)
         self._check(opening)
 
     def _check(self, opening: int) -> None:
-        """LinkError when the link has been closed since it was opened as `opening`."""
+        """Raise LinkError if the link has been closed since it was opened as `opening`."""
         if opening != self._openings:
             problem, cause = self._end
             raise self._error(problem) from cause
@@ -176,21 +177,21 @@ class SocketLink(ABC):
 
     def _refusal(self, error: OSError) -> str:
         if isinstance(error, TimeoutError):
-            return f"no answer from {self._target}"
+            return f"no response from {self._target}"
         if isinstance(error, ConnectionRefusedError):
             return f"connection refused by {self._target}"
         if error.errno == errno.EADDRINUSE or (sys.platform == "win32" and error.errno == errno.EACCES):
             return f"port {self._port} is in use by another program"
         if error.errno == errno.EADDRNOTAVAIL:
-            return f"{self._host} is no address of this computer"
+            return f"{self._host} is not an address of this computer"
         return f"cannot open: {reason(error)}"
 
     async def _resolve(self, kind: socket.SocketKind) -> list[tuple[socket.AddressFamily, Address]]:
-        """The addresses of the host. IPv4 comes first, because that is where MAVLink programs listen."""
+        """Return the addresses of the host, IPv4 first, because most MAVLink programs listen on IPv4."""
         try:
             return _addresses(socket.getaddrinfo(self._host, self._port, type=kind, flags=_NUMERIC))
         except socket.gaierror:
-            pass  # a name: ask the resolver, in a thread
+            pass  # not an address: use the resolver, in a thread
         try:
             return _addresses(await anyio.getaddrinfo(self._host, self._port, type=kind))
         except socket.gaierror as error:
@@ -198,22 +199,22 @@ class SocketLink(ABC):
 
 
 def claim(sock: socket.socket) -> None:
-    """Before it is bound: let nobody else have its port, whatever he asks for.
+    """Make a socket's port exclusive, before binding.
 
-    Elsewhere than on Windows two sockets share a port only where both have asked for that.
+    On systems other than Windows, two sockets share a port only if both request it.
     """
     if sys.platform == "win32":
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_EXCLUSIVEADDRUSE, 1)
 
 
 def close_socket(sock: socket.socket) -> None:
-    """Close a socket and wake who waits for it with ClosedResourceError."""
+    """Close a socket; tasks that wait for it get ClosedResourceError."""
     anyio.notify_closing(sock)
     sock.close()
 
 
 def reason(error: OSError) -> str:
-    """The operating system's words for an error, without its number."""
+    """Return the operating system's text for an error, without its number."""
     return error.strerror or str(error)
 
 

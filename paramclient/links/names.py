@@ -1,7 +1,7 @@
-"""Link names: the spellings of pymavlink, MAVProxy and MAVSDK, read into one form.
+"""Link names: parsing the spellings of pymavlink, MAVProxy and MAVSDK into one canonical form.
 
-The three programs disagree on few points, and where they do the meaning that all of them share is taken:
-`udp:` listens, as it does in pymavlink and in MAVSDK; `HOST:PORT` alone listens too, as in MAVProxy.
+Where the three programs disagree, a name has the meaning that most of them share: `udp:` listens, as in
+pymavlink and MAVSDK; `HOST:PORT` alone listens too, as in MAVProxy.
 """
 
 from __future__ import annotations
@@ -21,28 +21,28 @@ __all__ = ["FORMS", "LinkKind", "LinkSpec", "names_service", "parse_link"]
 
 FORMS: Final = """\
   udpin:HOST:PORT     listen for vehicles; also udp:HOST:PORT, udpin:PORT, HOST:PORT
-  udpout:HOST:PORT    speak to one address
+  udpout:HOST:PORT    send to one address
   tcp:HOST:PORT       connect; also tcpout:HOST:PORT
-  tcpin:HOST:PORT     let vehicles connect; also tcpin:PORT
+  tcpin:HOST:PORT     accept connections of vehicles; also tcpin:PORT
   serial:DEVICE:BAUD  a serial port; also /dev/ttyACM0,57600 and COM5:115200
   sim:px4             a simulated vehicle in this process; also sim:ardupilot, sim:px4?loss=0.05&seed=1
-  replay:FILE         a telemetry log (.tlog); also replay:FILE?speed=10, and speed=0 for as fast as it goes
-  udpin://HOST:PORT   // may follow the first colon of each; an IPv6 address stands in brackets
-  http://HOST:PORT    not a link, but a service that has some (paramclient serve); also https://HOST"""
-"""The accepted forms, for people."""
+  replay:FILE         a telemetry log (.tlog); also replay:FILE?speed=10, and speed=0 for full speed
+  udpin://HOST:PORT   // may follow the first colon of each; write an IPv6 address in brackets
+  http://HOST:PORT    not a link, but a service with links (paramclient serve); also https://HOST"""
+"""The accepted forms of a link name, for messages."""
 
 DEFAULT_BAUD: Final = 57600
-"""For a serial device without a rate: the rate of telemetry radios, and MAVSDK's and MAVProxy's default. A
-device that is USB itself takes any."""
+"""Baud rate of a serial device without one: that of telemetry radios, and MAVSDK's and MAVProxy's default. A
+device that is itself USB ignores it."""
 
-SLOWEST_BAUD: Final = 300
-FASTEST_BAUD: Final = 20_000_000
-"""Baud rates that a name may have. Below are no links but ArduPilot's abbreviations, as 57 for 57600; above
-is more than USB of full speed carries."""
+BAUD_MIN: Final = 300
+"""Smallest baud rate in a name. Lower numbers are ArduPilot's abbreviations, such as 57 for 57600."""
+BAUD_MAX: Final = 20_000_000
+"""Largest baud rate in a name: more than full-speed USB carries."""
 
 
 class LinkKind(StrEnum):
-    """How bytes travel."""
+    """The transport of a link."""
 
     UDPIN = "udpin"
     UDPOUT = "udpout"
@@ -55,14 +55,15 @@ class LinkKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class LinkSpec:
-    """A link name, read.
+    """A parsed link name.
 
     Attributes:
-        kind: how bytes travel.
+        kind: the transport.
         host: a host name or an address without brackets; the device of a serial link; the autopilot of a
-            simulated one; the file of a log.
-        port: 1 to 65535; 0 where a listening link lets the system choose; the baud rate of a serial link.
-        options: of a simulated link or a log, sorted by name.
+            simulated link; the file of a log.
+        port: 1 to 65535; 0 if a listening link lets the operating system choose; the baud rate of a serial
+            link.
+        options: options of a simulated link or a log, sorted by name.
     """
 
     kind: LinkKind
@@ -72,7 +73,7 @@ class LinkSpec:
 
     @property
     def name(self) -> str:
-        """The canonical spelling; `parse_link` reads it back to an equal object."""
+        """The canonical spelling; `parse_link` returns an equal object for it."""
         if self.kind in (LinkKind.SIM, LinkKind.REPLAY):
             query = "&".join(f"{key}={value}" for key, value in self.options)
             return f"{self.kind}:{self.host}?{query}" if query else f"{self.kind}:{self.host}"
@@ -84,10 +85,10 @@ class LinkSpec:
 
 
 def parse_link(text: str) -> LinkSpec:
-    """Read a link name.
+    """Parse a link name.
 
     Raises:
-        UsageError: the name has none of the accepted forms; the text of the error lists them.
+        UsageError: the name has none of the accepted forms; the error lists them.
     """
     if not isinstance(text, str):
         raise UsageError(f"a link name is a string, not {type(text).__name__}")
@@ -100,12 +101,12 @@ def parse_link(text: str) -> LinkSpec:
 
 
 def names_service(link: object) -> bool:
-    """Whether this is the address of a service, and not a link."""
+    """Return whether this is the address of a service, and not a link name."""
     return isinstance(link, str) and _SERVICE.match(link) is not None
 
 
 class _BadName(Exception):
-    """What is wrong with a name, in words."""
+    """The problem of a link name, in words."""
 
 
 _SCHEMES: dict[str, LinkKind] = {
@@ -127,12 +128,12 @@ def _parse(name: str) -> LinkSpec:
     if _BARE_DEVICE.match(name):
         return _serial(name)
     if names_service(name):
-        _fail("a service has links and is none; it goes only where a vehicle is wanted")
+        _fail("this is the address of a service, not of a link; use it only where a vehicle is expected")
     scheme = _SCHEME.fullmatch(name)
     kind = _SCHEMES.get(scheme[1].lower()) if scheme else None
     if scheme is None or kind is None:
         if "/" in name or not _HOST_PORT.fullmatch(name):
-            _fail(f"{scheme[1]!r} is no kind of link" if scheme else "it names no kind of link")
+            _fail(f"{scheme[1]!r} is not a kind of link" if scheme else "the kind of link is missing")
         return _network(LinkKind.UDPIN, name)
     rest = scheme[2].removeprefix("//")
     if kind is LinkKind.SERIAL:
@@ -150,7 +151,7 @@ def _network(kind: LinkKind, rest: str) -> LinkSpec:
     parts = _HOST_PORT.fullmatch(rest)
     if parts is None:
         if rest.count(":") > 1:
-            _fail("an IPv6 address stands in brackets, as in udpin:[::1]:14550")
+            _fail("write an IPv6 address in brackets, as in udpin:[::1]:14550")
         _fail("the host is missing" if rest.isdecimal() else "the port is missing")
     bracketed, host, digits = parts.groups()
     listening = kind in _LISTENING
@@ -158,7 +159,7 @@ def _network(kind: LinkKind, rest: str) -> LinkSpec:
         try:
             host = str(IPv6Address(bracketed))
         except AddressValueError:
-            _fail(f"{bracketed!r} is no IPv6 address")
+            _fail(f"{bracketed!r} is not an IPv6 address")
     elif host:
         host = _host(host)
     elif listening:
@@ -173,9 +174,9 @@ def _host(host: str) -> str:
         try:
             return str(IPv4Address(host))
         except AddressValueError:
-            _fail(f"{host!r} is no IPv4 address")
+            _fail(f"{host!r} is not an IPv4 address")
     if len(host) > 253 or not all(map(_HOST_LABEL.fullmatch, host.removesuffix(".").split("."))):
-        _fail(f"{host!r} is no host name")
+        _fail(f"{host!r} is not a host name")
     return host.lower()
 
 
@@ -183,7 +184,7 @@ def _port(digits: str, *, smallest: int) -> int:
     if not digits:
         _fail("the port is missing")
     if not re.fullmatch("[0-9]{1,5}", digits) or not smallest <= int(digits) <= 65535:
-        _fail(f"{digits!r} is no port; ports go from {smallest} to 65535")
+        _fail(f"{digits!r} is not a port; ports are {smallest} to 65535")
     return int(digits)
 
 
@@ -193,15 +194,15 @@ def _serial(rest: str) -> LinkSpec:
         _fail("a serial link is a device and a baud rate")
     device, digits = parts.groups()
     baud = int(digits) if digits else DEFAULT_BAUD
-    if not SLOWEST_BAUD <= baud <= FASTEST_BAUD:
-        _fail(f"a baud rate goes from {SLOWEST_BAUD} to {FASTEST_BAUD}, as 57600 or 115200 do, not {baud}")
+    if not BAUD_MIN <= baud <= BAUD_MAX:
+        _fail(f"a baud rate is from {BAUD_MIN} to {BAUD_MAX}, for example 57600 or 115200, not {baud}")
     return LinkSpec(LinkKind.SERIAL, device if device.startswith("/") else device.upper(), baud)
 
 
 def _sim(rest: str) -> LinkSpec:
     autopilot, _, query = rest.partition("?")
     if autopilot.lower() not in ("px4", "ardupilot"):
-        _fail("simulated are px4 and ardupilot")
+        _fail("simulated vehicles are px4 and ardupilot")
     options: dict[str, int | float] = {}
     try:
         pairs = parse_qsl(query, keep_blank_values=True, strict_parsing=True, max_num_fields=32)
@@ -209,7 +210,7 @@ def _sim(rest: str) -> LinkSpec:
         _fail("options are written as NAME=VALUE with & between them")
     for key, value in pairs:
         if key not in _SIM_OPTIONS:
-            _fail(f"{key!r} is no option of a simulated link; there are {', '.join(_SIM_OPTIONS)}")
+            _fail(f"{key!r} is not an option of a simulated link; the options are {', '.join(_SIM_OPTIONS)}")
         if key in options:
             _fail(f"option {key} is given twice")
         options[key] = _SIM_OPTIONS[key](key, value)
@@ -240,9 +241,9 @@ def _real(smallest: float, largest: float) -> Callable[[str, str], float]:
         try:
             value = float(text)
         except ValueError:
-            _fail(f"option {key}: {text!r} is no number")
+            _fail(f"option {key}: {text!r} is not a number")
         if not (isfinite(value) and smallest <= value <= largest):
-            _fail(f"option {key} goes from {smallest:g} to {largest:g}")
+            _fail(f"option {key} must be from {smallest:g} to {largest:g}")
         return abs(value)  # −0.0 is 0.0
 
     return read
@@ -251,7 +252,7 @@ def _real(smallest: float, largest: float) -> Callable[[str, str], float]:
 def _whole(smallest: int, largest: int) -> Callable[[str, str], int]:
     def read(key: str, text: str) -> int:
         if not re.fullmatch("[0-9]{1,20}", text) or not smallest <= int(text) <= largest:
-            _fail(f"option {key} is a whole number from {smallest} to {largest}")
+            _fail(f"option {key} must be a whole number from {smallest} to {largest}")
         return int(text)
 
     return read
@@ -272,4 +273,4 @@ _SIM_OPTIONS: dict[str, Callable[[str, str], int | float]] = {
     "param_error": _whole(0, 1),
 }
 """Options of `sim:` links: probabilities, datagrams lost in a row, seconds one way, bytes per second, bytes
-in the queue, numbers."""
+in the queue, and numbers. The values are parsers with the option's range."""

@@ -1,4 +1,4 @@
-"""The serial ports of this computer, and which of them are autopilots by their USB ids."""
+"""The serial ports of this computer, and detection of autopilots by their USB ids."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ AUTOPILOT_VENDORS: Final = {
     0x3162: "Holybro",
     0x3185: "Pixhawk",  # Auterion: FMU v5X and later, ARK
 }
-"""Vendors of whom every serial port is an autopilot's.
+"""USB vendors with only autopilots.
 
-From QGroundControl's list of boards (USBBoardInfo.json), and the USB_VENDOR of ArduPilot's (hwdef.dat).
+Sources: QGroundControl's list of boards (USBBoardInfo.json), and ArduPilot's USB_VENDOR (hwdef.dat).
 """
 
-AUTOPILOTS: Final = {
+AUTOPILOT_DEVICES: Final = {
     (0x0483, 0x0037): "SmartAP AIRLink",
     (0x0483, 0xA32F): "ModalAI",
     (0x0483, 0xA330): "ModalAI",
@@ -37,8 +37,8 @@ AUTOPILOTS: Final = {
     (0x35A7, 0x0002): "ThePeach",
     (0x3643, 0x001D): "Pixhawk",  # FMU v6X-RT
 }
-"""Autopilots of vendors who make other things, or whose ids are shared. The sources are the same, and for
-ArduPilot's own ids its chibios_hwdef.py."""
+"""Autopilots of vendors with other products too, or with shared ids. Sources: as for `AUTOPILOT_VENDORS`, and
+ArduPilot's chibios_hwdef.py for its own ids."""
 
 AUTOPILOT_MANUFACTURERS: Final = {
     "ArduPilot": "ArduPilot",
@@ -46,23 +46,23 @@ AUTOPILOT_MANUFACTURERS: Final = {
     "Holybro": "Holybro",
     "mRo": "mRo",
 }
-"""What autopilots call their manufacturer, where the ids are those that a chip has by default, as ST's
-0483:5740. The source is QGroundControl's list of boards."""
+"""Manufacturer texts of autopilots with the default ids of a chip, such as ST's 0483:5740. Source:
+QGroundControl's list of boards."""
 
-OTHERS: Final = {(0x26AC, 0x0015)}
-"""What is no autopilot although its vendor is one of those: the PX4 Flow, a sensor."""
+OTHER_DEVICES: Final = {(0x26AC, 0x0015)}
+"""Devices of autopilot vendors that are not autopilots: the PX4 Flow, a sensor."""
 
 
 @dataclass(frozen=True, slots=True)
 class SerialPort:
-    """A serial port of this computer. What it does not tell is None; its texts are the device's own.
+    """A serial port of this computer. Unknown attributes are None; texts come from the device.
 
     Attributes:
-        device: its path or name, as `/dev/ttyACM0` or `COM5`.
-        by_id: a path that stays the same wherever it is plugged in (Linux).
-        vendor_id, product_id: its USB ids.
-        manufacturer, product, serial_number: what it says of itself on USB.
-        interface: which of several ports of one device this is.
+        device: the path or name, such as `/dev/ttyACM0` or `COM5`.
+        by_id: a path that is the same on every USB socket (Linux).
+        vendor_id, product_id: the USB ids.
+        manufacturer, product, serial_number: the texts of the USB descriptor.
+        interface: the number of the port on a device with several ports.
     """
 
     device: str
@@ -76,34 +76,34 @@ class SerialPort:
 
     @property
     def link(self) -> str:
-        """The name of the link over it, with the default baud rate."""
+        """The link name of the port, with the default baud rate."""
         return LinkSpec(LinkKind.SERIAL, self.by_id or self.device, DEFAULT_BAUD).name
 
     @property
     def autopilot(self) -> str | None:
-        """The make, if its USB ids, or its manufacturer, are those of an autopilot."""
+        """The make, if the USB ids or the manufacturer are those of an autopilot; else None."""
         if self.vendor_id is None or self.product_id is None:
             return None
         ids = (self.vendor_id, self.product_id)
-        if ids in OTHERS:
+        if ids in OTHER_DEVICES:
             return None
         return (
-            AUTOPILOTS.get(ids)
+            AUTOPILOT_DEVICES.get(ids)
             or AUTOPILOT_VENDORS.get(self.vendor_id)
             or AUTOPILOT_MANUFACTURERS.get(self.manufacturer or "")
         )
 
 
 def list_ports() -> list[SerialPort]:
-    """The serial ports of this computer: autopilots first, then other USB devices, each in order of names.
+    """Return the serial ports of this computer: autopilots first, then other USB devices, sorted by name.
 
-    It asks the system, which takes some milliseconds.
+    Queries the operating system, which takes some milliseconds.
 
     Raises:
         UsageError: the extra `serial` is not installed.
     """
     need_serialx("a list of serial ports")
-    import serialx  # only here: most programs need none
+    import serialx  # imported here because it needs the extra
 
     found = [
         SerialPort(
@@ -122,7 +122,7 @@ def list_ports() -> list[SerialPort]:
 
 
 def _order(port: SerialPort) -> tuple[bool, bool, list[tuple[str, int]]]:
-    parts = re.findall(r"(\D*)(\d*)", port.device)  # ttyUSB10 comes after ttyUSB9
+    parts = re.findall(r"(\D*)(\d*)", port.device)  # sorts ttyUSB10 after ttyUSB9
     return (
         port.autopilot is None,
         port.vendor_id is None,

@@ -1,4 +1,4 @@
-"""A telemetry log in the place of a link."""
+"""ReplayLink: a telemetry log as a link."""
 
 from __future__ import annotations
 
@@ -16,24 +16,24 @@ from paramclient.links.tlog import Record, open_log, read_records
 __all__ = ["ReplayLink"]
 
 LOG_PEER: Final = "log"
-"""The one peer of a `ReplayLink`."""
+"""The only peer of a `ReplayLink`."""
 RECORDS_PER_READ: Final = 256
-"""Frames that one `receive` gives at most, so that other tasks get their turn."""
-LONGEST_PAUSE: Final = 60.0
-"""Seconds of the log after which a pause is cut short: logs may be joined, and nothing comes of waiting."""
+"""Frames that one `receive` returns at most, so that other tasks run in between."""
+PAUSE_MAX: Final = 60.0
+"""Seconds of the log after which a pause is shortened: joined logs may be days apart."""
 
 
 class ReplayLink:
-    """Delivers the frames of a log, those of every direction, at the times that they have in it.
+    """Delivers the frames of a log, of both directions, at the times in the log.
 
-    Nothing can be sent to a log. Opened again, it begins anew.
+    Data that is sent is discarded. Opening the link again starts at the beginning of the log.
 
     Args:
-        spec: of a name such as `replay:flight.tlog?speed=10`: ten times as fast as it was; 0 is as fast as it
-            can be read, and nothing is as it was.
+        spec: a parsed name such as `replay:flight.tlog?speed=10`: ten times the original speed. 0 is as fast
+            as the file can be read; without speed, the original speed.
 
     Attributes:
-        at: when the last frame that it has delivered was written, in unix seconds; None before the first.
+        at: the time of the last delivered frame, as a Unix time in seconds; None before the first.
     """
 
     is_stream = False
@@ -84,7 +84,7 @@ class ReplayLink:
         return found
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
-        """See `Link.send`; a log hears nothing."""
+        """See `Link.send`; discards the data."""
         await anyio.lowlevel.checkpoint()
 
     async def close(self) -> None:
@@ -101,4 +101,4 @@ class ReplayLink:
         except OSError as error:
             raise LinkError(f"{self.name}: cannot read: {reason(error)}", link=self.name) from error
         if self._next is not None and self._speed:
-            self._due += min(max(self._next.at - before.at, 0.0), LONGEST_PAUSE) / self._speed
+            self._due += min(max(self._next.at - before.at, 0.0), PAUSE_MAX) / self._speed

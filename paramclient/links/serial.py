@@ -1,13 +1,13 @@
 """Links over serial ports: an autopilot on USB, a telemetry radio, a UART.
 
-The library serialx, which the extra `serial` installs, opens and sets up the port: 8 data bits, no parity,
-one stop bit, no flow control. On POSIX systems bytes then go through its file descriptor, which never blocks,
-as through the sockets of other links, on every event loop that anyio knows. Windows has no such descriptors:
-there serialx's own transport moves the bytes, which only asyncio can run.
+The library serialx, which the extra `serial` installs, opens and configures the port: 8 data bits, no parity,
+one stop bit, no flow control. On POSIX systems, bytes then go through the port's non-blocking file
+descriptor, like through the sockets of other links, on every event loop that anyio supports. Windows has no
+such descriptors: there serialx's own transport moves the bytes, which only asyncio can run.
 
-The port is ours alone while it is open: two programs on one port would each get a part of the bytes. DTR and
-RTS are raised on opening, and lowered when the last program closes the port. Linux does that by itself, and
-pyserial does it, so pymavlink and MAVProxy too: a board is reset by it no more often than by those.
+An open port is exclusive: two programs on one port would each receive a part of the bytes. DTR and RTS are
+raised on opening, and lowered when the last program closes the port. Linux and pyserial do the same, and with
+pyserial also pymavlink and MAVProxy, so a board is not reset more often than by those programs.
 """
 
 from __future__ import annotations
@@ -43,40 +43,41 @@ __all__ = ["Device", "SerialLink", "need_serialx"]
 T = TypeVar("T")
 
 READ_SIZE: Final = 65536
-"""Bytes that are read at once. Linux holds 4,095 for a reader, and what comes meanwhile in the driver."""
+"""Bytes per read. Linux holds 4,095 for a reader, and bytes that arrive meanwhile in the driver."""
 
 STALL_TIMEOUT: Final = 5.0
-"""Seconds, beyond those that a full buffer takes at the port's rate, that a device may take nothing."""
+"""Seconds without progress, in addition to those that a full buffer takes at the port's rate, after which a
+device counts as lost."""
 
 SYSTEM_BUFFER: Final = 4096
-"""Bytes that may wait in the system for a UART (Linux, UART_XMIT_SIZE)."""
+"""Bytes that may wait in the operating system for a UART (Linux, UART_XMIT_SIZE)."""
 
 BITS_PER_BYTE: Final = 10
-"""With start and stop bit."""
+"""Bits on the wire per byte, with start and stop bit."""
 
 CLOSE_TIMEOUT: Final = 2.0
-"""Seconds that closing waits for a driver. What had not gone out is dropped before, so few ever wait."""
+"""Seconds that closing waits for a driver. Unsent bytes are dropped before, so it rarely has to wait."""
 
 
 class Device(NamedTuple):
-    """A serial port as a peer. The number makes it another one after each opening: half a frame that came
-    before it was unplugged is not continued by what comes after."""
+    """A serial port as a peer. The number changes with each opening, so that half a frame received before
+    unplugging is not continued with later bytes."""
 
     number: int
     path: str
 
 
 class SerialLink:
-    """`serial`: one serial port; `open` makes it work again after it was unplugged.
+    """`serial`: one serial port. `open` restores the link after the device was unplugged.
 
-    Nothing is queued here. A frame that finds the system's buffer full waits for room, so a slow port sets
-    the pace of what is sent. One that takes nothing for `STALL_TIMEOUT` counts as lost: it can neither fill
-    the memory nor hold up calls, the user is told, and opening it again empties the buffer.
+    The link has no queue. If the operating system's buffer is full, a frame waits for space, so a slow port
+    limits the send rate. A port that accepts no bytes for `STALL_TIMEOUT` counts as lost: waiting calls end,
+    the user gets an error, and opening the port again empties the buffer.
 
     Attributes:
         name: the canonical name.
         device: the path, or the name on Windows.
-        baud: bits a second; without meaning to devices that are USB themselves.
+        baud: bits per second; ignored by devices that are themselves USB.
 
     Raises:
         UsageError: the extra `serial` is not installed.
@@ -99,10 +100,10 @@ class SerialLink:
         return f"<{type(self).__name__} {self.name} {'closed' if self._port is None else 'open'}>"
 
     async def open(self) -> None:
-        """See `Link.open`; a link that is open is closed first.
+        """See `Link.open`; an open link is closed first.
 
         Raises:
-            UsageError: this system knows no such baud rate.
+            UsageError: the system does not support the baud rate.
         """
         await self._discard("closed")
         opening = self._openings
@@ -130,30 +131,30 @@ class SerialLink:
         return [(self._far, data)]
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
-        """See `Link.send`. Waits for room as long as the class says; then the port counts as lost.
+        """See `Link.send`. Waits for space until `STALL_TIMEOUT`; then the port counts as lost.
 
-        Cancelled, it may have sent a part.
+        After cancellation, a part may have been sent.
         """
         await anyio.lowlevel.checkpoint()
         port, opening = self._opened(), self._openings
         if peer is not None and peer != self._far:
             return
-        patience = STALL_TIMEOUT + SYSTEM_BUFFER * BITS_PER_BYTE / self.baud
-        with anyio.move_on_after(patience) as wait:
+        timeout = STALL_TIMEOUT + SYSTEM_BUFFER * BITS_PER_BYTE / self.baud
+        with anyio.move_on_after(timeout) as wait:
             try:
                 await port.write(data)
             except OSError as error:
                 await self._fail(opening, f"lost {self.device}: unplugged, or reset ({reason(error)})", error)
         if wait.cancelled_caught:
-            await self._fail(opening, f"{self.device} has taken nothing for {patience:.0f} s")
+            await self._fail(opening, f"{self.device} has accepted no data for {timeout:.0f} s")
         self._check(opening)
 
     async def close(self) -> None:
-        """See `Link.close`. What the device had not taken is dropped."""
+        """See `Link.close`. Unsent bytes are dropped."""
         await self._discard("closed")
 
     async def _discard(self, problem: str, cause: OSError | None = None) -> None:
-        """Close what is open and wake who waits for it. From here on an `open` under way comes too late."""
+        """Close the port and wake waiting tasks. An `open` in progress fails from now on."""
         self._openings += 1
         self._end = (problem, cause)
         port, self._port = self._port, None
@@ -161,13 +162,13 @@ class SerialLink:
             await port.close()
 
     async def _fail(self, opening: int, problem: str, cause: OSError | None = None) -> NoReturn:
-        """Close the link because of a fault, unless that has been done; who waits gets the same LinkError."""
+        """Close the link because of an error, unless already closed; waiting tasks get the same LinkError."""
         self._check(opening)
         await self._discard(problem, cause)
         raise self._error(problem) from cause
 
     def _check(self, opening: int) -> None:
-        """LinkError when the link has been closed since it was opened as `opening`."""
+        """Raise LinkError if the link has been closed since it was opened as `opening`."""
         if opening != self._openings:
             problem, cause = self._end
             raise self._error(problem) from cause
@@ -182,7 +183,7 @@ class SerialLink:
 
 
 def need_serialx(what: str) -> None:
-    """UsageError with the command that installs the extra, where it is missing."""
+    """Raise UsageError with the command that installs the extra, if serialx is missing."""
     if find_spec("serialx") is None:
         raise UsageError(f"{what} needs serialx: pip install 'paramclient[serial]'")
 
@@ -191,28 +192,28 @@ class _Port(Protocol):
     """An open port."""
 
     async def read(self) -> bytes:
-        """Wait for bytes; none at all when the port has hung up, or is closed meanwhile."""
+        """Wait for bytes; return b"" if the port has hung up, or is closed meanwhile."""
 
     async def write(self, data: bytes) -> None:
-        """Wait until the system has taken everything, or the port is closed."""
+        """Wait until the operating system has accepted all bytes, or the port is closed."""
 
     async def close(self) -> None:
-        """Wake who waits, drop what is unsent, close. Not to be cancelled, and not for long."""
+        """Wake waiting tasks, drop unsent bytes, close. Not cancellable; takes at most `CLOSE_TIMEOUT`."""
 
 
 async def _open_port(device: str, baud: int) -> _Port:
     if sys.platform == "win32":
-        from paramclient.links.transport import Transport  # only here: brings asyncio along
+        from paramclient.links.transport import Transport  # imported here because it imports asyncio
 
         return await Transport.opened(device, baud)
-    else:  # noqa: RET505 - each system's checker passes over the other branch only so
+    else:  # noqa: RET505 - with else, the type checker of each system skips the other branch
         return await _Descriptor.opened(device, baud)
 
 
 if sys.platform != "win32":
 
     class _Descriptor:
-        """A port as a file descriptor that never blocks."""
+        """A port as a non-blocking file descriptor."""
 
         def __init__(self, serial: serialx.BaseSerial) -> None:
             self._serial = serial
@@ -220,7 +221,7 @@ if sys.platform != "win32":
 
         @classmethod
         async def opened(cls, device: str, baud: int) -> _Descriptor:
-            """Open a port in a thread. One that comes when nobody waits for it any more is closed."""
+            """Open a port in a thread. A port that opens after cancellation is closed again."""
             return await _in_thread(lambda: cls._open(device, baud), undo=cls._release, grace=CLOSE_TIMEOUT)
 
         async def read(self) -> bytes:
@@ -247,17 +248,17 @@ if sys.platform != "win32":
 
         @classmethod
         def _open(cls, device: str, baud: int) -> _Descriptor:
-            import serialx  # only here: most links need none, and it takes longer than a loop should wait
+            import serialx  # imported here: needs the extra, and takes long to load
 
             serial = serialx.serial_for_url(device, baud)
             try:
                 serial.open()
             except serialx.UnsupportedSetting as error:
-                raise UsageError(f"{device}: no serial port of this system has {baud} baud") from error
-            except RuntimeError as error:  # of drivers that do not tell their rate back
+                raise UsageError(f"{device}: this system does not support {baud} baud") from error
+            except RuntimeError as error:  # of drivers that do not report the rate that they set
                 raise OSError(errno.EINVAL, os.strerror(errno.EINVAL)) from error
             try:
-                # serialx's own lock is one that only those heed who ask for it
+                # serialx's lock is advisory; TIOCEXCL makes open fail for every other program.
                 fcntl.ioctl(serial.fileno(), termios.TIOCEXCL)
             except OSError:
                 serial.close()
@@ -265,17 +266,17 @@ if sys.platform != "win32":
             return cls(serial)
 
         def _release(self) -> None:
-            with suppress(OSError, termios.error):  # it may have gone
-                termios.tcflush(self._file, termios.TCOFLUSH)  # else close waits for it, 30 s on Linux
-                fcntl.ioctl(self._file, termios.TIOCNXCL)  # a pseudo-terminal would stay closed to others
+            with suppress(OSError, termios.error):  # the device may be unplugged
+                termios.tcflush(self._file, termios.TCOFLUSH)  # otherwise close waits for it, 30 s on Linux
+                fcntl.ioctl(self._file, termios.TIOCNXCL)  # a pseudo-terminal would stay exclusive
             with suppress(OSError):
                 self._serial.close()
 
 
 async def _in_thread(work: Callable[[], T], *, undo: Callable[[T], object], grace: float) -> T:
-    """Do it in a thread of its own, which ends with it.
+    """Run a function in a thread of its own, and return its result.
 
-    Cancelled, it is undone, also when it is done late; that is waited for `grace` seconds at most.
+    On cancellation, a result is undone, even if it comes later; cancellation waits at most `grace` seconds.
     """
     ended = anyio.Event()
     token = anyio.lowlevel.current_token()
@@ -323,30 +324,30 @@ def _nothing(_: None) -> None:
 
 
 def _refusal(device: str, baud: int, error: OSError) -> str:
-    """Why a port cannot be opened, and what helps."""
+    """Return why a port cannot be opened, and what to do about it."""
     if isinstance(error, TimeoutError):
         return f"{device} did not open within {OPEN_TIMEOUT:g} s"
     if error.errno in (errno.ENOENT, errno.ENXIO, errno.ENODEV):
-        return f"there is no {device}; 'paramclient ports' lists the ports that there are"
+        return f"{device} does not exist; 'paramclient ports' lists the serial ports"
     if error.errno == errno.EBUSY or (sys.platform == "win32" and error.errno == errno.EACCES):
         return f"{device} is in use by another program"
     if error.errno in (errno.EACCES, errno.EPERM):
-        return f"no permission to open {device}{_who_may(device)}"
+        return f"no permission to open {device}{_group_hint(device)}"
     if error.errno in (errno.ENOTTY, errno.EISDIR):
-        return f"{device} is no serial port"
+        return f"{device} is not a serial port"
     if error.errno == errno.EINVAL:
         return f"{device} cannot be set to {baud} baud"
     return f"cannot open {device}: {reason(error)}"
 
 
-def _who_may(device: str) -> str:
-    """The group that may open a port, and how to join it, where a group is what is missing."""
+def _group_hint(device: str) -> str:
+    """Return a hint on joining the port's group, if the user is not in it; else ""."""
     if sys.platform == "linux":
-        import grp  # only here: POSIX has it, and only this needs it
+        import grp  # imported here: POSIX only
 
         with suppress(OSError, KeyError):
             info = Path(device).stat()
             group = grp.getgrgid(info.st_gid).gr_name
             if info.st_mode & stat.S_IWGRP and info.st_gid not in (0, *os.getgroups()):
-                return f", which is for the group {group}: sudo usermod -aG {group} $USER, then log in again"
+                return f", which needs the group {group}: sudo usermod -aG {group} $USER, then log in again"
     return ""

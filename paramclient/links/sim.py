@@ -1,7 +1,7 @@
 """Simulated vehicles as links, and on links.
 
-`SimLink` puts a vehicle into the program itself: no socket, no port, the real clock. `serve_endpoint` puts
-one onto a real link, for other programs.
+`SimLink` runs a vehicle inside the program: no socket, no port, the real clock. `serve_endpoint` runs a
+vehicle on a real link, for other programs.
 """
 
 from __future__ import annotations
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
 __all__ = ["SimLink", "serve_endpoint", "simulated"]
 
 SIM_PEER: Final = "sim"
-"""The one peer of a `SimLink`."""
+"""The only peer of a `SimLink`."""
 
-SHORTEST_WAIT: Final = 0.001
-"""Seconds for which `serve_endpoint` listens at least, also when the vehicle is late with its own work."""
+LISTEN_TIME_MIN: Final = 0.001
+"""Seconds for which `serve_endpoint` listens at least, also when the vehicle is behind schedule."""
 
 
 class SimLink:
-    """A link whose far end is an object in this process.
+    """A link whose remote end is an object in this process.
 
     Args:
-        endpoint: a vehicle or an `Air` of `paramclient.sim`, or anything with the same four methods. It
-            lives on the event loop's clock, and goes on where it stood when the link is opened again.
-        name: what the link is called; the cache tells vehicles without a hardware id apart by it.
+        endpoint: a vehicle or an `Air` of `paramclient.sim`, or any object with the same four methods. Runs
+            on the event loop's clock, and keeps its state when the link is opened again.
+        name: the link's name; the cache uses it to identify vehicles without a hardware id.
     """
 
     is_stream = False
@@ -50,11 +50,11 @@ class SimLink:
 
     @property
     def has_one_vehicle(self) -> bool:
-        """Whether it is certain that there is one vehicle at the far end, and no second one to look for."""
+        """Whether the remote end is certain to be a single vehicle, so that looking for others is useless."""
         return getattr(self.endpoint, "vehicle_count", None) == 1
 
     async def open(self) -> None:
-        """See `Link.open`; switches the vehicle on."""
+        """See `Link.open`; starts the vehicle."""
         await anyio.lowlevel.checkpoint()
         self._wake = anyio.Event()
         self.endpoint.tick(anyio.current_time())
@@ -98,11 +98,11 @@ async def serve_endpoint(
     *,
     task_status: anyio.abc.TaskStatus[Link] = anyio.TASK_STATUS_IGNORED,
 ) -> None:
-    """Run a simulated vehicle on a link until cancelled; the link is opened, and closed at the end.
+    """Run a simulated vehicle on a link until cancelled. Opens the link, and closes it at the end.
 
-    What the vehicle sends goes to every peer: on `udpout` from the start, on `udpin` and `tcpin` once
-    somebody has spoken or connected. With `await task_group.start(serve_endpoint, vehicle, link)` the link
-    is open on return, and its address known.
+    Data of the vehicle goes to every peer: on `udpout` from the start, on `udpin` and `tcpin` after the first
+    peer has sent data or connected. With `await task_group.start(serve_endpoint, vehicle, link)`, the link is
+    open on return, and its address is known.
 
     Raises:
         LinkError: the link cannot be opened, or dropped.
@@ -114,7 +114,7 @@ async def serve_endpoint(
             wait = _work(endpoint)
             for datagram in endpoint.data_to_send():
                 await link.send(datagram, None)
-            with anyio.move_on_after(None if wait is None else max(wait, SHORTEST_WAIT)):
+            with anyio.move_on_after(None if wait is None else max(wait, LISTEN_TIME_MIN)):
                 for _, data in await link.receive():
                     endpoint.receive(data, anyio.current_time())
     finally:
@@ -122,8 +122,8 @@ async def serve_endpoint(
 
 
 def simulated(spec: LinkSpec) -> SimLink:
-    """The vehicle that a `sim:` name describes, behind the faulty link that its options ask for."""
-    from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle  # only here: other links need no tables
+    """Return the vehicle of a `sim:` name, behind a faulty link with the faults of its options."""
+    from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle  # imported here: loads parameter tables
 
     faults: dict[str, Any] = dict(spec.options)
     make = PX4Vehicle if spec.host == "px4" else ArduPilotVehicle
@@ -132,7 +132,7 @@ def simulated(spec: LinkSpec) -> SimLink:
 
 
 def _work(endpoint: Endpoint) -> float | None:
-    """Let the endpoint do what is due; seconds until it wants to go on, None while it waits for bytes."""
+    """Run the endpoint's due work; return the seconds until its next work, or None if it waits for bytes."""
     now = anyio.current_time()
     endpoint.tick(now)
     deadline = endpoint.next_deadline()

@@ -1,4 +1,4 @@
-"""Links over TCP: `tcp` connects, `tcpin` lets others connect."""
+"""Links over TCP: `tcp` connects, `tcpin` accepts connections."""
 
 from __future__ import annotations
 
@@ -19,21 +19,21 @@ from paramclient.links.names import LinkSpec
 __all__ = ["Connection", "TcpIn", "TcpOut"]
 
 SEND_TIMEOUT: Final = 5.0
-"""Seconds that a peer may leave the system's buffers full before it counts as gone."""
+"""Seconds that a peer may leave the send buffer full before its connection counts as dropped."""
 
 SILENCE_TIMEOUT: Final = 15.0
-"""Seconds without an acknowledgement after which a connection counts as gone (Linux; its own default is a
-quarter of an hour). The heartbeat that every station sends each second needs one."""
+"""Seconds without a TCP acknowledgement after which a connection counts as dropped (Linux; its own default is
+15 minutes). The heartbeat that every station sends each second needs an acknowledgement."""
 
-CLIENTS: Final = 64
-"""Connections that `tcpin` holds at once; further ones are closed at once. Strangers cannot make it grow."""
+CONNECTIONS_MAX: Final = 64
+"""Connections of `tcpin` at a time; further ones are closed immediately, so that strangers use no memory."""
 
 READ_SIZE: Final = 65536
-"""Bytes that are read from one connection before the others have their turn."""
+"""Bytes that are read from one connection before the next one is read."""
 
 
 class Connection(NamedTuple):
-    """A TCP connection as a peer. The number makes it another one when the same address comes again."""
+    """A TCP connection as a peer. The number distinguishes several connections of the same address."""
 
     number: int
     host: str
@@ -41,7 +41,7 @@ class Connection(NamedTuple):
 
 
 class TcpOut(SocketLink):
-    """`tcp`: one outgoing connection; `open` makes a new one after it has dropped."""
+    """`tcp`: one outgoing connection. `open` makes a new one after it has dropped."""
 
     is_stream = True
     reconnects = True
@@ -66,9 +66,9 @@ class TcpOut(SocketLink):
             return [(self._far, data)]
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
-        """See `Link.send`. Waits at most `SEND_TIMEOUT` for room; then the connection counts as dropped.
+        """See `Link.send`. Waits at most `SEND_TIMEOUT` for space; then the connection counts as dropped.
 
-        Cancelled, it may have sent a part.
+        After cancellation, a part may have been sent.
         """
         await anyio.lowlevel.checkpoint()
         sock = self._open_socket()
@@ -100,7 +100,7 @@ class TcpOut(SocketLink):
 
 
 class TcpIn(SocketLink):
-    """`tcpin`: listens; speaks to every connection. One that ends takes no other with it."""
+    """`tcpin`: listens, and sends to every connection. The end of one connection does not affect others."""
 
     is_stream = True
     reconnects = False
@@ -112,7 +112,7 @@ class TcpIn(SocketLink):
         self._accepted = 0
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
-        """See `Link.receive`: up to `READ_SIZE` bytes from each connection that has some."""
+        """See `Link.receive`: up to `READ_SIZE` bytes from each readable connection."""
         listener, selector = self._open_socket(), self._selector
         assert selector is not None
         batch: list[tuple[Peer, bytes]] = []
@@ -129,9 +129,9 @@ class TcpIn(SocketLink):
         return batch
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
-        """See `Link.send`. A connection that has no room for `SEND_TIMEOUT` is ended.
+        """See `Link.send`. A connection without space for `SEND_TIMEOUT` is closed.
 
-        Cancelled, it may have sent a part.
+        After cancellation, a part may have been sent.
         """
         await anyio.lowlevel.checkpoint()
         self._open_socket()
@@ -142,7 +142,7 @@ class TcpIn(SocketLink):
             except OSError:
                 self._check(opening)
                 with suppress(OSError):
-                    client.shutdown(socket.SHUT_RDWR)  # `receive` finds its end, tells of it and closes it
+                    client.shutdown(socket.SHUT_RDWR)  # `receive` then reads the end, reports and closes it
 
     async def _open(self, opening: int) -> None:
         family, address = (await self._resolve(socket.SOCK_STREAM))[0]
@@ -150,8 +150,8 @@ class TcpIn(SocketLink):
         self._adopt(listener, opening)
         listener.setblocking(False)
         claim(listener)
-        if sys.platform != "win32":  # where it would let others have the port as well, and is not needed
-            # Not for a second listener, but to bind again while old connections linger in TIME_WAIT.
+        if sys.platform != "win32":  # on Windows the option would let others share the port
+            # The option allows binding again while old connections are in TIME_WAIT.
             listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         listener.bind(address)
         listener.listen()
@@ -170,7 +170,7 @@ class TcpIn(SocketLink):
             close_socket(client)
 
     async def _any_readable(self, sockets: list[socket.socket]) -> None:
-        """Wait for all of them; LinkError when the link is closed meanwhile."""
+        """Wait for any of the sockets; LinkError if the link is closed meanwhile."""
         opening = self._openings
         async with anyio.create_task_group() as tasks:
 
@@ -192,10 +192,10 @@ class TcpIn(SocketLink):
         try:
             client, (host, port, *_) = listener.accept()
         except (BlockingIOError, ConnectionError):
-            return  # it left before its turn
+            return  # the client has already disconnected
         except OSError as error:
             raise self._error(f"cannot accept: {reason(error)}") from error
-        if len(self._clients) >= CLIENTS:
+        if len(self._clients) >= CONNECTIONS_MAX:
             client.close()
             return
         _set_up(client)
@@ -220,7 +220,7 @@ class TcpIn(SocketLink):
 
 
 def _file_of(selector: selectors.DefaultSelector) -> int | None:
-    """The file that stands for all that is watched and becomes readable with any of it; None on Windows."""
+    """Return the selector's file descriptor, readable when any of its files is; None on Windows."""
     number = getattr(selector, "fileno", None)
     return None if number is None else int(number())
 
@@ -234,26 +234,26 @@ def _set_up(sock: socket.socket) -> None:
 
 async def _connect(sock: socket.socket, address: Address) -> None:
     status = sock.connect_ex(address)
-    if status in _UNDER_WAY:
+    if status in _IN_PROGRESS:
         await _writable(sock)
         status = sock.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
     if status:
-        raise OSError(status, _words(status))
+        raise OSError(status, _status_text(status))
 
 
 if sys.platform == "win32":
-    _UNDER_WAY = (errno.WSAEWOULDBLOCK, errno.WSAEINPROGRESS)
+    _IN_PROGRESS = (errno.WSAEWOULDBLOCK, errno.WSAEINPROGRESS)
 
-    def _words(status: int) -> str:
+    def _status_text(status: int) -> str:
         return socket.errorTab.get(status, os.strerror(status))
 
 else:
-    _UNDER_WAY = (errno.EINPROGRESS,)
-    _words = os.strerror
+    _IN_PROGRESS = (errno.EINPROGRESS,)
+    _status_text = os.strerror
 
 
 async def _send_all(sock: socket.socket, data: bytes) -> None:
-    """Send everything; OSError when the connection is gone, closed here, or has had no room for long."""
+    """Send all bytes; OSError if the connection dropped, was closed here, or stalled for `SEND_TIMEOUT`."""
     view = memoryview(data)
     with anyio.move_on_after(SEND_TIMEOUT):
         while view:
@@ -262,7 +262,7 @@ async def _send_all(sock: socket.socket, data: bytes) -> None:
             except BlockingIOError:
                 await _writable(sock)
         return
-    raise OSError(errno.ETIMEDOUT, f"the other side has not read for {SEND_TIMEOUT:g} s")
+    raise OSError(errno.ETIMEDOUT, f"the peer has not read any data for {SEND_TIMEOUT:g} s")
 
 
 async def _writable(sock: socket.socket) -> None:

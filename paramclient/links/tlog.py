@@ -1,6 +1,6 @@
-"""Telemetry logs: eight bytes of time, big-endian, in unix microseconds, before each frame.
+"""Telemetry logs (.tlog): 8 bytes of time, big-endian, in Unix microseconds, before each frame.
 
-The form of Mission Planner, MAVProxy, QGroundControl and pymavlink.
+The file format of Mission Planner, MAVProxy, QGroundControl and pymavlink.
 """
 
 from __future__ import annotations
@@ -18,20 +18,21 @@ from paramclient.errors import LinkError
 
 __all__ = ["Record", "open_log", "packed_time", "read_records"]
 
-BLOCK: Final = 65536
-"""Bytes that are read at once."""
-FIRST_WITHIN: Final = 1 << 20
-"""Bytes in which a log's first frame begins: what is no log may be a disk image, too long to be read."""
-LONGEST_LEAP: Final = 366 * 86400.0
-"""Seconds between two frames that are believed at once. A longer leap must be shared by the next frame: a
-clock that was not set begins with 1970 or 1980, and logs of many years may be joined; damage is alone."""
-LATEST: Final = 7_258_118_400.0
-"""The latest time that a frame may have, in the year 2200: bytes that are no log have any."""
+BLOCK_SIZE: Final = 65536
+"""Bytes per read."""
+FIRST_FRAME_OFFSET_MAX: Final = 1 << 20
+"""Bytes within which the first frame must begin: the file may be a disk image, too long to be searched."""
+TIME_STEP_MAX: Final = 366 * 86400.0
+"""Seconds between two frames that are accepted without a check. After a larger step, the next frame must have
+about the same time: a clock that was not set starts in 1970 or 1980, and logs of many years may be joined,
+but damage affects a single frame."""
+TIME_MAX: Final = 7_258_118_400.0
+"""Latest Unix time of a frame, in the year 2200, to reject random bytes."""
 
 _TIME: Final = struct.Struct(">Q")
 _LONGEST_RECORD: Final = 8 + 12 + 255 + 13
-_LOOKED_AT: Final = _LONGEST_RECORD + 8 + 3
-"""Bytes that say whether a record is one: it, and the beginning of the next one."""
+_RECORD_CHECK_SIZE: Final = _LONGEST_RECORD + 8 + 3
+"""Bytes that decide whether a record is valid: the record, and the beginning of the next one."""
 _MAGIC_V1: Final = 0xFE
 _MAGIC_V2: Final = 0xFD
 _MAGIC: Final = re.compile(b"[\xfd\xfe]").search
@@ -41,8 +42,8 @@ class Record(NamedTuple):
     """One frame of a log.
 
     Attributes:
-        at: when, in unix seconds.
-        data: the frame as it stood on the wire; nothing proves it.
+        at: Unix time in seconds.
+        data: the frame as on the wire; its checksum is not verified.
     """
 
     at: float
@@ -50,7 +51,7 @@ class Record(NamedTuple):
 
 
 def packed_time(at: float) -> bytes:
-    """A time, in unix seconds, as it stands in a log: 1970 for a clock that stands before it."""
+    """Return a Unix time in seconds, encoded for a log; times before 1970 become 1970."""
     return _TIME.pack(max(0, round(at * 1e6)))
 
 
@@ -59,24 +60,24 @@ def open_log(path: str, name: str) -> BinaryIO:
 
     Args:
         path: the file.
-        name: of the link, for the error.
+        name: the link's name, for errors.
 
     Raises:
-        LinkError: it cannot be read, or is no log. Nor is what is no regular file: it may have no end, or
-            keep us waiting.
+        LinkError: the file cannot be read, is not a log, or is not a regular file, which may be endless or
+            block the reader.
     """
     try:
         mode = Path(path).stat().st_mode
         if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-            raise LinkError(f"{name}: {path} is no regular file", link=name)
+            raise LinkError(f"{name}: {path} is not a regular file", link=name)
         file = Path(path).open("rb")  # noqa: SIM115 - the caller closes it
     except LinkError:
         raise
     except OSError as error:
         raise LinkError(f"{name}: cannot open {path}: {error.strerror}", link=name) from error
     try:
-        if next(read_records(BytesIO(file.read(FIRST_WITHIN))), None) is None:
-            raise LinkError(f"{name}: {path} is no telemetry log, or holds no frame", link=name)
+        if next(read_records(BytesIO(file.read(FIRST_FRAME_OFFSET_MAX))), None) is None:
+            raise LinkError(f"{name}: {path} is not a telemetry log, or contains no frames", link=name)
         file.seek(0)
     except OSError as error:
         file.close()
@@ -87,18 +88,18 @@ def open_log(path: str, name: str) -> BinaryIO:
 
 
 def read_records(file: BinaryIO) -> Iterator[Record]:
-    """The frames of a log, in order.
+    """Generate the frames of a log, in order.
 
-    Where what stands there is no record, as behind a write that was cut off, the next place is looked for
-    that may be one. A record that the end cuts off is left out.
+    Skips invalid bytes, as after an interrupted write, up to the next possible record. Leaves out a record
+    that the end of the file cuts off.
     """
     buffer = b""
     start = 0
     before = -math.inf
     is_over = False
     while True:
-        if not is_over and len(buffer) - start < _LOOKED_AT:
-            block = file.read(BLOCK)
+        if not is_over and len(buffer) - start < _RECORD_CHECK_SIZE:
+            block = file.read(BLOCK_SIZE)
             is_over = not block
             buffer = buffer[start:] + block
             start = 0
@@ -110,8 +111,8 @@ def read_records(file: BinaryIO) -> Iterator[Record]:
         at = _time_at(buffer, start)
         if (
             size
-            and at <= LATEST
-            and (_are_near(at, before) or _is_shared(buffer, end, at, alone=before == -math.inf))
+            and at <= TIME_MAX
+            and (_are_near(at, before) or _is_confirmed(buffer, end, at, alone=before == -math.inf))
         ):
             if end > len(buffer):
                 return
@@ -124,7 +125,7 @@ def read_records(file: BinaryIO) -> Iterator[Record]:
 
 
 def _size_at(buffer: bytes, at: int) -> int | None:
-    """Bytes of the frame that begins there, 0 where none does; None where the end cuts off its header."""
+    """Return the size of the frame at a position, 0 for no frame, None if the end cuts off its header."""
     if at + 3 > len(buffer):
         return None
     if buffer[at] == _MAGIC_V1:
@@ -139,11 +140,11 @@ def _time_at(buffer: bytes, at: int) -> float:
 
 
 def _are_near(at: float, before: float) -> bool:
-    return abs(at - before) <= LONGEST_LEAP
+    return abs(at - before) <= TIME_STEP_MAX
 
 
-def _is_shared(buffer: bytes, end: int, at: float, *, alone: bool) -> bool:
-    """Whether what stands behind a record is one of about the same time; the end will do for one alone."""
+def _is_confirmed(buffer: bytes, end: int, at: float, *, alone: bool) -> bool:
+    """Return whether the next record has about the same time; at the end of the file, return `alone`."""
     size = _size_at(buffer, end + 8)
     if size is None:
         return alone

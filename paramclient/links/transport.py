@@ -1,4 +1,4 @@
-"""A serial port behind serialx's asyncio transport: for Windows, where a port is no file descriptor."""
+"""Serial ports through serialx's asyncio transport: for Windows, where a port is not a file descriptor."""
 
 from __future__ import annotations
 
@@ -18,15 +18,16 @@ __all__ = ["Transport"]
 CLOSE_TIMEOUT: Final = 2.0
 """Seconds that closing waits for the driver."""
 
-UNREAD_LIMIT: Final = 65536
-"""Bytes that may come before they are read; the transport is then told to wait, and the system loses them."""
+UNREAD_BYTES_MAX: Final = 65536
+"""Received bytes that may wait for a reader; above it reading pauses, and the operating system drops
+bytes."""
 
 
 class Transport(asyncio.Protocol):
-    """An open port, as `paramclient.links.serial` wants it.
+    """An open port with the interface that `paramclient.links.serial` needs.
 
-    Bytes are taken from the system as they come, up to `UNREAD_LIMIT` of them; what is to be sent waits here
-    for the system, one frame at a time.
+    Takes bytes from the operating system as they arrive, up to `UNREAD_BYTES_MAX`. Bytes to send wait for the
+    operating system, one frame at a time.
     """
 
     def __init__(self) -> None:
@@ -41,20 +42,20 @@ class Transport(asyncio.Protocol):
 
     @classmethod
     async def opened(cls, device: str, baud: int) -> Transport:
-        """Open a port. OSError when it cannot be; UsageError on other event loops than asyncio's own."""
+        """Open a port. OSError if that fails; UsageError on event loops other than asyncio's own."""
         port = cls()
         try:
             loop = asyncio.get_running_loop()
             port._transport, _ = await serialx.create_serial_connection(loop, lambda: port, device, baud)
         except serialx.UnsupportedSetting as error:
-            raise UsageError(f"{device}: no serial port of this system has {baud} baud") from error
-        except RuntimeError as error:  # trio, or a loop that is not for pipes
+            raise UsageError(f"{device}: this system does not support {baud} baud") from error
+        except RuntimeError as error:  # trio, or an asyncio loop without pipes
             raise UsageError(f"{device}: on Windows serial ports need asyncio's own event loop") from error
         port._transport.set_write_buffer_limits(high=0)
         return port
 
     async def read(self) -> bytes:
-        """Wait for bytes; none at all when the port is closed meanwhile."""
+        """Wait for bytes; return b"" if the port is closed meanwhile."""
         while not self._chunks and not self._is_closed:
             self._news = anyio.Event()
             await self._news.wait()
@@ -67,7 +68,7 @@ class Transport(asyncio.Protocol):
         return data
 
     async def write(self, data: bytes) -> None:
-        """Wait until the system has taken everything, or the port is closed."""
+        """Wait until the operating system has accepted all bytes, or the port is closed."""
         await self._may_write.wait()
         if not self._is_closed:
             self._transport.write(data)
@@ -76,18 +77,18 @@ class Transport(asyncio.Protocol):
             raise self._loss
 
     async def close(self) -> None:
-        """Wake who waits, drop what is unsent, close."""
+        """Wake waiting tasks, drop unsent bytes, close."""
         self._finish(None)
         with anyio.move_on_after(CLOSE_TIMEOUT, shield=True):
             self._transport.abort()
             await self._transport.wait_closed()
 
-    # what the transport calls
+    # asyncio.Protocol: called by the transport
 
     def data_received(self, data: bytes) -> None:
         self._chunks.append(data)
         self._unread += len(data)
-        if self._unread >= UNREAD_LIMIT:
+        if self._unread >= UNREAD_BYTES_MAX:
             self._transport.pause_reading()
         self._news.set()
 

@@ -1,9 +1,9 @@
-"""Links over UDP: `udpin` waits for vehicles, `udpout` speaks to one address.
+"""Links over UDP: `udpin` listens for vehicles, `udpout` sends to one address.
 
-A reader that comes late finds in the kernel's buffer what arrived meanwhile, and only there. A datagram
-with one PARAM_VALUE takes 832 bytes of it (Linux 6.18, loopback), so a burst of 2,000 needs 1.7 MB, and
-Linux' usual limit for what a program may ask for (`net.core.rmem_max` = 212992, doubled by the kernel)
-holds 512. What was received of such a burst, sent in 6 ms while the event loop was held up for 100 ms:
+Datagrams that arrive while the reader is late wait in the kernel's buffer, and only there. A datagram with
+one PARAM_VALUE takes 832 bytes of it (Linux 6.18, loopback), so a burst of 2,000 needs 1.7 MB. Linux' usual
+limit for a program's buffer (`net.core.rmem_max` = 212992, doubled by the kernel) holds 512. Datagrams
+received of such a burst, sent in 6 ms while the event loop was blocked for 100 ms:
 
 ==================================  ============  =============
 way of reading                      loop sleeps   loop computes
@@ -14,13 +14,13 @@ small buffer, drained by a thread   1,167–1,694   512–1,258
 small buffer, thread with recvmmsg  1,891–2,000   512
 ==================================  ============  =============
 
-A thread must wait for the interpreter's lock after each call, so it does not make up for a small buffer.
-The buffer is therefore asked for, beyond the limit where the program is privileged enough, and what was
-granted can be read. Where that is too little, `sysctl -w net.core.rmem_max=4194304` helps.
+A thread waits for the interpreter's lock after each call, so it does not replace a large buffer. The link
+therefore requests the buffer, beyond the limit if the program is privileged, and `receive_buffer` tells its
+actual size. If that is too small, `sysctl -w net.core.rmem_max=4194304` helps.
 
-Linux notes when each datagram arrives, and tells it of the one that was read last (SIOCGSTAMP, socket(7)).
-One such call for each read costs 0.6 µs; with control messages (SO_TIMESTAMPNS) each datagram would cost
-twice that. So the datagrams of a read are told apart only where the first of them has waited.
+Linux records the arrival time of each datagram, and reports that of the datagram read last (SIOCGSTAMP,
+socket(7)). One such call per read costs 0.6 µs; control messages (SO_TIMESTAMPNS) for each datagram would
+cost twice that. The datagrams of a read therefore get individual times only if the first of them has waited.
 """
 
 from __future__ import annotations
@@ -47,47 +47,48 @@ from paramclient.protocol.wire import HEARTBEAT_ID, Framer
 __all__ = ["UdpIn", "UdpOut"]
 
 RECEIVE_BUFFER: Final = 4 * 1024 * 1024
-"""Bytes asked for; Linux doubles it. Holds about 10,000 PARAM_VALUEs."""
+"""Bytes requested for the kernel's buffer; Linux doubles them. Holds about 10,000 PARAM_VALUEs."""
 
 DATAGRAMS_PER_READ: Final = 128
-"""Datagrams that one `receive` gives at most, so that other tasks get their turn during a burst."""
+"""Datagrams that one `receive` returns at most, so that other tasks run during a burst."""
 
-PEERS: Final = 256
-"""Addresses that a listening link remembers, one for each system id: what is for all goes to those. Strangers
-cannot make it grow, nor come between a vehicle and what is for it alone."""
+PEERS_MAX: Final = 256
+"""Addresses that a listening link remembers, one for each system id: broadcasts go to those. The limit keeps
+strangers from using memory; messages to a single vehicle do not depend on it."""
 
-PEER_SILENCE: Final = 60.0
+PEER_TIMEOUT: Final = 60.0
 """Seconds without a valid frame after which an address is forgotten."""
 
-PROOF_PACE: Final = 1.0
-"""Seconds after which a frame of an address that has sent heartbeats is checked again here, beside the check
-that the station makes of every frame."""
+FRAME_CHECK_INTERVAL: Final = 1.0
+"""Seconds after which the link checks another frame of an address that has sent heartbeats. The station
+checks every frame in any case."""
 
-STRANGERS_PACE: Final = 1.0
-"""Seconds between two heartbeats to addresses that have sent none, all of them together: whoever forges the
-address of another computer has it sent no more than that."""
+UNKNOWN_PEER_INTERVAL: Final = 1.0
+"""Seconds between two heartbeats to addresses that have sent none, all of them together: a forged sender
+address causes no more traffic than that to another computer."""
 
-UNREACHABLE_PATIENCE: Final = 3.0
-"""Seconds in which nothing found a way out, after which the socket is made anew: three heartbeats. It has its
-own address from when it was opened, and this computer may have got another one since."""
+UNREACHABLE_TIMEOUT: Final = 3.0
+"""Seconds without a route, after which the socket counts as dropped: three heartbeats. The socket keeps the
+local address of its opening, and this computer may have got another one since."""
 
-LOOK_AGAIN: Final = 10.0
-"""Seconds of silence after which it is looked whether a name has another address by now."""
+RESOLVE_INTERVAL: Final = 10.0
+"""Seconds without data after which a host name is resolved again, in case its address has changed."""
 
 LOCAL_PORTS: Final = range(20480, 28672)
-"""Ports that `udpout` speaks from. Linux, macOS and Windows give out ports from 32768 on by themselves, so
-other programs rarely have one of these."""
+"""Local ports of `udpout`. Linux, macOS and Windows assign ports from 32768 on, so other programs rarely use
+one of these."""
 
-AT_ONCE: Final = 0.001
-"""Seconds within which the first datagram of a read was read at once: the others came later than that one."""
+READ_DELAY_MAX: Final = 0.001
+"""Seconds between arrival and read of a datagram up to which it was read immediately: the later datagrams of
+the same read then get its arrival time."""
 
 
-class _Known:
-    """What is known of an address.
+class _PeerState:
+    """State of one address.
 
     Attributes:
-        proven_at: when a valid frame came from it last.
-        served_at: when one that has sent no heartbeat was sent ours last.
+        proven_at: time of its last valid frame.
+        served_at: time of the last heartbeat sent to it, if it has sent none.
     """
 
     __slots__ = ("proven_at", "served_at")
@@ -97,17 +98,17 @@ class _Known:
 
 
 class UdpLink(SocketLink):
-    """What both kinds share: one UDP socket, and the peers on it.
+    """Base class of the UDP links: one socket, and the peers on it.
 
-    While the network is away, what is sent is lost, and counted. A socket that has its own address from when
-    it was opened, and finds no way out with it for `UNREACHABLE_PATIENCE`, counts as dropped.
+    While the network is down, datagrams to send are lost, and counted. A socket with the local address of its
+    opening and without a route for `UNREACHABLE_TIMEOUT` counts as dropped.
 
     Attributes:
-        receive_buffer: bytes that the kernel granted for unread datagrams, its own book-keeping included.
-        lost_sends: datagrams that the system did not take: no route, full buffer, firewall. Like those lost
-            on the way they are made up for by the protocol's own repeats.
-        arrived_at: when each datagram of the last `receive` came into the kernel's buffer, in their order, by
-            the event loop's clock; empty where the system does not tell.
+        receive_buffer: bytes that the kernel granted for unread datagrams, its own overhead included.
+        lost_sends: datagrams that the operating system rejected: no route, full buffer, firewall. The
+            protocol's retries replace them, like datagrams lost on the way.
+        arrived_at: when each datagram of the last `receive` arrived in the kernel's buffer, in their order,
+            on the event loop's clock; empty if the operating system does not report it.
     """
 
     is_stream = False
@@ -119,16 +120,18 @@ class UdpLink(SocketLink):
         self.lost_sends = 0
         self.arrived_at: list[float] = []
         self._tells_arrivals = False
-        self._local_port = 0  # of the opening before
+        self._local_port = 0  # of the previous opening
         self._room = memoryview(bytearray(_LARGEST_DATAGRAM))
-        self._stuck_since: float | None = None
-        self._peers: dict[Address, _Known] = {}  # that have sent heartbeats; who spoke last is last
-        self._strangers: dict[Address, _Known] = {}  # that have sent other frames
+        self._no_route_since: float | None = None
+        # Addresses that have sent heartbeats, the latest sender last.
+        self._peers: dict[Address, _PeerState] = {}
+        # Addresses that have sent only other frames.
+        self._strangers: dict[Address, _PeerState] = {}
         self._stranger_served_at = -math.inf
         self._framer = Framer((HEARTBEAT_ID,), stream=False)
 
     async def receive(self) -> list[tuple[Peer, bytes]]:
-        """See `Link.receive`. At most `DATAGRAMS_PER_READ` at a time; empty datagrams are passed over."""
+        """See `Link.receive`. Returns at most `DATAGRAMS_PER_READ` datagrams; skips empty ones."""
         sock = self._open_socket()
         into, room = sock.recvfrom_into, self._room
         batch: list[tuple[Address, bytes]] = []
@@ -142,14 +145,14 @@ class UdpLink(SocketLink):
                 except BlockingIOError:
                     break
                 except OSError as error:
-                    if error.errno not in _PASSING:
+                    if error.errno not in _TRANSIENT:
                         raise self._error(f"cannot receive: {reason(error)}") from error
-                    continue  # an ICMP message about something that was sent earlier
+                    continue  # an ICMP error for an earlier datagram
                 if size:
                     batch.append((address, bytes(room[:size])))
                     if asks:
                         arrivals.append(_arrived_at(sock))
-                        asks = time.time() - arrivals[-1] > AT_ONCE
+                        asks = time.time() - arrivals[-1] > READ_DELAY_MAX
         if arrivals:
             ahead = seconds_ahead(time.time, anyio.current_time)
             arrivals = [at - ahead for at in arrivals]
@@ -158,20 +161,20 @@ class UdpLink(SocketLink):
         return [*batch]
 
     async def send(self, data: bytes, peer: Peer | None) -> None:
-        """See `Link.send`. Does not wait for the network: what cannot go out now is lost, and counted."""
+        """See `Link.send`. Does not wait for the network: drops and counts datagrams that cannot be sent."""
         await anyio.lowlevel.checkpoint()
         sock = self._open_socket()
-        for address in self._for_all(data) if peer is None else self._destinations(peer):
+        for address in self._broadcast_addresses(data) if peer is None else self._destinations(peer):
             try:
                 self._transmit(sock, data, address)
             except OSError as error:
-                if error.errno not in _PASSING:
+                if error.errno not in _TRANSIENT:
                     raise self._error(f"cannot send: {reason(error)}") from error
                 self.lost_sends += 1
-                if error.errno in _NO_WAY_OUT and self._has_own_address:
-                    self._be_stuck(error)
+                if error.errno in _NO_ROUTE and self._has_own_address:
+                    self._note_no_route(error)
             else:
-                self._stuck_since = None
+                self._no_route_since = None
 
     async def close(self) -> None:
         """See `Link.close`."""
@@ -180,59 +183,59 @@ class UdpLink(SocketLink):
 
     @property
     def _has_own_address(self) -> bool:
-        """Whether the socket sends from one address, which this computer may lose."""
+        """Whether the socket sends from one fixed address, which this computer may lose."""
         return True
 
-    def _be_stuck(self, error: OSError) -> None:
+    def _note_no_route(self, error: OSError) -> None:
         now = anyio.current_time()
-        if self._stuck_since is None:
-            self._stuck_since = now
-        elif now - self._stuck_since >= UNREACHABLE_PATIENCE:
-            self._fail(f"no way out from {self._own_host} any more: {reason(error)}", error)
+        if self._no_route_since is None:
+            self._no_route_since = now
+        elif now - self._no_route_since >= UNREACHABLE_TIMEOUT:
+            self._fail(f"no route from {self._own_host} any more: {reason(error)}", error)
 
     @property
     def _own_host(self) -> str:
         return self.address[0] if self.address else self._host
 
     def _learn(self, batch: list[tuple[Address, bytes]]) -> None:
-        """Remember who sends valid frames, the latest last; forget who has been silent for longest."""
+        """Remember the senders of valid frames, the latest last; forget the one silent for longest."""
         peers, now = self._peers, anyio.current_time()
         for address, data in batch:
             known = peers.pop(address, None)
             if known is not None:
                 peers[address] = known
-                if now < known.proven_at + PROOF_PACE:
+                if now < known.proven_at + FRAME_CHECK_INTERVAL:
                     continue
             self._prove(address, data, now)
 
     def _prove(self, address: Address, data: bytes, now: float) -> None:
-        """See whether a datagram has a valid frame, and whether that is a heartbeat."""
+        """Check whether a datagram has a valid frame, and whether that is a heartbeat."""
         before = self._framer.frames
         beats = self._framer.receive(data)
         if self._framer.frames == before:
             return
-        known = self._strangers.pop(address, None) or self._peers.get(address) or _Known()
+        known = self._strangers.pop(address, None) or self._peers.get(address) or _PeerState()
         known.proven_at = now
         if beats or address in self._peers:
             self._peers[address] = known
         else:
             self._strangers[address] = known
-        if len(self._peers) + len(self._strangers) > PEERS:
-            fewest = self._strangers or self._peers
-            del fewest[next(iter(fewest))]
+        if len(self._peers) + len(self._strangers) > PEERS_MAX:
+            least_useful = self._strangers or self._peers
+            del least_useful[next(iter(least_useful))]
 
     def _forget_silent(self, now: float) -> None:
         for known in (self._peers, self._strangers):
-            for address in [each for each, at in known.items() if now - at.proven_at >= PEER_SILENCE]:
+            for address in [each for each, at in known.items() if now - at.proven_at >= PEER_TIMEOUT]:
                 del known[address]
 
-    def _for_all(self, data: bytes) -> list[Address]:
-        """Where what is for all goes: a heartbeat to one of those that have sent none, in turn."""
+    def _broadcast_addresses(self, data: bytes) -> list[Address]:
+        """Return the addresses for a broadcast. Addresses without heartbeats get heartbeats in turn."""
         now = anyio.current_time()
         self._forget_silent(now)
         strangers = list(self._strangers)
         if strangers and self._framer.receive(data):
-            is_due = now >= self._stranger_served_at + STRANGERS_PACE
+            is_due = now >= self._stranger_served_at + UNKNOWN_PEER_INTERVAL
             strangers = [min(strangers, key=lambda each: self._strangers[each].served_at)] if is_due else []
             for address in strangers:
                 self._stranger_served_at = self._strangers[address].served_at = now
@@ -255,7 +258,7 @@ class UdpLink(SocketLink):
         self.receive_buffer = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         self._tells_arrivals = _note_arrivals(sock)
         self._peers, self._strangers = {}, {}
-        self._stuck_since = None
+        self._no_route_since = None
         return sock
 
 
@@ -263,15 +266,15 @@ if sys.platform == "linux":
     from fcntl import ioctl
 
     def _note_arrivals(sock: socket.socket) -> bool:
-        """Have the kernel note when datagrams arrive; whether it does."""
+        """Make the kernel record arrival times; return whether it does."""
         try:
             _arrived_at(sock)
         except OSError as error:
-            return error.errno == errno.ENOENT  # nothing was read yet
+            return error.errno == errno.ENOENT  # supported, but nothing was read yet
         return True
 
     def _arrived_at(sock: socket.socket) -> float:
-        """Return when the datagram that was read last came into the kernel's buffer, in unix seconds."""
+        """Return when the last datagram read arrived in the kernel's buffer, as a Unix time in seconds."""
         stamp = ioctl(sock, _SIOCGSTAMP, bytes(_TIMEVAL.size))
         seconds, microseconds = _TIMEVAL.unpack(stamp)
         arrived_at: float = seconds + microseconds * 1e-6
@@ -280,21 +283,21 @@ if sys.platform == "linux":
 else:
 
     def _note_arrivals(sock: socket.socket) -> bool:
-        """Return false: the system does not tell when a datagram arrived."""
+        """Return false: the operating system does not report arrival times."""
         return False
 
     def _arrived_at(sock: socket.socket) -> float:
-        """Return 0: nobody asks."""
+        """Return 0; never called."""
         return 0.0
 
 
 class UdpIn(UdpLink):
-    """`udpin`: bound to a port; speaks to everyone who has spoken MAVLink to it.
+    """`udpin`: bound to a port; sends to all addresses from which MAVLink frames came.
 
-    Several vehicles may come from different addresses, or one after a restart from a new one. The `PEERS`
-    that sent valid frames last, in the last `PEER_SILENCE` seconds, get what is for all; those that have sent
-    no heartbeat share one of ours a second, in turn. What is for one peer goes there, however many others
-    speak.
+    Several vehicles may send from different addresses, or one after a restart from a new one. Broadcasts go
+    to the `PEERS_MAX` latest senders of valid frames in the last `PEER_TIMEOUT` seconds; those without
+    heartbeats share one heartbeat of ours per second, in turn. Messages to one peer go to its address,
+    independent of the number of senders.
     """
 
     async def _open(self, opening: int) -> None:
@@ -305,48 +308,48 @@ class UdpIn(UdpLink):
 
     @property
     def _has_own_address(self) -> bool:
-        return self._host not in _EVERY_ADDRESS
+        return self._host not in _ANY_ADDRESS
 
     def _destinations(self, peer: Peer) -> list[Address]:
         return [peer] if isinstance(peer, tuple) else []
 
 
 class UdpOut(UdpLink):
-    """`udpout`: speaks to one address, from one local port for as long as it is open.
+    """`udpout`: sends to one address, from one local port while it is open.
 
-    Only what comes from that very address and port is heard: it is where a vehicle answers from. Nobody need
-    be there yet: refusals are passed over.
+    Receives only datagrams from exactly that address and port, from which a vehicle responds. The vehicle may
+    start later: ICMP port-unreachable errors are ignored.
 
-    PX4 answers only the address and port that it heard first, until it restarts (`MavlinkReceiver::run`). So
-    the local port follows from the remote address, and is the same in each session. While another program on
-    this computer has it, the system chooses another one.
+    PX4 responds only to the first address and port from which it received data, until it restarts
+    (`MavlinkReceiver::run`). The local port is therefore derived from the remote address, and is equal in
+    each session. While another program on this computer uses it, the operating system chooses another one.
 
-    From a broadcast address nobody answers. There everyone who speaks to the local port is heard and is a
-    peer; what is for all peers still goes to the broadcast address.
+    A broadcast address never responds. With one, every sender to the local port is received and is a peer;
+    broadcasts still go to the broadcast address.
 
-    A name is looked up on opening, and again every `LOOK_AGAIN` seconds for as long as nothing comes: where
-    it has another address by then, the link counts as dropped.
+    A host name is resolved on opening, and again every `RESOLVE_INTERVAL` seconds without data: if its
+    address has changed, the link counts as dropped.
     """
 
     def __init__(self, spec: LinkSpec) -> None:
         super().__init__(spec)
         self._group: Address | None = None
         self._far: Address | None = None
-        self._near: Address | None = None  # the same, as datagrams from there name it
+        self._near: Address | None = None  # _far, as datagrams from it are labelled
 
     async def _open(self, opening: int) -> None:
         family, address = (await self._resolve(socket.SOCK_DGRAM))[0]
         sock = self._new_socket(family, opening)
         try:
             sock.bind(("", self._local_port or _usual_port(address)))
-        except OSError:  # another program has it
+        except OSError:  # another program uses the port
             sock.bind(("", 0))
         self._local_port = sock.getsockname()[1]
         self._far = address
         self._group = self._near = None
         try:
             sock.connect(address)
-        except PermissionError:  # how the system says that this is a broadcast address
+        except PermissionError:  # the operating system's error for a broadcast address
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
             self._group = address
         else:
@@ -354,12 +357,12 @@ class UdpOut(UdpLink):
 
     async def _readable(self, waitable: socket.socket | int) -> None:
         while True:
-            with anyio.move_on_after(LOOK_AGAIN):
+            with anyio.move_on_after(RESOLVE_INTERVAL):
                 await super()._readable(waitable)
                 return
             failures: list[LinkError] = []
-            async with anyio.create_task_group() as tasks:  # a slow resolver must not keep what comes waiting
-                tasks.start_soon(self._look_again)
+            async with anyio.create_task_group() as tasks:  # a slow resolver must not delay received data
+                tasks.start_soon(self._check_address)
                 try:
                     await super()._readable(waitable)
                 except LinkError as error:
@@ -369,21 +372,21 @@ class UdpOut(UdpLink):
                 raise failures[0]
             return
 
-    async def _look_again(self) -> None:
-        """While nothing comes: fail when the name has another address than the one that is spoken to."""
+    async def _check_address(self) -> None:
+        """While no data comes: fail if the name's address is no longer the one in use."""
         opening = self._openings
         while True:
             with suppress(LinkError, TimeoutError), anyio.fail_after(OPEN_TIMEOUT):
                 found = [address for _, address in await self._resolve(socket.SOCK_DGRAM)]
                 if opening == self._openings and self._far not in found:
-                    self._fail(f"{self._host} is at {found[0][0]} now")
-            await anyio.sleep(LOOK_AGAIN)
+                    self._fail(f"the address of {self._host} changed to {found[0][0]}")
+            await anyio.sleep(RESOLVE_INTERVAL)
 
     def _learn(self, batch: list[tuple[Address, bytes]]) -> None:
         if self._group is not None:
             super()._learn(batch)
 
-    def _for_all(self, data: bytes) -> list[Address]:
+    def _broadcast_addresses(self, data: bytes) -> list[Address]:
         return [each for each in (self._group or self._near,) if each is not None]
 
     def _destinations(self, peer: Peer) -> list[Address]:
@@ -398,18 +401,18 @@ class UdpOut(UdpLink):
         try:
             sock.send(data)
         except ConnectionRefusedError:
-            sock.send(data)  # that was the answer to an earlier datagram; this one had not been sent
+            sock.send(data)  # the error was for an earlier datagram; this one had not been sent
 
 
 def _usual_port(address: Address) -> int:
-    """Return the local port from which a remote address is spoken to, one of `LOCAL_PORTS`."""
+    """Return the local port for a remote address, one of `LOCAL_PORTS`."""
     return LOCAL_PORTS.start + crc32(f"{address[0]} {address[1]}".encode()) % len(LOCAL_PORTS)
 
 
-_NO_WAY_OUT = frozenset({errno.EADDRNOTAVAIL, errno.EINVAL, errno.ENETDOWN, errno.ENETUNREACH})
-"""What is said of a socket whose own address has gone; the second by Linux before 5.3."""
+_NO_ROUTE = frozenset({errno.EADDRNOTAVAIL, errno.EINVAL, errno.ENETDOWN, errno.ENETUNREACH})
+"""Errors of a socket whose local address is gone; EINVAL is that of Linux before 5.3."""
 
-_PASSING = _NO_WAY_OUT | frozenset(
+_TRANSIENT = _NO_ROUTE | frozenset(
     {
         errno.EAGAIN,
         errno.ECONNREFUSED,
@@ -422,10 +425,10 @@ _PASSING = _NO_WAY_OUT | frozenset(
         errno.EPERM,
     }
 )
-"""What may be gone at the next datagram: no route, no listener (in two words of Windows, too), no room, a
-firewall's refusal."""
+"""Errors that may not occur for the next datagram: no route, no listener (two errors on Windows), no buffer
+space, rejected by a firewall."""
 
-_EVERY_ADDRESS = ("0.0.0.0", "::")
+_ANY_ADDRESS = ("0.0.0.0", "::")
 
 _LARGEST_DATAGRAM = 65535
 _SO_RCVBUFFORCE = 33  # Linux, asm-generic/socket.h; the socket module has no name for it

@@ -1,1 +1,1 @@
-"""Telemetry logs as sources of parameters."""
+"""Telemetry logs as sources of parameters: import into a cache."""

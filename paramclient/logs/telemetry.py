@@ -1,4 +1,4 @@
-"""What telemetry logs hold of vehicles, brought into a cache with the times that it has there."""
+"""Import of telemetry logs into a cache, with the times of the log."""
 
 from __future__ import annotations
 
@@ -30,23 +30,24 @@ from paramclient.protocol.wire import AUTOPILOT_VERSION_ID, HEARTBEAT_ID, Framer
 
 __all__ = ["ImportedTable", "import_log"]
 
-RECORDS_PER_TURN: Final = 1_000
-"""Frames that are read before other tasks have their turn: a few milliseconds."""
+RECORDS_PER_CHECKPOINT: Final = 1_000
+"""Frames between two checkpoints, at which other tasks can run: a few milliseconds."""
 LOG_PEER: Final = "log"
+"""The only peer of a log."""
 
 
 @dataclass(frozen=True, slots=True)
 class ImportedTable:
-    """What a log held of one component.
+    """The imported table of one component.
 
     Attributes:
-        key: the name under which the vehicle's tables are kept.
+        key: the key of the vehicle's tables in the cache.
         system, component: its address.
         autopilot: MAV_AUTOPILOT of its heartbeat, or None.
-        params: how many parameters were heard.
-        complete: whether those are all.
+        params: the number of received parameters.
+        complete: whether the table is complete.
         hash: the PX4 hash that confirms the table at the end of the log, or None.
-        notes: what was not taken from files that a ground station read over MAVFTP, in sentences.
+        notes: parts that were skipped of files that a ground station read over MAVFTP, in sentences.
     """
 
     key: str
@@ -60,46 +61,47 @@ class ImportedTable:
 
 
 async def import_log(path: str | os.PathLike[str], cache: ParamCache) -> tuple[ImportedTable, ...]:
-    """Bring what a telemetry log holds into a cache; all of it is kept, or nothing.
+    """Import the parameters of a telemetry log into a cache, in one transaction.
 
-    Each value and each change has the time of the log. What the cache has of a later time stays as it is, so
-    it does not matter in which order logs are brought in, nor how often. A vehicle is known by its hardware
-    id if its AUTOPILOT_VERSION is anywhere in the log; else it is one of this log alone.
+    Each value and each change has the time of the log. Later observations in the cache stay unchanged, so
+    logs may be imported in any order and repeatedly. A vehicle is identified by its hardware id if the log
+    contains its AUTOPILOT_VERSION; otherwise the vehicle has a key that is unique to the log.
 
     Args:
         path: the log.
-        cache: where to.
+        cache: the cache to write to.
 
     Raises:
-        LinkError: the file cannot be read, or is no telemetry log.
+        LinkError: the file cannot be read, or is not a telemetry log.
         CacheError: the cache cannot be written.
     """
     name = f"replay:{await anyio.Path(path).resolve()}"
     with closing(open_log(os.fspath(path), name)) as file:
-        said = await _introductions(read_records(file))
+        said = await _first_introductions(read_records(file))
         file.seek(0)
         return await _Import(name, said, cache).read(read_records(file))
 
 
-async def _introductions(records: Iterator[Record]) -> dict[int, dict[Address, bytes]]:
-    """The first HEARTBEAT and AUTOPILOT_VERSION of each component, by message, as they stand in the log."""
+async def _first_introductions(records: Iterator[Record]) -> dict[int, dict[Address, bytes]]:
+    """Return the first HEARTBEAT and AUTOPILOT_VERSION of each component, by message, as in the log."""
     found: dict[int, dict[Address, bytes]] = {HEARTBEAT_ID: {}, AUTOPILOT_VERSION_ID: {}}
     framer = Framer(set(found), stream=False)
     for number, record in enumerate(records):
         for frame in framer.receive(record.data):
             found[frame.message_id].setdefault((frame.system, frame.component), record.data)
-        if not number % RECORDS_PER_TURN:
+        if not number % RECORDS_PER_CHECKPOINT:
             await anyio.lowlevel.checkpoint()
     return found
 
 
 class _Import:
-    """One log on its way into a cache.
+    """The import of one log.
 
     Args:
-        name: of the log as a link, which an identity without a hardware id has.
-        said: who the components are, and how they write values, ahead of the time when they say it.
-        cache: where to.
+        name: the log's link name, part of an identity without a hardware id.
+        said: HEARTBEAT and AUTOPILOT_VERSION of the components, which define identity and encoding before
+            their time in the log.
+        cache: the cache to write to.
     """
 
     def __init__(self, name: str, said: Mapping[int, Mapping[Address, bytes]], cache: ParamCache) -> None:
@@ -107,10 +109,10 @@ class _Import:
         self._versions = said[AUTOPILOT_VERSION_ID]
         self._at = 0.0
         self._station = Station(link=name, is_stream=False, upkeep=Upkeep.chosen(None, "auto", is_log=True))
-        self._writer = _PastWriter(
+        self._writer = _LogWriter(
             cache,
             identity_of=self._identity_of,
-            is_doubted=lambda machine: False,  # nobody can be asked: the last one who said it counts
+            is_doubted=lambda machine: False,  # a log cannot be queried: the last identity applies
             clock=lambda: self._at,
         )
 
@@ -121,14 +123,14 @@ class _Import:
             flush_at = 0.0
             for number, record in enumerate(records):
                 if record.at >= flush_at and number:
-                    station.tick(record.at)  # what ended in a pause, ended at its beginning
+                    station.tick(record.at)  # operations that time out in a pause end before it
                     await self._follow()
                     await writer.flush()
                     flush_at = record.at + FLUSH_INTERVAL
-                self._at = max(self._at, record.at)  # a clock that was set back does not make time go back
+                self._at = max(self._at, record.at)  # a clock that was set back does not turn back the time
                 station.receive(record.data, LOG_PEER, self._at)
                 await self._follow()
-                if not number % RECORDS_PER_TURN:
+                if not number % RECORDS_PER_CHECKPOINT:
                     await anyio.lowlevel.checkpoint()
             station.over(self._at)
             await self._follow()
@@ -137,10 +139,10 @@ class _Import:
         finally:
             await writer.close()
         heard = (machines[address] for address in sorted(machines))
-        return tuple(self._told(each) for each in heard if each.table.params or each.fetches.notes)
+        return tuple(self._imported_table(each) for each in heard if each.table.params or each.fetches.notes)
 
     async def _follow(self) -> None:
-        """See to what has happened, as the client does."""
+        """Handle the station's events, as the client does."""
         station, writer = self._station, self._writer
         while events := station.events():
             for event in events:
@@ -148,7 +150,7 @@ class _Import:
                 if isinstance(event, ComponentHeard):
                     address = (machine.system, machine.component)
                     for said in (self._heartbeats, self._versions):
-                        if address in said:  # what comes before it is of the same vehicle
+                        if address in said:  # frames before the first introduction are of the same vehicle
                             station.receive(said[address], LOG_PEER, self._at)
                     await self._bring(machine)
                 elif isinstance(event, ComponentIdentified):
@@ -168,12 +170,12 @@ class _Import:
             await self._writer.bring(machine, identity)
 
     def _identity_of(self, machine: ComponentMachine) -> Identity | None:
-        """Who the vehicle is; where nothing in the log says it, one of this log alone."""
+        """Return the vehicle's identity; without one in the log, an identity that is unique to the log."""
         identity = self._station.identity_of(machine)
         is_silent = all(system != machine.system for system, _ in self._versions)
         return machine.identity if identity is None and is_silent else identity
 
-    def _told(self, machine: ComponentMachine) -> ImportedTable:
+    def _imported_table(self, machine: ComponentMachine) -> ImportedTable:
         identity = self._identity_of(machine) or machine.identity
         complete = machine.table.complete
         return ImportedTable(
@@ -188,8 +190,8 @@ class _Import:
         )
 
 
-class _PastWriter(WriteThrough):
-    """Gathers what the tables learn, with the times of the log, until `merge`."""
+class _LogWriter(WriteThrough):
+    """Collects the updates of the tables, with the times of the log, until `merge`."""
 
     def __init__(
         self,
@@ -209,12 +211,12 @@ class _PastWriter(WriteThrough):
         self._has_values: set[tuple[str, int]] = set()
 
     async def merge(self) -> None:
-        """Write everything that was gathered."""
+        """Write all collected updates."""
         work = partial(self._kept_tables.merge, self._updates, based_on=self._based_on)
         await self._worker.run(work)
 
     async def _load(self, machine: ComponentMachine, identity: Identity) -> CachedComponent | None:
-        """The kept table, where it is of an earlier time: once, as what follows it is not written yet."""
+        """Return the cached table if it is older; only once, as later updates are not written yet."""
         key = (identity.key, machine.component)
         if key in self._has_asked:
             return None

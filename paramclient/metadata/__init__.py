@@ -1,6 +1,6 @@
-"""What firmwares say of their parameters: units, ranges, names of values and bits, descriptions.
+"""Parameter metadata of firmwares: units, ranges, names of values and bits, descriptions.
 
-Nothing depends on it. It comes from a file (`read_metadata`) or from the vehicle itself (`metadata_of`).
+The metadata is optional. It comes from a file (`read_metadata`) or from the vehicle (`metadata_of`).
 """
 
 from __future__ import annotations

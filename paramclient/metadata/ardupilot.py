@@ -1,8 +1,8 @@
-"""ArduPilot's descriptions: apm.pdef.xml and apm.pdef.json, which its build makes of comments in its source.
+"""ArduPilot's metadata files apm.pdef.xml and apm.pdef.json, which its build generates from source comments.
 
-Source of the forms: `Tools/autotest/param_metadata` of ArduPilot (xmlemit.py, jsonemit.py). Their texts are
-written by hand, so a range or a list that does not read as numbers is left out; of a file that has another
-structure nothing is taken.
+Source of the formats: `Tools/autotest/param_metadata` of ArduPilot (xmlemit.py, jsonemit.py). The texts are
+written by hand, so a range or a list that cannot be parsed as numbers is left out. A file with another
+structure is rejected.
 """
 
 from __future__ import annotations
@@ -18,22 +18,22 @@ from xml.parsers import expat
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from paramclient.errors import MetadataError, UsageError
-from paramclient.metadata.info import MOST_BITS, Metadata, ParamInfo, number_of
-from paramclient.metadata.px4 import MOST_PARAMS, told, whole
+from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo, number_of
+from paramclient.metadata.px4 import PARAMS_MAX, error_text, whole
 
 __all__ = ["read_json", "read_xml"]
 
-DEEPEST: Final = 16
+DEPTH_MAX: Final = 16
 """Levels of elements; the files have six."""
 
 
 def read_xml(content: bytes, *, source: str) -> Metadata:
     """Read an apm.pdef.xml.
 
-    What a document type can declare, entities above all, is refused: the files have none.
+    Rejects document type declarations, and with them entities: the files have none.
 
     Raises:
-        MetadataError: it is none.
+        MetadataError: the file is invalid.
     """
     reader = _XmlReader(source)
     try:
@@ -41,32 +41,34 @@ def read_xml(content: bytes, *, source: str) -> Metadata:
     except MetadataError:
         raise
     except (expat.ExpatError, ValueError, LookupError) as error:
-        raise MetadataError(f"{source}: no XML: {error}", source=source) from None
+        raise MetadataError(f"{source}: not XML: {error}", source=source) from None
     return _gathered(reader.found, source)
 
 
 def read_json(document: object, *, source: str) -> Metadata:
-    """Take an apm.pdef.json, its JSON read.
+    """Read an apm.pdef.json that has been parsed as JSON.
 
     Raises:
-        MetadataError: it is none.
+        MetadataError: the document is invalid.
     """
     try:
         groups = _GROUPS.validate_python(document)
         if groups.pop("json", None) is None:
-            raise MetadataError(f'{source}: has no "json", which marks the files of ArduPilot', source=source)
-        if sum(map(len, groups.values())) > MOST_PARAMS:
+            raise MetadataError(
+                f'{source}: has no "json" member, which ArduPilot\'s files have', source=source
+            )
+        if sum(map(len, groups.values())) > PARAMS_MAX:
             raise _too_many(source)
         rows = {group: _ROWS.validate_python(described) for group, described in groups.items()}
     except ValidationError as error:
-        raise MetadataError(f"{source}{told(error)}", source=source) from None
+        raise MetadataError(f"{source}{error_text(error)}", source=source) from None
     infos = (each.info(name, group) for group, described in rows.items() for name, each in described.items())
     return _gathered(infos, source)
 
 
 @dataclass(slots=True)
 class _Row:
-    """One parameter, its fields as text."""
+    """One parameter, with its fields as text."""
 
     name: str
     short: str = ""
@@ -103,7 +105,7 @@ class _Row:
 
 
 class _Described(BaseModel):
-    """A parameter in the JSON; what the build could not take apart stands there as one text."""
+    """A parameter in the JSON. A field that the build could not parse is one text."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -143,10 +145,10 @@ _ROWS: Final = TypeAdapter(dict[str, _Described])
 
 
 class _XmlReader:
-    """Takes the parameters out of an XML file, element by element.
+    """Reads the parameters of an XML file, element by element.
 
     Attributes:
-        found: the parameters; the group of each is the vehicle or the library that it belongs to.
+        found: the parameters; the group of each is its vehicle or library.
     """
 
     def __init__(self, source: str) -> None:
@@ -155,16 +157,17 @@ class _XmlReader:
         self._depth = 0
         self._group = ""
         self._row: _Row | None = None
-        self._store: dict[str, str] | None = None  # where the text of the element goes, under this key
+        # Receives the text of the current element, under _key.
+        self._store: dict[str, str] | None = None
         self._key = ""
         self._text: list[str] = []
 
     def parse(self, content: bytes) -> None:
-        """Read it all.
+        """Parse the file.
 
         Raises:
-            MetadataError: it has a document type, or is no file of parameters.
-            ExpatError, ValueError, LookupError: it is no XML.
+            MetadataError: the file has a document type, or is not a parameter file.
+            ExpatError, ValueError, LookupError: the file is not XML.
         """
         parser = expat.ParserCreate()
         parser.buffer_text = True
@@ -175,20 +178,20 @@ class _XmlReader:
         parser.Parse(content, True)
 
     def _refuse_doctype(self, *_: object) -> None:
-        raise self._error("has a document type (<!DOCTYPE …>), which the files of ArduPilot have not")
+        raise self._error("has a document type (<!DOCTYPE …>), which ArduPilot's files do not have")
 
     def _begin(self, tag: str, attributes: dict[str, str]) -> None:
         self._depth += 1
         if self._depth == 1 and tag != "paramfile":
-            raise self._error(f"begins with <{tag}>, where the files of ArduPilot have <paramfile>")
-        if self._depth > DEEPEST:
-            raise self._error(f"has more than {DEEPEST} levels")
+            raise self._error(f"begins with <{tag}>, not with <paramfile> as ArduPilot's files")
+        if self._depth > DEPTH_MAX:
+            raise self._error(f"has more than {DEPTH_MAX} levels")
         row = self._row
         if tag == "parameters":
             self._group = attributes.get("name", "")
         elif tag == "param":
             if row is not None:
-                raise self._error(f"has a parameter inside of {row.name}")
+                raise self._error(f"has a parameter inside {row.name}")
             name = attributes.get("name", "").rpartition(":")[2]
             if not name:
                 raise self._error("has a parameter without a name")
@@ -210,7 +213,7 @@ class _XmlReader:
     def _end(self, tag: str) -> None:
         self._depth -= 1
         if tag == "param" and self._row is not None:
-            if len(self.found) >= MOST_PARAMS:
+            if len(self.found) >= PARAMS_MAX:
                 raise _too_many(self._source)
             self.found.append(self._row.info(self._group))
             self._row = None
@@ -223,11 +226,12 @@ class _XmlReader:
 
 
 _KEYS: Final = {"field": "name", "value": "code", "bit": "code"}
-_ITEM: Final = re.compile(r",(?=\s*[+-]?[0-9.]+\s*:)")  # a comma may also stand in a name
+_ITEM: Final = re.compile(r",(?=\s*[+-]?[0-9.]+\s*:)")
+"""Separator of items: a comma before a number and a colon, as a name may contain commas."""
 
 
 def _gathered(found: Iterable[ParamInfo], source: str) -> Metadata:
-    """The parameters of all groups. One that two vehicles describe differently is left out."""
+    """Return the parameters of all groups. Leaves out those that two vehicles describe differently."""
     infos: dict[str, ParamInfo] = {}
     doubtful = set()
     for info in found:
@@ -240,7 +244,7 @@ def _gathered(found: Iterable[ParamInfo], source: str) -> Metadata:
 
 
 def _too_many(source: str) -> MetadataError:
-    return MetadataError(f"{source}: describes more than {MOST_PARAMS} parameters", source=source)
+    return MetadataError(f"{source}: describes more than {PARAMS_MAX} parameters", source=source)
 
 
 def _range(text: str) -> tuple[int | float | None, int | float | None]:
@@ -250,7 +254,7 @@ def _range(text: str) -> tuple[int | float | None, int | float | None]:
 
 
 def _number(text: str) -> int | float | None:
-    """A finite number, whole ones as int; None for anything else."""
+    """Return a finite number, whole numbers as int; None for other text."""
     try:
         number = number_of(text)
     except UsageError:
@@ -259,7 +263,7 @@ def _number(text: str) -> int | float | None:
 
 
 def _items(text: str) -> dict[str, str]:
-    """`0:Disabled,1:Enabled` by the numbers; empty where any of it has another form."""
+    """Parse `0:Disabled,1:Enabled`; empty if any part has another format."""
     items = {}
     for each in _ITEM.split(text):
         code, colon, name = each.partition(":")
@@ -280,7 +284,7 @@ def _bits(items: Mapping[str, str]) -> Mapping[int, str]:
         {
             code: name
             for code, name in named.items()
-            if isinstance(code, int) and 0 <= code < MOST_BITS and name
+            if isinstance(code, int) and 0 <= code < BITS_MAX and name
         }
     )
 

@@ -1,7 +1,7 @@
-"""What a vehicle says of its parameters by itself: MAVLink's component metadata protocol.
+"""Download of parameter metadata from a vehicle: MAVLink's component metadata protocol.
 
-COMPONENT_METADATA names a general file, which names the file of descriptions; both lie on board and come over
-MAVFTP, or are kept from before (MAVLink guide, "Component Metadata Protocol").
+COMPONENT_METADATA names a general file, which names the parameter metadata file. Both are on board and are
+read over MAVFTP, or from the metadata cache (MAVLink guide, "Component Metadata Protocol").
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import anyio.to_thread
 
 from paramclient.client.files import Ftp
 from paramclient.errors import MetadataError, UsageError
-from paramclient.metadata.formats import LARGEST_PACKED, json_of, read_content, unpacked
+from paramclient.metadata.formats import PACKED_SIZE_MAX, json_of, read_content, unpacked
 from paramclient.metadata.info import Metadata
 from paramclient.metadata.metadata_cache import MetadataStore, has_checksum
 from paramclient.protocol.wire import ComponentMetadata
@@ -41,22 +41,23 @@ async def metadata_of(
     timeout: float | None = None,
     progress: Callable[[int, int | None], None] | None = None,
 ) -> Metadata | None:
-    """What a component says of its parameters, or None where it says that it has nothing to say.
+    """Return the parameter metadata of a component, or None if the component has none.
 
-    It is asked in every case; a file that is kept from before is not read again where its checksum is still
-    the announced one. Nothing is fetched from the internet. Cancelling it closes what is open on board.
+    Always requests COMPONENT_METADATA; a cached file is used if it has the announced checksum. Downloads
+    nothing from the internet. Cancellation closes open files on board.
 
     Args:
-        component: as `ParamClient.component` gives it.
-        store: where files are kept; True for beside the client's cache, if it has one; False for nowhere.
-        timeout: seconds for everything; None leaves it to the number of tries, which follows the link.
+        component: from `ParamClient.component`.
+        store: the metadata cache; True for the one beside the client's cache, if it has one; False for none.
+        timeout: seconds for the complete operation; None for the number of attempts, which depends on the
+            link.
         progress: as in `Ftp.read`, for each of the two files.
 
     Raises:
-        MetadataError: the descriptions are only on the internet (`source` is the address), on a component
-            that was not heard, do not have the announced checksum, or are damaged.
-        FileTransferError: it does not give the file that it names.
-        NoReply: it did not answer in time.
+        MetadataError: the metadata is only on the internet (`source` is the address), is on an unknown
+            component, does not have the announced checksum, or is damaged.
+        FileTransferError: the vehicle does not serve the file that it names.
+        NoReply: no response in time.
         LinkError: the link failed, or the client was closed.
     """
     if isinstance(store, bool):
@@ -85,13 +86,13 @@ async def metadata_of(
 
 @dataclass(frozen=True, slots=True)
 class _Files:
-    """The files of a component, from before or from on board.
+    """The metadata files of a component, from the metadata cache or from on board.
 
     Attributes:
-        component: whose.
-        kept: those from before, or None.
-        deadline: when everything is to be over, or None.
-        progress: is told of each that comes.
+        component: the component.
+        kept: the metadata cache, or None.
+        deadline: the end of the complete operation on the event loop's clock, or None.
+        progress: called for each file.
     """
 
     component: Component
@@ -104,15 +105,15 @@ class _Files:
         return f"{self.component.system}/{self.component.component}"
 
     def left(self) -> float | None:
-        """Seconds that are left, or None for any number."""
+        """Return the remaining seconds, or None without a deadline."""
         return None if self.deadline is None else max(self.deadline - anyio.current_time(), 0.0)
 
     async def get(self, uri: str, crc: int | None) -> bytes:
-        """One file, as it lies on board.
+        """Return one file, as stored on board.
 
         Args:
-            uri: where it is.
-            crc: its checksum, or None where that is not known; it is not kept then.
+            uri: the file's address.
+            crc: the file's checksum, or None if unknown; the file is not cached then.
         """
         if self.kept is not None and crc is not None:
             content = await _in_thread(self.kept.get, crc)
@@ -121,28 +122,26 @@ class _Files:
         files, path = self._on_board(uri)
         try:
             content = await files.read(
-                path, timeout=self.left(), progress=self.progress, limit=LARGEST_PACKED
+                path, timeout=self.left(), progress=self.progress, limit=PACKED_SIZE_MAX
             )
         except UsageError as error:
-            raise MetadataError(
-                f"{self.who} says that its descriptions are at {uri}: {error}", source=uri
-            ) from error
+            raise MetadataError(f"{self.who} announces its metadata at {uri}: {error}", source=uri) from error
         if crc is not None:
             if not await _in_thread(has_checksum, content, crc):
                 raise MetadataError(
-                    f"{uri} of {self.who} does not have the checksum {crc:08x} that was announced", source=uri
+                    f"{uri} of {self.who} does not have the announced checksum {crc:08x}", source=uri
                 )
             if self.kept is not None:
                 await _in_thread(self.kept.put, content, crc)
         return content
 
     def _on_board(self, uri: str) -> tuple[Ftp, str]:
-        """Who has a file, and under which path: `mftp://PATH`, or `mftp://[;comp=ID]PATH` for another one."""
+        """Return server and path of `mftp://PATH`, or of `mftp://[;comp=ID]PATH` on another component."""
         found = _ON_BOARD.fullmatch(uri)
         if found is None:
             raise MetadataError(
-                f"{self.who} says that its descriptions are at {uri}, and nothing is fetched from there: "
-                f"download the file, and read that",
+                f"{self.who} announces its metadata at {uri}, which is not downloaded from "
+                f"there: download the file, and pass it to read_metadata or --metadata",
                 source=uri,
             )
         number, path = found.groups()
@@ -151,21 +150,21 @@ class _Files:
             other = self.component._client.components.get((self.component.system, int(number)))
         if other is None:
             raise MetadataError(
-                f"{self.who} says that its descriptions are at {uri}, and no component {number} was heard",
+                f"{self.who} announces its metadata at {uri}, but component {number} has not been received",
                 source=uri,
             )
         return Ftp(other), path
 
 
 async def announced_metadata(component: Component, timeout: float | None) -> ComponentMetadata | None:
-    """Return where a component says that its general metadata file is; None where it names none.
+    """Return the announced address of a component's general metadata file; None if it announces none.
 
     Args:
-        component: as `ParamClient.component` gives it.
-        timeout: seconds; None leaves it to the number of attempts.
+        component: from `ParamClient.component`.
+        timeout: seconds; None for the number of attempts.
 
     Raises:
-        NoReply: it did not answer in time.
+        NoReply: no response in time.
         LinkError: the link failed, or the client was closed.
     """
     component._client._check_open()
@@ -180,8 +179,8 @@ async def announced_metadata(component: Component, timeout: float | None) -> Com
 
 
 def _places_of_parameters(general: bytes, source: str) -> list[tuple[str, int | None]]:
-    """Where the general file says that the descriptions of parameters are, and their checksum."""
-    from paramclient.metadata.px4 import read_general  # only here: it loads pydantic
+    """Return the addresses and checksums of the parameter metadata in a general file."""
+    from paramclient.metadata.px4 import read_general  # imported here: loads pydantic
 
     files = read_general(json_of(unpacked(general, source=source), source=source), source=source)
     return [
@@ -198,7 +197,7 @@ def _read_parameters(content: bytes, source: str) -> Metadata:
 
 
 async def _in_thread(work: Callable[P, Result], *args: P.args, **kwargs: P.kwargs) -> Result:
-    """Do something that takes milliseconds, while the loop goes on."""
+    """Run blocking work in a worker thread."""
     return await anyio.to_thread.run_sync(partial(work, *args, **kwargs))
 
 

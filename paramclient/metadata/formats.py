@@ -1,4 +1,4 @@
-"""A file that describes parameters, whichever of the known forms it has."""
+"""Detection and reading of metadata files in all supported formats."""
 
 from __future__ import annotations
 
@@ -10,39 +10,39 @@ from typing import Final
 from paramclient.errors import MetadataError
 from paramclient.metadata.info import Metadata
 
-__all__ = ["LARGEST_PACKED", "json_of", "read_content", "read_metadata", "unpacked"]
+__all__ = ["PACKED_SIZE_MAX", "json_of", "read_content", "read_metadata", "unpacked"]
 
-LARGEST_PACKED: Final = 4 << 20
-"""Bytes of a file that is packed, or comes from a vehicle; PX4's has about 0.1 million."""
-LARGEST: Final = 16 << 20
-"""Bytes of a file, and of what a packed one may become; those of ArduPilot and PX4 have 2 to 5 million."""
-MOST_MEMORY: Final = 96 << 20
-"""Bytes that unpacking may take. PX4 packs with a dictionary of 64 million, `xz -9`."""
+PACKED_SIZE_MAX: Final = 4 << 20
+"""Bytes of a packed file, or of a file from a vehicle; PX4's has about 0.1 million."""
+CONTENT_SIZE_MAX: Final = 16 << 20
+"""Bytes of a file, and of an unpacked one; those of ArduPilot and PX4 have 2 to 5 million."""
+UNPACKING_MEMORY_MAX: Final = 96 << 20
+"""Bytes of memory for unpacking. PX4 packs with a dictionary of 64 million, `xz -9`."""
 
 
 def read_metadata(path: str | os.PathLike[str]) -> Metadata:
-    """Read a file of descriptions: PX4's parameters.json, or ArduPilot's apm.pdef.xml or apm.pdef.json.
+    """Read a metadata file: PX4's parameters.json, or ArduPilot's apm.pdef.xml or apm.pdef.json.
 
-    Each may be packed with xz. The form is told by the content, not by the name.
+    Each may be packed with xz. The format is detected from the content, not from the name.
 
     Raises:
-        MetadataError: it cannot be read, is too large, or is none of these.
+        MetadataError: the file cannot be read, is too large, or has another format.
     """
     source = os.fspath(path)
     try:
         with Path(path).open("rb") as file:
-            content = file.read(LARGEST + 1)
+            content = file.read(CONTENT_SIZE_MAX + 1)
     except OSError as error:
         raise MetadataError(f"{source}: cannot be read: {error.strerror or error}", source=source) from error
     return read_content(content, source=source)
 
 
 def read_content(content: bytes, *, source: str) -> Metadata:
-    """The same with the bytes of a file, as they are.
+    """Read the bytes of a metadata file, as `read_metadata`.
 
     Args:
-        content: the bytes.
-        source: their name, for errors and for people.
+        content: the bytes, possibly packed.
+        source: their origin, for errors and for users.
 
     Raises:
         MetadataError: as `read_metadata`.
@@ -50,63 +50,63 @@ def read_content(content: bytes, *, source: str) -> Metadata:
     content = unpacked(content, source=source).removeprefix(b"\xef\xbb\xbf")
     start = content.lstrip(b" \t\r\n")[:64]
     if start.startswith(b"<"):
-        from paramclient.metadata import ardupilot  # only here: both load pydantic
+        from paramclient.metadata import ardupilot  # imported here: loads pydantic
 
         return ardupilot.read_xml(content, source=source)
     if not start.startswith(b"{"):
         what = "PX4's parameters.json, ArduPilot's apm.pdef.xml or apm.pdef.json"
         raise MetadataError(f"{source}: is neither JSON nor XML; expected {what}", source=source)
-    from paramclient.metadata import ardupilot, px4  # only here: both load pydantic
+    from paramclient.metadata import ardupilot, px4  # imported here: both load pydantic
 
     document = json_of(content, source=source)
     if "parameters" in document:
         return px4.read_parameters(document, source=source)
     if "metadataTypes" in document:
         raise MetadataError(
-            f"{source}: is the general metadata file, which only says where others are; "
-            f"the one with the parameters is wanted",
+            f"{source}: is the general metadata file, which only names other files; "
+            f"use the file with the parameters",
             source=source,
         )
     return ardupilot.read_json(document, source=source)
 
 
 def json_of(content: bytes, *, source: str) -> dict[str, object]:
-    """The object that a JSON text is.
+    """Parse a JSON object.
 
     Raises:
-        MetadataError: it is none.
+        MetadataError: the text is not a JSON object.
     """
-    from pydantic_core import from_json  # only here: it takes time to load
+    from pydantic_core import from_json  # imported here: takes time to load
 
     try:
         document = from_json(content)
     except ValueError as error:
-        raise MetadataError(f"{source}: no JSON: {error}", source=source) from None
+        raise MetadataError(f"{source}: not JSON: {error}", source=source) from None
     if not isinstance(document, dict):
-        raise MetadataError(f"{source}: is JSON, and no object", source=source)
+        raise MetadataError(f"{source}: is JSON, but not an object", source=source)
     return document
 
 
 def unpacked(content: bytes, *, source: str) -> bytes:
-    """The content of a file that may be packed with xz.
+    """Return the content of a file that may be packed with xz.
 
     Raises:
-        MetadataError: it is damaged, or too large.
+        MetadataError: the file is damaged, or too large.
     """
     is_packed = content.startswith(_XZ)
-    if len(content) > (LARGEST_PACKED if is_packed else LARGEST):
+    if len(content) > (PACKED_SIZE_MAX if is_packed else CONTENT_SIZE_MAX):
         raise _too_large(source)
     if not is_packed:
         return content
-    unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=MOST_MEMORY)
+    unpacker = lzma.LZMADecompressor(lzma.FORMAT_XZ, memlimit=UNPACKING_MEMORY_MAX)
     try:
-        result = unpacker.decompress(content, LARGEST + 1)
+        result = unpacker.decompress(content, CONTENT_SIZE_MAX + 1)
     except lzma.LZMAError as error:
         raise MetadataError(f"{source}: cannot be unpacked: {error}", source=source) from None
-    if len(result) > LARGEST:
+    if len(result) > CONTENT_SIZE_MAX:
         raise _too_large(source)
     if not unpacker.eof:
-        raise MetadataError(f"{source}: cannot be unpacked: it is cut short", source=source)
+        raise MetadataError(f"{source}: cannot be unpacked: the file is truncated", source=source)
     return result
 
 
@@ -114,4 +114,4 @@ _XZ: Final = b"\xfd7zXZ\0"
 
 
 def _too_large(source: str) -> MetadataError:
-    return MetadataError(f"{source}: is too large for a description of parameters", source=source)
+    return MetadataError(f"{source}: is too large for a metadata file", source=source)

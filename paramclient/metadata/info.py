@@ -1,4 +1,4 @@
-"""What is known of a parameter beside its value: units, range, names of values and of bits, in words."""
+"""ParamInfo and Metadata: units, range, names of values and bits of parameters."""
 
 from __future__ import annotations
 
@@ -18,34 +18,34 @@ from paramclient.model.values import ParamType, Value, format_value, shortest_fl
 
 __all__ = ["Metadata", "ParamInfo", "number_of"]
 
-MOST_NAMED: Final = 12
-"""Names that an error lists; of more it gives the nearest, as a line with hundreds says nothing."""
-MOST_BITS: Final = 64
+NAMES_LISTED_MAX: Final = 12
+"""Names that an error lists; of more names it lists the closest ones, so that the error stays readable."""
+BITS_MAX: Final = 64
 """Bits of the widest type."""
 INSTANCE: Final = "{n}"
-"""What stands for a number in the name of a group of equal parameters, and in what is said of them."""
+"""Placeholder of the number in the name and texts of a group of equal parameters."""
 
 Key = TypeVar("Key", int, int | float)
 
 
 @dataclass(frozen=True, slots=True)
 class ParamInfo:
-    """One parameter as its firmware describes it. What the description leaves out is None, "" or empty.
+    """The firmware's description of one parameter. Missing fields are None, "" or empty.
 
     Attributes:
-        name: param_id; in a group of equal parameters with `{n}` where each has its number.
-        type: its type, where that is said (ArduPilot does not).
-        short_description, long_description: in words for people.
+        name: param_id; for a group of equal parameters with `{n}` in place of the number.
+        type: its type, if given (ArduPilot does not give it).
+        short_description, long_description: texts for users.
         units: such as `m/s` or `deg`.
-        minimum, maximum: the range that its developers mean it to have. Vehicles take other values as well.
-        increment: the step in which to change it.
-        decimals: how many places behind the point to show.
-        default: the firmware's own value; that of one vehicle may be another, see `Param.default`.
-        values: what single values mean.
-        bits: what the bits mean where it is a mask, by their number from 0.
-        reboot_required: whether a new value counts only when the vehicle has started again.
-        is_read_only: whether the vehicle sets it by itself.
-        is_volatile: whether the vehicle changes it by itself; PX4 leaves it out of its hash.
+        minimum, maximum: the range intended by the developers. Vehicles accept other values as well.
+        increment: the recommended step for changes.
+        decimals: the number of decimal places to show.
+        default: the firmware's default; a particular vehicle may have another, see `Param.default`.
+        values: the meaning of single values.
+        bits: for a bit mask, the meaning of the bits by number from 0.
+        reboot_required: whether a new value takes effect only after a reboot.
+        is_read_only: whether only the vehicle sets the parameter.
+        is_volatile: whether the vehicle changes the value on its own; PX4 excludes it from its hash.
         category, group: where ground stations show it.
     """
 
@@ -68,10 +68,10 @@ class ParamInfo:
     group: str = ""
 
     def text(self, value: Value) -> str | None:
-        """A value in words: `Loiter`, or for a mask `GPS|Baro`. None where there are none for it.
+        """Return the name of a value: `Loiter`, or for a mask `GPS|Baro`. None without a name.
 
-        Bits without a name, or with a number for one, stand at the end as one hexadecimal number. `parse`
-        reads the text back, unless the name of a value is a number.
+        Bits without a name, or with a number as name, are appended as one hexadecimal number. `parse`
+        accepts the text, unless the name of a value is a number.
         """
         if isinstance(value, bytes) or not math.isfinite(value):
             return None
@@ -90,13 +90,13 @@ class ParamInfo:
         return "|".join([*names, hex(rest)] if rest else names)
 
     def parse(self, text: str) -> int | float:
-        """The value that a text means: a number, the name of a value, or names of bits.
+        """Return the value of a text: a number, the name of a value, or names of bits.
 
-        A number is always itself, also where a name looks like one. Names are taken in any case. Names of
+        A number always means itself, even if a name looks like it. Names are case-insensitive. Names of
         bits, and numbers among them, are joined with `|`, `+` or a comma.
 
         Raises:
-            UsageError: it is none of these; the error says what could have been meant.
+            UsageError: the text is none of these; the error suggests names.
         """
         number = number_of(text)
         if number is not None:
@@ -105,19 +105,19 @@ class ParamInfo:
         if value is None and self.bits:
             value = self._mask(text)
         if value is None:
-            raise UsageError(f"{self.name}: {text!r} is no number{self._meant(text)}")
+            raise UsageError(f"{self.name}: {text!r} is not a number{self._suggestion(text)}")
         return value
 
     def problem(self, value: Value) -> str | None:
-        """What speaks against a value: that it is outside the range. None where nothing does.
+        """Return why a value is invalid: it is outside the range. None for a valid value.
 
-        Numbers with a fraction are compared as float32, which is what a vehicle makes of them.
+        Fractions are compared as float32, the precision of vehicles.
         """
         if isinstance(value, bytes):
             return None
         if math.isnan(value):
             is_bounded = self.minimum is not None or self.maximum is not None
-            return f"{self.name}: nan is in no range" if is_bounded else None
+            return f"{self.name}: nan is outside every range" if is_bounded else None
         units = f" {self.units}" if self.units else ""
         shown = format_value(value)
         if self.minimum is not None and _is_below(value, self.minimum):
@@ -127,7 +127,7 @@ class ParamInfo:
         return None
 
     def instance(self, name: str, number: str) -> ParamInfo:
-        """The description of one of a group of equal parameters."""
+        """Return the description of one parameter of a group of equal parameters."""
         return replace(
             self,
             name=name,
@@ -136,7 +136,7 @@ class ParamInfo:
         )
 
     def _unsigned(self, number: int) -> int | None:
-        """The bits of a number; None for a negative one whose width is not known."""
+        """Return the bits of a number; None for a negative one of unknown width."""
         if number >= 0:
             return number
         if self.type is None or not self.type.is_integer:
@@ -144,10 +144,10 @@ class ParamInfo:
         return number & ((1 << 8 * self.type.size) - 1)
 
     def _mask(self, text: str) -> int | None:
-        """What the names of bits in a text make together; None where one of them is none.
+        """Return the mask of the names of bits in a text; None if one of them is unknown.
 
         Raises:
-            UsageError: it can be read in two ways.
+            UsageError: the text is ambiguous.
         """
         bit = self._bit(text)
         if bit is not None:
@@ -163,15 +163,15 @@ class ParamInfo:
         return None
 
     def _bit(self, text: str) -> int | None:
-        """One of the things that are joined to a mask."""
+        """Return the mask of one name or number."""
         number = number_of(text)
         if number is not None:
-            return number if isinstance(number, int) and 0 <= number < 1 << MOST_BITS else None
+            return number if isinstance(number, int) and 0 <= number < 1 << BITS_MAX else None
         bit = self._only(self.bits, text)
         return None if bit is None else 1 << bit
 
     def _as_typed(self, mask: int) -> int:
-        """The number of a signed type that has these bits."""
+        """Return the number with these bits in a signed type."""
         if self.type is not None and self.type.is_integer:
             low, high = self.type.bounds
             if low < 0 and high < mask <= high - low:
@@ -179,10 +179,10 @@ class ParamInfo:
         return mask
 
     def _only(self, named: Mapping[Key, str], text: str) -> Key | None:
-        """What has this name; None for nothing.
+        """Return the number with this name; None if there is none.
 
         Raises:
-            UsageError: more than one has it.
+            UsageError: several numbers have this name.
         """
         wanted = _folded(text)
         found = [number for number, name in named.items() if wanted and _folded(name) == wanted]
@@ -191,8 +191,8 @@ class ParamInfo:
             raise UsageError(f"{self.name}: {text.strip()!r} is the name of {listed}; give the number")
         return found[0] if found else None
 
-    def _meant(self, text: str) -> str:
-        """The rest of the sentence that says what could have been meant."""
+    def _suggestion(self, text: str) -> str:
+        """Return the end of an error, with the names that may have been meant."""
         if not self.bits:
             return _choice(", nor one of its values", self.values, text)
         parts = [part.strip() for part in re.split("[|+,]", text)]
@@ -204,14 +204,14 @@ class ParamInfo:
 
 @dataclass(frozen=True, slots=True, repr=False)
 class Metadata(Mapping[str, ParamInfo]):
-    """What a firmware says of its parameters, by their names. It does not change.
+    """Descriptions of a firmware's parameters, by name. Immutable.
 
-    A parameter that is described as one of a group (`FOO{n}_BAR` for FOO1_BAR, FOO2_BAR, …) is found under
-    its own name; the group counts and is listed once.
+    A parameter that is described as one of a group (`FOO{n}_BAR` for FOO1_BAR, FOO2_BAR, …) is found by its
+    own name; the group counts and is listed once.
 
     Attributes:
-        params: the descriptions as they are written.
-        source: where they come from, in words for people.
+        params: the descriptions, as in the file.
+        source: their origin, for users.
     """
 
     params: Mapping[str, ParamInfo]
@@ -219,7 +219,7 @@ class Metadata(Mapping[str, ParamInfo]):
 
     @classmethod
     def of(cls, infos: Iterable[ParamInfo], *, source: str = "") -> Metadata:
-        """Of these descriptions; of two with one name the last counts."""
+        """Return these descriptions; of two with the same name, the last one."""
         return cls(MappingProxyType({info.name: info for info in infos}), source)
 
     def __getitem__(self, name: str) -> ParamInfo:
@@ -233,7 +233,7 @@ class Metadata(Mapping[str, ParamInfo]):
         raise KeyError(name)
 
     def find(self, name: str) -> ParamInfo | None:
-        """The description of a parameter, however it is spelt: ArduPilot takes small letters as well."""
+        """Return the description of a parameter, also by its name in lower case, as ArduPilot accepts it."""
         return self.get(name) or self.get(name.upper())
 
     def __iter__(self) -> Iterator[str]:
@@ -248,12 +248,12 @@ class Metadata(Mapping[str, ParamInfo]):
 
 
 def number_of(text: str) -> int | float | None:
-    """The number that a text is, read exactly: integers as int, everything else as float. None for none.
+    """Return the number of a text, exactly: integers as int, others as float. None for other text.
 
-    Hexadecimal ones begin with `0x`; `nan` and `inf` are numbers.
+    Hexadecimal numbers begin with `0x`; `nan` and `inf` are numbers.
 
     Raises:
-        UsageError: it is one beyond a float.
+        UsageError: the number is beyond the range of a float.
     """
     text = text.strip()
     if _INTEGER.fullmatch(text):
@@ -275,20 +275,20 @@ _FLOAT32: Final = struct.Struct("<f")
 
 
 def _folded(name: str) -> str:
-    """What two spellings of a name have in common."""
+    """Return a name without case and repeated spaces, for comparison."""
     return " ".join(name.split()).casefold()
 
 
 def _choice(sentence: str, named: Mapping[Key, str], text: str) -> str:
-    """A sentence with the names that there are, or those near to a text where there are many."""
+    """Return the end of an error with all names, or with those close to a text if there are many."""
     if not named:
         return ", and its values have no names"
-    if len(named) <= MOST_NAMED:
+    if len(named) <= NAMES_LISTED_MAX:
         return f"{sentence}: {', '.join(f'{name} ({number})' for number, name in named.items())}"
     folded = {_folded(name): name for name in named.values()}
     nearest = [folded[each] for each in difflib.get_close_matches(_folded(text), folded, n=3, cutoff=0.5)]
     return (
-        f"{sentence}; near it: {', '.join(nearest)}"
+        f"{sentence}; similar: {', '.join(nearest)}"
         if nearest
         else f"{sentence}, of which there are {len(named)}"
     )
@@ -303,6 +303,6 @@ def _is_below(a: int | float, b: int | float) -> bool:
 def _as_float32(number: int | float) -> float:
     try:
         rounded: float = _FLOAT32.unpack(_FLOAT32.pack(number))[0]
-    except (OverflowError, struct.error):  # the latter for integers that no float can hold
+    except (OverflowError, struct.error):  # struct.error for integers beyond the range of a float
         return math.inf if number > 0 else -math.inf
     return rounded

@@ -1,4 +1,4 @@
-"""Descriptions that came from vehicles, kept on disk."""
+"""MetadataStore: metadata files of vehicles, cached on disk."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Final
 
 from paramclient.errors import MetadataError
-from paramclient.metadata.formats import LARGEST_PACKED, read_content, unpacked
+from paramclient.metadata.formats import PACKED_SIZE_MAX, read_content, unpacked
 from paramclient.metadata.info import Metadata
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet
@@ -21,22 +21,21 @@ from paramclient.model.values import crc32_px4
 
 __all__ = ["MetadataStore", "has_checksum"]
 
-MOST_FILES: Final = 64
-"""Files that are kept, those that were used last: three for a firmware, of 0.1 million bytes with PX4."""
+CACHED_FILES_MAX: Final = 64
+"""Most recently used files that are kept: three for a firmware, with about 0.1 million bytes for PX4."""
 
 logger = logging.getLogger(__name__)
 
 
 class MetadataStore:
-    """Files of descriptions by their CRC-32, and which one belongs to which firmware.
+    """Metadata files by CRC-32, and the file of each firmware.
 
-    A folder of small files, each written in one go and readable by its owner alone. What does not have its
-    checksum any more is thrown away, and is as if it had never been there. Several processes may use it at
-    once. A disk that fails is no error: it is warned of, and nothing is kept. Every call blocks for a few
-    milliseconds.
+    A folder of small files, each replaced atomically and readable only by its owner. A file that no longer
+    has its checksum is deleted and treated as missing. Several processes may use the folder at the same time.
+    Disk errors are logged as warnings, and nothing is cached. Every call blocks for a few milliseconds.
 
     Args:
-        folder: the folder; it is made when something is to be kept.
+        folder: the folder; created when the first file is cached.
     """
 
     def __init__(self, folder: str | os.PathLike[str]) -> None:
@@ -44,7 +43,7 @@ class MetadataStore:
 
     @classmethod
     def beside(cls, cache: str | os.PathLike[str]) -> MetadataStore:
-        """The one that belongs to a cache: the folder of its name with `.metadata` for a suffix."""
+        """Return the store of a cache: the folder with the cache's name and the suffix `.metadata`."""
         return cls(Path(cache).with_suffix(".metadata"))
 
     def __repr__(self) -> str:
@@ -52,14 +51,14 @@ class MetadataStore:
 
     @property
     def has_notes(self) -> bool:
-        """Whether anything is kept for any firmware."""
+        """Whether metadata of any firmware is cached."""
         try:
             return any(path.suffix == _NOTES for path in self.folder.iterdir())
         except OSError:
             return False
 
     def get(self, crc: int) -> bytes | None:
-        """A file as the vehicle has it, or None where it is not here."""
+        """Return a file as stored on board, or None if it is not cached."""
         path = self._file(crc)
         content = self._read(path)
         if content is None:
@@ -69,21 +68,21 @@ class MetadataStore:
             self._remove(path)
             return None
         with suppress(OSError):
-            os.utime(path)  # those used last are kept
+            os.utime(path)  # marks the file as recently used
         return content
 
     def put(self, content: bytes, crc: int) -> None:
-        """Keep a file that has this checksum."""
+        """Cache a file with this checksum."""
         self._write(self._file(crc), content)
 
     def remember(self, identity: Identity, component: int, crc: int) -> None:
-        """Note that the file with this checksum describes the parameters of a firmware."""
+        """Record that the file with this checksum describes a firmware's parameters."""
         path = self._note(identity, component)
         if path is not None:
             self._write(path, f"{crc:08x}\n".encode("ascii"))
 
     def known(self, identity: Identity, component: int) -> Metadata | None:
-        """What is kept of a firmware: of its version, commit and board. None for nothing."""
+        """Return the cached metadata of a firmware with this version, commit and board, or None."""
         path = self._note(identity, component)
         noted = None if path is None else self._read(path)
         if path is None or noted is None:
@@ -93,14 +92,14 @@ class MetadataStore:
             self._remove(path)
             return None
         try:
-            return read_content(content, source=f"the cached descriptions {noted.decode('ascii').strip()}")
+            return read_content(content, source=f"the cached metadata {noted.decode('ascii').strip()}")
         except MetadataError as error:
             logger.warning("%s", error)
             self._remove(path)
             return None
 
     def known_of_sets(self, sets: Sequence[ParamSet]) -> list[Metadata | None]:
-        """For each set what is kept for its vehicle's firmware; where it names none, what another one has."""
+        """Return the metadata of each set's firmware; for a set without identity, that of another set."""
         own = [
             None
             if params.identity is None or params.component is None
@@ -114,7 +113,7 @@ class MetadataStore:
         return self.folder / f"{crc:08x}.metadata"
 
     def _note(self, identity: Identity, component: int) -> Path | None:
-        """Where it is noted what belongs to a firmware; None for one that has not said its commit."""
+        """Return the file that names a firmware's metadata; None for a firmware without a commit."""
         if not identity.git_hash:
             return None
         what = (
@@ -131,7 +130,7 @@ class MetadataStore:
     def _read(self, path: Path) -> bytes | None:
         try:
             with path.open("rb") as file:
-                content = file.read(LARGEST_PACKED + 1)
+                content = file.read(PACKED_SIZE_MAX + 1)
         except FileNotFoundError:
             return None
         except OSError as error:
@@ -151,17 +150,17 @@ class MetadataStore:
                 with suppress(OSError):
                     Path(name).unlink()
                 raise
-            self._make_room()
+            self._delete_oldest()
         except OSError as error:
             logger.warning("%s cannot be written: %s", path, error.strerror)
 
-    def _make_room(self) -> None:
-        """Throw away what was used least lately, and what a process that died has left."""
+    def _delete_oldest(self) -> None:
+        """Delete the least recently used files, and temporary files of killed processes."""
         found = []
         for path in self.folder.iterdir():
             with suppress(OSError):
                 found.append((path.stat().st_mtime, path))
-        for _, path in sorted(found, reverse=True)[MOST_FILES:]:
+        for _, path in sorted(found, reverse=True)[CACHED_FILES_MAX:]:
             self._remove(path)
 
     def _remove(self, path: Path) -> None:
@@ -170,10 +169,10 @@ class MetadataStore:
 
 
 def has_checksum(content: bytes, crc: int) -> bool:
-    """Whether a file has a CRC-32: as it is, or unpacked.
+    """Return whether a file, packed or unpacked, has a CRC-32.
 
-    The protocol means the packed file, and so does PX4 for that with the parameters; for its general file it
-    announces the checksum of what is packed in it (PX4, `src/lib/component_information/CMakeLists.txt`).
+    The protocol specifies the checksum of the packed file. PX4 follows it for the parameter file, but
+    announces the checksum of the unpacked general file (`src/lib/component_information/CMakeLists.txt`).
     """
     if crc32_px4(content) == crc:
         return True

@@ -1,7 +1,7 @@
-"""Descriptions in the schema of MAVLink's component metadata, which PX4 uses: parameters.json.
+"""Metadata in the schema of MAVLink's component metadata, which PX4 uses: parameters.json.
 
-Source of the schema: `parameter.schema.json` and `general.schema.json` of MAVLink. PX4 says version 1,
-later ones only add to it. Fields that are not known here are passed over, as MAVLink asks.
+Source of the schema: `parameter.schema.json` and `general.schema.json` of MAVLink. PX4 uses version 1; later
+versions only add fields. Unknown fields are ignored, as MAVLink requires.
 """
 
 from __future__ import annotations
@@ -11,34 +11,34 @@ from types import MappingProxyType
 from typing import Annotated, Final, NotRequired, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, with_config
-from typing_extensions import TypedDict  # pydantic, whose own it is, takes no other before Python 3.12
+from typing_extensions import TypedDict  # pydantic needs this one before Python 3.12
 
 from paramclient.errors import MetadataError
-from paramclient.metadata.info import MOST_BITS, Metadata, ParamInfo
+from paramclient.metadata.info import BITS_MAX, Metadata, ParamInfo
 from paramclient.model.values import ParamType
 
-__all__ = ["MetadataFile", "read_general", "read_parameters", "told", "whole"]
+__all__ = ["MetadataFile", "error_text", "read_general", "read_parameters", "whole"]
 
-MOST_PARAMS: Final = 65_535
-"""As many as a vehicle can count."""
-MOST_NAMES: Final = 10_000
-"""Values of one parameter that have names."""
-MOST_FILES: Final = 1_000
+PARAMS_MAX: Final = 65_535
+"""Parameters of a file: as many as param_count can count."""
+VALUE_NAMES_MAX: Final = 10_000
+"""Named values of one parameter."""
+METADATA_FILES_MAX: Final = 1_000
 """Kinds of metadata; MAVLink has six."""
-MOST_DECIMALS: Final = 50
-"""Places behind the point; a float32 has no use for more."""
+DECIMALS_MAX: Final = 50
+"""Decimal places; a float32 never needs more."""
 
 _STRICT: Final = ConfigDict(strict=True, frozen=True)
 Model = TypeVar("Model", bound=BaseModel)
 
 
 class _Strict(BaseModel):
-    """No text counts as a number, and no number as a flag."""
+    """Strict types: text is not converted to numbers, nor numbers to booleans."""
 
     model_config = _STRICT
 
 
-# no models: there are many of them, and a model takes three times the memory
+# TypedDicts, because a file has many of them and a model takes three times the memory.
 @with_config(_STRICT)
 class _Named(TypedDict):
     value: float
@@ -47,7 +47,7 @@ class _Named(TypedDict):
 
 @with_config(_STRICT)
 class _Bit(TypedDict):
-    index: Annotated[int, Field(ge=0, lt=MOST_BITS)]
+    index: Annotated[int, Field(ge=0, lt=BITS_MAX)]
     description: NotRequired[str]
 
 
@@ -60,10 +60,10 @@ class _Parameter(_Strict):
     minimum: float | None = Field(None, alias="min")
     maximum: float | None = Field(None, alias="max")
     increment: float | None = None
-    decimals: int | None = Field(None, alias="decimalPlaces", ge=0, le=MOST_DECIMALS)
+    decimals: int | None = Field(None, alias="decimalPlaces", ge=0, le=DECIMALS_MAX)
     default: float | None = None
-    values: list[_Named] = Field([], max_length=MOST_NAMES)
-    bits: list[_Bit] = Field([], alias="bitmask", max_length=MOST_BITS)
+    values: list[_Named] = Field([], max_length=VALUE_NAMES_MAX)
+    bits: list[_Bit] = Field([], alias="bitmask", max_length=BITS_MAX)
     reboot_required: bool = Field(False, alias="rebootRequired")
     is_read_only: bool = Field(False, alias="readOnly")
     is_volatile: bool = Field(False, alias="volatile")
@@ -101,17 +101,17 @@ class _Parameter(_Strict):
 
 class _Parameters(_Strict):
     version: int = Field(ge=1)
-    parameters: list[_Parameter] = Field(max_length=MOST_PARAMS)
+    parameters: list[_Parameter] = Field(max_length=PARAMS_MAX)
 
 
 class MetadataFile(_Strict):
-    """Where one kind of description lies.
+    """The address of one kind of metadata.
 
     Attributes:
-        type: COMP_METADATA_TYPE; 1 for that of parameters.
-        uri: where: `mftp://…` on board, or `https://…`.
-        crc: the CRC-32 of the file there, or None where it may change.
-        fallback_uri, fallback_crc: another place, or "" and None.
+        type: COMP_METADATA_TYPE; 1 for parameters.
+        uri: `mftp://…` for a file on board, or `https://…`.
+        crc: the CRC-32 of the file, or None if the file may change.
+        fallback_uri, fallback_crc: a second address, or "" and None.
     """
 
     type: int
@@ -123,35 +123,35 @@ class MetadataFile(_Strict):
 
 class _General(_Strict):
     version: int = Field(ge=1)
-    files: list[MetadataFile] = Field(alias="metadataTypes", max_length=MOST_FILES)
+    files: list[MetadataFile] = Field(alias="metadataTypes", max_length=METADATA_FILES_MAX)
 
 
 def read_parameters(document: object, *, source: str) -> Metadata:
-    """Take a parameters.json, its JSON read.
+    """Read a parameters.json that has been parsed as JSON.
 
     Raises:
-        MetadataError: it is none, or breaks its schema.
+        MetadataError: the document does not follow the schema.
     """
     read = _read(_Parameters, document, source)
     return Metadata.of((each.info() for each in read.parameters), source=source)
 
 
 def read_general(document: object, *, source: str) -> tuple[MetadataFile, ...]:
-    """Take a general metadata file, its JSON read: what else there is, and where.
+    """Read a general metadata file that has been parsed as JSON: kinds of metadata and their addresses.
 
     Raises:
-        MetadataError: it is none, or breaks its schema.
+        MetadataError: the document does not follow the schema.
     """
     return tuple(_read(_General, document, source).files)
 
 
 def whole(number: int | float) -> int | float:
-    """A number as an int, where it is whole."""
+    """Return a whole number as int; other numbers unchanged."""
     return int(number) if isinstance(number, float) and number.is_integer() else number
 
 
-def told(error: ValidationError) -> str:
-    """What was found first, in words: behind the name of the file."""
+def error_text(error: ValidationError) -> str:
+    """Return the first problem as text, to be appended to the file's name."""
     first = error.errors(include_url=False, include_context=False, include_input=False)[0]
     place = "".join(f"[{each}]" if isinstance(each, int) else f".{each}" for each in first["loc"])
     return f"{', ' if place else ''}{place.lstrip('.')}: {first['msg']}"
@@ -161,7 +161,7 @@ def _read(model: type[Model], document: object, source: str) -> Model:
     try:
         return model.model_validate(document)
     except ValidationError as error:
-        raise MetadataError(f"{source}{told(error)}", source=source) from None
+        raise MetadataError(f"{source}{error_text(error)}", source=source) from None
 
 
 def _finite(number: float | None) -> int | float | None:

@@ -1,6 +1,6 @@
-"""How two sets of parameters stand to each other, and which of them has moved away from a third.
+"""Comparison of two parameter sets, optionally against a common base.
 
-Nothing here knows of a vehicle, a file or the time: whatever can be had as a `ParamSet` can be compared.
+Has no knowledge of vehicles, files or time: every source that gives a `ParamSet` can be compared.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ __all__ = ["Comparison", "Difference", "Moved", "Standing", "compare", "defaults
 
 
 class Standing(StrEnum):
-    """How a parameter of the left stands to the one of the same name on the right."""
+    """How the left parameter compares with the right parameter of the same name."""
 
     SAME = "same"
     DIFFERENT = "different"
@@ -28,27 +28,27 @@ class Standing(StrEnum):
 
 
 class Moved(StrEnum):
-    """Who has another value than the base. A side that lacks the parameter has not moved."""
+    """Which side has another value than the base. A side without the parameter has not moved."""
 
     NEITHER = "neither"
     LEFT = "left"
     RIGHT = "right"
     BOTH = "both"
-    """Both, to the same value."""
+    """Both sides differ from the base and have the same value."""
     CONFLICT = "conflict"
-    """Both, to different values."""
+    """Both sides differ from the base and have different values."""
 
 
 @dataclass(frozen=True, slots=True)
 class Difference:
-    """One name of either side.
+    """The comparison of one name.
 
     Attributes:
         name: param_id.
-        left, right: as each side has it, or None; at least one of them has.
-        base: as the base has it, or None.
-        standing: how left and right stand to each other. It is about values alone, see `types_differ`.
-        moved: who has moved away from the base; None where the base does not know the name, or there is none.
+        left, right: the parameter on each side, or None; at least one is not None.
+        base: the parameter in the base, or None.
+        standing: how left and right compare, by value alone (see `types_differ`).
+        moved: which side differs from the base; None without a base, or if the base lacks the name.
     """
 
     name: str
@@ -64,12 +64,12 @@ class Difference:
 
     @property
     def is_news(self) -> bool:
-        """Whether there is anything to see: another value or type, or one that has moved."""
+        """Whether to report the entry: the values or types differ, or a side differs from the base."""
         return not self.is_same or self.types_differ or self.moved not in (None, Moved.NEITHER)
 
     @property
     def types_differ(self) -> bool:
-        """Whether both sides say a type, and not the same one. `INT32 1` and `REAL32 1.0` are one value."""
+        """Whether both sides have a type and the types differ. `INT32 1` equals `REAL32 1.0`."""
         return (
             self.left is not None
             and self.right is not None
@@ -79,10 +79,10 @@ class Difference:
 
     @property
     def is_rounding(self) -> bool:
-        """Whether they are different integers, and one is what a float32 makes of the other.
+        """Whether the values are different integers, and one is the other rounded to float32.
 
-        A vehicle with the C-cast encoding gives integers beyond 24 bits rounded so, and they may be the same
-        on board; only a packed file could tell.
+        A vehicle with the C-cast encoding reports integers beyond 24 bits rounded this way, so the values
+        may be equal on board. Only a packed parameter file holds the exact value.
         """
         if self.standing is not Standing.DIFFERENT or self.left is None or self.right is None:
             return False
@@ -99,12 +99,12 @@ class Difference:
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """What came of a comparison.
+    """The result of a comparison.
 
     Attributes:
-        left, right: what was compared, whole.
-        base: what both were held against, or None.
-        entries: every name of either side that was asked for, also those that are the same, ordered by name.
+        left, right: the compared sets, complete.
+        base: the base, or None.
+        entries: every selected name of either side, equal ones included, ordered by name.
     """
 
     left: ParamSet
@@ -119,17 +119,17 @@ class Comparison:
 
     @property
     def differences(self) -> tuple[Difference, ...]:
-        """Those that are not the same."""
+        """The entries that are not the same."""
         return tuple(entry for entry in self.entries if not entry.is_same)
 
     @property
     def counts(self) -> Mapping[Standing, int]:
-        """How many there are of each standing, 0 for those that do not occur."""
+        """The number of entries of each standing, 0 for those that do not occur."""
         return Counter(entry.standing for entry in self.entries)
 
     @property
     def moves(self) -> Mapping[Moved, int]:
-        """How many have moved in each way; those that the base does not know are not counted."""
+        """The number of entries of each kind of move. Names that the base lacks are not counted."""
         return Counter(entry.moved for entry in self.entries if entry.moved is not None)
 
     def __repr__(self) -> str:
@@ -139,17 +139,17 @@ class Comparison:
 def compare(
     left: ParamSet, right: ParamSet, *, base: ParamSet | None = None, names: Iterable[str] | None = None
 ) -> Comparison:
-    """Hold two sets against each other, by `same_value`.
+    """Compare two sets with `same_value`.
 
     Args:
-        base: a third one, to tell who has moved away from it: an earlier state, or `defaults_of` both.
-            Names that only it has are of no interest.
-        names: names, or patterns of the shell (`MC_*`, `SERVO?_TRIM`) in the spelling of the vehicle, to
-            leave out all others. Only these are compared.
+        base: a third set, to tell which side differs from it: an earlier state, or `defaults_of` both.
+            Names that only the base has are ignored.
+        names: names or shell patterns (`MC_*`, `SERVO?_TRIM`), case-sensitive, to compare only the names
+            that match.
 
     Raises:
-        UsageError: a pattern fits no name of either side. Whoever misspells one must not hear that all is
-            the same.
+        UsageError: a pattern matches no name of either side. Without this error, a misspelt name would
+            compare as equal.
     """
     chosen = left.keys() | right.keys()
     if names is not None:
@@ -158,18 +158,18 @@ def compare(
 
 
 def same_value(left: WrittenParam, right: WrittenParam) -> bool:
-    """Whether both stand for one parameter value, whatever form they are written in.
+    """Return whether both are the same parameter value, independent of the notation.
 
-    Where one of them is REAL32, or neither has a type and one is no whole number, both are rounded to float32
-    first: files seldom give more digits than that. A value without a type is otherwise read as the type of
-    the other side; integers are compared exactly. −0 equals 0, a NaN equals only the same NaN, and raw bytes
-    equal only the same bytes of the same type.
+    If one of them is REAL32, or neither has a type and one is not a whole number, both are rounded to float32
+    first: files seldom give more digits. Otherwise a value without a type is read as the type of the other
+    side; integers are compared exactly. −0 equals 0, NaN equals only the same NaN, and raw bytes equal only
+    the same bytes of the same type.
 
-    It is symmetrical, and not transitive: 16777217 and 16777217.0 are the same, 16777217.0 and 16777216 too.
+    Symmetric but not transitive: 16777217 equals 16777217.0, and 16777217.0 equals 16777216.
     """
     if isinstance(left.value, bytes) or isinstance(right.value, bytes):
         return left.value == right.value and (None in (left.type, right.type) or left.type == right.type)
-    if left.value == right.value:  # then they are so in any type, and most are: what follows takes its time
+    if left.value == right.value:  # equal in every type, and the common case: skips the slower comparison
         return True
     kind = _common_type(left, right)
     if kind is None:
@@ -181,10 +181,10 @@ def same_value(left: WrittenParam, right: WrittenParam) -> bool:
 
 
 def defaults_of(*sets: ParamSet) -> ParamSet:
-    """The firmware's defaults, as far as the sets know them: a base for `compare`.
+    """Return the firmware's defaults that the sets contain: a base for `compare`.
 
-    A parameter for which two of them name different defaults, as after a change of the firmware, is left out:
-    there is nothing that both could have moved away from.
+    A parameter with different defaults in two sets, as after a change of the firmware, is left out: the sides
+    have no common default.
     """
     known: dict[str, WrittenParam] = {}
     disputed: set[str] = set()
@@ -233,7 +233,7 @@ def _moved(
 
 
 def _common_type(left: WrittenParam, right: WrittenParam) -> ParamType | int | None:
-    """The type in which two numbers are compared, or None where they are as numbers."""
+    """Return the type in which to compare two values, or None to compare them as numbers."""
     kinds = {param.type for param in (left, right) if param.type is not None}
     if ParamType.REAL32 in kinds:
         return ParamType.REAL32
@@ -243,7 +243,7 @@ def _common_type(left: WrittenParam, right: WrittenParam) -> ParamType | int | N
 
 
 def _bits(value: Value, number: ParamType | int) -> int | None:
-    """The bits of a value in a type, or None where it does not fit."""
+    """Return the bits of a value in a type, or None if the value does not fit."""
     try:
         return bits_of(value, number)
     except UsageError:
@@ -251,7 +251,7 @@ def _bits(value: Value, number: ParamType | int) -> int | None:
 
 
 def _same_number(left: int | float, right: int | float) -> bool:
-    """Whether two numbers are equal as they are written; NaN by its bits."""
+    """Return whether two numbers are equal as written; NaN by its bits."""
     if isinstance(left, float) and isinstance(right, float):
         kind = ParamType.REAL64
         return same_bits(kind, bits_of(left, kind), bits_of(right, kind))

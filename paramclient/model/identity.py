@@ -1,4 +1,4 @@
-"""Who a vehicle is: what tells it apart from others, today and in the next session."""
+"""Vehicle identity: hardware id, system id, link, firmware, and the cache key made of them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Final
 __all__ = ["SHARED_UIDS", "Identity", "autopilot_name", "hardware_id", "reason_against_non_finite"]
 
 SHARED_UIDS: Final = frozenset({"4954414c44494e4f"})
-"""Hardware ids that name no single vehicle: every simulated PX4 reports this one (measured). Their system ids
-tell them apart, as PX4 numbers the simulated vehicles on one machine."""
+"""Hardware ids that several vehicles share: every simulated PX4 reports this one (measured). The system id
+distinguishes the vehicles, as PX4 numbers the simulated vehicles on one machine."""
 
 _AGAINST_NON_FINITE = {
     "px4": "PX4 cannot save NaN and infinity: its parameter file becomes invalid, it saves nothing any more, "
@@ -25,13 +25,13 @@ class Identity:
     """One vehicle, as its heartbeat and AUTOPILOT_VERSION describe it.
 
     Attributes:
-        system: system id, 1 to 255. Other vehicles use the same one all the time.
-        link: the canonical name of the link it was heard on.
-        uid: its hardware id in hexadecimal, or None while it has given none.
-        autopilot: MAV_AUTOPILOT of its heartbeat.
-        vehicle_type: MAV_TYPE of its heartbeat.
-        firmware: flight_sw_version; 0 while unknown, as everything below.
-        git_hash: the firmware's commit, as far as it is given; "" while unknown.
+        system: system id, 1 to 255. Other vehicles may use the same system id.
+        link: the canonical name of the link on which the vehicle was received.
+        uid: the hardware id in hexadecimal, or None while unknown.
+        autopilot: MAV_AUTOPILOT of the heartbeat.
+        vehicle_type: MAV_TYPE of the heartbeat.
+        firmware: flight_sw_version; 0 while unknown, like the following attributes.
+        git_hash: the commit of the firmware, as many digits as the vehicle sends; "" while unknown.
         board: board_version.
         vendor_id, product_id: of the board.
         capabilities: MAV_PROTOCOL_CAPABILITY bits.
@@ -66,10 +66,10 @@ class Identity:
         product_id: int = 0,
         capabilities: int = 0,
     ) -> Identity:
-        """Build it from the fields of AUTOPILOT_VERSION as they stand in the message.
+        """Build an identity from the fields of AUTOPILOT_VERSION.
 
         Args:
-            uid: the older hardware id, 64 bits; it counts where `uid2` is all zero.
+            uid: the older hardware id, 64 bits; used if `uid2` is all zero.
             uid2: the hardware id, 18 bytes.
             git_hash: flight_custom_version, 8 bytes: ArduPilot writes the hash as text, PX4 as a
                 little-endian number (both measured).
@@ -94,11 +94,11 @@ class Identity:
 
     @property
     def key(self) -> str:
-        """The name under which its tables are kept.
+        """The key of the vehicle's tables in the cache.
 
-        `uid:<hex>` where there is a hardware id, with the system id behind it for one that many have; else
-        `system:<n>@<link>`, which holds only as long as no other vehicle comes to the same link with the
-        same system id.
+        `uid:<hex>` with a hardware id, followed by the system id if several vehicles share the hardware id.
+        Without a hardware id, `system:<n>@<link>`, which is unique only while no other vehicle uses the same
+        system id on the same link.
         """
         if self.uid in SHARED_UIDS:
             return f"uid:{self.uid}/{self.system}"
@@ -108,14 +108,14 @@ class Identity:
 
     @property
     def has_own_uid(self) -> bool:
-        """Whether its hardware id names it alone."""
+        """Whether the hardware id is known and unique to this vehicle."""
         return self.uid is not None and self.uid not in SHARED_UIDS
 
     def is_same_vehicle(self, other: Identity) -> bool:
-        """Whether what was heard as `other`, under this or another system id, is this vehicle.
+        """Return whether `other`, with the same or another system id, is this vehicle.
 
-        The hardware id decides. Where there is none, or one that many have, as far as can be told: the same
-        link, autopilot and vehicle type.
+        Compares the hardware ids. Without one, or with one that several vehicles share, compares link,
+        autopilot and vehicle type as well.
         """
         if self.has_own_uid:
             return other.uid == self.uid
@@ -129,20 +129,20 @@ class Identity:
 
 
 def hardware_id(uid: int, uid2: bytes) -> str | None:
-    """The hardware id of an AUTOPILOT_VERSION in hexadecimal; None where it gives none.
+    """Return the hardware id of an AUTOPILOT_VERSION in hexadecimal; None if the message has none.
 
     Args:
-        uid: the older one, 64 bits; it counts where `uid2` is all zero.
+        uid: the older hardware id, 64 bits; used if `uid2` is all zero.
         uid2: the hardware id, 18 bytes.
     """
     return uid2.hex() if any(uid2) else f"{uid:016x}" if uid else None
 
 
 def autopilot_name(number: int) -> str:
-    """A MAV_AUTOPILOT in a word: px4, ardupilot, generic, …; others by their number."""
+    """Return the name of a MAV_AUTOPILOT: px4, ardupilot, generic, …; others as `autopilot <number>`."""
     return _AUTOPILOTS.get(number, f"autopilot {number}")
 
 
 def reason_against_non_finite(autopilot: str) -> str:
-    """Return why an autopilot, by its name, must not be sent NaN and infinity; "" where it may be."""
+    """Return why NaN and infinity must not be sent to an autopilot, given by name; "" if they may be."""
     return _AGAINST_NON_FINITE.get(autopilot, "")

@@ -1,4 +1,4 @@
-"""How values, bits, hashes and times are written in JSON: the one place for it."""
+"""JSON notation of values, bits, hashes and times."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ __all__ = [
 ]
 
 Scalar: TypeAlias = int | float | str
-"""A value as strict JSON can say it."""
+"""A value in strict JSON."""
 
 
 def value_json(value: Value, number: ParamType | int) -> Scalar:
-    """A value as strict JSON knows it: NaN and infinities as text, raw bytes as hexadecimal text.
+    """Return a value in strict JSON: NaN and infinities as text, raw bytes as hexadecimal text.
 
-    A REAL32 is given by the shortest number that rounds to the same float32.
+    A REAL32 becomes the shortest number that rounds to the same float32.
     """
     if isinstance(value, bytes):
         return format_value(value, number)
@@ -42,15 +42,14 @@ def value_json(value: Value, number: ParamType | int) -> Scalar:
 
 
 def value_written(value: Value, param: WrittenParam) -> Scalar:
-    """The same for a parameter that may have no type: then it is the number as it is written."""
+    """Return a written value in strict JSON; without a type, as the number that was written."""
     return value_json(value, ParamType.REAL64 if param.type is None else param.type)
 
 
 def typed(value: Value, number: ParamType | int | None) -> tuple[Value, ParamType | int]:
-    """A value that was written for a parameter of this type, and the type in which to say it.
+    """Return a written value and the type in which to show it.
 
-    A whole number that was written for a float is the float that it is. Where the type is not known, it is
-    said as a REAL32.
+    A whole number for a REAL32 or REAL64 becomes a float. A value without a type is shown as a REAL32.
     """
     kind = ParamType.REAL32 if number is None else number
     is_float = number in (ParamType.REAL32, ParamType.REAL64)
@@ -58,12 +57,12 @@ def typed(value: Value, number: ParamType | int | None) -> tuple[Value, ParamTyp
 
 
 def bits_text(param: Param) -> str:
-    """`Param.bits` as hexadecimal digits: 16 for the types of 8 bytes, else 8."""
+    """Return `Param.bits` as hexadecimal digits: 16 for types of 8 bytes, else 8."""
     return _digits(param.bits, param.type)
 
 
 def bits_written(param: WrittenParam) -> str | None:
-    """The value's bits as hexadecimal digits; None where no type stands beside it, or one that it exceeds."""
+    """Return a written value's bits as hexadecimal digits; None without a type or beyond its range."""
     if param.type is None:
         return None
     try:
@@ -73,22 +72,22 @@ def bits_written(param: WrittenParam) -> str | None:
 
 
 def hash_text(crc: int | None) -> str | None:
-    """A PX4 hash as 8 hexadecimal digits."""
+    """Return a PX4 hash as 8 hexadecimal digits; None for None."""
     return None if crc is None else f"{crc:08x}"
 
 
 def time_text(at: float) -> str:
-    """A unix time in ISO 8601, UTC, with milliseconds."""
+    """Return a Unix time in ISO 8601, UTC, with milliseconds."""
     return datetime.fromtimestamp(at, UTC).isoformat(timespec="milliseconds").replace("+00:00", "Z")
 
 
 def time_or_none(at: float | None) -> str | None:
-    """The same, and None for none."""
+    """Return a Unix time as `time_text` does; None for None."""
     return None if at is None else time_text(at)
 
 
 def rounded(seconds: float | None) -> float | None:
-    """Seconds to a tenth of a millisecond."""
+    """Return seconds rounded to 0.1 ms; None for None."""
     return None if seconds is None else round(seconds, 4)
 
 

@@ -1,9 +1,9 @@
-"""Parameters by name: how tables keep them, and the read-only mapping in which users see them.
+"""The compact form of parameters in tables, and the read-only mapping that users see.
 
-A table keeps each parameter as a few bytes, and makes a `Param` of it when it is asked for. Python's garbage
-collector goes through every object that might be part of a cycle, a `Param` or a tuple too: with the tables
-of 250 vehicles it took up to 80 ms at a time, in which nothing else was done. Bytes, and dictionaries of
-them, it leaves out.
+A table stores each parameter as a few bytes, and makes a `Param` on access. Python's garbage collector
+traverses every object that can be part of a cycle, including `Param` and tuples: with the tables of 250
+vehicles, collections blocked the process for up to 80 ms. The collector skips bytes, and
+dictionaries of bytes.
 """
 
 from __future__ import annotations
@@ -25,51 +25,55 @@ __all__ = [
     "copy_params",
     "held_of",
     "is_listed",
-    "iter_parts",
-    "kept",
+    "iter_unpack_fields",
+    "as_params",
     "number_of",
     "param_of",
-    "parts_of",
-    "placed",
+    "unpack_fields",
+    "with_index",
     "same_held",
-    "to_hold",
+    "pack_fields",
     "trust_of",
-    "trusted",
+    "with_trust_number",
 ]
 
 Held: TypeAlias = bytes
-"""A parameter as it is kept, without its name and default: what `to_hold` makes and `parts_of` reads."""
+"""A parameter in compact form, without name and default; see `pack_fields` and `unpack_fields`."""
 
 LIVE: Final = 0
+"""`Trust.LIVE` in the compact form."""
 VERIFIED: Final = 1
+"""`Trust.VERIFIED` in the compact form."""
 CACHED: Final = 2
-"""The numbers of `Trust` in it."""
+"""`Trust.CACHED` in the compact form."""
 NOWHERE: Final = -1
-"""The place of a parameter without an index."""
+"""The index, in the compact form, of a parameter without an index."""
 
 _LAYOUT = struct.Struct("<QBBBi")
-to_hold = _LAYOUT.pack
-"""Bits, the number of the type, whether it stays raw bytes, the number of the trust, and the place."""
-parts_of = _LAYOUT.unpack
-"""The same, from what is kept."""
-iter_parts = _LAYOUT.iter_unpack
-"""The same of many, whose bytes follow each other."""
+pack_fields = _LAYOUT.pack
+"""Pack bits, the number of the type, whether the value is raw bytes, the number of the trust, the index."""
+unpack_fields = _LAYOUT.unpack
+"""Unpack the fields that `pack_fields` takes."""
+iter_unpack_fields = _LAYOUT.iter_unpack
+"""Iterate over the fields of several compact parameters that are joined into one `bytes`."""
 _TRUST_AT: Final = 10
-_PLACE_AT: Final = 11
-_NO_PLACE: Final = NOWHERE.to_bytes(4, "little", signed=True)
+"""Offset of the trust in the compact form, in bytes."""
+_INDEX_AT: Final = 11
+"""Offset of the index in the compact form, in bytes."""
+_NO_INDEX: Final = NOWHERE.to_bytes(4, "little", signed=True)
 _TRUSTS: Final = (Trust.LIVE, Trust.VERIFIED, Trust.CACHED)
 _NUMBERS: Final = {trust: number for number, trust in enumerate(_TRUSTS)}
 _KNOWN_TYPES: Final = tuple(map(known_type, range(256)))
 
 
 class Params(MutableMapping[str, Param]):
-    """Parameters by name, in the order in which they were put in first, each made when it is asked for.
+    """Parameters by name, in the order of insertion. Each `Param` is made on access.
 
     Attributes:
-        held: what is kept, by name.
-        defaults: the firmware's defaults, by the names of those of which they are known.
-        moments: when each value was observed last, by name, in seconds of the clock of whoever fills this;
-            without the names of which that is not known.
+        held: the compact form, by name.
+        defaults: the firmware's defaults that are known, by name.
+        moments: when each value was last observed, by name, in seconds of the clock of the table's owner.
+            Names without a known time are absent.
     """
 
     __slots__ = ("defaults", "held", "moments")
@@ -109,19 +113,19 @@ class Params(MutableMapping[str, Param]):
         return len(self.held)
 
     def values(self) -> ValuesView[Param]:
-        """Each parameter, made as it is come to."""
+        """Return a view of the parameters, each made when the iteration reaches it."""
         return _Values(self)
 
     def items(self) -> ItemsView[str, Param]:
-        """Each name with its parameter, made as it is come to."""
+        """Return a view of names and parameters, each made when the iteration reaches it."""
         return _Items(self)
 
     def copy(self) -> Params:
-        """The same parameters, as they are now."""
+        """Return a copy of the table."""
         return Params(self.held.copy(), self.defaults.copy(), self.moments.copy())
 
     def only(self, names: Iterable[str]) -> Params:
-        """Those of these names that there are, as they are now."""
+        """Return a copy with only those of these names that the table has."""
         held, defaults, moments = self.held, self.defaults, self.moments
         known = [name for name in names if name in held]
         return Params(
@@ -135,7 +139,7 @@ class Params(MutableMapping[str, Param]):
 
 
 class _Values(ValuesView[Param]):
-    """The parameters of a `Params`, without a look for each name."""
+    """The parameters of a `Params`, without one look-up for each name."""
 
     _mapping: Params
 
@@ -145,7 +149,7 @@ class _Values(ValuesView[Param]):
 
 
 class _Items(ItemsView[str, Param]):
-    """The same with their names."""
+    """The names and parameters of a `Params`, without one look-up for each name."""
 
     _mapping: Params
 
@@ -153,8 +157,8 @@ class _Items(ItemsView[str, Param]):
         return zip(self._mapping.held, self._mapping.values(), strict=True)
 
 
-def kept(params: Mapping[str, Param]) -> Params:
-    """Parameters as a table keeps them: these themselves where they are kept so, or are shown by a view."""
+def as_params(params: Mapping[str, Param]) -> Params:
+    """Return parameters as a `Params`: the argument or the table behind a `ParamMap`, otherwise a copy."""
     shown = params._params if isinstance(params, ParamMap) else params
     if isinstance(shown, Params):
         return shown
@@ -164,66 +168,67 @@ def kept(params: Mapping[str, Param]) -> Params:
 
 
 def copy_params(params: Mapping[str, Param]) -> Mapping[str, Param]:
-    """Return a copy of a table, for another thread to read. Makes no `Param`: 0.5 ms for 10,000 names."""
+    """Return a copy of a table for use in another thread. Makes no `Param`: 0.5 ms for 10,000 names."""
     shown = params._params if isinstance(params, ParamMap) else params
     return shown.copy() if isinstance(shown, Params) else dict(shown)
 
 
 def held_of(param: Param) -> Held:
-    """A parameter as it is kept."""
-    place = NOWHERE if param.index is None else param.index
-    return to_hold(param.bits, param.type, isinstance(param.value, bytes), number_of(param.trust), place)
+    """Return a parameter in compact form."""
+    index = NOWHERE if param.index is None else param.index
+    return pack_fields(param.bits, param.type, isinstance(param.value, bytes), number_of(param.trust), index)
 
 
 def number_of(trust: Trust) -> int:
-    """The number of a trust in what is kept."""
+    """Return the number of a trust in the compact form."""
     return _NUMBERS[trust]
 
 
 def param_of(name: str, held: Held, default: Value | None = None) -> Param:
-    """The parameter that is kept like this."""
-    bits, number, is_raw, trust, place = parts_of(held)
+    """Return the `Param` of a compact parameter."""
+    bits, number, is_raw, trust, place = unpack_fields(held)
     value = from_bits(bits, number, is_raw=is_raw)
     index = None if place == NOWHERE else place
     return Param(name, value, _KNOWN_TYPES[number], index, bits, _TRUSTS[trust], default)
 
 
 def trust_of(held: Held) -> int:
-    """The number of its trust."""
+    """Return the number of a compact parameter's trust."""
     return held[_TRUST_AT]
 
 
-def trusted(held: Held, trust: int) -> Held:
-    """The same parameter, trusted like this."""
-    return held[:_TRUST_AT] + bytes((trust,)) + held[_PLACE_AT:]
+def with_trust_number(held: Held, trust: int) -> Held:
+    """Return a compact parameter with another trust."""
+    return held[:_TRUST_AT] + bytes((trust,)) + held[_INDEX_AT:]
 
 
 def is_listed(held: Held) -> bool:
-    """Whether it has an index."""
-    return held[_PLACE_AT:] != _NO_PLACE
+    """Return whether a compact parameter has an index."""
+    return held[_INDEX_AT:] != _NO_INDEX
 
 
-def placed(held: Held, place: int) -> Held:
-    """The same parameter at this place."""
-    return held[:_PLACE_AT] + place.to_bytes(4, "little", signed=True)
+def with_index(held: Held, place: int) -> Held:
+    """Return a compact parameter with another index."""
+    return held[:_INDEX_AT] + place.to_bytes(4, "little", signed=True)
 
 
 def same_held(one: Held, other: Held) -> bool:
-    """Whether both hold the same value in the same type, as `Param.same_value` says it."""
+    """Return whether both have the same value in the same type, as `Param.same_value` defines it."""
     if one[:_TRUST_AT] == other[:_TRUST_AT]:
         return True
-    bits, number, is_raw, *_ = parts_of(one)
-    bits2, number2, is_raw2, *_ = parts_of(other)
+    bits, number, is_raw, *_ = unpack_fields(one)
+    bits2, number2, is_raw2, *_ = unpack_fields(other)
     return (number, is_raw) == (number2, is_raw2) and same_bits(number, bits, bits2)
 
 
 class ParamMap(Mapping[str, Param]):
-    """Parameters by name: a read-only view of a table that may go on changing.
+    """Parameters by name: a read-only view of a table that may still change.
 
-    Take a copy, `dict(params)`, to iterate over it across an `await`: names may come and go meanwhile.
+    Copy the view, `dict(params)`, before iterating over it across an `await`: names may be added and removed
+    meanwhile.
 
     Args:
-        params: what to show. It is not copied; its order is kept.
+        params: the table. It is not copied; its order is kept.
     """
 
     __slots__ = ("_params",)
@@ -244,9 +249,9 @@ class ParamMap(Mapping[str, Param]):
         return len(self._params)
 
     def changed(self) -> dict[str, Param]:
-        """Those whose value differs from the firmware's default, by name: a copy.
+        """Return a copy of the parameters whose value differs from the firmware's default.
 
-        None where the vehicle has not said what its defaults are (see `Param.default`).
+        Parameters whose default the vehicle has not given are left out (see `Param.default`).
         """
         return {name: param for name, param in self._params.items() if param.is_changed}
 

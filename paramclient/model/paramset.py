@@ -1,4 +1,4 @@
-"""Parameters that no vehicle stands behind: as a file, a snapshot or a kept table has them."""
+"""Parameter sets without a vehicle: the contents of a file, a snapshot or a cached table."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ __all__ = ["ParamSet", "WrittenParam"]
 
 @dataclass(frozen=True, slots=True)
 class WrittenParam:
-    """One parameter as it is written down.
+    """One parameter of a set.
 
     Attributes:
         name: param_id.
-        value: int where a whole number is written, else float; the raw four bytes for what cannot be said
-            as a number. A number that no type stands beside is kept as written: what it is as a float32
-            only shows beside the vehicle's own type (see `bits_as`).
-        type: param_type, or None where the source does not say.
-        default: the value that the firmware gives it, or None where the source does not say.
-        comment: what stands beside it in words, without the mark that begins it; "" for nothing.
-        line: its line in the file it comes from, from 1; None where there is none. Takes no part in equality.
+        value: int for a written whole number, else float; the four raw bytes for a value that is not a
+            number. A number without a type is kept as written: only the vehicle's own type shows
+            which float32 it becomes (see `bits_as`).
+        type: param_type, or None if the source has no types.
+        default: the firmware's default, or None if the source does not contain it.
+        comment: the comment in the file, without the comment character; "" for none.
+        line: the line in the source file, from 1; None for other sources. Takes no part in equality.
     """
 
     name: str
@@ -37,25 +37,24 @@ class WrittenParam:
 
     @classmethod
     def of(cls, param: Param) -> WrittenParam:
-        """The same value without what only a table knows of it."""
+        """Return the value, type and default of a table's parameter, without index and trust."""
         return cls(param.name, param.value, param.type, param.default)
 
     def bits_as(self, number: ParamType | int) -> int:
-        """The bits (see `Param.bits`) that a parameter of this type has when it holds this value.
+        """Return the bits (see `Param.bits`) of a parameter of this type with this value.
 
         Raises:
             UsageError: the value does not fit the type.
         """
         if isinstance(self.value, bytes):
-            return int.from_bytes(self.value, "little")  # all four, also of a type that has fewer
+            return int.from_bytes(self.value, "little")  # four bytes, also if the type has fewer
         return bits_of(self.value, number)
 
     def is_held_by(self, param: Param) -> bool:
-        """Whether a vehicle's parameter has this value, compared in the type that the vehicle gives it.
+        """Return whether a vehicle's parameter has this value, compared in the vehicle's type.
 
-        −0 equals 0, a NaN equals only the same NaN, and a float is rounded to float32 first. False where the
-        value does not fit that type at all. Raw bytes equal only the same raw bytes: what they mean as a
-        number is not known.
+        −0 equals 0, NaN equals only the same NaN, and a float is rounded to float32 first. False if the
+        value does not fit the type. Raw bytes equal only the same raw bytes, as their number is unknown.
         """
         if isinstance(self.value, bytes) or param.is_raw:
             return self.value == param.value
@@ -72,15 +71,15 @@ class WrittenParam:
 
 @dataclass(frozen=True, slots=True)
 class ParamSet(Mapping[str, WrittenParam]):
-    """Parameters of one component by name, in the order in which they are written. It does not change.
+    """The parameters of one component by name, in the order of the source. Immutable.
 
     Attributes:
         params: the parameters.
-        component: component id, or None where the source does not say (the autopilot's then).
-        system: system id, or None where the source does not say.
-        identity: who the vehicle was, where the source says so.
-        at: when it was so, in unix seconds, or None.
-        source: where it comes from, in words for people: a file's name, `link udpin:…`, `cache uid:…`.
+        component: component id, or None if the source does not contain it (then the autopilot's is meant).
+        system: system id, or None if the source does not contain it.
+        identity: the vehicle's identity, or None if the source does not contain it.
+        at: when the values were observed, as a Unix time in seconds, or None if unknown.
+        source: the source, for messages: a file's name, `link udpin:…`, `cache uid:…`.
     """
 
     params: Mapping[str, WrittenParam]
@@ -101,18 +100,18 @@ class ParamSet(Mapping[str, WrittenParam]):
         at: float | None = None,
         source: str = "",
     ) -> ParamSet:
-        """A copy of a table, such as `component.params.values()`, as it is at this moment."""
+        """Return a copy of a table's parameters, such as `component.params.values()`."""
         written = {param.name: WrittenParam.of(param) for param in params}
         return cls(written, component, system, identity, at, source)
 
     def only(self, patterns: Iterable[str]) -> ParamSet:
-        """Those that are named.
+        """Return the set with only the selected parameters.
 
         Args:
-            patterns: names, or patterns of the shell (`MC_*`, `SERVO?_TRIM`) in the spelling of the set.
+            patterns: names or shell patterns (`MC_*`, `SERVO?_TRIM`), case-sensitive.
 
         Raises:
-            UsageError: one fits no name. Whoever misspells one must not hear that all is well.
+            UsageError: a pattern matches no name. Without this error, a misspelt name would go unnoticed.
         """
         chosen, useless = NameChoice(patterns).choose(self.keys())
         if useless:

@@ -1,4 +1,4 @@
-"""Names chosen by name, or by patterns of the shell such as `MC_*`."""
+"""Selection of parameter names by name or by shell pattern such as `MC_*`."""
 
 from __future__ import annotations
 
@@ -9,20 +9,20 @@ from typing import Final
 
 __all__ = ["NameChoice", "is_pattern"]
 
-NAMED_MAX: Final = 20
-"""Names and patterns that one message lists."""
+UNMATCHED_LISTED_MAX: Final = 20
+"""Names and patterns without a match that one message lists, so that the message stays readable."""
 
 
 def is_pattern(text: str) -> bool:
-    """Whether a text is a pattern; else it is the name that it stands for."""
-    return not _SIGNS.isdisjoint(text)
+    """Return whether a text is a pattern; otherwise it is an exact name."""
+    return not _WILDCARDS.isdisjoint(text)
 
 
 class NameChoice:
-    """A choice of names. An exact name costs one look-up, a pattern one comparison with each name.
+    """A selection of names. An exact name costs one look-up, a pattern one comparison with each name.
 
     Args:
-        given: names, or patterns of the shell (`MC_*`, `SERVO?_TRIM`), in the spelling of the names.
+        given: exact names or shell patterns (`MC_*`, `SERVO?_TRIM`), case-sensitive.
     """
 
     def __init__(self, given: Iterable[str]) -> None:
@@ -31,14 +31,14 @@ class NameChoice:
         self._patterns = {text: re.compile(translate(text)) for text in each if is_pattern(text)}
 
     def has(self, name: str) -> bool:
-        """Whether a name is chosen."""
+        """Return whether a name is selected."""
         return name in self._names or any(pattern.match(name) for pattern in self._patterns.values())
 
     def choose(self, known: Collection[str]) -> tuple[set[str], str]:
-        """Choose among these names.
+        """Select among these names.
 
         Returns:
-            The names that are chosen; and, in words, the names and patterns that fit none, or "".
+            The selected names; and a text that lists the names and patterns without a match, or "".
         """
         names = frozenset(known)
         chosen = {name for name in self._names if name in names}
@@ -48,9 +48,9 @@ class NameChoice:
             chosen.update(fitting)
             if not fitting:
                 useless.append(text)
-        more = len(useless) - NAMED_MAX
-        words = " or ".join(useless[:NAMED_MAX])
+        more = len(useless) - UNMATCHED_LISTED_MAX
+        words = " or ".join(useless[:UNMATCHED_LISTED_MAX])
         return chosen, f"{words} (and {more} more)" if more > 0 else words
 
 
-_SIGNS: Final = frozenset("*?[")
+_WILDCARDS: Final = frozenset("*?[")

@@ -1,9 +1,9 @@
 """Parameter types, the two wire encodings, float32 comparison, and the PX4 hash.
 
 A PARAM_VALUE has four bytes for the value, whatever its type. Two encodings are in use (MAVLink guide,
-"Parameter Protocol"): *byte-wise*, the standard, lays the value's own bytes into the field; *C-cast*,
-ArduPilot's, converts the value to a float32. Nothing here turns the four bytes into a Python float and
-back on the way to an integer: a byte-wise integer whose bytes form a signalling NaN would change.
+"Parameter Protocol"). *Byte-wise*, the standard, copies the value's own bytes into the field. *C-cast*,
+ArduPilot's, converts the value to a float32. An integer is never decoded through a Python float: the
+conversion would change a byte-wise integer whose bytes form a signalling NaN.
 """
 
 from __future__ import annotations
@@ -45,13 +45,13 @@ __all__ = [
 ]
 
 Value: TypeAlias = int | float | bytes
-"""A parameter's value. `bytes` only where the four wire bytes cannot be read as a number of the type: a
+"""A parameter's value. `bytes` only where the four wire bytes cannot be decoded as a number of the type: a
 64-bit type in the byte-wise encoding, an unknown type, a C-cast float that the integer type cannot hold."""
 
 NAME_LENGTH = 16
-"""Bytes in param_id; shorter names end with a NUL, names of 16 have none."""
-NAMES_REMEMBERED: Final = 4096
-"""Names of which it is remembered whether files can hold them: those of a few autopilots."""
+"""Bytes in param_id. Shorter names end with a NUL, names of 16 bytes have none."""
+PORTABLE_NAMES_CACHED: Final = 4096
+"""Names in the cache of `is_portable_name`: as many as a few autopilots have."""
 _portable: Final = re.compile(r"(?=[^A-Za-z]*[A-Za-z])(?![@/])(?:(?![#,;=])[!-~]){1,16}(?<!:)").fullmatch
 
 
@@ -71,7 +71,7 @@ class ParamType(IntEnum):
 
     @property
     def size(self) -> int:
-        """Bytes of a value of this type."""
+        """Size of a value of this type, in bytes."""
         return _LAYOUT[self].size
 
     @property
@@ -90,21 +90,21 @@ _FLOAT32 = _LAYOUT[ParamType.REAL32]
 
 
 class Encoding(StrEnum):
-    """How a component lays values into the four bytes."""
+    """How a component encodes values in the four bytes of PARAM_VALUE and PARAM_SET."""
 
     BYTEWISE = "bytewise"
     C_CAST = "c-cast"
 
 
 class Trust(StrEnum):
-    """How far a value in a table can be relied upon."""
+    """How a value in a table was confirmed."""
 
     LIVE = "live"
-    """Heard from the vehicle on this link, and it has not been away since."""
+    """Received from the vehicle on this link, and the component has not been lost since."""
     VERIFIED = "verified"
-    """Last known, and the vehicle's hash has confirmed it in this session."""
+    """Last known value, confirmed by the vehicle's hash in this session."""
     CACHED = "cached"
-    """Last known: from the cache, or from before the vehicle was away."""
+    """Last known value: from the cache, or received before the component was lost."""
 
 
 @dataclass(frozen=True, slots=True, init=False)
@@ -113,16 +113,16 @@ class Param:
 
     Attributes:
         name: param_id, 1 to 16 characters.
-        value: int for integer types, float for REAL32 and REAL64, and the raw four bytes where they cannot
-            be read as the type (see `Value`). A REAL32 is the exact float32 value as a Python float.
-        type: a `ParamType`, or the bare number of a type that MAVLink does not define.
-        index: the component's index for it, or None while unknown (PX4 gives none to parameters not in
-            use, ArduPilot none in replies by name).
-        bits: the value's own bytes in its type, read as a little-endian unsigned number. Two values are
-            the same parameter value when `same_bits` says so; `value` does not take part in equality.
-        trust: where the value comes from.
-        default: the value that the firmware gives it, where the vehicle has said so (only a packed
-            parameter file does), else None. It takes no part in equality.
+        value: int for integer types, float for REAL32 and REAL64, and the four wire bytes where they cannot
+            be decoded as the type (see `Value`). A REAL32 is the exact float32 value as a Python float.
+        type: a `ParamType`, or the number of a type that MAVLink does not define.
+        index: the component's index of the parameter, or None while unknown (PX4 gives none to parameters
+            not in use, ArduPilot none in responses by name).
+        bits: the value's own bytes in its type, as a little-endian unsigned number. Two values are
+            equal if `same_bits` returns true for them; `value` does not take part in equality.
+        trust: how the value was confirmed.
+        default: the firmware's default, or None where the vehicle has not given it (only a packed
+            parameter file does). `default` does not take part in equality.
     """
 
     name: str
@@ -143,7 +143,7 @@ class Param:
         trust: Trust = Trust.LIVE,
         default: Value | None = None,
     ) -> None:
-        # A generated one takes twice as long, and each value that comes makes a Param.
+        # The generated __init__ takes twice as long, and every PARAM_VALUE makes a Param.
         _set_name(self, name)
         _set_value(self, value)
         _set_type(self, type)
@@ -154,23 +154,23 @@ class Param:
 
     @property
     def is_raw(self) -> bool:
-        """Whether `value` holds the undecoded wire bytes."""
+        """Whether `value` is the undecoded wire bytes."""
         return isinstance(self.value, bytes)
 
     @property
     def is_changed(self) -> bool | None:
-        """Whether the value differs from the firmware's default; None where that is not known."""
+        """Whether the value differs from the firmware's default; None while the default is unknown."""
         if self.default is None:
             return None
-        # NaN is not equal to itself, and a vehicle may well have it for a default
+        # NaN is not equal to NaN, and a default can be NaN.
         return self.value != self.default and not (self.value != self.value and self.default != self.default)
 
     def with_trust(self, trust: Trust) -> Param:
-        """The same parameter, trusted differently."""
+        """Return this parameter with another trust."""
         return self if self.trust is trust else replace(self, trust=trust)
 
     def same_value(self, other: Param) -> bool:
-        """Whether both hold the same value in the same type (−0 equals 0, NaN by its bits)."""
+        """Return whether both have the same value in the same type (−0 equals 0, NaN is compared by bits)."""
         return (
             self.type == other.type
             and self.is_raw == other.is_raw
@@ -185,7 +185,7 @@ _set_name, _set_value, _set_type, _set_index, _set_bits, _set_trust, _set_defaul
     vars(Param)[each.name].__set__ for each in fields(Param)
 )
 
-# What `decode` needs, without the detours of an enumeration: it runs for every value that comes.
+# Constants for `decode`, which runs for every received value: enumeration members are slower than numbers.
 _REAL32 = int(ParamType.REAL32)
 _REAL64 = int(ParamType.REAL64)
 _BYTEWISE = Encoding.BYTEWISE
@@ -195,7 +195,7 @@ _BOUNDS = {int(kind): kind.bounds for kind in ParamType if kind.is_integer}
 
 
 def known_type(number: int) -> ParamType | int:
-    """The `ParamType` of a number, or the number itself where MAVLink defines none."""
+    """Return the `ParamType` of a number, or the number where MAVLink defines no such type."""
     return _TYPES[number] if number < len(_TYPES) else number
 
 
@@ -203,12 +203,12 @@ _TYPES: tuple[ParamType | int, ...] = (0, *ParamType)
 
 
 def type_name(number: ParamType | int) -> str:
-    """`INT32`, `REAL32`, …; an unknown type is shown as `TYPE_77`."""
+    """Return the name of a type, `INT32`, `REAL32`, …, or `TYPE_77` for an unknown type."""
     return number.name if isinstance(number, ParamType) else f"TYPE_{number}"
 
 
 def check_name(name: str) -> str:
-    """Give the name back if it can be a param_id: 1 to 16 printable ASCII characters; else UsageError."""
+    """Return a valid param_id, 1 to 16 printable ASCII characters, unchanged; else raise UsageError."""
     if not isinstance(name, str):
         raise UsageError(f"a parameter name is a string, not {type(name).__name__}")
     if not name:
@@ -220,22 +220,22 @@ def check_name(name: str) -> str:
     return name
 
 
-@lru_cache(maxsize=NAMES_REMEMBERED)
+@lru_cache(maxsize=PORTABLE_NAMES_CACHED)
 def is_portable_name(name: str) -> bool:
-    """Return whether every form of parameter file can hold a name.
+    """Return whether every format of parameter file can hold a name.
 
-    It has 1 to 16 printable ASCII characters without space, `#`, `,`, `;` and `=`, one of them a letter; the
-    first is neither `@` nor `/`, and the last is not `:`. Names of PX4 and ArduPilot have capitals, digits
-    and `_`.
+    A portable name has 1 to 16 printable ASCII characters, at least one of them a letter, and no space, `#`,
+    `,`, `;` and `=`. The first character is neither `@` nor `/`, and the last is not `:`. Names of PX4 and
+    ArduPilot consist of capitals, digits and `_`.
     """
     return _portable(name) is not None
 
 
 def check_value(value: SupportsIndex | SupportsFloat | bytes) -> Value:
-    """Turn what a caller gives into an int, a float or four raw bytes; else UsageError.
+    """Convert a caller's value to an int, a float or four raw bytes; else raise UsageError.
 
-    Numbers of other libraries (numpy's, Decimal) are taken through `__index__` or `__float__`. Text is not:
-    who reads text knows better what was meant.
+    Numbers of other libraries (numpy's, Decimal) are converted with `__index__` or `__float__`. Text is
+    rejected: only the code that read the text knows its notation.
     """
     if isinstance(value, bytes):
         if len(value) != 4:
@@ -254,19 +254,22 @@ def check_value(value: SupportsIndex | SupportsFloat | bytes) -> Value:
 
 
 def decode(raw: bytes, number: int, encoding: Encoding) -> tuple[Value, int]:
-    """Read the four wire bytes of a value: the value, and its own bits (see `Param.bits`).
+    """Decode the four wire bytes of a value.
 
     Args:
         raw: exactly 4 bytes.
-        number: param_type as it stood in the message.
-        encoding: how the component writes values.
+        number: param_type of the message.
+        encoding: the component's encoding.
+
+    Returns:
+        The value, and its bits (see `Param.bits`).
     """
     bits, is_raw = bits_of_wire(raw, number, encoding)
     return from_bits(bits, number, is_raw=is_raw), bits
 
 
 def bits_of_wire(raw: bytes, number: int, encoding: Encoding) -> tuple[int, bool]:
-    """What `decode` reads, without making a value of it: its own bits, and whether they stay raw bytes."""
+    """Return the bits of a value, as `decode` does, and whether the value stays raw bytes."""
     bits = int.from_bytes(raw, "little")
     if number == _REAL32:
         return bits, False
@@ -281,18 +284,18 @@ def bits_of_wire(raw: bytes, number: int, encoding: Encoding) -> tuple[int, bool
         whole = int(number32)
         low, high = bounds
         if low <= whole <= high:
-            return whole & (high - low), False  # as many ones as the type has bits
+            return whole & (high - low), False  # high - low has as many ones as the type has bits
     return bits, True
 
 
 def encode(value: Value, number: int, encoding: Encoding) -> bytes:
-    """Lay a value into the four wire bytes.
+    """Encode a value in the four wire bytes.
 
     Raises:
         UsageError: the value does not fit. A fraction for an integer type fits only in the C-cast encoding,
-            where the vehicle itself does the conversion (ArduPilot cuts 1234.7 to 1234). An integer that a
-            float32 cannot hold exactly does not fit in the C-cast encoding. A 64-bit type does not fit in
-            the byte-wise encoding, and an unknown type takes raw bytes only.
+            where the vehicle converts it (ArduPilot truncates 1234.7 to 1234). An integer that a float32
+            cannot hold exactly does not fit in the C-cast encoding. A 64-bit type does not fit in the
+            byte-wise encoding, and an unknown type takes raw bytes only.
     """
     if isinstance(value, bytes):
         return value
@@ -328,10 +331,10 @@ def encode(value: Value, number: int, encoding: Encoding) -> bytes:
 
 
 def as_sent(bits: int, number: int, encoding: Encoding) -> bytes:
-    """The four bytes of a message in which a vehicle gives a value of these `bits` and this type.
+    """Return the four wire bytes with which a vehicle reports a value of these bits and this type.
 
-    The other way round from `decode`, and not its inverse: a vehicle that casts rounds integers beyond 24
-    bits to the next float32, and of a type with eight bytes a message holds the first four.
+    Not the inverse of `decode`: a C-casting vehicle rounds integers beyond 24 bits to the next float32, and
+    a message holds only the first four bytes of an 8-byte type.
     """
     if encoding is Encoding.C_CAST and number in _BOUNDS:
         return struct.pack("<f", from_bits(bits, number))
@@ -339,12 +342,12 @@ def as_sent(bits: int, number: int, encoding: Encoding) -> bytes:
 
 
 def from_bits(bits: int, number: int, *, is_raw: bool = False) -> Value:
-    """The value whose own bits these are: the inverse of `Param.bits`, for what was kept on disk.
+    """Return the value with these bits: the inverse of `Param.bits`, for values kept on disk.
 
     Args:
         bits: as in `Param.bits`.
         number: param_type.
-        is_raw: whether `Param.is_raw` was true.
+        is_raw: `Param.is_raw` of the parameter.
     """
     layout = None if is_raw else _LAYOUTS.get(number)
     if layout is None:
@@ -354,7 +357,7 @@ def from_bits(bits: int, number: int, *, is_raw: bool = False) -> Value:
 
 
 def bits_of(value: Value, number: int) -> int:
-    """The value's own bytes in its type, read as a little-endian unsigned number.
+    """Return the value's own bytes in its type, as a little-endian unsigned number.
 
     Raises:
         UsageError: the value does not fit the type.
@@ -380,7 +383,7 @@ def bits_of(value: Value, number: int) -> int:
 
 
 def same_bits(number: int, a: int, b: int) -> bool:
-    """Whether two values of a type are equal, given by their bits: −0 equals 0, a NaN equals only itself."""
+    """Return whether two values of a type, given as bits, are equal: −0 equals 0, NaN equals only itself."""
     if a == b:
         return True
     if number == ParamType.REAL32:
@@ -389,7 +392,7 @@ def same_bits(number: int, a: int, b: int) -> bool:
 
 
 def format_value(value: Value, number: int = ParamType.REAL32) -> str:
-    """The shortest text that reads back as the same value: floats as float32, raw bytes as hexadecimal."""
+    """Return the shortest text that parses to the same value: floats as float32, raw bytes as hexadecimal."""
     if isinstance(value, bytes):
         return f"0x{int.from_bytes(value, 'little'):08x}"
     if isinstance(value, int):
@@ -398,12 +401,12 @@ def format_value(value: Value, number: int = ParamType.REAL32) -> str:
 
 
 def shortest_float(value: float) -> float:
-    """The float with the shortest decimal form among those that round to the same float32."""
+    """Return the float with the shortest decimal form among those that round to the same float32."""
     if not abs(value) < _FLOAT32_END:
         return value
     same = _FLOAT32.pack(value)
     value = _FLOAT32.unpack(same)[0]
-    # Below a power of two the floats lie closer: the middle of what rounds to it is a little above it.
+    # Floats are denser below a power of two: the middle of the rounding interval is slightly above value.
     middle = value * (1 + 2**-26) if abs(math.frexp(value)[0]) == 0.5 else value
     for digits in range(6 if abs(value) >= _FLOAT32_NORMAL else 1, 9):
         for point in (value, middle):
@@ -413,21 +416,23 @@ def shortest_float(value: float) -> float:
     return float(f"{value:.9g}")
 
 
-_FLOAT32_END = 2.0**128 - 2.0**103  # what is smaller rounds to a finite float32
-_FLOAT32_NORMAL = 2.0**-126  # from here on, all decimals of up to 6 digits are different floats
+_FLOAT32_END = 2.0**128 - 2.0**103
+"""Upper bound: smaller floats round to a finite float32."""
+_FLOAT32_NORMAL = 2.0**-126
+"""Smallest normal float32: from here on, all decimals of up to 6 digits are different floats."""
 
 
 def crc32_px4(data: bytes, crc: int = 0) -> int:
-    """PX4's CRC-32: reflected polynomial 0xEDB88320, start value 0, no final xor (PX4 crc.c, `crc32part`)."""
+    """Return PX4's CRC-32: polynomial 0xEDB88320, reflected, start 0, no final xor (crc.c, `crc32part`)."""
     return zlib.crc32(data, crc ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
 
 
 def px4_hash(params: Iterable[Param], *, leave_out: Iterable[str] = ()) -> int:
-    """The value of PX4's `_HASH_CHECK` for a table.
+    """Return the value of PX4's `_HASH_CHECK` for a table.
 
     Args:
         params: the parameters in use, in any order; PX4's types have 4 bytes each.
-        leave_out: names of volatile parameters, which PX4 does not count in.
+        leave_out: names of volatile parameters, which PX4 excludes from the hash.
     """
     without = frozenset(leave_out)
     kept = sorted((param for param in params if param.name not in without), key=lambda param: param.name)
@@ -435,7 +440,7 @@ def px4_hash(params: Iterable[Param], *, leave_out: Iterable[str] = ()) -> int:
 
 
 def hash_chunk(param: Param) -> bytes:
-    """What PX4's hash takes in of one parameter: its name without NUL, and its 4 value bytes."""
+    """Return the bytes that PX4 hashes for a parameter: the name without NUL, and the 4 value bytes."""
     return param.name.encode("latin-1") + (param.bits & 0xFFFFFFFF).to_bytes(4, "little")
 
 

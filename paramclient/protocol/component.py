@@ -9,7 +9,7 @@ from typing import Final, Protocol
 
 from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.model.identity import Identity, autopilot_name, reason_against_non_finite
-from paramclient.model.params import parts_of
+from paramclient.model.params import unpack_fields
 from paramclient.model.values import (
     Encoding,
     Param,
@@ -537,7 +537,7 @@ class ComponentMachine:
         """Remember the value before a change. PX4 has none on the way: it answers with the value of now."""
         old = change[1]
         if old is not None and self.who.autopilot != MAV_AUTOPILOT_PX4:
-            bits, number, *_ = parts_of(old)
+            bits, number, *_ = unpack_fields(old)
             raw = as_sent(bits, number, self.table.encoding)
             self._checks.replaced(change.name, number, raw, message, now, self.reads.sent_at)
 

@@ -14,7 +14,7 @@ from paramclient.client.events import Changes
 from paramclient.documents.component import ComponentDoc, ProgressDoc
 from paramclient.errors import NoReply, ParamClientError
 from paramclient.model.notation import bits_text, value_json
-from paramclient.model.params import held_of, kept
+from paramclient.model.params import as_params, held_of
 from paramclient.model.values import Param, Trust, type_name
 from paramclient.protocol.params.change import Change
 from paramclient.service.event_feed import COMPACT
@@ -44,7 +44,7 @@ class Followed:
         self.line = line
         self.metadata: Metadata | None = None
         self._feed = feed
-        self._shown = kept(component.params).copy()
+        self._shown = as_params(component.params).copy()
         self._heard_at: dict[str, float] = {}
         self._texts: dict[str, str] = {}
         self._told: tuple[object, ...] | None = None
@@ -173,7 +173,7 @@ class Followed:
 
     def _look_at_values(self) -> None:
         """See which parameters are others than were told: their trust, default or index has moved."""
-        params, shown = kept(self.component.params), self._shown
+        params, shown = as_params(self.component.params), self._shown
         last = self.component._machine.fetches.last
         if last is not self._last_fetch:
             self._last_fetch = last

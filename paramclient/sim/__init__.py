@@ -1,22 +1,22 @@
-"""Simulated vehicles and a faulty link, to test programs against.
+"""Simulated vehicles and a faulty link, for tests of other programs.
 
-Everything here speaks bytes and takes the time as an argument: no sockets, no clock, no threads, and the
-same outcome on every run. A whole session needs no more than a loop::
+All of it is sans-I/O: bytes and the time come in as arguments. There are no sockets, clocks or threads, and
+every run has the same outcome. A complete session is a loop::
 
     vehicle = PX4Vehicle()
     air = Air.symmetric([vehicle], loss=0.05, delay=0.03, seed=1)
     now = 0.0
-    air.tick(now)                                  # the first call switches everything on
+    air.tick(now)                                  # the first call starts all vehicles
     while now < 10.0:
         for datagram in air.data_to_send():
-            ...                                    # give it to the program, and its answers back:
-            air.receive(answer, now)
+            ...                                    # pass it to the program, and its responses back:
+            air.receive(response, now)
         now = air.next_deadline()
         air.tick(now)
     assert program.params == vehicle.values
 
-The vehicles behave as real ones were measured, at their real pace; what differs between them stands in the
-docstrings of `PX4Vehicle` and `ArduPilotVehicle`.
+The vehicles behave as measured on real ones, with the real timing. The docstrings of `PX4Vehicle` and
+`ArduPilotVehicle` describe the differences between the two.
 """
 
 from __future__ import annotations

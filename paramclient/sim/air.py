@@ -1,4 +1,4 @@
-"""What lies between a program and its vehicles: a link that loses, delays, reorders and damages."""
+"""Air: a link between a program and simulated vehicles that loses, delays, reorders and damages datagrams."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ __all__ = ["Air", "Endpoint", "FaultyLink"]
 
 
 class Endpoint(Protocol):
-    """The far side of a link: a vehicle, or an `Air` with several.
+    """The remote end of a link: a vehicle, or an `Air` with several vehicles.
 
-    Time is any monotonic clock in seconds; the first call fixes when it starts. After `receive` and `tick`
-    the caller sends what `data_to_send` gives and calls `tick` again when `next_deadline` has come::
+    Time is any monotonic clock in seconds; the first call defines the start. After `receive` and `tick`, the
+    caller sends the result of `data_to_send`, and calls `tick` again at `next_deadline`::
 
         endpoint.tick(now)
         for datagram in endpoint.data_to_send(): ...
@@ -26,20 +26,20 @@ class Endpoint(Protocol):
     """
 
     def receive(self, data: bytes, now: float) -> None:
-        """Take one datagram (or whatever a byte stream delivered) at the time `now`. Never raises."""
+        """Take one datagram (or a piece of a byte stream) at the time `now`. Never raises."""
 
     def tick(self, now: float) -> None:
-        """Do what has become due by `now`, later than by the moment it was due if the call comes late."""
+        """Do all work that is due by `now`. Late work is done at `now`, not at its deadline."""
 
     def next_deadline(self) -> float | None:
-        """When `tick` is wanted next; None while there is nothing to wait for, as before the first call."""
+        """Return the time of the next work; None if there is none, as before the first call."""
 
     def data_to_send(self) -> list[bytes]:
-        """Hand over what is to be sent, and forget it: each item one frame, to be sent as one datagram."""
+        """Return the data to send, and clear it. Each item is one frame, to be sent as one datagram."""
 
 
 class Faults(TypedDict, total=False):
-    """What a link can do to datagrams; `FaultyLink` says what each is."""
+    """Faults of a link; see `FaultyLink`."""
 
     loss: float
     loss_burst: float
@@ -53,35 +53,34 @@ class Faults(TypedDict, total=False):
 
 
 class FaultyLink:
-    """One direction of a link, with the faults that are asked for and the same ones for the same seed.
+    """One direction of a link with faults, reproducible by its seed.
 
-    A datagram first waits for its turn at `rate`; then it may be lost; then it travels for `delay` plus up
-    to `jitter`. Datagrams keep their order whatever the jitter. Only those that `reorder` picks are held
-    back by up to 30 ms more while the ones behind pass them.
+    A datagram first waits in the queue of `rate`; then it may be lost; then it travels for `delay` plus up
+    to `jitter`. Jitter does not change the order of datagrams. Only datagrams selected by `reorder` are
+    delayed by up to 30 ms more, so that later ones overtake them.
 
     Args:
-        loss: the share of datagrams that never arrive, 0 to 1.
-        loss_burst: how many in a row are lost, on average: 1 for losses that know nothing of each other,
-            more for a link that fades (Gilbert's model: a good state that loses nothing, a bad one that
-            loses all).
-        delay: seconds on the way.
-        jitter: further seconds on the way, uniform between 0 and this.
-        duplicate: the share that arrives twice, 0 to 1.
-        reorder: the share that is overtaken, 0 to 1.
-        bit_errors: the chance of each single bit to arrive turned over, 0 to 1.
+        loss: the share of datagrams that are lost, 0 to 1.
+        loss_burst: the average number of datagrams lost in a row: 1 for independent losses, more for a
+            fading link (Gilbert's model: a good state without losses, and a bad state that loses all).
+        delay: one-way delay in seconds.
+        jitter: additional delay in seconds, uniform between 0 and this.
+        duplicate: the share of datagrams that arrive twice, 0 to 1.
+        reorder: the share of datagrams that are overtaken, 0 to 1.
+        bit_errors: the probability of each bit to be inverted, 0 to 1.
         rate: bytes per second; None for no limit.
-        queue: bytes that may wait for their turn at `rate`, those being sent included; a datagram that
-            finds the link busy and no room is lost. None for no limit.
-        seed: of this link's own random numbers.
+        queue: bytes that may wait in the queue of `rate`, including those in transmission. If the link is
+            busy and the queue is full, a datagram is lost. None for no limit.
+        seed: of this link's random numbers.
 
     Attributes:
         sent: datagrams given to `send`.
-        lost: those of them that will not arrive, by `loss` or because the queue was full.
-        duplicated: those of them that arrive twice.
-        delivered: datagrams given out; in the end `sent - lost + duplicated`.
+        lost: the number of them that do not arrive, because of `loss` or a full queue.
+        duplicated: the number of them that arrive twice.
+        delivered: datagrams returned by `deliver`; in the end `sent - lost + duplicated`.
 
     Raises:
-        UsageError: an argument is outside its range.
+        UsageError: an argument is out of range.
     """
 
     def __init__(
@@ -132,7 +131,7 @@ class FaultyLink:
         self.delivered = 0
 
     def send(self, data: bytes, now: float) -> None:
-        """Put one datagram on the way."""
+        """Send one datagram."""
         self.sent += 1
         leaves_at = now
         if self._rate is not None:
@@ -163,7 +162,7 @@ class FaultyLink:
             heappush(self._flying, (arrives_at, self._number, self._damaged(data)))
 
     def deliver(self, now: float) -> list[bytes]:
-        """What has arrived by `now`, in the order of arrival."""
+        """Return the datagrams that have arrived by `now`, in order of arrival."""
         arrived = []
         while self._flying and self._flying[0][0] <= now:
             arrived.append(heappop(self._flying)[2])
@@ -171,11 +170,11 @@ class FaultyLink:
         return arrived
 
     def next_deadline(self) -> float | None:
-        """When the next datagram arrives; None while none is on the way."""
+        """Return the arrival time of the next datagram; None if there is none in flight."""
         return self._flying[0][0] if self._flying else None
 
     def _loses(self) -> bool:
-        """Whether the next datagram is lost; in bursts, whether the link is in its bad state."""
+        """Return whether the next datagram is lost; with bursts, whether the link is in its bad state."""
         if self._loss_burst == 1.0 or self._loss == 1.0:
             return self._random.random() < self._loss
         if self._is_fading:
@@ -196,25 +195,25 @@ class FaultyLink:
         return bytes(damaged)
 
     def _gap(self) -> int:
-        """How many bits stay whole before the next one that does not."""
+        """Return the number of undamaged bits before the next damaged one."""
         if self._bit_errors == 1.0:
             return 0
-        # 1 - random() is above 0. Without the ceiling a tiny error rate gives numbers without meaning.
+        # 1 - random() is above 0. The limit avoids overflow with tiny error rates.
         return int(min(math.log(1.0 - self._random.random()) / math.log1p(-self._bit_errors), _FAR))
 
 
 class Air:
-    """Several vehicles behind one faulty link, itself an `Endpoint`.
+    """Several vehicles behind one faulty link; itself an `Endpoint`.
 
-    Everything that is received goes to every vehicle, as on one radio channel. Between two calls all that
-    falls due happens at its own time, so the outcome does not depend on how often `tick` is called.
+    Received data goes to every vehicle, as on one radio channel. Between two calls, all work is done at its
+    own due time, so the outcome does not depend on how often `tick` is called.
 
     Args:
         vehicles: any endpoints.
-        uplink: from the program to the vehicles; None for a perfect one.
-        downlink: from the vehicles to the program; None for a perfect one.
-        others: further ground stations on the channel. What they send takes its turn on both links, and
-            reaches the vehicles and the program.
+        uplink: from the program to the vehicles; None for a link without faults.
+        downlink: from the vehicles to the program; None for a link without faults.
+        others: further ground stations on the channel. Their data goes through both links, to the vehicles
+            and to the program.
 
     Attributes:
         vehicles, uplink, downlink, others: as given.
@@ -236,7 +235,7 @@ class Air:
 
     @property
     def vehicle_count(self) -> int | None:
-        """The number of vehicles; None where an endpoint does not say how many it has."""
+        """The number of vehicles; None if an endpoint does not tell its number."""
         counts = [getattr(each, "vehicle_count", None) for each in self.vehicles]
         known = [count for count in counts if isinstance(count, int)]
         return sum(known) if len(known) == len(counts) else None
@@ -250,10 +249,10 @@ class Air:
         seed: int = 0,
         **faults: Unpack[Faults],
     ) -> Air:
-        """An air with the same faults in both directions; `delay` is for one way.
+        """Make an `Air` with the same faults in both directions; `delay` is one-way.
 
-        The faults are those of `FaultyLink`. The two directions draw different random numbers, both from
-        this seed.
+        See `FaultyLink` for the faults. The two directions use different random numbers, both derived from
+        the seed.
         """
         uplink = FaultyLink(seed=2 * seed, **faults)
         downlink = FaultyLink(seed=2 * seed + 1, **faults)
@@ -266,19 +265,19 @@ class Air:
         self._step(now, self._deadlines())
 
     def tick(self, now: float) -> None:
-        """Let everything happen that falls due by `now`."""
+        """Do all work that is due by `now`, in the order of its deadlines."""
         due = self._deadlines()
         while (first := min(*due, _at(self.uplink), _at(self.downlink), now)) < now:
             self._step(first, due)
         self._step(now, [now] * len(due))
 
     def next_deadline(self) -> float | None:
-        """The first deadline of the vehicles and the two links."""
+        """Return the earliest deadline of the vehicles, stations and links."""
         first = min(*self._deadlines(), _at(self.uplink), _at(self.downlink))
         return None if first == math.inf else first
 
     def data_to_send(self) -> list[bytes]:
-        """Hand over the datagrams that came down."""
+        """Return the datagrams that have arrived at the program, and clear them."""
         out, self._out = self._out, []
         return out
 
@@ -286,7 +285,7 @@ class Air:
         return [*map(_at, self.vehicles), *map(_at, self.others)]
 
     def _step(self, now: float, due: list[float]) -> None:
-        """Move everything on to `now`; a vehicle with nothing due and nothing to receive is left alone."""
+        """Advance to `now`; skips vehicles without due work and received data."""
         for place, station in enumerate(self.others, start=len(self.vehicles)):
             if due[place] <= now:
                 station.tick(now)
@@ -308,10 +307,12 @@ class Air:
 
 
 OUT_LIMIT = 20_000
-"""Frames that an endpoint keeps for a caller who does not fetch them; further ones are dropped."""
+"""Frames that an endpoint keeps for `data_to_send`; further ones are dropped to bound the memory."""
 
 _HELD_BACK = 0.03
+"""Largest additional delay of a reordered datagram, in seconds."""
 _FAR = 1e9
+"""Largest gap between bit errors, in bits."""
 
 
 def _at(part: Endpoint | OtherStation | FaultyLink) -> float:

@@ -23,66 +23,66 @@ __all__ = ["ArduPilotVehicle"]
 
 
 class ArduPilotVehicle(Vehicle):
-    """An ArduPilot autopilot, ArduCopter 4.6, as it was measured; with `param_error` as newer ones are.
+    """An ArduPilot autopilot, ArduCopter 4.6, as measured; with `param_error` as newer versions.
 
-    - Values are sent as float32 whatever their type; type and value are kept exactly on board.
-    - PARAM_REQUEST_LIST: a banner, then all parameters by index from the next slot on (slots come every
-      100 ms), 10 every 5.95 ms. Asked for again it starts again. It goes on with the count that it began
-      with, also when a group is shown or hidden meanwhile.
-    - A list of more than 1,000 values per second takes the whole loop: nothing received is looked at for
-      130 ms, and no block of a file is sent. Then everything that has come is handled. If a list was
-      requested, it begins at 0 at once, pauses 18 ms later and goes on with the next slot. If there are
-      reads, 5 are answered and the list pauses; the next slot answers 5 more, the one after it 5 more and
-      goes on with the list. So the list runs for 130 of every 300 ms. The first time in a list, up to 10
+    - Values are sent as float32 for every type; type and value are exact on board.
+    - PARAM_REQUEST_LIST: a banner, then all parameters by index from the next slot on (slots start every
+      100 ms), 10 every 5.95 ms. A second request restarts the list. The list keeps the count of its start,
+      also if a group is shown or hidden meanwhile.
+    - A list of more than 1,000 values per second occupies the main loop: for 130 ms, received messages are
+      not processed, and no block of a file is sent. Then all received messages are processed. If a list was
+      requested, it restarts at 0 immediately, pauses 18 ms later and continues with the next slot. If there
+      are reads, 5 are answered and the list pauses; the next slot answers 5 more, the one after it 5 more and
+      continues the list. The list therefore runs for 130 of every 300 ms. The first time in a list, up to 10
       waiting reads do not make it pause.
-    - Reads wait for the next slot, which serves 5; 20 more can wait, what comes on top is dropped without a
-      word. One of a name that does not exist takes 5 ms, and no place in a slot. By name the answer
-      has index 65535 and the spelling that was asked for; case does not matter.
-    - A set converts the value to the parameter's own type (cut to whole numbers, kept within its range) and
+    - Reads wait for the next slot, which serves 5; 20 more can wait, further ones are dropped silently. A
+      read of an unknown name takes 5 ms, and no place in a slot. A response by name has index 65535 and the
+      requested spelling; names are case-insensitive.
+    - A set converts the value to the parameter's type (truncated to whole numbers, clamped to its range) and
       is answered within 6 ms, index 65535, even if nothing changed; sets of one name meanwhile share one
-      answer. NaN, infinity and unknown names are met with silence. Of a read-only parameter the old value
-      is sent, and a STATUSTEXT.
-    - The answer to a set has the type REAL32, whatever the parameter's own type is, if the value is the
+      response. NaN, infinity and unknown names are not answered. For a read-only parameter, the old value and
+      a STATUSTEXT are sent.
+    - The response to a set has the type REAL32, independent of the parameter's type, if the value is the
       default, the parameter never had another value, and it belongs to a group: of the real quad's table,
       all but the first 57.
-    - A parameter that switches a group shows it while it is not 0 and hides it at 0: count and indices move.
+    - A parameter that switches a group shows it while it is not 0 and hides it at 0: count and indices
+    change.
       Hidden parameters can be read and set by name.
-    - MAVFTP serves `@PARAM/param.pck` and `files`: one session, 5 requests waiting, bursts paced to a third
-      of the link (see `FileServer`). A param.pck that is written sets parameters, and nothing tells of it.
-    - SYSID_THISMAV takes effect with the next full second, of a Copter with the next start; nothing is said
-      of it.
-    - Told to start again it acknowledges, and goes off 0.2 s later; armed it answers FAILED. After it the
-      heartbeat has another MAV_STATE for a while: a Copter says ACTIVE for 2 s, the others CALIBRATING.
-    - SYSTEM_TIME is sent once a second by Plane and Rover, as streams to a station are set there; by a Copter
-      on request alone. It is not sent before the main loop runs, 1.4 s after the first heartbeat; what is
-      requested before that is acknowledged, and sent then.
-    - With each start after the first one it measures gyroscopes and barometers anew (INS_GYR*OFFS_*,
-      INS_GYR*_CALTEMP, BARO*_GND_PRESS of sensors that are there), until its main loop runs; nothing is said
-      of it.
-    - Some values change by themselves and are sent unasked, index 65535.
+    - MAVFTP serves `@PARAM/param.pck` and `files`: one session, 5 requests waiting, bursts limited to a third
+      of the link (see `FileServer`). An uploaded param.pck sets parameters without announcing the changes.
+    - SYSID_THISMAV takes effect with the next full second, on a Copter after a reboot, without announcement.
+    - A reboot command is acknowledged, and the vehicle switches off 0.2 s later; while armed the result is
+      FAILED. After the reboot, the heartbeat has another MAV_STATE for a while: ACTIVE for 2 s on a Copter,
+      CALIBRATING on the others.
+    - SYSTEM_TIME is sent once a second by Plane and Rover, according to their stream settings; by a Copter
+      only on request. It is not sent before the main loop runs, 1.4 s after the first heartbeat; an earlier
+      request is acknowledged, and SYSTEM_TIME sent then.
+    - After every start but the first, the vehicle measures gyroscopes and barometers again (INS_GYR*OFFS_*,
+      INS_GYR*_CALTEMP, BARO*_GND_PRESS of existing sensors) when the main loop starts, without announcement.
+    - Some values change on their own and are sent unsolicited, index 65535.
 
     Args:
-        table: its parameters (see `Table`), in the order of their indices; None for those of a real quad,
-            `ardupilot_table()`. SYSID_THISMAV, where it is among them, says `system`.
+        table: the parameters (see `Table`), in the order of their indices; None for those of a real quad,
+            `ardupilot_table()`. SYSID_THISMAV, if the table has it, is set to `system`.
         kind: "copter", "plane" or "rover".
-        system, component: its own ids, 1 to 255.
-        uid2: the hardware id that it reports, up to 18 bytes; by default its own for every system.
-        groups: by the name of a switch in the table, the parameters that follow it while it is not 0.
+        system, component: the vehicle's ids, 1 to 255.
+        uid2: the reported hardware id, up to 18 bytes; by default unique for every system.
+        groups: by the name of a switch in the table, the parameters that are shown while it is not 0.
             None: with the table of the real quad, the 52 of EK2_ENABLE; with another table, none.
-        reboot_groups: names of switches whose group appears, or goes, with the next start only.
-        read_only: names that cannot be set. None: those that ArduPilot marks for its own use, such as
+        reboot_groups: names of switches that take effect only after a reboot.
+        read_only: names that cannot be set. None: those that ArduPilot marks as internal, such as
             BARO1_GND_PRESS and BARO1_DEVID.
-        live: names of parameters that change by themselves: whole numbers count seconds, others waver in
-            their last bit. Names that are not in the table are passed over.
+        live: names of parameters that change on their own: whole numbers count seconds, others change their
+            last bit. Names that are not in the table are ignored.
         live_period: seconds between two such changes; 0 for none.
         burst, period: by default UDP. On 57600 baud it is 1 every 0.025 s.
-        ftp: whether MAVFTP is on.
+        ftp: whether MAVFTP is available.
         ftp_rate: bytes per second of a burst: a third of the link. By default UDP as measured; on 57600 baud
             it is 1920.
-        options: those of every `Vehicle`. Within its `boot_time`, PARAM_REQUEST_LIST is ignored.
+        options: those of every `Vehicle`. Within `boot_time`, PARAM_REQUEST_LIST is ignored.
 
     Raises:
-        UsageError: an argument cannot be.
+        UsageError: an argument is invalid.
     """
 
     _restart_delay = 0.2
@@ -219,7 +219,7 @@ class ArduPilotVehicle(Vehicle):
             self._write(entry, bits)
 
     def _was_never_stored(self, entry: Entry) -> bool:
-        """Whether a parameter of a group has its default and has never had another value."""
+        """Return whether a parameter of a group has its default and has never had another value."""
         has_default = entry.packed is not None and entry.packed.default is None
         return has_default and entry.name in self._in_groups and entry.name not in self._stored
 
@@ -229,7 +229,7 @@ class ArduPilotVehicle(Vehicle):
         self._answer_at = min(self._answer_at, self._next(_LOOP))
 
     def _next_place(self, position: int) -> int:
-        """The one behind the last that was sent, also where others were shown or hidden meanwhile."""
+        """Return the place after the last one sent, also if parameters were shown or hidden meanwhile."""
         last = -1 if self._last_listed is None else self._last_listed.order
         return bisect_right(self._listed, last, key=lambda entry: entry.order)
 
@@ -310,7 +310,7 @@ class ArduPilotVehicle(Vehicle):
             self._untyped.clear()
 
     def _measure(self) -> None:
-        """Set what is measured at a start, a thousandth above the last time."""
+        """Change the values that are measured at a start by 0.1 %."""
         for entry in self._entries:
             value = from_bits(entry.bits, entry.type)
             if (
@@ -332,7 +332,7 @@ class ArduPilotVehicle(Vehicle):
         super()._send_list(now)
 
     def _mind_list(self, now: float) -> None:
-        """See to what has been received, where the list has taken the whole loop until now."""
+        """Process received messages, after the list has occupied the main loop."""
         if self._window_at == math.inf:
             return
         if self._position is None or self._high_latency:
@@ -343,11 +343,11 @@ class ArduPilotVehicle(Vehicle):
             self._open_window(self._window_at)
 
     def _open_window(self, at: float) -> None:
-        """Handle what has been received during a run of the list, and decide how the list goes on."""
+        """Process the messages received during a run of the list, and decide how the list continues."""
         is_pause_due = self._list_pause_at <= at
         self._list_pause_at = self._window_at = math.inf
         self._take_backlog(until_list=not is_pause_due)
-        if self._position is None:  # a restart
+        if self._position is None:  # the vehicle has rebooted
             return
         if self._ready:
             is_first = not self._has_answered_in_list
@@ -366,7 +366,7 @@ class ArduPilotVehicle(Vehicle):
             self._window_at = at + _LIST_RUN
 
     def _take_backlog(self, *, until_list: bool = False) -> None:
-        """Handle the frames that wait, or those up to a request for the list."""
+        """Process the waiting frames, or those up to a request for the list."""
         backlog, self._backlog = deque(self._backlog), []
         while backlog and not (until_list and self._list_pause_at < math.inf):
             super()._take(backlog.popleft())
@@ -375,7 +375,7 @@ class ArduPilotVehicle(Vehicle):
             self._serve_files(self._now)
 
     def _answer_reads(self) -> None:
-        """Send the answers that are complete, and look up those for the next slot."""
+        """Send the completed responses, and look up those for the next slot."""
         for answer in self._ready:
             self._send(answer)
         self._ready.clear()
@@ -404,7 +404,7 @@ class ArduPilotVehicle(Vehicle):
             self._send(wire.StatusText(_INFO, text))
 
     def _next(self, period: float, *, after: float | None = None) -> float:
-        """When the next turn of something begins that comes every `period` seconds since switching on."""
+        """Return the start of the next period; periods are counted from switching on."""
         if after is None:
             after = self._now
         if after < self._on_at:
@@ -413,9 +413,9 @@ class ArduPilotVehicle(Vehicle):
         return self._on_at + (math.floor(turns + _ROUNDING) + 1) * period
 
     def _look_up(self) -> None:
-        """Make answers to waiting reads until those for the next slot are complete.
+        """Look up responses to waiting reads until those for the next slot are complete.
 
-        A value is taken at this moment, so an answer may be older than a set that came before it is sent.
+        The value is that of the look-up, so a response may be older than a set received before it is sent.
         """
         while self._waiting and len(self._ready) < _READS_PER_SLOT and self._look_at == math.inf:
             request, sender = self._waiting.popleft()
@@ -443,7 +443,8 @@ class ArduPilotVehicle(Vehicle):
 
 _INTERNAL = re.compile(r"MIS_TOTAL|BARO\d_(GND_PRESS|DEVID)|ARSPD\d?_DEVID|MNT\d_DEVID")
 _MEASURED = re.compile(r"INS_GYR\d?OFFS_[XYZ]|INS_GYR\d_CALTEMP|BARO\d_GND_PRESS")
-_NO_SENSOR = -300.0  # degrees
+_NO_SENSOR = -300.0
+"""Calibration temperature without a sensor, in °C."""
 _SYSTEM_ID = "SYSID_THISMAV"
 _STANDBY = 3
 _CALIBRATING = 2
@@ -452,31 +453,41 @@ _KINDS: dict[str, tuple[int, int, tuple[int, float]]] = {
     "plane": (1, _STANDBY, (_CALIBRATING, 0.7)),
     "rover": (10, wire.MAV_STATE_ACTIVE, (_CALIBRATING, 1.3)),
 }
-"""MAV_TYPE, MAV_STATE while disarmed, MAV_STATE after a start and the seconds for which it is sent."""
+"""By kind: MAV_TYPE, MAV_STATE while disarmed, MAV_STATE after a reboot, and its duration in seconds."""
 _UID2 = b"3d1219c7c4c5404aa\0"
 _BANNER = ("ArduCopter V4.6.0-dev (fbb78585)", "3d1219c7c4c5404aaa1f6d2a48adfda4", "Frame: QUAD/PLUS")
 _INFO = 6
 _WARNING = 4
-_LOOP = 0.0058  # seconds from one turn of the main loop to the next, which answers sets
-_SLOT = 0.1  # seconds from one turn of the parameter task to the next, which answers reads
-_ROUNDING = 1e-6  # a turn that begins at `now` may come out a little less than whole
-_LOOK = 0.005  # seconds from one request that is looked up to the next; boards take a millisecond
+_LOOP = 0.0058
+"""Period of the main loop, which answers sets, in seconds."""
+_SLOT = 0.1
+"""Period of the parameter task, which answers reads, in seconds."""
+_ROUNDING = 1e-6
+"""Tolerance for the number of periods, which may be slightly less than whole at the start of a period."""
+_LOOK = 0.005
+"""Seconds per look-up of an unknown name; real boards take 1 ms."""
 _READS_PER_SLOT = 5
 _READ_QUEUE = 20
-_NOT_IN_GROUPS = 57  # parameters of the real quad's table
-_BUSY_RATE = 1000.0  # values per second above which a list takes the whole loop
-_LIST_RUN = 0.130  # seconds for which a list then takes it
-_LIST_START = 0.018  # seconds from a request for the list until it pauses, if a slot has begun in between
-_LIST_PAUSE = 0.080  # seconds from the answers to reads until a slot may go on with the list
-_READS_WITHOUT_PAUSE = 10  # reads, waiting for the first time in a list, that do not make it pause
-_FILE_QUEUE = (
-    19  # answers of MAVFTP that wait while a list takes the loop, besides the one that is being made
-)
-_BACKLOG = 1000  # frames that wait to be looked at
+_NOT_IN_GROUPS = 57
+"""Number of parameters at the start of the real quad's table that belong to no group."""
+_BUSY_RATE = 1000.0
+"""Values per second above which a list occupies the main loop."""
+_LIST_RUN = 0.130
+"""Seconds for which such a list occupies the main loop."""
+_LIST_START = 0.018
+"""Seconds from a list request until the list pauses, if a slot has started in between."""
+_LIST_PAUSE = 0.080
+"""Seconds from the responses to reads until a slot may continue the list."""
+_READS_WITHOUT_PAUSE = 10
+"""Reads, waiting for the first time in a list, that do not make it pause."""
+_FILE_QUEUE = 19
+"""MAVFTP responses that wait while a list occupies the main loop, in addition to the one in preparation."""
+_BACKLOG = 1000
+"""Received frames that wait for processing."""
 
 
 def _converted(value: float, kind: ParamType | int) -> int:
-    """The bits of a finite float32 in another type: integers are cut to whole numbers, within their range."""
+    """Return the bits of a finite float32 in another type; integers are truncated and clamped."""
     if isinstance(kind, ParamType) and kind.is_integer:
         low, high = kind.bounds
         return bits_of(min(max(int(value), low), high), kind)

@@ -1,4 +1,4 @@
-"""What a simulated component does besides parameters: power, frames in and out, signs of life, commands."""
+"""Base of simulated components: power, framing, signing, heartbeat, telemetry and commands."""
 
 from __future__ import annotations
 
@@ -17,18 +17,23 @@ __all__ = ["Device"]
 
 
 class Device(ABC):
-    """A simulated component that is switched on and off, sends signs of life, and obeys commands.
+    """A simulated component that is switched on and off, sends heartbeats, and executes commands.
 
-    `Vehicle` adds the parameters, and says what the arguments and attributes are.
+    `Vehicle` adds the parameters, and documents the arguments and attributes.
     """
 
     vehicle_count: Final = 1
     """See `Air.vehicle_count`."""
-    _ack_first = True  # whether COMMAND_ACK comes before what the command asked for
-    _restart_delay = 0.3  # seconds from accepting to start again until it is off
-    _armed_result = wire.MAV_RESULT_DENIED  # what becomes of a restart while it is armed
-    _clock_delay = 0.0  # seconds from the first heartbeat until SYSTEM_TIME is sent, also where requested
-    _start_state: tuple[int, float] | None = None  # MAV_STATE after a start that follows on another, seconds
+    _ack_first = True
+    """Whether COMMAND_ACK precedes the requested message."""
+    _restart_delay = 0.3
+    """Seconds from accepting a reboot command until the vehicle switches off."""
+    _armed_result = wire.MAV_RESULT_DENIED
+    """MAV_RESULT of a reboot command while armed."""
+    _clock_delay = 0.0
+    """Seconds from the first heartbeat until SYSTEM_TIME is sent, also on request."""
+    _start_state: tuple[int, float] | None = None
+    """MAV_STATE after a reboot, and its duration in seconds."""
     _next_telemetry: float
 
     def __init__(
@@ -87,19 +92,20 @@ class Device(ABC):
 
     @property
     def signing_key(self) -> wire.SigningKey | None:
-        """The key with which it signs and checks now; None where it does not."""
+        """The current signing key; None without signing."""
         return None if self._signer is None else self._signer.key
 
     @property
     def signing_report(self) -> wire.SigningReport | None:
-        """What it makes of the signatures that it gets; None where it has no key."""
+        """The statistics of received signatures; None without a key."""
         return None if self._verifier is None else self._verifier.report()
 
     @property
     def high_latency(self) -> bool:
-        """Whether it speaks as on a satellite link (PX4's `MAVLINK_MODE_IRIDIUM`); can be set in flight.
+        """Whether the component is in high-latency mode (PX4's `MAVLINK_MODE_IRIDIUM`); can be changed at any
+        time.
 
-        HIGH_LATENCY2 every 5 s then stands in for heartbeat and telemetry; lists, files and pushes wait.
+        HIGH_LATENCY2 every 5 s then replaces heartbeat and telemetry; lists, files and pushes wait.
         """
         return self._high_latency
 
@@ -108,14 +114,14 @@ class Device(ABC):
         if is_on != self._high_latency:
             self._high_latency = is_on
             self._next_heartbeat = max(self._now, self._on_at)
-            self._skip_what_was_left_out()
+            self._skip_suppressed()
 
     def reboot(self, now: float | None = None, *, down: float = 0.0) -> None:
-        """Switch off at `now` and on again `down` seconds later, never if that is `math.inf`.
+        """Switch off at `now`, and on again `down` seconds later, never if that is `math.inf`.
 
-        All that was going on ends, and what is received while it is off is gone, as is what it had ready to
-        be fetched; the values stay, and those that wait for a start take effect. Without `now` it happens at
-        the time that the vehicle was last given.
+        Ends all operations. Data received while switched off is lost, as is data waiting in `data_to_send`.
+        The values stay, and those that take effect after a reboot do. Without `now`, reboots at the time of
+        the last call.
         """
         if now is None:
             now = self._now
@@ -126,7 +132,7 @@ class Device(ABC):
         self.tick(now)
 
     def receive(self, data: bytes, now: float) -> None:
-        """Take what the link delivered at `now`."""
+        """Take received data at the time `now`."""
         self.tick(now)
         if now >= self._on_at:
             for frame in self._framer.receive(data):
@@ -134,7 +140,7 @@ class Device(ABC):
             self._work(now)
 
     def tick(self, now: float) -> None:
-        """Do what has become due by `now`."""
+        """Do all work that is due by `now`."""
         self._now = now
         if self._signer is not None:
             self._signer.advance(now)
@@ -148,51 +154,51 @@ class Device(ABC):
             self._work(now)
 
     def next_deadline(self) -> float | None:
-        """When `tick` is wanted next; None before the first call and when switched off for good."""
+        """Return the time of the next work; None before the first call, and if switched off permanently."""
         if self._now < self._on_at:
             return None if self._on_at == math.inf else self._on_at
         due = [self._next_heartbeat, self._restart_at, self._clock_due, *self._timers()]
         return min(due) if self._high_latency else min(self._next_transmission(), *due)
 
     def data_to_send(self) -> list[bytes]:
-        """Hand over the frames to send, and forget them."""
+        """Return the frames to send, and clear them."""
         out, self._out = self._out, []
         return out
 
-    # What a kind of component does in its own way
+    # Implemented by subclasses
 
     @abstractmethod
     def _on_request(self, message: wire.Message, sender: wire.Frame) -> None:
-        """A request for it has come that is no command."""
+        """Handle a request for this component that is not a command."""
 
     def _answers_system(self, target: int) -> bool:
         return target in (0, self.system)
 
     def _timers(self) -> tuple[float, ...]:
-        """Deadlines besides those of the heartbeat, the telemetry and the list."""
+        """Return deadlines other than those of heartbeat, telemetry and list."""
         return ()
 
     def _next_transmission(self) -> float:
-        """When something is due that high latency leaves out."""
+        """Return the time of the next transmission that high-latency mode suppresses."""
         return self._next_telemetry
 
     def _end_all(self) -> None:
-        """Going off ends what was under way; see to what takes effect with the next start."""
+        """End all operations on switching off, and apply values that take effect after a reboot."""
         self._out.clear()
         self._framer.flush()
 
     def _may_restart(self, mode: int) -> int:
-        """The MAV_RESULT for MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN with this as its first parameter."""
+        """Return the MAV_RESULT of MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN with this first parameter."""
         if self.armed:
             return self._armed_result
         return wire.MAV_RESULT_ACCEPTED if mode == _REBOOT else wire.MAV_RESULT_UNSUPPORTED
 
-    def _skip_what_was_left_out(self) -> None:
-        """What became due while high latency left it out is due from now on, once."""
+    def _skip_suppressed(self) -> None:
+        """Move deadlines that passed in high-latency mode to now, each only once."""
         self._next_telemetry = max(self._now, self._next_telemetry)
 
     def _switch_on(self, at: float) -> None:
-        """Begin anew, with nothing going on, at the time `at`; `math.inf` leaves it off."""
+        """Reset the state, and switch on at the time `at`; `math.inf` leaves the component off."""
         self._on_at = at
         self._sequence = 0
         self._restart_at = math.inf
@@ -202,13 +208,13 @@ class Device(ABC):
         self._forget_streams()
 
     def _work(self, now: float) -> None:
-        """Do what is due, each thing at its own pace; of what repeats for ever, a late call skips some."""
+        """Do the due work, each part with its own period; a late call skips periods of repeated work."""
         if self._clock_due <= now:
             self._clock_due = math.inf
             self._send_system_time(now)
         if self._next_heartbeat <= now:
             pause = _HIGH_LATENCY_PAUSE if self._high_latency else 1.0
-            self._send_signs_of_life(now)
+            self._send_heartbeat(now)
             self._next_heartbeat += pause
             if self._next_heartbeat <= now:
                 self._next_heartbeat = now + pause
@@ -222,7 +228,7 @@ class Device(ABC):
             if self._next_telemetry <= now:
                 self._next_telemetry = now + self._telemetry_period
 
-    # Tools for the kinds
+    # Helpers for subclasses
 
     def _send(self, message: wire.Message) -> None:
         self._queue(
@@ -235,7 +241,7 @@ class Device(ABC):
             )
         )
 
-    # The rest
+    # Internal
 
     def _take_key(self, key: wire.SigningKey | None, timestamp: int) -> None:
         """Sign with another key from now on, or not at all."""
@@ -243,14 +249,14 @@ class Device(ABC):
         self._forget_streams()
 
     def _forget_streams(self) -> None:
-        """Know nobody's timestamps, as after a start."""
+        """Forget the timestamps of all signing streams, as after a start."""
         self._verifier = None
         if self._signer is not None:
             policy = wire.SigningPolicy.ACCEPT_ALL if self._usb else wire.SigningPolicy.UNSIGNED_RADIOS
             self._verifier = wire.Verifier(self._signer, policy, most_streams=_MOST_STREAMS)
         self._framer.guard = None if self._verifier is None else self._verifier.accepts
 
-    def _send_signs_of_life(self, now: float) -> None:
+    def _send_heartbeat(self, now: float) -> None:
         if self._high_latency:
             self._send(wire.HighLatency2(self._heartbeat.type, self._heartbeat.autopilot))
             return
@@ -258,19 +264,19 @@ class Device(ABC):
         self._send_clock(now)
 
     def _send_clock(self, now: float) -> None:
-        """Send what tells the time since boot once a second."""
+        """Send the message with the time since boot, once a second."""
         self._send_system_time(now)
 
     def _send_system_time(self, now: float) -> None:
         self._send(wire.SystemTime(0, self._time_boot_ms(now)))
 
     def _time_boot_ms(self, now: float) -> int:
-        """Since it was switched on, as it is sent: in 32 bits."""
+        """Return the time since switching on in milliseconds, in 32 bits."""
         return int((now - self._on_at) * 1000.0) & 0xFFFFFFFF
 
     @property
     def _beat(self) -> wire.Heartbeat:
-        """The heartbeat as it is sent now."""
+        """The current heartbeat."""
         beat = self._heartbeat
         if self._start_state is not None and not self._is_first_run:
             state, seconds = self._start_state
@@ -341,7 +347,7 @@ class Device(ABC):
                 wire.AUTOPILOT_VERSION_ID: self._version,
                 wire.HEARTBEAT_ID: self._beat,
             }
-            wanted = known.get(request.params[0])  # a float, and perhaps no number
+            wanted = known.get(request.params[0])  # a float, possibly NaN
             if request.params[0] == wire.SYSTEM_TIME_ID:
                 self._on_clock_request(sender)
                 return
@@ -352,7 +358,7 @@ class Device(ABC):
             self._send(answer)
 
     def _on_clock_request(self, sender: wire.Frame) -> None:
-        """SYSTEM_TIME is requested: acknowledge that, and send it as soon as the main loop runs."""
+        """Acknowledge a request for SYSTEM_TIME, and send the message as soon as the main loop runs."""
         number, result = wire.MAV_CMD_REQUEST_MESSAGE, wire.MAV_RESULT_ACCEPTED
         self._send(wire.CommandAck(number, result, sender.system, sender.component))
         self._clock_due = max(self._now, self._on_at + self._clock_delay)
@@ -375,8 +381,11 @@ _NAMES = {
     wire.FileTransfer: "FILE_TRANSFER_PROTOCOL",
     wire.SetupSigning: "SETUP_SIGNING",
 }
-_REBOOT = 1  # of the autopilot; others shut down, or stay in the bootloader
+_REBOOT = 1
+"""Value of the command that reboots the autopilot; other values shut down, or stay in the bootloader."""
 _ATTITUDE = 30
 _LEVEL_FLIGHT = struct.pack("<6f", 0.0, 0.0, 0.5, 0.0, 0.0, 0.01)
 _HIGH_LATENCY_PAUSE = 5.0
-_MOST_STREAMS = 16  # MAVLINK_MAX_SIGNING_STREAMS of the C library, which both autopilots use
+"""Seconds between two HIGH_LATENCY2."""
+_MOST_STREAMS = 16
+"""MAVLINK_MAX_SIGNING_STREAMS of the C library, which both autopilots use."""

@@ -1,4 +1,4 @@
-"""MAVFTP of a simulated vehicle: files in memory, and param.pck made of what it holds at the moment."""
+"""MAVFTP server of a simulated vehicle: files in memory, and param.pck generated from its parameters."""
 
 from __future__ import annotations
 
@@ -18,14 +18,15 @@ __all__ = ["PARAM_FILE", "Address", "FileServer"]
 
 PARAM_FILE: Final = "@PARAM/param.pck"
 IDLE_LIMIT: Final = 3.0
-"""Seconds without an answer after which ArduPilot gives the session to another; each answer renews it."""
+"""Seconds without a response after which ArduPilot reassigns the session; each response restarts the time."""
 PX4_IDLE_LIMIT: Final = 11.0
 """Seconds without a request after which PX4 closes a session (measured: between 10.5 and 12)."""
 PX4_BURST_BLOCKS: Final = 168
-"""Blocks after which PX4 ends a burst and says so: 40,152 bytes."""
+"""Blocks after which PX4 ends a burst with burst_complete: 40,152 bytes."""
 PX4_STEP: Final = 0.010
-"""Seconds from one turn of PX4's MAVLink loop to the next: a burst begins and goes on with one."""
+"""Period of PX4's MAVLink loop in seconds; bursts start and continue with it."""
 EINVAL: Final = 22
+"""Linux' error number for invalid arguments, as in NAKs."""
 
 Address: TypeAlias = tuple[int, int]
 """System and component."""
@@ -42,8 +43,8 @@ class _Session:
     """One open file.
 
     Attributes:
-        read: gives the bytes at an offset, or None where they cannot be read in this size.
-        written: what was written, or None while it is open for reading.
+        read: returns the bytes at an offset, or None if they cannot be read in this size.
+        written: the written bytes, or None if the file is open for reading.
     """
 
     owner: Address
@@ -55,7 +56,7 @@ class _Session:
 
 @dataclass(slots=True)
 class _Burst:
-    """A burst that is being sent; with PX4, at what time it goes on and how many bytes it may send then."""
+    """A burst in progress; for PX4 with the time of its next step and the bytes that it may send then."""
 
     request: Packet
     sender: Address
@@ -68,33 +69,32 @@ class _Burst:
 
 @dataclass(slots=True)
 class FileServer:
-    """The server's side of MAVFTP, one request after the other, as ArduPilot's worker takes them.
+    """The server side of MAVFTP; processes one request after the other, like ArduPilot's worker.
 
-    - Up to 5 requests wait for their turn, which comes with the next one of the vehicle's loop; further ones
-      are dropped. While a burst of ArduPilot runs nothing else is served.
-    - A request that comes again, its number the same, gets the same answer, as long as that was the last.
-    - ArduPilot has one session for all stations and links. While its file is open, whatever another session
-      requests is refused with InvalidSession, except that closing it is acknowledged and closes nothing. The
-      session ends when nobody has been answered for 3 s; every answer counts, a refusal too.
-    - param.pck is made anew for every read. With ArduPilot all reads through one session ask for one size,
-      and its size in the answer to the open is an estimate, 12 bytes for each parameter. Written, it sets
-      parameters when it is closed.
+    - Up to 5 requests wait for the next period of the vehicle's loop; further ones are dropped. While a burst
+      of ArduPilot runs, no other request is served.
+    - A repeated request with the same sequence number gets the same response, if it was the last request.
+    - ArduPilot has one session for all stations and links. While its file is open, requests of another
+      session are refused with InvalidSession; closing another session is acknowledged and closes nothing. The
+      session ends after 3 s without any response; refusals count as responses.
+    - param.pck is generated for every read. With ArduPilot, all reads of a session request the same size, and
+      the file size in the response to the open is an estimate, 12 bytes per parameter. An uploaded param.pck
+      sets parameters when it is closed.
     - A burst of ArduPilot sends a block whenever a third of the link is free again, to the end of the file.
-    - PX4 has one session for each link, closes it after 11 s without a request, and a reset closes it whoever
-      sends it. A burst begins up to 10 ms after its request, in blocks of 239 bytes whatever was asked for,
-      ends after 168 of them, and says so; other requests are answered meanwhile, and another burst takes its
-      place.
+    - PX4 has one session for each link, closes it after 11 s without a request, and a reset from any sender
+      closes it. A burst starts up to 10 ms after its request, has blocks of 239 bytes independent of the
+      requested size, and ends after 168 blocks with burst_complete; other requests are answered meanwhile,
+      and another burst replaces it.
 
     Attributes:
-        files: paths and contents; a path's directories exist with it.
+        files: contents by path; a path's directories exist implicitly.
 
     Args:
-        params: all parameters for the file, in order; None where it cannot be made.
-        apply: takes the parameters of a file that was written.
-        rate: bytes per second of a burst; what is asked for singly goes three times as fast.
-        turn: seconds until a request is looked at.
-        is_px4: whether it serves as PX4 does, which gives sessions its own numbers; else as ArduPilot, where
-            a session has the number that its open asked for.
+        params: returns all parameters for param.pck, in order; None if it cannot be generated.
+        apply: sets the parameters of an uploaded file.
+        rate: bytes per second of a burst; single reads are three times as fast.
+        is_px4: whether the server behaves like PX4, which assigns session numbers; else like ArduPilot,
+            which uses the session number of the open request.
     """
 
     params: Callable[[], Sequence[PackedParam] | None]
@@ -116,31 +116,31 @@ class FileServer:
 
     @property
     def open_files(self) -> list[str]:
-        """The paths of the files that are open."""
+        """The paths of the open files."""
         return [session.path for session in self._open.values()]
 
     def reset(self) -> None:
-        """The vehicle was switched off."""
+        """Close all sessions, as after switching off."""
         self._open.clear()
         self._waiting.clear()
         self._burst = self._last = None
         self._free_at = self._answered_at = -math.inf
 
     def receive(self, payload: bytes, sender: Address, now: float) -> None:
-        """A request has come."""
+        """Queue a request."""
         if len(self._waiting) < _QUEUE:
             turn = _PX4_TURN if self.is_px4 else _LOOP
             self._waiting.append((now + turn, Packet.unpack(payload), sender))
 
     def next_deadline(self) -> float:
-        """When `work` has something to do, or infinity."""
+        """Return the time of the next work, or infinity."""
         request_at = max(self._waiting[0][0], self._free_at) if self._waiting else math.inf
         if self._burst is None:
             return request_at
         return min(request_at, self._burst.at) if self.is_px4 else self._free_at
 
     def work(self, now: float, most: int | None = None) -> list[tuple[Packet, Address]]:
-        """Do what is due, but make no more than `most` answers: the answers, and whom they are for."""
+        """Do the due work, limited to `most` responses; return the responses with their receivers."""
         out: list[tuple[Packet, Address]] = []
         while (due := self.next_deadline()) <= now:
             if most is not None and len(out) >= most:
@@ -169,7 +169,7 @@ class FileServer:
         return out
 
     def _answer(self, request: Packet, sender: Address, now: float) -> Packet | None:
-        """One request; None of a burst, whose blocks follow, and of what is no request."""
+        """Return the response to one request; None for a burst, whose blocks follow, and for non-requests."""
         if request.opcode in (Opcode.ACK, Opcode.NAK):
             return None
         if self._last is not None:
@@ -281,7 +281,7 @@ class FileServer:
         return _Answer(Opcode.ACK, data, offset)
 
     def _not_open(self) -> _Answer:
-        """The refusal of a read or write in a session that has no file open."""
+        """Return the refusal of a read or write in a session without an open file."""
         return _no(FileErrorCode.INVALID_SESSION if self.is_px4 else FileErrorCode.FILE_NOT_FOUND)
 
     def _write(self, number: int, request: Packet, now: float) -> _Answer:
@@ -311,7 +311,7 @@ class FileServer:
         return _Answer(Opcode.ACK)
 
     def _param_file(self, query: dict[str, int]) -> Callable[[int, int], bytes | None]:
-        """How a session reads param.pck: as it is at that moment, always by the size of the first read."""
+        """Return a function that reads the current param.pck, always with the first read's size."""
         start, count, with_defaults = query["start"], query["count"] or None, bool(query["withdefaults"])
         first_size: int | None = None
 
@@ -355,11 +355,17 @@ class FileServer:
 
 
 _QUEUE = 5
-_LOOP = 0.0058  # seconds until ArduPilot looks at a request
-_PX4_TURN = 0.0001  # seconds until PX4 does
-_OVERHEAD = 27  # bytes of a frame besides the data
+"""Requests that wait; further ones are dropped."""
+_LOOP = 0.0058
+"""Seconds until ArduPilot processes a request."""
+_PX4_TURN = 0.0001
+"""Seconds until PX4 processes a request."""
+_OVERHEAD = 27
+"""Bytes of a frame besides the data."""
 _ESTIMATE = 12
-_LARGEST = 0xFFFF  # of what is written, in bytes
+"""Estimated bytes per parameter in param.pck."""
+_LARGEST = 0xFFFF
+"""Largest offset of a write, in bytes."""
 
 
 def _no(code: FileErrorCode, errno: int = 0) -> _Answer:
@@ -385,7 +391,7 @@ def _packet(answer: _Answer, request: Packet, session: int, sequence: int) -> Pa
 
 
 def _size(packet: Packet) -> int:
-    """Bytes on the wire."""
+    """Return the size of a packet on the wire, in bytes."""
     return _OVERHEAD + len(packet.data)
 
 
@@ -394,7 +400,7 @@ def _text(data: bytes) -> str:
 
 
 def _query(path: str) -> dict[str, int] | None:
-    """What stands behind the question mark; None where ArduPilot would refuse it."""
+    """Return the options after the question mark of a path; None for options that ArduPilot refuses."""
     found = {"start": 0, "count": 0, "withdefaults": 0}
     for part in path.partition("?")[2].split("&"):
         name, _, text = part.partition("=")

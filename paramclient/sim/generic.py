@@ -1,4 +1,4 @@
-"""A component that keeps to the standard."""
+"""A simulated component that follows the MAVLink standard."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ __all__ = ["BytewiseVehicle", "GenericVehicle"]
 
 
 class BytewiseVehicle(Vehicle):
-    """The part that PX4 and the standard share: values lie byte-wise, requests are answered at once."""
+    """Common base of PX4 and the standard component: byte-wise values, immediate responses."""
 
     def _on_list(self) -> None:
         self._start_list(self._now)
@@ -53,22 +53,22 @@ class BytewiseVehicle(Vehicle):
 
 
 class GenericVehicle(BytewiseVehicle):
-    """A component as the MAVLink guide describes it: byte-wise, every type, no hash, answers at once.
+    """A component as in the MAVLink guide: byte-wise, all types, no hash, immediate responses.
 
-    A set of another type changes nothing: it is answered with the value that stands or, with
-    `param_error`, with PARAM_ERROR. Of a 64-bit type the lower four bytes are sent.
+    A set with another type changes nothing; the response is the current value or, with `param_error`,
+    PARAM_ERROR. Of a 64-bit type, the lower four bytes are sent.
 
     Args:
-        table: its parameters (see `Table`), listed in the order given.
-        system, component: its own ids, 1 to 255.
-        uid: the hardware id that it reports; by default its own for every system.
-        autopilot: MAV_AUTOPILOT in its heartbeat.
+        table: the parameters (see `Table`), listed in the given order.
+        system, component: the component's ids, 1 to 255.
+        uid: the reported hardware id; by default unique for every system.
+        autopilot: MAV_AUTOPILOT in the heartbeat.
         capabilities: as in AUTOPILOT_VERSION; by default MAVLink 2 and byte-wise parameters.
         burst, period: see `Vehicle`.
         options: those of every `Vehicle`.
 
     Raises:
-        UsageError: an argument cannot be.
+        UsageError: an argument is invalid.
     """
 
     def __init__(

@@ -1,4 +1,4 @@
-"""What a simulated vehicle says of its parameters: the files of the component metadata protocol."""
+"""Parameter metadata of a simulated vehicle: the files of the component metadata protocol."""
 
 from __future__ import annotations
 
@@ -14,13 +14,14 @@ from paramclient.sim.param_table import SimParam
 __all__ = ["GENERAL_FILE", "PARAMETER_FILE", "metadata_files"]
 
 GENERAL_FILE: Final = "etc/extras/component_general.json.xz"
+"""Path of PX4's general metadata file (COMPONENT_METADATA.hpp)."""
 PARAMETER_FILE: Final = "etc/extras/parameters.json.xz"
-"""Where PX4 has them (COMPONENT_METADATA.hpp and its build)."""
+"""Path of PX4's parameter metadata file (PX4's build)."""
 
 
 @cache
 def metadata_files(rows: tuple[SimParam, ...]) -> dict[str, bytes]:
-    """The two files of a table by their paths, both packed. Of a few parameters they say more than a type."""
+    """Return the two packed files of a table, by path. Only a few parameters have more than a type."""
     parameters = _packed({"version": 1, "parameters": [_described(row) for row in rows]})
     kinds = [{"type": 1, "uri": f"mftp://{PARAMETER_FILE}", "fileCrc": crc32_px4(parameters)}]
     return {

@@ -1,4 +1,4 @@
-"""Another ground station on the same channel, which does as it likes."""
+"""OtherStation: a second ground station on the same channel."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ __all__ = ["OtherStation"]
 
 
 class OtherStation:
-    """A second ground station of an `Air`: the vehicles hear it, and so does the program.
+    """A second ground station of an `Air`. The vehicles and the program receive its messages.
 
-    It sends a heartbeat each second, asks for the list, which starts the vehicle's stream again, and sets
-    parameters. It never listens, and takes no notice of what becomes of its requests.
+    Sends a heartbeat each second, requests the list, which restarts the vehicle's list, and sets parameters.
+    Receives nothing, and ignores the outcome of its requests.
 
     Args:
-        system, component: its own ids, 1 to 255.
-        target_system, target_component: to whom it speaks.
-        list_every: seconds from the first call to its first PARAM_REQUEST_LIST, and from one to the next;
+        system, component: the station's ids, 1 to 255.
+        target_system, target_component: the receiver of its requests.
+        list_every: seconds from the first call to the first PARAM_REQUEST_LIST, and between two of them;
             `math.inf` for none.
-        sets: what it sets, each with the seconds from the first call.
-        encoding: of the values that it sets.
+        sets: the parameters to set, each with the seconds from the first call.
+        encoding: of the values in `sets`.
 
     Raises:
-        UsageError: an argument cannot be.
+        UsageError: an argument is invalid.
     """
 
     def __init__(
@@ -62,7 +62,7 @@ class OtherStation:
         self._out: list[bytes] = []
 
     def tick(self, now: float) -> None:
-        """Do what has become due by `now`; of what repeats, a late call skips some."""
+        """Do all work that is due by `now`; a late call skips periods of repeated work."""
         if self._started_at is None:
             self._started_at = self._next_heartbeat = now
             self._next_list = now + self._list_every
@@ -81,14 +81,14 @@ class OtherStation:
             self._send(wire.ParamSet(*self._target, row.name, raw, row.type))
 
     def next_deadline(self) -> float | None:
-        """When `tick` is wanted next; None before the first call."""
+        """Return the time of the next work; None before the first call."""
         if self._started_at is None:
             return None
         due = min(self._next_heartbeat, self._next_list)
         return min(due, self._started_at + self._sets[0][0]) if self._sets else due
 
     def data_to_send(self) -> list[bytes]:
-        """Hand over the frames to send, and forget them."""
+        """Return the frames to send, and clear them."""
         out, self._out = self._out, []
         return out
 
@@ -99,6 +99,6 @@ class OtherStation:
 
 
 def _next(due: float, pause: float, now: float) -> float:
-    """The next turn of what was due; after a late call a whole pause from now."""
+    """Return the next deadline of repeated work; after a late call, a full period from now."""
     due += pause
     return due if due > now else now + pause

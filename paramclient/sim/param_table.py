@@ -1,4 +1,4 @@
-"""Parameter tables for simulated vehicles: the two that ship with the package, and the caller's own."""
+"""Parameter tables of simulated vehicles: two recorded ones, and tables of the caller."""
 
 from __future__ import annotations
 
@@ -36,23 +36,23 @@ __all__ = [
 ]
 
 FLT_EPSILON = 2.0**-23
-"""By how much ArduPilot lets a value differ from its default before it tells the default."""
+"""Difference from the default up to which ArduPilot does not report the default separately."""
 
 
 @dataclass(frozen=True, slots=True)
 class SimParam:
-    """One parameter of a simulated vehicle's table, as it stands when the vehicle is made.
+    """One parameter of a simulated vehicle's table, with its initial value.
 
     Attributes:
         name: 1 to 16 printable ASCII characters.
-        type: any MAV_PARAM_TYPE, or the number of one that MAVLink does not define.
+        type: any MAV_PARAM_TYPE, or the number of a type that MAVLink does not define.
         value: within the type; four raw bytes for a type that MAVLink does not define.
-        volatile: whether PX4 leaves it out of the hash.
-        default: the firmware's default as the number in its source, or None where it is not known.
+        volatile: whether PX4 excludes the parameter from the hash.
+        default: the firmware's default as the number in its source, or None if unknown.
         bits: the value's own bytes, as in `paramclient.Param.bits`.
 
     Raises:
-        UsageError: the name or the value cannot be.
+        UsageError: the name or the value is invalid.
     """
 
     name: str
@@ -69,19 +69,19 @@ class SimParam:
 
 
 Table: TypeAlias = Iterable[SimParam] | Mapping[str, Value | tuple[ParamType | int, Value]]
-"""A table as a caller may give it: `SimParam`s, or a mapping from names to values, where an int becomes an
-INT32, a float a REAL32, and `(type, value)` is for the other types."""
+"""A table: `SimParam`s, or a mapping from names to values, where an int becomes an INT32, a float a REAL32,
+and `(type, value)` gives another type."""
 
 
 class Entry:
-    """A parameter as the vehicle holds it now.
+    """A parameter with its current value on board.
 
     Attributes:
         name, type, volatile, default: as in `SimParam`.
         bits: the value, as in `SimParam.bits`.
-        order: its place among all that the vehicle has, listed or not.
-        index: its place in the list, or None while it is not listed.
-        raw: the four bytes that stand for it in a message.
+        order: its position among all parameters of the vehicle, listed or not.
+        index: its position in the list, or None if it is not listed.
+        raw: the four bytes of the value in a message.
     """
 
     __slots__ = (
@@ -110,7 +110,7 @@ class Entry:
 
     @property
     def packed(self) -> PackedParam | None:
-        """How it stands in param.pck, with its default if that differs; None for a type it does not have."""
+        """The entry in param.pck, with its default if that differs; None for a type that param.pck lacks."""
         if self._packed is None and isinstance(self.type, ParamType) and self.type in PACKABLE:
             default = None
             if self.default is not None and self._differs_from(self.default):
@@ -123,7 +123,7 @@ class Entry:
         return self._packed
 
     def store(self, bits: int) -> None:
-        """Hold another value."""
+        """Set another value."""
         self.bits = bits
         self._packed = None
         value = self.value
@@ -133,7 +133,7 @@ class Entry:
             self.raw = _cast(value)
 
     def _differs_from(self, default: float) -> bool:
-        """As ArduPilot compares them: as float32, and by more than FLT_EPSILON."""
+        """Compare as ArduPilot does: as float32, and with a tolerance of FLT_EPSILON."""
         value = self.value
         if isinstance(value, bytes):
             return True
@@ -142,10 +142,10 @@ class Entry:
 
 
 def as_table(table: Table) -> tuple[SimParam, ...]:
-    """Any form of `Table` as a tuple of `SimParam`, in the order given.
+    """Return any form of `Table` as a tuple of `SimParam`, in the given order.
 
     Raises:
-        UsageError: a name or value cannot be.
+        UsageError: a name or value is invalid.
     """
     if isinstance(table, Mapping):
         return tuple(_row(name, entry) for name, entry in table.items())
@@ -153,13 +153,13 @@ def as_table(table: Table) -> tuple[SimParam, ...]:
 
 
 def with_system_id(rows: Iterable[SimParam], name: str, system: int) -> tuple[SimParam, ...]:
-    """A table in which the parameter of this name says the system id."""
+    """Return a table in which the parameter with this name is set to the system id."""
     return tuple(replace(row, value=system) if row.name == name else row for row in rows)
 
 
 @cache
 def px4_table() -> tuple[SimParam, ...]:
-    """The 903 parameters of a PX4 1.17 quad, read from a real one; 58 of them are volatile."""
+    """Return the 903 parameters of a PX4 1.17 quad, read from a real one; 58 of them are volatile."""
     rows = []
     for row in _read("px4.csv"):
         kind = ParamType[row["type"]]
@@ -171,13 +171,13 @@ def px4_table() -> tuple[SimParam, ...]:
 
 @cache
 def ardupilot_table() -> tuple[SimParam, ...]:
-    """The 1382 parameters of an ArduCopter 4.6 quad, read from a real one."""
+    """Return the 1382 parameters of an ArduCopter 4.6 quad, read from a real one."""
     return tuple(map(_plain, _read("ardupilot.csv")))
 
 
 @cache
 def ek2_group() -> tuple[SimParam, ...]:
-    """The 52 parameters that EK2_ENABLE shows on that quad. Only their number is measured."""
+    """Return the 52 parameters that EK2_ENABLE shows on that quad. Only their number is measured."""
     return tuple(map(_plain, _read("ardupilot_ek2.csv")))
 
 
@@ -201,7 +201,7 @@ def _read(name: str) -> Iterable[dict[str, str]]:
 
 
 def _cast(value: float) -> bytes:
-    """What a C-cast to float gives; a REAL64 beyond its range becomes infinite."""
+    """Return a number cast to float as in C; a REAL64 beyond its range becomes infinite."""
     try:
         return struct.pack("<f", value)
     except OverflowError:

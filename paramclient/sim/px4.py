@@ -39,79 +39,81 @@ UPPER_LIMITS: Final[tuple[tuple[str, str | float], ...]] = (
     ("MPC_Z_V_AUTO_DN", "MPC_Z_VEL_MAX_DN"),
     ("MPC_THR_HOVER", "MPC_THR_MAX"),
 )
-"""What the position controller of PX4 sets to a limit, a value or that of another parameter, when it is above
-it (measured with 1.17)."""
+"""Limits that PX4's position controller enforces from above: parameters, and their largest value or the
+parameter that has it (measured with 1.17)."""
 LOWER_LIMITS: Final = (("MPC_THR_HOVER", "MPC_THR_MIN"),)
-"""The same below it."""
+"""Limits that PX4's position controller enforces from below: parameters, and the one with their smallest
+value (measured with 1.17)."""
 
 RESET_KEEPS: Final = (
     *("SYS_AUTOSTART", "SYS_PARAM_VER", "RC", "CAL_", "COM_FLTMODE", "LND_FLIGHT", "TC_", "COM_FLIGHT"),
 )
-"""How the names begin that SYS_AUTOCONFIG leaves alone (the start script `rcS` of PX4 1.16)."""
+"""Prefixes of names that SYS_AUTOCONFIG does not reset (the start script `rcS` of PX4 1.16)."""
 
 
 class PX4Vehicle(BytewiseVehicle):
-    """A PX4 autopilot, version 1.17, as it was measured; with `param_error` as newer ones are.
+    """A PX4 autopilot, version 1.17, as measured; with `param_error` as newer versions.
 
-    - PARAM_REQUEST_LIST: `_HASH_CHECK` first (type UINT32, index 65535), then all parameters in use in the
-      order of their names, 20 messages every 20 ms. While the list is being sent it starts again without
-      the hash, at the earliest 10 ms after the last 20.
-    - A read of `_HASH_CHECK` gives the hash alone; a set of it, to any value, stops the list.
-    - A set with exactly the right type is acknowledged at once, whatever the value. If it changed the
-      value, 10 ms later that value is sent again, and with it every other one that is not yet saved; both
+    - PARAM_REQUEST_LIST: `_HASH_CHECK` first (type UINT32, index 65535), then all parameters in use, sorted
+      by name, 20 messages every 20 ms. A request during the list restarts it without the hash, at the
+      earliest 10 ms after the last 20.
+    - A read of `_HASH_CHECK` returns only the hash; a set of it, to any value, stops the list.
+    - A set with exactly the right type is acknowledged immediately, whatever the value. If it changed the
+      value, PX4 sends that value again 10 ms later, and with it every other one that is not yet saved; both
       wait for the end of a list. These are sent in the order of the list, 20 every 20 ms. A change meanwhile
-      begins no second round: where its place is behind, nothing is sent of it. Once saved, 0.3 s after a
-      change and 2 s after the last time, no value is sent any more. So of many changes in a short time some
-      are told to nobody.
-    - What `load` changes, and MAV_CMD_PREFLIGHT_STORAGE with 2, which brings all values of the table back, is
-      told to nobody at all.
-    - Its position controller looks at its own parameters 0.4 s after one of them has changed, and sets those
-      to their limit that are beyond it (see `UPPER_LIMITS`); a real one takes 10 ms to 1.1 s. These changes
-      are sent as any other.
-    - A change of a float by at most 1.19e-7 counts as none: the value is not sent again and not saved by
-      itself. With the start the value of before is back, unless another change had all saved. A value that
-      close to the default is never saved.
-    - A wrong type, an unknown name and an unknown index are met with silence.
+      does not start a second round: if its position has passed, it is not sent. After the values are saved,
+      0.3 s after a change and 2 s after the last save, no value is sent any more. With many changes in a
+      short time, some are therefore never announced.
+    - Changes by `load`, and by MAV_CMD_PREFLIGHT_STORAGE with 2, which restores all values of the table, are
+      never announced.
+    - The position controller checks its parameters 0.4 s after one of them has changed, and sets those beyond
+      their limit to the limit (see `UPPER_LIMITS`); a real one takes 10 ms to 1.1 s. These changes are sent
+      like any other.
+    - A change of a float by at most 1.19e-7 does not count as a change: the value is neither sent again nor
+      saved on its own. After a reboot the earlier value is back, unless another change caused a save. A value
+      that close to the default is never saved.
+    - A wrong type, an unknown name and an unknown index are not answered.
     - A parameter that is not in use can be read and set by name (index 65535) and is neither in the list
       nor in the hash.
-    - With `metadata`, COMPONENT_METADATA names a general file among `files`, and that one with descriptions
-      of the parameters.
-    - MAVFTP serves `files` and, if `ftp` is on as in the newest ones, `@PARAM/param.pck` (see `FileServer`).
-    - It answers to its own system only, and to component 0.
-    - Its time since boot comes with ATTITUDE, once a second and with `telemetry`. SYSTEM_TIME is not sent
-      before its clock is set, which it never is. After a restart MAV_STATE is UNINIT for 3 s.
-    - Told to start again it acknowledges, and goes off 0.4 s later; armed it denies that. With the start,
-      MAV_SYS_ID takes effect, and SYS_AUTOCONFIG above 0 has brought what it resets (see `RESET_KEEPS`) to
-      the values of the table, MAV_SYS_ID to 1. Values that it has not saved are not lost, as they may be with
-      a real one.
+    - With `metadata`, COMPONENT_METADATA names a general file among `files`, which names the file with the
+      descriptions of the parameters.
+    - MAVFTP serves `files` and, if `ftp` is on as in the newest versions, `@PARAM/param.pck` (see
+      `FileServer`).
+    - Only requests to its own system are answered, and to its own component or component 0.
+    - The time since boot is in ATTITUDE, sent once a second and with `telemetry`. SYSTEM_TIME is not sent
+      before the clock is set, which never happens. After a reboot MAV_STATE is UNINIT for 3 s.
+    - A reboot command is acknowledged, and the vehicle switches off 0.4 s later; while armed it is denied.
+      With the reboot, MAV_SYS_ID takes effect, and SYS_AUTOCONFIG above 0 resets parameters (see
+      `RESET_KEEPS`) to the values of the table, MAV_SYS_ID to 1. Unsaved values are not lost, as they may be
+      on a real one.
 
     Args:
-        table: its parameters (see `Table`), in any order; None for those of a real quad, `px4_table()`.
-            MAV_SYS_ID, where it is among them, says `system`.
-        system, component: its own ids, 1 to 255.
-        uid: the hardware id that it reports; by default its own for every system.
-        hash_check: whether it has `_HASH_CHECK` at all; the parameter MAV_HASH_CHK_EN at 0 also turns it off.
-        not_in_use: names in the table that nothing in the firmware has used yet.
-        first_start_only: names that nothing uses any more from the second start on, when the firmware has
-            stored what it found at the first. None: with the table of the real quad, CAL_BARO1_ID to
+        table: the parameters (see `Table`), in any order; None for those of a real quad, `px4_table()`.
+            MAV_SYS_ID, if the table has it, is set to `system`.
+        system, component: the vehicle's ids, 1 to 255.
+        uid: the reported hardware id; by default unique for every system.
+        hash_check: whether the vehicle has `_HASH_CHECK`; the parameter MAV_HASH_CHK_EN at 0 also disables
+            it.
+        not_in_use: names in the table that the firmware has not used yet.
+        first_start_only: names that are not in use from the second start on, when the firmware has stored
+            the sensors that it found at the first. None: with the table of the real quad, CAL_BARO1_ID to
             CAL_BARO3_ID (a real one had 908 parameters, then 905); with another table, nothing.
         late_use: by the name of one parameter, those that come into use 10 ms after it changes. Until then
             they are not in use. None: with the table of the real quad, CAL_MAG2_ID brings 16 more of
             CAL_MAG2_*; with another table, nothing.
-        unsaved: names that the firmware itself has changed while it booted and not saved.
-        autosave: seconds from a change until all that was unsaved is saved, if it was not saved in the
-            last 2 s. With 0 nothing is ever unsaved for long enough to be sent.
-        clamp_delay: seconds from a change until the position controller sets values to their limits; None for
-            never.
+        unsaved: names that the firmware has changed during boot and not saved.
+        autosave: seconds from a change until all unsaved values are saved, if none were saved in the
+            last 2 s. With 0, values are saved before they can be sent again.
+        clamp_delay: seconds from a change until the position controller enforces its limits; None for never.
         burst, period: by default UDP and USB. A serial port has a burst of 3, the low-bandwidth mode 1
             every 0.125 s.
-        ftp: whether there is a param.pck, as after 1.17; otherwise it is said not to be found.
+        ftp: whether there is a param.pck, as after 1.17; otherwise the response is file not found.
         ftp_rate: bytes per second of a burst of MAVFTP. By default UDP as measured.
-        metadata: whether it describes its parameters, as those with enough memory do.
-        options: those of every `Vehicle`. A list that is asked for within its `boot_time` starts then.
+        metadata: whether the vehicle serves descriptions of its parameters, as boards with enough memory do.
+        options: those of every `Vehicle`. A list requested within `boot_time` starts after it.
 
     Raises:
-        UsageError: an argument cannot be.
+        UsageError: an argument is invalid.
     """
 
     _ack_first = False
@@ -153,7 +155,7 @@ class PX4Vehicle(BytewiseVehicle):
         if first_start_only is None:
             first_start_only = _FIRST_START_ONLY if table is None else ()
         self._first_start_only = frozenset(first_start_only)
-        self._has_stored = False  # what it found at its first start
+        self._has_stored = False  # whether the sensors of the first start are stored
         self._first_unsaved = frozenset(unsaved)
         unknown = self._first_unused | self._first_start_only | self._first_unsaved | self._late_use.keys()
         if unknown := unknown.difference(row.name for row in rows):
@@ -196,7 +198,7 @@ class PX4Vehicle(BytewiseVehicle):
         )
 
     def announced_hash(self) -> int | None:
-        """The hash that it gives for its table now; None where it has no `_HASH_CHECK`."""
+        """Return the current hash of the table; None without `_HASH_CHECK`."""
         switch = self._find("MAV_HASH_CHK_EN")
         if not self._hash_check or (switch is not None and switch.bits == 0):
             return None
@@ -205,10 +207,10 @@ class PX4Vehicle(BytewiseVehicle):
         return self._hash
 
     def use(self, *names: str) -> None:
-        """Let the firmware use parameters for the first time: they join the list, and indices shift.
+        """Mark parameters as in use: they join the list, and indices shift.
 
         Raises:
-            UsageError: it has no parameter of such a name.
+            UsageError: the vehicle has no parameter with such a name.
         """
         self._unused.difference_update([self._entry(name).name for name in names])
         self._relist()
@@ -217,7 +219,7 @@ class PX4Vehicle(BytewiseVehicle):
         """Change values as `param load`, `param reset` and `param set-default` do: nothing is sent.
 
         Raises:
-            UsageError: it has no parameter of such a name, or a value does not fit its type.
+            UsageError: the vehicle has no parameter with such a name, or a value does not fit its type.
         """
         bits = {name: bits_of(value, self._entry(name).type) for name, value in values.items()}
         self._load_bits(bits)
@@ -314,7 +316,7 @@ class PX4Vehicle(BytewiseVehicle):
 
     def _may_restart(self, mode: int) -> int:
         if mode == 0:
-            return wire.MAV_RESULT_ACCEPTED  # and nothing happens
+            return wire.MAV_RESULT_ACCEPTED  # without any effect
         return super()._may_restart(mode) if mode == 1 else wire.MAV_RESULT_DENIED
 
     def _end_all(self) -> None:
@@ -340,7 +342,8 @@ class PX4Vehicle(BytewiseVehicle):
         if self._has_stored:
             self._unused |= self._first_start_only
         self._unsaved = set(self._first_unsaved)
-        self._unkept: dict[str, int] = {}  # what is saved of those that have changed too little since
+        # The saved bits of floats that have since changed by at most FLT_EPSILON.
+        self._unkept: dict[str, int] = {}
         self._waking: frozenset[str] = frozenset()
         self._hash_next = False
         self._push_from: int | None = None
@@ -350,7 +353,7 @@ class PX4Vehicle(BytewiseVehicle):
         super()._switch_on(at)
 
     def _clamp(self) -> None:
-        """Set what is beyond its limit to that."""
+        """Set values beyond their limits to the limits."""
         for limits, is_beyond in ((UPPER_LIMITS, operator.gt), (LOWER_LIMITS, operator.lt)):
             for name, limit in limits:
                 entry = self._find(name)
@@ -388,7 +391,7 @@ class PX4Vehicle(BytewiseVehicle):
         return super()._send_next() or self._push_next()
 
     def _push_next(self) -> bool:
-        """Send the next unsaved parameter; False when there is none, or nothing has changed."""
+        """Send the next unsaved parameter; return False if there is none."""
         if self._push_from is not None:
             for index in range(self._push_from, len(self._listed)):
                 if self._listed[index].name in self._unsaved:
@@ -408,7 +411,7 @@ class PX4Vehicle(BytewiseVehicle):
 
 
 def _is_near(entry: Entry, bits: int) -> bool:
-    """Whether it is a float that PX4 takes for the same as another one."""
+    """Return whether the entry is a float that PX4 considers equal to another one."""
     value, other = entry.value, from_bits(bits, entry.type)
     if not isinstance(value, float) or not isinstance(other, float):
         return False
@@ -421,19 +424,26 @@ _LIMITED = frozenset(
 _FIRST_START_ONLY = ("CAL_BARO1_ID", "CAL_BARO2_ID", "CAL_BARO3_ID")
 _SYSTEM_ID = "MAV_SYS_ID"
 _QUADROTOR = 2
-_RELEASE = 17891392  # 1.17.0
-_MAIN = 0x01120000  # 1.18
+_RELEASE = 17891392
+"""flight_sw_version of 1.17.0."""
+_MAIN = 0x01120000
+"""flight_sw_version of 1.18."""
 _STANDBY = 3
-_CLOCK_LEAD = 0.3  # seconds for which the clock has run when the first message comes
+_CLOCK_LEAD = 0.3
+"""Seconds on the boot clock at the first message."""
 _UID = 5283920058631409231
 _PUSH_DELAY = 0.010
-_TURN = 0.0002  # seconds in which what has been received is looked at
+"""Seconds from a change until it is sent again."""
+_TURN = 0.0002
+"""Seconds in which received messages are processed."""
 _SAVE_INTERVAL = 2.0
-_RESET_ALL = 2.0  # of MAV_CMD_PREFLIGHT_STORAGE
+"""Seconds between two saves, at least."""
+_RESET_ALL = 2.0
+"""First parameter of MAV_CMD_PREFLIGHT_STORAGE that resets all parameters."""
 
 
 def _third_compass(rows: tuple[SimParam, ...]) -> tuple[SimParam, ...]:
-    """What the third compass has and the real quad, which has two, does not use; values as of the second."""
+    """Return the parameters of a third compass, not in use on the real quad, with the second's values."""
     names = {row.name for row in rows}
     return tuple(
         SimParam(name, row.type, row.value, row.volatile)

@@ -1,4 +1,4 @@
-"""What every simulated vehicle has in common: a table, a list that is sent in bursts, identity, heartbeat."""
+"""Vehicle, the base of all simulated vehicles: parameter table, list in bursts, identity, heartbeat."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["Vehicle", "VehicleOptions"]
 
 
 class VehicleOptions(TypedDict, total=False):
-    """What every kind of vehicle takes beside its own arguments; `Vehicle` says what each is."""
+    """Arguments of every kind of vehicle; see `Vehicle`."""
 
     boot_time: float
     param_error: bool
@@ -40,47 +40,51 @@ class VehicleOptions(TypedDict, total=False):
 
 
 class Vehicle(Device):
-    """A simulated component that speaks the parameter protocol in bytes; an `Endpoint`.
+    """A simulated component with the parameter protocol in bytes; an `Endpoint`.
 
-    It does no input or output and reads no clock. What it is asked at `now` it answers in its own time;
-    `next_deadline` says when. The first call of `tick` or `receive` switches it on.
+    Sans-I/O, without a clock. Requests at `now` are answered with the delays of a real vehicle;
+    `next_deadline` returns when. The first call of `tick` or `receive` switches the vehicle on.
 
     Attributes:
-        system, component: its own ids.
-        armed: whether its heartbeat says so; it does not start again then. Can be set in flight.
-        requests: how many messages of each kind were received that were for this vehicle, by their MAVLink
-            names (`requests["PARAM_REQUEST_READ"]`).
+        system, component: the vehicle's ids.
+        armed: whether the heartbeat says armed, which prevents reboots; can be changed at any time.
+        requests: number of received messages for this vehicle, by their MAVLink names
+            (`requests["PARAM_REQUEST_READ"]`).
 
     Args of every vehicle:
-        burst, period: parameters in one go of the list, and the seconds from one go to the next.
-        boot_time: seconds from switching on in which it does not yet send its list; its heartbeat says
+        burst, period: parameters per burst of the list, and the seconds between two bursts.
+        boot_time: seconds from switching on in which the vehicle does not send its list; the heartbeat says
             MAV_STATE_BOOT meanwhile.
-        param_error: answer what cannot be done with PARAM_ERROR, as newer firmware does.
-        telemetry: other messages per second (ATTITUDE), which a client has to step over.
-        mavlink_version: 2, or 1 to speak like an old vehicle.
-        stream: whether it hangs on a byte stream, where a frame may be spread over several `receive`
+        param_error: refuse requests with PARAM_ERROR, as newer firmware does.
+        telemetry: additional messages per second (ATTITUDE), which a client must skip.
+        mavlink_version: 2, or 1 for an old vehicle.
+        stream: whether the link is a byte stream, where a frame may be split over several `receive`
             calls; datagrams are never joined.
-        dead: indices, and names, that the list leaves out and no read is answered for. They still count,
+        dead: indices and names that the list leaves out, and whose reads are not answered. They still count,
             and a set of them is answered.
-        list_stops_at: after how many values a list falls silent; None for never. It is over then: one that
-            is asked for again begins at its start.
-        list_stops: how many lists that happens to; `math.inf` for all.
-        repeated_names: whether a name may stand in the table more than once, as it does where names are cut
-            at 16 bytes. Each has its index; by name the first is meant.
+        list_stops_at: number of values after which a list stops; None for never. The list has then ended: a
+            new request starts at the beginning.
+        list_stops: the number of lists that stop; `math.inf` for all.
+        repeated_names: whether the table may contain a name more than once, as with names truncated to 16
+            bytes. Each has its index; requests by name get the first.
         high_latency, armed: see the attributes.
-        reboot_ack: whether it acknowledges the command to start again before it does.
-        reboot_down: seconds for which it is off then.
-        signing_key: with which it signs what it sends; it takes only frames signed with it, and RADIO_STATUS.
-            None: neither, until SETUP_SIGNING brings a key. Of a sender's frames it takes those with a
-            rising timestamp, from at most 16 senders and links, until it is switched off.
-        signing_timestamp: where its timestamps begin; it has no other clock. They go on from those it hears.
-        usb: whether the link counts as safe: it takes whatever comes, as ArduPilot does over USB.
+        reboot_ack: whether a reboot command is acknowledged before the reboot.
+        reboot_down: seconds for which the vehicle is off during a reboot.
+        signing_key: the key that signs sent frames; only frames signed with it, and RADIO_STATUS, are then
+            accepted. None: no signing, until SETUP_SIGNING sets a key. A sender's timestamps must rise, and
+            at most 16 senders and links are accepted until the vehicle is switched off.
+        signing_timestamp: the initial signing timestamp, as the vehicle has no other clock. Received
+            timestamps advance it.
+        usb: whether the link counts as safe: all frames are accepted, as by ArduPilot over USB.
     """
 
     _ftp: FileServer | None = None
-    _position: int | None  # where the list stands, None while it is not being sent
-    _last_listed: Entry | None  # what it sent last
-    _list_sent: int  # values since its start
+    _position: int | None
+    """The next index of the list, None while no list is being sent."""
+    _last_listed: Entry | None
+    """The last parameter that the list has sent."""
+    _list_sent: int
+    """Values since the start of the list."""
     _next_burst: float
 
     def __init__(
@@ -113,9 +117,9 @@ class Vehicle(Device):
     ) -> None:
         rows = tuple(table)
         if not repeated_names and len({row.name for row in rows}) < len(rows):
-            raise UsageError("a parameter name stands twice in the table")
-        if len(rows) > _LONGEST:
-            raise UsageError(f"a table holds at most {_LONGEST} parameters, not {len(rows)}")
+            raise UsageError("the table contains a parameter name twice")
+        if len(rows) > _TABLE_SIZE_MAX:
+            raise UsageError(f"a table holds at most {_TABLE_SIZE_MAX} parameters, not {len(rows)}")
         if param_error and mavlink_version == 1:
             raise UsageError("PARAM_ERROR does not exist in MAVLink 1")
         if burst < 1 or not (math.isfinite(period) and period > 0.0):
@@ -129,8 +133,8 @@ class Vehicle(Device):
         self._listed: list[Entry] = []
         self._dead: set[int | str] = set()
         for each in dead:
-            if isinstance(each, int) and not 0 <= each < _LONGEST:
-                raise UsageError(f"an index is a number from 0 to {_LONGEST - 1}, not {each}")
+            if isinstance(each, int) and not 0 <= each < _TABLE_SIZE_MAX:
+                raise UsageError(f"an index is a number from 0 to {_TABLE_SIZE_MAX - 1}, not {each}")
             self._dead.add(self._entry(each).name if isinstance(each, str) else each)
         self._list_stops_at = math.inf if list_stops_at is None else list_stops_at
         self._list_stops = list_stops
@@ -156,26 +160,27 @@ class Vehicle(Device):
             reboot_down=reboot_down,
         )
 
-    # The public face
+    # Public interface
 
     def param(self, name: str) -> Param:
-        """One parameter as the vehicle really holds it, listed or not.
+        """Return one parameter with its value on board, listed or not.
 
         Raises:
-            UsageError: it has no parameter of that name.
+            UsageError: the vehicle has no parameter with that name.
         """
         return self._entry(name).param
 
     @property
     def listed(self) -> list[Param]:
-        """The listed parameters in the order of their indices, those with repeated names one by one."""
+        """The listed parameters in the order of their indices, including repeated names."""
         return [entry.param for entry in self._listed]
 
     @property
     def params(self) -> dict[str, Param]:
-        """The listed parameters by name, in the order of their indices: what a full download should give.
+        """The listed parameters by name, in the order of their indices: the expected result of a full
+        download.
 
-        Of a repeated name the first one.
+        Of a repeated name, the first one.
         """
         found: dict[str, Param] = {}
         for entry in self._listed:
@@ -184,15 +189,15 @@ class Vehicle(Device):
 
     @property
     def values(self) -> dict[str, Value]:
-        """The listed values by name, as `params`."""
+        """The listed values by name, like `params`."""
         return {name: param.value for name, param in self.params.items()}
 
     def when_listed(self, count: int, do: Callable[[], object]) -> None:
-        """Call something once, as soon as a list has sent so many values since its start.
+        """Call a function once, when a list has sent this many values since its start.
 
-        For what happens in mid-stream: `px4.when_listed(300, lambda: px4.use("WV_EN"))` moves the count,
-        `px4.when_listed(300, px4.reboot)` ends it. The call may change the vehicle in any way; several for
-        one count are made in the order given.
+        For events during a list: `px4.when_listed(300, lambda: px4.use("WV_EN"))` changes the count,
+        `px4.when_listed(300, px4.reboot)` ends the list. The function may change the vehicle in any way;
+        several functions for one count are called in the given order.
 
         Raises:
             UsageError: the count is below 1.
@@ -203,49 +208,49 @@ class Vehicle(Device):
 
     @property
     def files(self) -> dict[str, bytes]:
-        """The files that it has besides param.pck, by path; they can be changed at any time.
+        """The vehicle's files besides param.pck, by path; can be changed at any time.
 
         Raises:
-            UsageError: this vehicle does not speak MAVFTP.
+            UsageError: this vehicle has no MAVFTP.
         """
         if self._ftp is None:
-            raise UsageError("this vehicle does not speak MAVFTP")
+            raise UsageError("this vehicle has no MAVFTP")
         return self._ftp.files
 
     @property
     def open_files(self) -> list[str]:
-        """The paths of the files that are open in a session of MAVFTP."""
+        """The paths of the files that are open in a MAVFTP session."""
         return [] if self._ftp is None else self._ftp.open_files
 
     def set_param(self, name: str, value: Value) -> None:
-        """Change a value as if on board or by another station; the vehicle tells of it if its kind does.
+        """Change a value as if on board or by another station; announced as this kind of vehicle does.
 
         Raises:
-            UsageError: it has no parameter of that name, or the value does not fit its type.
+            UsageError: the vehicle has no parameter with that name, or the value does not fit its type.
         """
         entry = self._entry(name)
         self._write(entry, bits_of(value, entry.type))
 
-    # What a kind of vehicle does in its own way
+    # Implemented by subclasses
 
     @abstractmethod
     def _on_list(self) -> None:
-        """PARAM_REQUEST_LIST has come."""
+        """Handle PARAM_REQUEST_LIST."""
 
     @abstractmethod
     def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
-        """PARAM_REQUEST_READ has come."""
+        """Handle PARAM_REQUEST_READ."""
 
     @abstractmethod
     def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
-        """PARAM_SET has come."""
+        """Handle PARAM_SET."""
 
     @abstractmethod
     def _write(self, entry: Entry, bits: int) -> None:
-        """Hold another value, by whomever, and see to what follows from that."""
+        """Set another value, from any source, and start what follows from the change."""
 
     def _set_from_file(self, entry: Entry, param: PackedParam) -> None:
-        """A parameter has come in a file."""
+        """Set a parameter from an uploaded file."""
         if param.type == entry.type:
             self._write(entry, param.bits)
 
@@ -253,19 +258,19 @@ class Vehicle(Device):
         return True
 
     def _key(self, name: str) -> str:
-        """What two names have in common that mean one parameter."""
+        """Return the key of a name: names of the same parameter have the same key."""
         return name
 
     def _next_place(self, position: int) -> int:
-        """Which of the listed comes at this position of the list that is being sent."""
+        """Return the index among the listed parameters for a position of the list in progress."""
         return position
 
     def _count_in_list(self) -> int:
-        """The count that the values of a list carry."""
+        """Return the param_count of the list's values."""
         return len(self._listed)
 
     def _send_next(self) -> bool:
-        """Send the next item of the list; False when there is none."""
+        """Send the next item of the list; return False if there is none."""
         if self._position is None:
             return False
         index = self._position
@@ -283,7 +288,7 @@ class Vehicle(Device):
         return True
 
     def _falls_silent(self) -> bool:
-        """Whether the list breaks off here, where it still has a value to send."""
+        """Return whether the list stops here, with values left to send."""
         if self._list_sent < self._list_stops_at or self._list_stops < 1:
             return False
         self._list_stops -= 1
@@ -306,11 +311,11 @@ class Vehicle(Device):
         return min(super()._next_transmission(), self._next_burst, self._next_file_work())
 
     def _next_file_work(self) -> float:
-        """When MAVFTP has something to do."""
+        """Return the time of the next work of MAVFTP."""
         return math.inf if self._ftp is None else self._ftp.next_deadline()
 
-    def _skip_what_was_left_out(self) -> None:
-        super()._skip_what_was_left_out()
+    def _skip_suppressed(self) -> None:
+        super()._skip_suppressed()
         self._next_burst = max(self._now, self._next_burst)
 
     def _switch_on(self, at: float) -> None:
@@ -330,7 +335,7 @@ class Vehicle(Device):
             self._serve_files(now)
 
     def _send_list(self, now: float) -> None:
-        """Send what is due of the list."""
+        """Send the due part of the list."""
         while self._next_burst <= now:
             self._next_burst += self._period
             for _ in range(self._burst):
@@ -339,15 +344,15 @@ class Vehicle(Device):
                     break
 
     def _serve_files(self, now: float) -> None:
-        """Send what is due of MAVFTP."""
+        """Send the due MAVFTP responses."""
         if self._ftp is not None:
             for answer, sender in self._ftp.work(now):
                 self._send(wire.FileTransfer(0, *sender, answer.pack()))
 
-    # Tools for the kinds
+    # Helpers for subclasses
 
     def _packed_params(self) -> list[PackedParam] | None:
-        """The list for param.pck; None where a type in it has no place there."""
+        """Return the parameters for param.pck; None if it cannot hold one of the types."""
         packed = [each for entry in self._listed if (each := entry.packed) is not None]
         return packed if len(packed) == len(self._listed) else None
 
@@ -358,7 +363,7 @@ class Vehicle(Device):
                 self._set_from_file(entry, param)
 
     def _take_system_id(self, entry: Entry | None) -> None:
-        """Speak under the system id that a parameter says, if it is there and can be one."""
+        """Use the system id in a parameter, if the parameter exists and its value is a valid id."""
         if entry is not None and isinstance(entry.value, int) and 1 <= entry.value <= 255:
             self.system = entry.value
 
@@ -382,7 +387,7 @@ class Vehicle(Device):
         return self._listed[index] if 0 <= index < len(self._listed) else None
 
     def _relist(self) -> None:
-        """Number the listed parameters anew."""
+        """Assign indices to the listed parameters."""
         for entry in self._listed:
             entry.index = None
         self._listed = [entry for entry in self._entries if self._is_listed(entry)]
@@ -392,7 +397,7 @@ class Vehicle(Device):
     def _send_value(
         self, entry: Entry, *, index: int | None = None, count: int | None = None, kind: int | None = None
     ) -> None:
-        """Send a PARAM_VALUE with the entry's own index and type and the list's count, or others."""
+        """Send a PARAM_VALUE with the entry's index and type and the list's count, or the given ones."""
         if index is None:
             index = wire.NO_INDEX if entry.index is None else entry.index
         if count is None:
@@ -402,11 +407,12 @@ class Vehicle(Device):
     def _refuse(
         self, code: ParamErrorCode, request: wire.ParamRequestRead | wire.ParamSet, sender: wire.Frame
     ) -> None:
-        """Send PARAM_ERROR, if this vehicle does that."""
+        """Send PARAM_ERROR, if this vehicle supports it."""
         if self._param_error:
             index = request.param_index if isinstance(request, wire.ParamRequestRead) else -1
             name = request.param_id if index < 0 else ""
             self._send(wire.ParamError(sender.system, sender.component, name, index, code))
 
 
-_LONGEST = 65535  # param_count has 16 bits, and index 65535 means none
+_TABLE_SIZE_MAX = 65535
+"""Parameters of a table: param_count has 16 bits, and index 65535 means none."""

@@ -281,7 +281,7 @@ def test_a_vehicle_without_a_hardware_id_is_named_by_its_key(command: Command, c
         (
             ["quad.params", "1"],
             2,
-            "no such file, and no cached vehicle; link name 'quad.params': it names no kind",
+            "no such file, and no cached vehicle; link name 'quad.params': the kind of link is missing",
         ),
         (["1", "2", "--base", "quad.params"], 2, "  cache:VEHICLE "),
         (["udpin:x", "1"], 2, "link name 'udpin:x': the port is missing"),
@@ -404,7 +404,7 @@ def test_a_pipe_is_no_file(command: Command, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     outcome = command("diff", tmp_path / "pipe", "1")
     assert (outcome.code, outcome.out) == (2, "")
-    assert "no regular file" in outcome.err
+    assert "not a regular file" in outcome.err
 
 
 def test_show_prints_a_file(command: Command, write: Callable[..., str]) -> None:

@@ -94,9 +94,9 @@ def test_numbers_may_stand_behind_an_equals_sign(command: Command, put: Any) -> 
     [
         (
             ["FLTMODE1=Loitr"],
-            r"FLTMODE1: 'Loitr' is no number, nor one of its values: Stabilize (0), Loiter (5)",
+            r"FLTMODE1: 'Loitr' is not a number, nor one of its values: Stabilize (0), Loiter (5)",
         ),
-        (["TST_LOG=7", "FLTMODE1=x", "TST_ALT=1"], "FLTMODE1: 'x' is no number"),
+        (["TST_LOG=7", "FLTMODE1=x", "TST_ALT=1"], "FLTMODE1: 'x' is not a number"),
         (["NONE=On"], "NONE: 'On' is no number, and NONE is not described"),
         (["TST_ALT=high"], "and its values have no names"),
         (["FLTMODE1="], "FLTMODE1: there is no value behind the equals sign"),
@@ -129,7 +129,7 @@ def test_a_wrong_name_is_not_sent_to_a_vehicle_that_describes_itself(command: Co
     vehicle = quad()
     done = command("set", put(vehicle), "MC_ROLL_P", 3, "COM_FLTMODE1=Retrun", "--no-cache")
     assert (done.code, done.out) == (2, "")
-    assert "COM_FLTMODE1: 'Retrun' is no number, nor one of its values: Unassigned (-1)" in done.err
+    assert "COM_FLTMODE1: 'Retrun' is not a number, nor one of its values: Unassigned (-1)" in done.err
     assert not vehicle.requests["PARAM_SET"]
 
 

@@ -139,7 +139,7 @@ def test_a_link_and_a_vehicle_are_told_apart(where: str, is_link: bool) -> None:
 def test_nobody_is_asked_where_the_file_cannot_be(command: Command, tmp_path: Path) -> None:
     saved = command("save", "tcp:127.0.0.1:1", tmp_path / "quad.txt")
     assert saved.code == 2
-    assert "the ending '.txt' stands for no form" in saved.err
+    assert "unknown file extension '.txt'" in saved.err
 
 
 def test_a_vehicle_that_is_not_in_the_cache_says_so(command: Command, tmp_path: Path) -> None:
@@ -218,7 +218,7 @@ def test_all_components_of_a_vehicle_go_into_one_file(
 
     refused = command("save", "1", tmp_path / "all.param", "--all", "--cache", cache)
     assert refused.code == 2
-    assert "the form mission-planner holds one component, and there are 1/1, 1/100" in refused.err
+    assert "the format mission-planner holds one component, and there are 1/1, 1/100" in refused.err
     assert not (tmp_path / "all.param").exists()
 
 

@@ -21,7 +21,7 @@ from paramclient import ParamClient, UsageError
 from paramclient.cli import run
 from paramclient.client import recording
 from paramclient.client.recording import Capture
-from paramclient.links.tlog import LATEST, LONGEST_LEAP, Record, packed_time, read_records
+from paramclient.links.tlog import TIME_MAX, TIME_STEP_MAX, Record, packed_time, read_records
 from paramclient.protocol import wire
 from paramclient.protocol.stats.sniffer import MOST_PEERS, FrameCutter
 from paramclient.sim import ArduPilotVehicle
@@ -69,7 +69,7 @@ def test_recordings_are_read_frame_by_frame(name: str) -> None:
 
 @pytest.mark.parametrize("size", [1, 7, 64])
 def test_a_log_is_read_whatever_its_blocks(size: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("paramclient.links.tlog.BLOCK", size)
+    monkeypatch.setattr("paramclient.links.tlog.BLOCK_SIZE", size)
     frames = [frame(number) for number in range(5)]
     assert [each.data for each in records(log_of(*frames))] == frames
 
@@ -84,7 +84,7 @@ def test_what_is_no_record_is_stepped_over() -> None:
 
 @pytest.mark.parametrize(
     ("first", "second"),
-    [(20.0, NOW), (315_964_800.0, NOW), (NOW, 315_964_800.0), (NOW, NOW - LONGEST_LEAP - 10), (20.0, 30.0)],
+    [(20.0, NOW), (315_964_800.0, NOW), (NOW, 315_964_800.0), (NOW, NOW - TIME_STEP_MAX - 10), (20.0, 30.0)],
     ids=["set from 1970", "set from 1980", "lost", "joined", "never set"],
 )
 @pytest.mark.parametrize("behind", [2, 9])
@@ -97,9 +97,9 @@ def test_a_clock_that_is_set_costs_no_frame(first: float, second: float, behind:
 
 def test_no_frame_is_later_than_the_latest_time() -> None:
     """Not in many steps either: dates end with the year 9999."""
-    step = LONGEST_LEAP - 1
-    data = b"".join(packed_time(LATEST - step + number * step) + frame(number) for number in range(9))
-    assert [each.at for each in records(data)] == [LATEST - step, LATEST]
+    step = TIME_STEP_MAX - 1
+    data = b"".join(packed_time(TIME_MAX - step + number * step) + frame(number) for number in range(9))
+    assert [each.at for each in records(data)] == [TIME_MAX - step, TIME_MAX]
 
 
 @pytest.mark.parametrize("damaged", [0, 2, 4])

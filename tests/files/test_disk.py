@@ -1,4 +1,4 @@
-"""Parameter files on disk: read whole, and replaced whole or not at all."""
+"""Parameter files on disk: reading, atomic replacement, included files."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def refused(call: Callable[[], object]) -> FileError:
 
 
 @pytest.mark.parametrize(("ending", "form"), ENDINGS.items())
-def test_the_ending_names_the_form_that_is_written(ending: str, form: FileForm, tmp_path: Path) -> None:
+def test_the_extension_selects_the_format_to_write(ending: str, form: FileForm, tmp_path: Path) -> None:
     path = tmp_path / f"quad{ending.upper()}"
     assert write_file(path, TYPED) is form
     file = read_file(path)
@@ -54,26 +54,26 @@ def test_the_ending_names_the_form_that_is_written(ending: str, form: FileForm, 
     assert listed(tmp_path) == [path.name]
 
 
-def test_a_form_that_is_named_counts_more_than_the_ending(tmp_path: Path) -> None:
+def test_a_given_format_overrides_the_extension(tmp_path: Path) -> None:
     path = tmp_path / "quad.json"
     assert write_file(str(path), PARAMS, form="mission-planner") is FileForm.MISSION_PLANNER
     assert path.read_bytes().endswith(b"\nA,5\nB,0.5\n")
     assert read_file(str(path), form="parm").form is FileForm.PARM
-    with pytest.raises(UsageError, match="no form of file is called 'exe'"):
+    with pytest.raises(UsageError, match="unknown file format 'exe'"):
         write_file(path, PARAMS, form="exe")
-    with pytest.raises(UsageError, match="no form of file is called 'exe'"):
+    with pytest.raises(UsageError, match="unknown file format 'exe'"):
         read_file(path, form="exe")
 
 
-def test_an_ending_that_stands_for_nothing_is_refused(tmp_path: Path) -> None:
+def test_an_unknown_extension_is_rejected(tmp_path: Path) -> None:
     error = refused(lambda: write_file(tmp_path / "quad.txt", PARAMS))
-    assert "the ending '.txt' stands for no form; name one (qgc, parm, mission-planner" in str(error)
-    assert "end in one of .params, .parm, .param" in str(error)
+    assert "unknown file extension '.txt'. Choose a format (qgc, parm, mission-planner" in str(error)
+    assert "one of the extensions .params, .parm, .param" in str(error)
     assert error.source == str(tmp_path / "quad.txt")
     assert listed(tmp_path) == []
 
 
-def test_a_file_that_is_there_is_replaced_and_keeps_its_mode(tmp_path: Path) -> None:
+def test_replacing_a_file_keeps_its_mode(tmp_path: Path) -> None:
     path = tmp_path / "quad.param"
     path.write_bytes(OLD)
     path.chmod(0o640)
@@ -83,7 +83,7 @@ def test_a_file_that_is_there_is_replaced_and_keeps_its_mode(tmp_path: Path) -> 
     assert listed(tmp_path) == ["quad.param"]
 
 
-def test_a_new_file_has_the_mode_that_the_user_wants(tmp_path: Path) -> None:
+def test_a_new_file_follows_the_umask(tmp_path: Path) -> None:
     before = os.umask(0o027)
     try:
         write_file(tmp_path / "quad.param", PARAMS)
@@ -92,7 +92,7 @@ def test_a_new_file_has_the_mode_that_the_user_wants(tmp_path: Path) -> None:
     assert stat.S_IMODE((tmp_path / "quad.param").stat().st_mode) == 0o640
 
 
-def test_a_symbolic_link_stays_one(tmp_path: Path) -> None:
+def test_a_symbolic_link_is_kept(tmp_path: Path) -> None:
     folder = tmp_path / "real"
     folder.mkdir()
     (folder / "quad.param").write_bytes(OLD)
@@ -105,7 +105,7 @@ def test_a_symbolic_link_stays_one(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("call", ["fchmod", "fsync"])
-def test_a_full_disk_leaves_the_old_file_alone(
+def test_a_full_disk_leaves_the_old_file_unchanged(
     call: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def full(*_: Any) -> None:
@@ -122,8 +122,8 @@ def test_a_full_disk_leaves_the_old_file_alone(
     assert listed(tmp_path) == ["quad.param"]
 
 
-def test_a_real_limit_leaves_the_old_file_alone(tmp_path: Path) -> None:
-    """A process that may write no more than a kilobyte."""
+def test_a_file_size_limit_leaves_the_old_file_unchanged(tmp_path: Path) -> None:
+    """A process with a limit of one kilobyte per file."""
     path = tmp_path / "quad.param"
     path.write_bytes(OLD)
     program = f"""
@@ -145,7 +145,7 @@ except FileError as error:
     assert listed(tmp_path) == ["quad.param"]
 
 
-def test_whatever_ends_the_call_leaves_no_half_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_an_interrupted_write_leaves_no_partial_file(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     def interrupted(_: int) -> None:
         raise KeyboardInterrupt
 
@@ -158,9 +158,7 @@ def test_whatever_ends_the_call_leaves_no_half_file(monkeypatch: pytest.MonkeyPa
     assert listed(tmp_path) == ["quad.param"]
 
 
-def test_the_content_is_on_the_disk_before_the_name_is(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_the_content_is_synced_before_the_rename(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     path = tmp_path / "quad.param"
     path.write_bytes(OLD)
     real = os.fsync
@@ -178,15 +176,15 @@ def test_the_content_is_on_the_disk_before_the_name_is(
     assert (second, after) == (str(tmp_path), path.read_bytes())
 
 
-def test_what_a_form_cannot_say_is_found_before_the_disk_is_touched(tmp_path: Path) -> None:
+def test_inexpressible_content_fails_before_writing(tmp_path: Path) -> None:
     path = tmp_path / "quad.params"
     path.write_bytes(OLD)
     error = refused(lambda: write_file(path, PARAMS))
-    assert str(error) == f"{path}: B has no type that MAVLink defines, and this form needs one"
+    assert str(error) == f"{path}: B has no type that MAVLink defines, and this format needs one"
     assert path.read_bytes() == OLD
 
 
-def test_a_file_as_it_was_read_goes_into_another_form(tmp_path: Path) -> None:
+def test_a_file_can_be_converted_to_another_format(tmp_path: Path) -> None:
     first = tmp_path / "quad.param"
     first.write_text("# mine\nA,5\n# why\nB,0.5\n")
     write_file(tmp_path / "quad.yaml", read_file(first))
@@ -196,23 +194,23 @@ def test_a_file_as_it_was_read_goes_into_another_form(tmp_path: Path) -> None:
     assert (tmp_path / "back.param").read_text() == first.read_text()
 
 
-def test_what_cannot_be_opened_says_why(tmp_path: Path) -> None:
+def test_errors_of_opening_a_file_have_the_reason(tmp_path: Path) -> None:
     missing = tmp_path / "none.param"
     assert str(refused(lambda: read_file(missing))) == (
         f"{missing}: cannot be read: No such file or directory"
     )
-    assert "cannot be read: it is no regular file" in str(refused(lambda: read_file(tmp_path)))
+    assert "cannot be read: not a regular file" in str(refused(lambda: read_file(tmp_path)))
     assert "cannot be read: embedded null byte" in str(refused(lambda: read_file("a\0b")))
     assert "cannot be written: embedded null byte" in str(refused(lambda: write_file("a\0b.parm", PARAMS)))
     deep = missing / "quad.param"
     assert "cannot be written: No such file or directory" in str(refused(lambda: write_file(deep, PARAMS)))
     folder = tmp_path / "folder.param"
     folder.mkdir()
-    assert "cannot be written: it is no regular file" in str(refused(lambda: write_file(folder, PARAMS)))
+    assert "cannot be written: not a regular file" in str(refused(lambda: write_file(folder, PARAMS)))
 
 
-def test_a_file_that_nobody_may_read_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """By a system that says no, as a test may run as root."""
+def test_an_unreadable_file_is_reported(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """With a mocked system call, as the test may run as root."""
 
     def forbidden(*_: Any) -> int:
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES))
@@ -223,25 +221,25 @@ def test_a_file_that_nobody_may_read_says_so(monkeypatch: pytest.MonkeyPatch, tm
     assert "cannot be written: Permission denied" in str(refused(lambda: write_file(path, PARAMS)))
 
 
-def test_a_pipe_holds_nobody_up(tmp_path: Path) -> None:
+def test_opening_a_pipe_does_not_block(tmp_path: Path) -> None:
     pipe = tmp_path / "pipe.param"
     os.mkfifo(pipe)
-    assert "it is no regular file" in str(refused(lambda: read_file(pipe)))
-    assert "it is no regular file" in str(refused(lambda: write_file(pipe, PARAMS)))
+    assert str(refused(lambda: read_file(pipe))) == f"{pipe}: cannot be read: not a regular file"
+    assert str(refused(lambda: write_file(pipe, PARAMS))) == f"{pipe}: cannot be written: not a regular file"
     assert stat.S_ISFIFO(pipe.stat().st_mode)
 
 
-def test_a_file_that_is_too_large_to_be_one_is_not_read(tmp_path: Path) -> None:
+def test_a_too_large_file_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "huge.param"
     with path.open("wb") as file:
         file.truncate(LARGEST_FILE + 1)
-    assert f"no parameter file has more than {LARGEST_FILE} bytes" in str(refused(lambda: read_file(path)))
+    assert f"a parameter file has at most {LARGEST_FILE} bytes" in str(refused(lambda: read_file(path)))
 
 
-def test_reading_keeps_no_descriptor_open(tmp_path: Path) -> None:
+def test_reading_closes_its_descriptor(tmp_path: Path) -> None:
     path = tmp_path / "quad.param"
     write_file(path, PARAMS)
-    before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - one more is open while it is listed either way
+    before = len(os.listdir("/proc/self/fd"))  # noqa: PTH208 - listing opens one descriptor in both cases
     for _ in range(5):
         read_file(path)
         refused(lambda: read_file(tmp_path))
@@ -249,8 +247,8 @@ def test_reading_keeps_no_descriptor_open(tmp_path: Path) -> None:
     assert len(os.listdir("/proc/self/fd")) == before  # noqa: PTH208 - as above
 
 
-def test_the_largest_table_fits_into_the_largest_file() -> None:
-    """As many parameters as an index can count, in the longest form, with all that a line can have."""
+def test_the_largest_table_fits_in_the_largest_file() -> None:
+    """As many parameters as an index can count, in the longest format, with every field."""
     from paramclient.files import dumps
 
     names = [f"P{at:015d}" for at in range(1000)]
@@ -265,7 +263,7 @@ def test_the_largest_table_fits_into_the_largest_file() -> None:
     assert len(dumps(params, form="json")) * 65.535 < LARGEST_FILE
 
 
-def test_several_sets_go_into_one_file(tmp_path: Path) -> None:
+def test_several_sets_can_be_written_to_one_file(tmp_path: Path) -> None:
     camera = ParamSet({"C": WrittenParam("C", 1, ParamType.INT8)}, 100, 1)
     for name in ("fleet.params", "fleet.json", "fleet.yaml"):
         write_file(tmp_path / name, [TYPED, camera])
@@ -273,7 +271,7 @@ def test_several_sets_go_into_one_file(tmp_path: Path) -> None:
         assert [(each.component, list(each)) for each in file.sets] == [(1, ["A"]), (100, ["C"])]
 
 
-def test_a_header_tells_people_what_a_plain_list_cannot(tmp_path: Path) -> None:
+def test_a_list_has_a_header_that_names_the_vehicle(tmp_path: Path) -> None:
     from paramclient import Identity
 
     who = Identity(3, "udp", "00ff", 12, firmware=0x01110000, git_hash="abc")
@@ -287,7 +285,7 @@ def test_a_header_tells_people_what_a_plain_list_cannot(tmp_path: Path) -> None:
     )
 
 
-def test_yaml_and_pydantic_are_loaded_by_those_who_need_them() -> None:
+def test_yaml_and_pydantic_are_loaded_only_when_needed() -> None:
     program = """
 import sys
 from paramclient.files import dumps, loads
@@ -300,7 +298,7 @@ assert "yaml" not in sys.modules
     subprocess.run([sys.executable, "-c", program], cwd=ROOT, check=True, timeout=60)
 
 
-def test_a_file_of_bytes_has_no_name() -> None:
+def test_bytes_without_a_name() -> None:
     file = loads(b"A 1")
     assert isinstance(file, ParamFile)
     assert repr(file) == "<ParamFile unnamed parm ?/?: 1>"
@@ -308,11 +306,11 @@ def test_a_file_of_bytes_has_no_name() -> None:
         loads(b"x")
 
 
-# files that include others
+# Included files
 
 
 def tree(folder: Path, **files: str) -> Path:
-    """Files in folders, `__` in a key for a slash and `_parm` for the ending; the path of the first one."""
+    """Write files, with `__` in a key for `/` and `_parm` for the extension; return the first path."""
     paths = []
     for key, text in files.items():
         path = folder / key.replace("__", "/").replace("_parm", ".parm")
@@ -326,7 +324,7 @@ def values(path: Path) -> dict[str, object]:
     return {name: param.value for name, param in read_file(path).sets[0].items()}
 
 
-def test_an_included_file_stands_in_the_place_of_its_line(tmp_path: Path) -> None:
+def test_an_included_file_replaces_its_line(tmp_path: Path) -> None:
     first = tree(
         tmp_path,
         board__new__defaults_parm="A 1\n@include ../base/defaults.parm  # as on the other board\nB 20\n",
@@ -339,27 +337,25 @@ def test_an_included_file_stands_in_the_place_of_its_line(tmp_path: Path) -> Non
     assert (params["A"].comment, params["A"].line, params["B"].line) == ("ten", None, 3)
     base = f"{first.parent}/../base/defaults.parm"
     assert file.notes == (
-        f"A stands twice: 10 in {base}:2 counts, not 1 in line 1.",
-        f"B stands twice: 20 in line 3 counts, not 11 in {base}:3.",
+        f"A occurs twice: 10 in {base}:2 is used, not 1 in line 1.",
+        f"B occurs twice: 20 in line 3 is used, not 11 in {base}:3.",
     )
     assert loads(dumps(file)).sets[0] == ParamSet(params.params)
 
 
-def test_a_file_may_do_nothing_but_include_another_one(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_file_may_consist_of_one_include(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = tree(tmp_path, here__a_parm="@include ../there/b.parm\n", there__b_parm="A 1\n")
     assert values(first) == {"A": 1}
     monkeypatch.chdir(first.parent)
     assert values(Path("a.parm")) == {"A": 1}
 
 
-def test_two_lines_may_include_one_file(tmp_path: Path) -> None:
+def test_a_file_may_be_included_twice(tmp_path: Path) -> None:
     first = tree(tmp_path, a_parm="@include b.parm\nA 2\n@include b.parm\n", b_parm="A 1\n")
     assert values(first) == {"A": 1}
 
 
-def test_a_delete_line_takes_out_what_stands_above_it(tmp_path: Path) -> None:
+def test_a_delete_line_removes_parameters_above_it(tmp_path: Path) -> None:
     first = tree(
         tmp_path,
         a_parm="A_X 1\nB 1\n@include b.parm\n@delete A_*  # of the other board\n@delete NONE\nA_X 3\n",
@@ -367,10 +363,10 @@ def test_a_delete_line_takes_out_what_stands_above_it(tmp_path: Path) -> None:
     )
     assert values(first) == {"B": 1, "C": 2, "A_X": 3}
     assert read_file(first).notes == (
-        f"@delete B in {tmp_path}/b.parm:6 takes out B.",
-        f"@delete D in {tmp_path}/b.parm:7 takes out D.",
-        "@delete A_* in line 4 takes out A_X, A_Y.",
-        "@delete NONE in line 5 fits no parameter above it.",
+        f"@delete B in {tmp_path}/b.parm:6 removes B.",
+        f"@delete D in {tmp_path}/b.parm:7 removes D.",
+        "@delete A_* in line 4 removes A_X, A_Y.",
+        "@delete NONE in line 5 matches no parameter above it.",
     )
 
 
@@ -378,16 +374,16 @@ def test_a_delete_line_takes_out_what_stands_above_it(tmp_path: Path) -> None:
     ("line", "problem"),
     [
         ("@include gone.parm", "x/y/gone.parm cannot be read: No such file or directory"),
-        ("@include ../y", "x/y/../y cannot be read: it is no regular file"),
+        ("@include ../y", "x/y/../y cannot be read: not a regular file"),
         ("@include ../../outside.parm", "lies outside of"),
         ("@include ../z/../../outside.parm", "lies outside of"),
-        ("@include /etc/hostname", "an absolute path is not followed"),
+        ("@include /etc/hostname", "absolute paths are not allowed"),
         ("@include link.parm", "lies outside of"),
-        ("@include first.parm", "in a circle"),
-        ("@include round.parm", "in a circle"),
+        ("@include first.parm", "circular @include"),
+        ("@include round.parm", "circular @include"),
     ],
 )
-def test_what_cannot_be_included_says_so_with_its_line(line: str, problem: str, tmp_path: Path) -> None:
+def test_an_impossible_include_is_reported_with_its_line(line: str, problem: str, tmp_path: Path) -> None:
     first = tree(
         tmp_path,
         x__y__first_parm=f"A 1\n{line}\nbad\n",
@@ -415,11 +411,11 @@ def test_an_error_in_an_included_file_names_both_lines(tmp_path: Path) -> None:
     assert "includes that file" in str(refused(lambda: read_file(first)))
 
 
-def test_how_much_is_included_is_limited(tmp_path: Path) -> None:
+def test_includes_are_limited(tmp_path: Path) -> None:
     chain = {f"f{number}_parm": f"@include f{number + 1}.parm\n" for number in range(DEPTH_MAX)}
     assert values(tree(tmp_path, **chain, **{f"f{DEPTH_MAX}_parm": "A 1\n"})) == {"A": 1}
     (tmp_path / f"f{DEPTH_MAX}.parm").write_text(f"@include f{DEPTH_MAX + 1}.parm\n")
-    assert "in a row" in str(refused(lambda: read_file(tmp_path / "f0.parm")))
+    assert "nested more than" in str(refused(lambda: read_file(tmp_path / "f0.parm")))
     wide = {f"g{number}_parm": f"@include g{number + 1}.parm\n" * 4 for number in range(DEPTH_MAX)}
     first = tree(tmp_path, **wide, **{f"g{DEPTH_MAX}_parm": "A 1\n"})
     assert f"more than {FILES_MAX} files" in str(refused(lambda: read_file(first)))

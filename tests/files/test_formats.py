@@ -1,4 +1,4 @@
-"""Every form of parameter file: exactly back, as other programs read it, and what is refused."""
+"""Every file format: round trips, compatibility with other programs, and rejected files."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def numbered(values: list[Value], kind: ParamType) -> ParamSet:
 
 
 def back(params: ParamSet, form: FileForm) -> ParamSet:
-    """What comes back of a set that goes through a form."""
+    """Return a set after writing and reading it in a format."""
     (only,) = loads(dumps(params, form=form), form=form).sets
     return only
 
@@ -49,17 +49,17 @@ def bits(params: ParamSet, kind: ParamType) -> list[int]:
 def failed(data: bytes | str, **options: object) -> FileError:
     content = data.encode() if isinstance(data, str) else data
     with pytest.raises(FileError) as caught:
-        loads(content, source="quad.x", **options)  # type: ignore[arg-type]  # each is one of its own
+        loads(content, source="quad.x", **options)  # type: ignore[arg-type]  # options of several types
     return caught.value
 
 
-# exactly back
+# Round trips
 
 
 @pytest.mark.parametrize("form", WRITTEN)
 @given(written=st.lists(finite_bits, min_size=1, max_size=60))
 @settings(max_examples=25, deadline=None)
-def test_every_finite_float_comes_back(form: FileForm, written: list[int]) -> None:
+def test_finite_floats_round_trip(form: FileForm, written: list[int]) -> None:
     floats: list[Value] = [from_bits(each, ParamType.REAL32) for each in written]
     assert bits(back(numbered(floats, ParamType.REAL32), form), ParamType.REAL32) == written
 
@@ -68,7 +68,7 @@ def test_every_finite_float_comes_back(form: FileForm, written: list[int]) -> No
 @pytest.mark.parametrize("kind", [kind for kind in ParamType if kind.is_integer])
 @given(data=st.data())
 @settings(max_examples=8, deadline=None)
-def test_every_integer_comes_back(form: FileForm, kind: ParamType, data: st.DataObject) -> None:
+def test_integers_round_trip(form: FileForm, kind: ParamType, data: st.DataObject) -> None:
     if form is FileForm.PCK and kind not in (ParamType.INT8, ParamType.INT16, ParamType.INT32):
         with pytest.raises(FileError, match=f"P0 has the type {kind.name}"):
             dumps(numbered([1], kind), form=form)
@@ -84,7 +84,7 @@ def test_every_integer_comes_back(form: FileForm, kind: ParamType, data: st.Data
 @pytest.mark.parametrize("form", [FileForm.PARM, *TYPED])
 @given(values=st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=1, max_size=20))
 @settings(max_examples=20, deadline=None)
-def test_every_double_comes_back(form: FileForm, values: list[Value]) -> None:
+def test_doubles_round_trip(form: FileForm, values: list[Value]) -> None:
     expected = bits(numbered(values, ParamType.REAL64), ParamType.REAL64)
     assert bits(back(numbered(values, ParamType.REAL64), form), ParamType.REAL64) == expected
 
@@ -92,15 +92,15 @@ def test_every_double_comes_back(form: FileForm, values: list[Value]) -> None:
 @pytest.mark.parametrize("form", [*PAIRS, *TYPED[1:]])
 @given(value=st.floats(allow_nan=False) | st.integers(-(2**70), 2**70))
 @settings(max_examples=40, deadline=None)
-def test_a_number_without_a_type_stays_as_it_was_written(form: FileForm, value: float) -> None:
+def test_a_number_without_a_type_round_trips(form: FileForm, value: float) -> None:
     read = back(params_of(WrittenParam("A", value)), form)["A"].value
     assert (type(read), repr(read)) == (type(value), repr(value))
 
 
 @given(name=st.text("ABCXYZabcxyz0189_", min_size=1, max_size=16), written=finite_bits)
 @settings(max_examples=60, deadline=None)
-def test_what_was_read_is_written_as_it_was(name: str, written: int) -> None:
-    """The other way round: text that any of the forms has written is written so again."""
+def test_written_text_is_stable(name: str, written: int) -> None:
+    """Text that was written in a format is unchanged after reading and writing it."""
     value = from_bits(written, ParamType.REAL32)
     for form in (FileForm.QGC, *PAIRS, FileForm.PCK):
         if not name.strip("0189_"):
@@ -111,19 +111,19 @@ def test_what_was_read_is_written_as_it_was(name: str, written: int) -> None:
 
 @pytest.mark.parametrize("form", WRITTEN)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_plain_nan_and_infinities_come_back(form: FileForm, value: float) -> None:
+def test_nan_and_infinities_round_trip(form: FileForm, value: float) -> None:
     read = back(numbered([value], ParamType.REAL32), form)
     assert bits(read, ParamType.REAL32) == [bits_of(value, ParamType.REAL32)]
 
 
 @pytest.mark.parametrize("word", ["nan", "NaN", "inf", "Infinity", "-inf"])
-def test_the_words_of_other_programs_are_understood(word: str) -> None:
+def test_nan_words_of_other_programs_are_parsed(word: str) -> None:
     read = loads(f"A {word}\n".encode()).choose()["A"].value
     assert struct.pack("<d", read) == struct.pack("<d", float(word))
 
 
 @pytest.mark.parametrize("form", TYPED[1:])
-def test_a_document_keeps_what_no_word_says(form: FileForm) -> None:
+def test_a_document_keeps_raw_bytes_and_nan_payloads(form: FileForm) -> None:
     quiet = from_bits(0x7FC12345, ParamType.REAL32)
     cast, _ = decode(struct.pack("<f", 1e20), ParamType.INT8, Encoding.C_CAST)
     params = params_of(
@@ -145,7 +145,7 @@ def test_a_document_keeps_what_no_word_says(form: FileForm) -> None:
     ("value", "kind"),
     [(b"\x01\0\0\0", ParamType.INT32), (from_bits(0x7FC12345, ParamType.REAL32), ParamType.REAL32)],
 )
-def test_other_forms_refuse_what_they_cannot_say(form: FileForm, value: Value, kind: ParamType) -> None:
+def test_other_formats_reject_raw_bytes_and_payloads(form: FileForm, value: Value, kind: ParamType) -> None:
     if form is FileForm.PCK and kind is ParamType.REAL32:
         assert bits(back(numbered([value], kind), form), kind) == [0x7FC12345]
         return
@@ -153,14 +153,14 @@ def test_other_forms_refuse_what_they_cannot_say(form: FileForm, value: Value, k
         dumps(numbered([value], kind), form=form)
 
 
-def test_a_nan_with_bits_and_no_type_cannot_be_kept() -> None:
+def test_a_nan_payload_without_a_type_is_rejected() -> None:
     value = from_bits(0x7FC12345, ParamType.REAL32)
-    with pytest.raises(FileError, match="A is a NaN with bits of its own, and has no type"):
+    with pytest.raises(FileError, match="A is a NaN with payload bits, and has no type"):
         dumps(params_of(WrittenParam("A", value)), form="json")
 
 
 @pytest.mark.parametrize("form", TYPED[1:])
-def test_a_document_says_whose_parameters_they_are_and_when(form: FileForm) -> None:
+def test_a_document_has_identity_and_time(form: FileForm) -> None:
     who = Identity(3, 'udpin:"x"', "00ff", 12, 2, 0x01110000, "abc123", 5, 6, 7, 2**40)
     first = ParamSet({"A": WrittenParam("A", 1)}, 1, 3, who, 1_700_000_000.25)
     second = ParamSet({"yes": WrittenParam("yes", 1e-5), "NULL": WrittenParam("NULL", 1e30)}, 100, 3)
@@ -170,8 +170,8 @@ def test_a_document_says_whose_parameters_they_are_and_when(form: FileForm) -> N
     assert [each.source for each in file.sets] == ["fleet.x", "fleet.x"]
 
 
-def test_a_document_in_yaml_says_the_same_to_another_reader() -> None:
-    """Whatever reads YAML 1.1, where `1e-05` is text and `no` is false."""
+def test_a_yaml_document_means_the_same_to_other_parsers() -> None:
+    """To every reader of YAML 1.1, where `1e-05` is text and `no` is false."""
     params = params_of(
         *(WrittenParam(name, 1e-05, ParamType.REAL32) for name in ("no", "Y", "A-1", "null")),
         WrittenParam("B", -0.0, ParamType.REAL32, 1e30),
@@ -183,7 +183,7 @@ def test_a_document_in_yaml_says_the_same_to_another_reader() -> None:
 
 
 @pytest.mark.parametrize("form", [FileForm.QGC, *PAIRS])
-def test_header_comments_and_footer_stay_where_they_are(form: FileForm) -> None:
+def test_header_comments_and_footer_round_trip(form: FileForm) -> None:
     plain = ParamSet({"A": WrittenParam("A", 1, ParamType.INT8, comment="first"), "B": WrittenParam("B", 2)})
     marked = WrittenParam("B", 2, ParamType.INT8, comment="two\n\n # lines\n#marked")
     params = ParamSet({"A": plain["A"], "B": marked, "C": WrittenParam("C", 3, ParamType.INT8)}, 1, 1)
@@ -200,7 +200,7 @@ def test_header_comments_and_footer_stay_where_they_are(form: FileForm) -> None:
     assert dumps(loads(dumps(once))) == dumps(once)
 
 
-def test_comments_of_mission_planner_survive() -> None:
+def test_comments_of_mission_planner_are_kept() -> None:
     text = "# for the X500\n# by Jo\nA,1\n\n# above B\nB,2 # beside B\n//off,3\nC,3\n; the end\n"
     file = loads(text.encode(), source="quad.param")
     assert file.header == ("for the X500", "by Jo")
@@ -213,7 +213,7 @@ def test_comments_of_mission_planner_survive() -> None:
 
 
 @pytest.mark.parametrize("form", [FileForm.QGC, *PAIRS, *TYPED[1:]])
-def test_no_comment_becomes_a_parameter(form: FileForm) -> None:
+def test_a_comment_never_becomes_a_parameter(form: FileForm) -> None:
     params = params_of(
         WrittenParam("A", 1, ParamType.INT8, comment="x\nB,2\r\nB 2\rB,2\x0bB,2\u2028B,2\x00\x1b[31m")
     )
@@ -223,7 +223,7 @@ def test_no_comment_becomes_a_parameter(form: FileForm) -> None:
     assert "\x1b" not in dumps(around).decode()
 
 
-# as others read it
+# Compatibility with other programs
 
 
 @pytest.mark.parametrize("form", PAIRS)
@@ -257,8 +257,8 @@ def test_mavproxy_reads_a_whole_vehicle(
         assert "Invalid" not in capsys.readouterr().out
 
 
-def test_mission_planner_takes_every_line_that_is_no_comment() -> None:
-    """ParamFile.cs skips lines that begin with `#` and splits others at blanks and commas: two parts."""
+def test_mission_planner_reads_every_parameter_line() -> None:
+    """ParamFile.cs skips lines that begin with `#`, and splits others at blanks and commas into two parts."""
     params = params_of(
         WrittenParam("A", 1, comment="why"), WrittenParam("B", math.inf), WrittenParam("C", math.nan)
     )
@@ -267,8 +267,8 @@ def test_mission_planner_takes_every_line_that_is_no_comment() -> None:
     assert rows == [["A", "1"], ["B", "Infinity"], ["C", "NaN"]]
 
 
-def test_qgroundcontrol_takes_every_line_that_is_no_comment() -> None:
-    """ParameterManager.cc skips lines that begin with `#` and splits others at tabs; five parts count."""
+def test_qgroundcontrol_reads_every_parameter_line() -> None:
+    """ParameterManager.cc skips lines that begin with `#`, and splits others at tabs into five parts."""
     pilot = params_of(
         WrittenParam("A", 0.1, ParamType.REAL32, comment="why"),
         WrittenParam("B", -5, ParamType.INT32),
@@ -303,7 +303,7 @@ QGC_TEXT = """# Onboard parameters for Vehicle 1
 """
 
 
-def test_a_file_of_qgroundcontrol_has_a_set_for_each_component() -> None:
+def test_a_qgroundcontrol_file_has_a_set_per_component() -> None:
     file = loads(QGC_TEXT.encode(), source="quad.params")
     assert file.form is FileForm.QGC
     assert file.header[0] == "Onboard parameters for Vehicle 1"
@@ -315,21 +315,21 @@ def test_a_file_of_qgroundcontrol_has_a_set_for_each_component() -> None:
     assert file.choose(system=1)["BAT1_CAPACITY"].bits_as(ParamType.REAL32) == 0x7FC00000
     assert (file.choose(100)["CAM_MODE"].value, file.choose(100)["CAM_MODE"].type) == (2, ParamType.INT8)
     assert isinstance(file.choose(1, system=2)["MC_ROLL_P"].value, float)
-    with pytest.raises(FileError, match=r"quad.params: more than one fits .*holds 1/1, 1/100, 2/1"):
+    with pytest.raises(FileError, match=r"quad.params: several sets match .*contains 1/1, 1/100, 2/1"):
         file.choose()
-    with pytest.raises(FileError, match=r"none fits \(any system, component 7\)"):
+    with pytest.raises(FileError, match=r"no set matches \(any system, component 7\)"):
         file.choose(7)
-    with pytest.raises(FileError, match=r"none fits \(system 9, the autopilot\)"):
+    with pytest.raises(FileError, match=r"no set matches \(system 9, the autopilot\)"):
         file.choose(system=9)
 
 
-def test_a_set_of_nobody_in_particular_fits_everyone() -> None:
+def test_a_set_without_ids_matches_every_component() -> None:
     file = loads(b"A 1\n")
     assert file.choose() == file.choose(1) == file.choose(42, system=3) == file.sets[0]
 
 
 @pytest.mark.parametrize("name", ["ardupilot_param.pck", "ardupilot_param_withdefaults.pck"])
-def test_what_a_vehicle_has_packed_goes_through_other_forms(name: str) -> None:
+def test_packed_files_convert_to_other_formats(name: str) -> None:
     file = loads((DATA / name).read_bytes(), source=name)
     assert (file.form, len(file.sets[0]), file.notes) == (FileForm.PCK, 1382, ())
     with_defaults = "defaults" in name
@@ -344,19 +344,19 @@ def test_what_a_vehicle_has_packed_goes_through_other_forms(name: str) -> None:
     assert with_defaults or dumps(params, form="pck") == (DATA / name).read_bytes()
 
 
-def test_a_part_of_a_packed_file_is_told_as_one() -> None:
+def test_an_incomplete_packed_file_has_a_note() -> None:
     from paramclient.protocol.ftp import param_pck
 
     entry = param_pck.PackedParam("A", ParamType.INT8, 1)
     file = loads(param_pck.encode([entry], total=3))
-    assert file.notes == ("The file holds 1 of the vehicle's 3 parameters.",)
+    assert file.notes == ("The file contains 1 of the vehicle's 3 parameters.",)
     assert loads(param_pck.encode_upload([entry])).notes == ()
-    assert "holds no parameter" in str(failed(param_pck.encode([])))
-    assert "no packed parameter file: the file is cut off" in str(failed(param_pck.encode([entry])[:-1]))
+    assert "contains no parameters" in str(failed(param_pck.encode([])))
+    assert "invalid packed parameter file: the file is cut off" in str(failed(param_pck.encode([entry])[:-1]))
 
 
 @pytest.mark.parametrize("table", ["px4.csv", "ardupilot.csv"])
-def test_the_tables_of_real_vehicles_go_through_other_forms(table: str) -> None:
+def test_tables_of_real_vehicles_round_trip(table: str) -> None:
     with (TABLES / table).open(encoding="utf-8") as file:
         rows = list(csv.DictReader(line for line in file if not line.startswith("#")))
     params = params_of(
@@ -374,7 +374,7 @@ def test_the_tables_of_real_vehicles_go_through_other_forms(table: str) -> None:
         )
 
 
-# scripts of PX4
+# PX4 start scripts
 
 SCRIPT = """#!/bin/sh
 # @name Generic
@@ -391,7 +391,7 @@ set MIXER quad_x
 """
 
 
-def test_a_script_is_read_for_what_it_sets_in_any_case() -> None:
+def test_a_script_gives_the_parameters_set_in_every_case() -> None:
     file = loads(SCRIPT.encode(), source="4001_quad_x")
     assert file.form is FileForm.PX4_SCRIPT
     assert [(each.name, each.value, each.comment, each.line) for each in file.sets[0].values()] == [
@@ -401,8 +401,10 @@ def test_a_script_is_read_for_what_it_sets_in_any_case() -> None:
     ]
     assert file.header == ("!/bin/sh", "@name Generic")
     (note,) = file.notes
-    assert note.startswith("Lines 3, 7, 8, 9, 10, … of the script set no parameter; what other scripts set")
-    with pytest.raises(FileError, match="are read and not written"):
+    assert note.startswith(
+        "Lines 3, 7, 8, 9, 10, … of the script set no parameter. Parameters of other scripts"
+    )
+    with pytest.raises(FileError, match="can be read but not written"):
         dumps(file)
 
 
@@ -412,24 +414,24 @@ def test_a_script_is_read_for_what_it_sets_in_any_case() -> None:
         ("param set A 1\nparam set A 2", 2, 2),
         ("param set-default A 1\nparam set-default A 2", 2, 2),
         ("param set-default A 1\nparam set A 2", 2, 2),
-        ("param set A 1\nparam set-default A 2", 1, 1),  # a default replaces no value
+        ("param set A 1\nparam set-default A 2", 1, 1),  # a default does not replace a value
         ("param set A 1\nparam set-default A 2\nparam set A 3", 3, 3),
     ],
 )
-def test_of_a_name_that_a_script_sets_twice_the_last_value_counts(lines: str, value: int, line: int) -> None:
+def test_a_script_uses_the_last_value_of_a_repeated_name(lines: str, value: int, line: int) -> None:
     file = loads(lines.encode())
     param = file.sets[0]["A"]
     assert (param.value, param.line) == (value, line)
-    assert any(f"{value} in line {line} counts, not" in note for note in file.notes)
+    assert any(f"{value} in line {line} is used, not" in note for note in file.notes)
 
 
 @pytest.mark.parametrize(
     ("lines", "line", "problem"),
     [
-        ("if [ $X ]\nthen\nparam set A 1\nfi", 3, "inside of a condition, loop or function"),
-        ("while x\ndo\n  param set A 1\ndone", 3, "inside of a condition"),
-        ("f() {\nparam set A 1\n}", 2, "inside of a condition"),
-        ("if x; then exit; fi\nparam set A 1", 2, "behind an exit"),
+        ("if [ $X ]\nthen\nparam set A 1\nfi", 3, "inside a condition, loop or function"),
+        ("while x\ndo\n  param set A 1\ndone", 3, "inside a condition"),
+        ("f() {\nparam set A 1\n}", 2, "inside a condition"),
+        ("if x; then exit; fi\nparam set A 1", 2, "after an exit"),
         ("if x; then param set A 1; fi", 1, "and nothing else"),
         ("param set A $X", 1, "without variables"),
         ("param set A ${X}", 1, "without variables"),
@@ -442,19 +444,19 @@ def test_of_a_name_that_a_script_sets_twice_the_last_value_counts(lines: str, va
         ("param set A_VERY_LONG_NAME_ 1", 1, "a param_id holds 16"),
     ],
 )
-def test_what_a_script_sets_only_perhaps_is_refused(lines: str, line: int, problem: str) -> None:
+def test_conditional_lines_of_a_script_are_rejected(lines: str, line: int, problem: str) -> None:
     error = failed(lines)
     assert (error.line, problem in str(error)) == (line, True), str(error)
 
 
-def test_a_block_that_is_over_no_longer_counts() -> None:
+def test_lines_after_a_block_are_unconditional() -> None:
     text = (
         "if x; then\nif y; then\necho\nfi\nelif z; then echo\nfi\ncase a in\nb) echo;;\nesac\nparam set A 1"
     )
     assert loads(text.encode()).sets[0]["A"].value == 1
 
 
-# look-alikes
+# Lines that resemble a parameter
 
 
 @pytest.mark.parametrize(
@@ -470,13 +472,13 @@ def test_a_block_that_is_over_no_longer_counts() -> None:
         b"A 1\nA 1.0\nB 31\n",
     ],
 )
-def test_look_alikes_of_a_list_are_read_as_meant(data: bytes) -> None:
+def test_variants_of_a_list_are_parsed(data: bytes) -> None:
     read = loads(data, source="quad.parm").sets[0]
     assert {name: param.value for name, param in read.items()} == {"A": 1, "B": 31}
 
 
-def test_a_name_that_comes_twice_with_one_value_is_told() -> None:
-    assert loads(b"A 1\nB 2\nA 1\n").notes == ("A stands with one value in line 1 and line 3.",)
+def test_a_repeated_value_has_a_note() -> None:
+    assert loads(b"A 1\nB 2\nA 1\n").notes == ("A occurs twice with the same value, in line 1 and line 3.",)
     assert loads(b"A nan\nA nan\n").notes != ()
     many = loads(b"A 1\n" * 1000).notes
     assert (len(many), many[-1]) == (21, "979 more lines repeat a name.")
@@ -486,13 +488,13 @@ def test_a_name_that_comes_twice_with_one_value_is_told() -> None:
 @pytest.mark.parametrize(
     ("text", "value", "note"),
     [
-        ("A 1\nB 5\nA 2 # new", 2, "A stands twice: 2 in line 3 counts, not 1 in line 1."),
-        ("A 0.0\nA -0.0\nB 5", -0.0, "A stands twice: -0.0 in line 2 counts, not 0.0 in line 1."),
-        ("1\t1\tA\t1\t6\n1\t1\tB\t5\t6\n1\t1\tA\t2\t6\n", 2, "2 (INT32) in line 3 counts, not 1 (INT32)"),
-        ("1\t1\tA\t1\t9\n1\t1\tB\t5\t6\n1\t1\tA\t1\t6\n", 1, "1 (INT32) in line 3 counts, not 1.0 (REAL32)"),
+        ("A 1\nB 5\nA 2 # new", 2, "A occurs twice: 2 in line 3 is used, not 1 in line 1."),
+        ("A 0.0\nA -0.0\nB 5", -0.0, "A occurs twice: -0.0 in line 2 is used, not 0.0 in line 1."),
+        ("1\t1\tA\t1\t6\n1\t1\tB\t5\t6\n1\t1\tA\t2\t6\n", 2, "2 (INT32) in line 3 is used, not 1 (INT32)"),
+        ("1\t1\tA\t1\t9\n1\t1\tB\t5\t6\n1\t1\tA\t1\t6\n", 1, "1 (INT32) in line 3 is used, not 1.0 (REAL32)"),
     ],
 )
-def test_of_a_name_that_comes_twice_the_last_value_counts(text: str, value: float, note: str) -> None:
+def test_the_last_value_of_a_repeated_name_is_used(text: str, value: float, note: str) -> None:
     file = loads(text.encode())
     params = file.sets[0]
     assert (list(params), repr(params["A"].value)) == (["A", "B"], repr(value))
@@ -500,18 +502,18 @@ def test_of_a_name_that_comes_twice_the_last_value_counts(text: str, value: floa
     assert note in told
 
 
-def test_the_last_of_three_counts_with_its_comment_and_line() -> None:
+def test_the_last_of_three_values_keeps_its_comment_and_line() -> None:
     file = loads(b"A 1 # one\nA 2 # two\nA 3 # three\n")
     param = file.sets[0]["A"]
     assert (param.value, param.comment, param.line, len(file.notes)) == (3, "three", 3, 2)
 
 
-def test_two_components_may_have_one_name() -> None:
+def test_two_components_may_have_the_same_name() -> None:
     file = loads(b"1\t1\tA\t1\t6\n1\t100\tA\t2\t6\n")
     assert ([each["A"].value for each in file.sets], file.notes) == ([1, 2], ())
 
 
-def test_what_only_ardupilot_reads_of_a_line_is_kept_as_a_comment() -> None:
+def test_readonly_is_kept_as_a_comment() -> None:
     assert loads(b"A 1 @READONLY # mine\n").sets[0]["A"].comment == "mine\n@READONLY"
 
 
@@ -520,9 +522,9 @@ def test_what_only_ardupilot_reads_of_a_line_is_kept_as_a_comment() -> None:
     [
         ("A,1,5", "expected NAME,VALUE with a decimal point (1.5, not 1,5), found 'A,1,5'"),
         ("A 1,5", "with a decimal point"),
-        ("A 1.5 m/s", "and nothing behind it (no unit, no further column)"),
+        ("A 1.5 m/s", "and nothing after it (no unit, no further column)"),
         ("A 1.5m", "with a number"),
-        ("A 1 2", "and nothing behind it"),
+        ("A 1 2", "and nothing after it"),
         ("A", "expected NAME VALUE, found 'A'"),
         ("A,", "with a number"),
         ("A;5", "expected"),
@@ -542,17 +544,17 @@ def test_what_only_ardupilot_reads_of_a_line_is_kept_as_a_comment() -> None:
         ("AÄ 2", "only printable ASCII"),
         ("A: 2", "with a parameter's name"),
         ("A_VERY_LONG_NAME_ 2", "a param_id holds 16"),
-        ("@include other.parm", "only a file on the disk can include another one"),
-        ("@include", "a line for ArduPilot's tools that is not known"),
-        ("@delete", "a line for ArduPilot's tools that is not known"),
-        ("@delete A B", "not known"),
-        ("@delete A", "the file holds no parameter"),
+        ("@include other.parm", "only a file on disk can include another file"),
+        ("@include", "an unknown instruction for ArduPilot's tools"),
+        ("@delete", "an unknown instruction for ArduPilot's tools"),
+        ("@delete A B", "an unknown instruction"),
+        ("@delete A", "the file contains no parameters"),
         ("A 1\n" + "@delete A\n" * 257, "at most 256 lines with @delete"),
         ("<html>", "expected"),
         ("hello world", "with a number"),
     ],
 )
-def test_look_alikes_that_nobody_can_be_sure_of_are_refused(text: str, problem: str) -> None:
+def test_ambiguous_lines_are_rejected(text: str, problem: str) -> None:
     assert problem in str(failed(text))
 
 
@@ -572,12 +574,12 @@ def test_look_alikes_that_nobody_can_be_sure_of_are_refused(text: str, problem: 
         ("B,1", "vehicle, component"),
     ],
 )
-def test_a_bad_row_of_qgroundcontrol_is_refused(row: str, problem: str) -> None:
+def test_an_invalid_qgroundcontrol_row_is_rejected(row: str, problem: str) -> None:
     error = failed(f"1\t1\tA\t1\t9\n{row}\n")
     assert (error.line, problem in str(error)) == (2, True), str(error)
 
 
-def test_all_bad_lines_are_listed_but_no_more_than_anyone_reads() -> None:
+def test_an_error_lists_at_most_twenty_bad_lines() -> None:
     error = failed("A 1\n" + "bad\n" * 50)
     assert str(error).splitlines()[:2] == [
         "quad.x:2: expected NAME VALUE, found 'bad'",
@@ -599,24 +601,24 @@ def test_all_bad_lines_are_listed_but_no_more_than_anyone_reads() -> None:
     ("data", "problem", "line"),
     [
         (b"", "the file is empty", None),
-        (b" \n\n", "holds no parameter", None),
-        (b"# only a comment\n", "holds no parameter", None),
+        (b" \n\n", "contains no parameters", None),
+        (b"# only a comment\n", "contains no parameters", None),
         (b"A 1\nB \xff\n", "expected UTF-8 text, found the byte 0xff", 2),
         (b"A 1\n\x00\x01", "found the character 0x00", 2),
         (b"\x7fELF\x02", "found the character 0x7f", 1),
         (b"\x1f\x8b\x08\x00", "found the byte 0x8b", 1),
-        (b"\x1b\x67\x05", "no packed parameter file", None),
+        (b"\x1b\x67\x05", "invalid packed parameter file", None),
         ("A 1\n".encode("utf-16-le"), "found the character 0x00", 1),
     ],
 )
-def test_what_is_no_parameter_file_says_so(data: bytes, problem: str, line: int | None) -> None:
+def test_other_files_are_rejected(data: bytes, problem: str, line: int | None) -> None:
     error = failed(data)
     assert (problem in str(error), error.line) == (True, line), str(error)
 
 
 @given(data=st.binary(max_size=200), form=st.sampled_from([None, *FileForm]))
 @settings(max_examples=300, deadline=None)
-def test_rubbish_leads_to_an_error_or_to_parameters(data: bytes, form: FileForm | None) -> None:
+def test_random_bytes_give_an_error_or_parameters(data: bytes, form: FileForm | None) -> None:
     try:
         file = loads(data, form=form)
     except FileError:
@@ -629,14 +631,14 @@ def test_rubbish_leads_to_an_error_or_to_parameters(data: bytes, form: FileForm 
     form=st.sampled_from(list(FileForm)),
 )
 @settings(max_examples=400, deadline=None)
-def test_so_does_rubbish_that_looks_like_something(text: str, form: FileForm) -> None:
+def test_random_text_gives_an_error_or_parameters(text: str, form: FileForm) -> None:
     try:
         loads(text.encode(), form=form)
     except FileError:
         return
 
 
-# which form
+# Format detection
 
 
 @pytest.mark.parametrize(
@@ -659,39 +661,39 @@ def test_so_does_rubbish_that_looks_like_something(text: str, form: FileForm) ->
         ("sets: [{params: {A: {value: 1}}}]\nparamclient: 1", "x.yml", "yaml"),
     ],
 )
-def test_the_content_tells_the_form(text: str, source: str, form: str) -> None:
+def test_the_content_selects_the_format(text: str, source: str, form: str) -> None:
     file = loads(text.encode(), source=source)
     assert (file.form, file.sets[0]["A"].value, file.sets[0].source) == (form, 1, source)
 
 
-def test_a_form_that_is_named_is_taken_at_its_word() -> None:
+def test_a_given_format_is_not_detected() -> None:
     assert loads(b"A 1", form="mission-planner").form is FileForm.MISSION_PLANNER
     assert "vehicle, component" in str(failed("A 1", form="qgc"))
-    with pytest.raises(UsageError, match=r"no form of file is called 'xml'; there are qgc, parm"):
+    with pytest.raises(UsageError, match=r"unknown file format 'xml'; the formats are qgc, parm"):
         loads(b"A 1", form="xml")
-    with pytest.raises(UsageError, match="a form is needed"):
+    with pytest.raises(UsageError, match="give the format in which to write"):
         dumps(params_of(WrittenParam("A", 1)))
 
 
 @pytest.mark.parametrize(
     ("text", "problem"), [("bad", "expected JSON"), ("A: 1", "paramclient: the field is missing")]
 )
-def test_the_ending_says_what_was_expected_where_the_content_does_not(text: str, problem: str) -> None:
+def test_the_extension_selects_the_error_for_unknown_content(text: str, problem: str) -> None:
     with pytest.raises(FileError, match=problem):
         loads(text.encode(), source="x.json" if text == "bad" else "x.yaml")
 
 
-# what cannot be written
+# Content that cannot be written
 
 
 @pytest.mark.parametrize(
     ("params", "form", "problem"),
     [
-        (params_of(), "parm", "there is no parameter to write"),
+        (params_of(), "parm", "there are no parameters to write"),
         (
             params_of(WrittenParam("A", 1)),
             "qgc",
-            "A has no type that MAVLink defines, and this form needs one",
+            "A has no type that MAVLink defines, and this format needs one",
         ),
         (
             params_of(WrittenParam("A", 1, ParamType.INT8), system=None),
@@ -699,14 +701,22 @@ def test_the_ending_says_what_was_expected_where_the_content_does_not(text: str,
             "the set has none: give it one",
         ),
         (params_of(WrittenParam("A", 1)), "pck", "A has no type, and a packed file holds INT8, INT16"),
-        (params_of(WrittenParam("A B", 1)), "parm", "the name 'A B' cannot stand in a line"),
-        (params_of(WrittenParam("@A", 1)), "parm", "the name '@A' cannot stand in a line"),
-        (params_of(WrittenParam("A#", 1, ParamType.INT8)), "qgc", "the name 'A#' cannot stand in a line"),
-        (params_of(WrittenParam("A=", 1)), "mission-planner", "the name 'A=' cannot stand in a line"),
+        (params_of(WrittenParam("A B", 1)), "parm", "the name 'A B' cannot be written in this format"),
+        (params_of(WrittenParam("@A", 1)), "parm", "the name '@A' cannot be written in this format"),
+        (
+            params_of(WrittenParam("A#", 1, ParamType.INT8)),
+            "qgc",
+            "the name 'A#' cannot be written",
+        ),
+        (
+            params_of(WrittenParam("A=", 1)),
+            "mission-planner",
+            "the name 'A=' cannot be written",
+        ),
         (params_of(WrittenParam("A", 300, ParamType.INT8)), "json", "300 does not fit INT8"),
     ],
 )
-def test_what_a_form_cannot_say_is_refused(params: ParamSet, form: str, problem: str) -> None:
+def test_inexpressible_content_is_rejected(params: ParamSet, form: str, problem: str) -> None:
     with pytest.raises(FileError) as caught:
         dumps(params, form=form, target="out.x")
     assert str(caught.value).startswith("out.x: ")
@@ -720,41 +730,41 @@ def test_what_a_form_cannot_say_is_refused(params: ParamSet, form: str, problem:
         (params_of(WrittenParam("A", 1), component=0), "ids from 1 to 255, not 0"),
         (params_of(WrittenParam("", 1)), "at least one character"),
         (params_of(WrittenParam("A_VERY_LONG_NAME_", 1)), "a param_id holds 16"),
-        (replace(params_of(WrittenParam("A", 1)), at=math.inf), "inf is no time in unix seconds"),
-        (replace(params_of(WrittenParam("A", 1)), at=1e300), "is no time in unix seconds"),
+        (replace(params_of(WrittenParam("A", 1)), at=math.inf), "inf is not a valid Unix time in seconds"),
+        (replace(params_of(WrittenParam("A", 1)), at=1e300), "is not a valid Unix time in seconds"),
     ],
 )
 @pytest.mark.parametrize("form", ["parm", "json", "yaml"])
-def test_what_nobody_could_read_again_is_not_written(params: ParamSet, problem: str, form: str) -> None:
+def test_unreadable_content_is_not_written(params: ParamSet, problem: str, form: str) -> None:
     with pytest.raises(FileError, match=problem):
         dumps(params, form=form)
 
 
 @pytest.mark.parametrize("form", [*PAIRS, FileForm.PCK])
-def test_a_form_for_one_component_refuses_two(form: FileForm) -> None:
+def test_a_single_component_format_rejects_two(form: FileForm) -> None:
     two = [params_of(WrittenParam("A", 1, ParamType.INT8), component=each) for each in (1, 100)]
-    with pytest.raises(FileError, match=f"the form {form} holds one component, and there are 1/1, 1/100"):
+    with pytest.raises(FileError, match=f"the format {form} holds one component, and there are 1/1, 1/100"):
         dumps(two, form=form)
 
 
-def test_two_sets_of_one_component_are_refused() -> None:
+def test_two_sets_of_one_component_are_rejected() -> None:
     two = [params_of(WrittenParam("A", 1, ParamType.INT8), component=each) for each in (1, None)]
-    with pytest.raises(FileError, match=r"two sets are of one component, 1/\?"):
+    with pytest.raises(FileError, match=r"two sets have the same component, 1/\?"):
         dumps(two, form="qgc")
 
 
-# the document
+# paramclient's own format
 
 
 @pytest.mark.parametrize(
     ("fields", "problem"),
     [
         ('"value": 1, "type": "INT8", "bits": "00000002"', "value 1 and bits 00000002 (2) contradict"),
-        ('"value": 1, "bits": "00000001"', "bits say nothing without a type"),
+        ('"value": 1, "bits": "00000001"', "bits need a type"),
         ('"value": 1, "type": "INT8", "bits": "1"', "8 or 16 hexadecimal digits"),
-        ('"value": 1, "type": "INT8", "bits": "00000101"', "more than the type has"),
-        ('"value": 1, "type": "INT9"', "no type is called 'INT9'"),
-        ('"value": 1, "type": "TYPE_3"', "no type is called 'TYPE_3'"),
+        ('"value": 1, "type": "INT8", "bits": "00000101"', "exceed the size of the type"),
+        ('"value": 1, "type": "INT9"', "unknown type 'INT9'"),
+        ('"value": 1, "type": "TYPE_3"', "unknown type 'TYPE_3'"),
         ('"value": 1, "type": 6', "found 6"),
         ('"value": 1.5, "type": "INT8"', "1.5 is not a whole number"),
         ('"value": 300, "type": "INT8"', "300 does not fit INT8"),
@@ -765,14 +775,14 @@ def test_two_sets_of_one_component_are_refused() -> None:
         ('"value": "nan"', "expected a number"),
         ('"value": [1]', "expected a number"),
         ('"value": 1e999', "beyond the range of a double"),
-        ('"value": NaN', "NaN is no JSON"),
-        ('"value": 1, "units": "m"', "no such field is known"),
+        ('"value": NaN', "NaN is not valid JSON"),
+        ('"value": 1, "units": "m"', "unknown field"),
         ('"type": "INT8"', "the field is missing"),
-        ('"value": 1, "value": 2', "'value' stands twice"),
+        ('"value": 1, "value": 2', "'value' occurs twice"),
         ('"value": 1, "comment": 5', "found 5"),
     ],
 )
-def test_a_field_that_cannot_be_right_is_refused(fields: str, problem: str) -> None:
+def test_an_invalid_field_is_rejected(fields: str, problem: str) -> None:
     error = failed(
         f'{{"paramclient": 1, "sets": [{{"params": {{"OK": {{"value": 1}}, "A": {{{fields}}}}}}}]}}'
     )
@@ -786,8 +796,8 @@ def test_a_field_that_cannot_be_right_is_refused(fields: str, problem: str) -> N
         ("{", "expected JSON"),
         ("{}", "paramclient: the field is missing"),
         ('{"paramclient": 2, "sets": []}', "paramclient"),
-        ('{"paramclient": 1, "sets": []}', "holds no parameter"),
-        ('{"paramclient": 1, "sets": [{"params": {}}]}', "holds no parameter"),
+        ('{"paramclient": 1, "sets": []}', "contains no parameters"),
+        ('{"paramclient": 1, "sets": [{"params": {}}]}', "contains no parameters"),
         ('{"paramclient": 1, "sets": [{"at": 5, "params": {}}]}', "is written as 2026"),
         ('{"paramclient": 1, "sets": [{"at": "2026-01-31T12:00:00", "params": {}}]}', "needs its zone"),
         ('{"paramclient": 1, "sets": [{"at": "soon", "params": {}}]}', "is written as 2026"),
@@ -798,22 +808,22 @@ def test_a_field_that_cannot_be_right_is_refused(fields: str, problem: str) -> N
         ('{"paramclient": 1, "sets": [{"params": {"\\u001b": {"value": 1}}}]}', "only printable ASCII"),
         (
             '{"paramclient": 1, "sets": [{"params": {"A": {"value": 1}, "A": {"value": 1}}}]}',
-            "'A' stands twice",
+            "'A' occurs twice",
         ),
-        ('{"a":' * 100_000, "nested that deep"),
+        ('{"a":' * 100_000, "nested too deep"),
         ('{"A": %s}' % ("9" * 5000), "9…' is beyond the range of every type"),
         ('{"A": %s.0}' % ("9" * 5000), "9…' is beyond the range of a double"),
     ],
 )
-def test_a_document_that_is_none_is_refused(text: str, problem: str) -> None:
+def test_an_invalid_document_is_rejected(text: str, problem: str) -> None:
     assert problem in str(failed(text))
 
 
-def test_errors_in_a_document_name_the_line_of_the_parameter() -> None:
+def test_document_errors_have_the_parameters_line() -> None:
     bad = "".join(f',\n"B{at}": {{"value": 1, "type": "?"}}' for at in range(30))
     error = failed(f'{{"paramclient": 1, "sets": [{{"params": {{\n"A": {{"value": 1}}{bad}}}}}]}}')
     lines = str(error).splitlines()
-    assert lines[0].startswith("quad.x:3: sets.0.params.B0: no type is called '?'")
+    assert lines[0].startswith("quad.x:3: sets.0.params.B0: unknown type '?'")
     assert lines[1].startswith("quad.x:4: sets.0.params.B1: ")
     assert lines[20:] == ["and 10 more"]
     assert error.line == 3
@@ -833,13 +843,13 @@ def test_errors_in_a_document_name_the_line_of_the_parameter() -> None:
         ("*a", "an alias"),
         ("[" * 30 + "]" * 30, "more than 20 levels"),
         ("9" * 5000, "9…' is beyond the range of every type"),
-        ("1, value: 2", "'value' stands twice"),
-        ("1, 2: 3", "a key that is no text"),
+        ("1, value: 2", "'value' occurs twice"),
+        ("1, 2: 3", "a key that is not text"),
         ("{", "expected YAML"),
-        ("1, <<: {}", "no such field"),
+        ("1, <<: {}", "unknown field"),
     ],
 )
-def test_traps_of_yaml_are_refused(value: str, problem: str) -> None:
+def test_ambiguous_yaml_is_rejected(value: str, problem: str) -> None:
     error = failed(f"paramclient: 1\nsets:\n- params:\n    A: {{value: {value}}}\n")
     assert problem in str(error)
 
@@ -848,35 +858,35 @@ def test_yaml_reads_numbers_as_json_does() -> None:
     rows = "".join(f"    {name}: {{value: {name[1:]}}}\n" for name in ("A1e3", "A-1.5E-3", "A0", "A-7"))
     rows += "    NO: {value: 1}\n    null: {value: 2}\n"
     text = f"# mine\nparamclient: 1\nheader: [x]\nsets:\n- params:\n{rows}"
-    with pytest.raises(FileError, match="a key that is no text"):
+    with pytest.raises(FileError, match="a key that is not text"):
         loads(text.encode())
     file = loads(text.replace("null", '"null"').encode())
     assert [param.value for param in file.sets[0].values()] == [1000.0, -0.0015, 0, -7, 1, 2]
     assert file.header == ("x",)
 
 
-def test_yaml_without_its_library_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_yaml_without_pyyaml_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("paramclient.files.document.find_spec", lambda _: None)
     data = dumps(params_of(WrittenParam("A", 1)), form="yaml")
     with pytest.raises(FileError, match=r"pip install 'paramclient\[yaml\]'"):
         loads(data)
 
 
-def test_a_file_shows_what_it_holds() -> None:
+def test_repr_of_a_param_file() -> None:
     file = loads(b"A 1", source="x.parm")
     assert repr(file) == "<ParamFile x.parm parm ?/?: 1>"
 
 
-def test_a_letter_of_a_higher_plane_in_a_header_can_be_read_again() -> None:
-    """YAML knows no surrogates, which JSON writes such letters with."""
+def test_non_bmp_characters_in_a_header_round_trip() -> None:
+    """YAML has no surrogate pairs, with which JSON escapes such characters."""
     file = loads("# for the \N{HELICOPTER} of Jo \U0004f78d\n\nRC1_MIN,1100\n".encode())
     for form in (FileForm.YAML, FileForm.JSON):
         assert loads(dumps(file, form=form)).header == file.header
 
 
-def test_lines_that_delete_look_at_so_many_parameters_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(line_formats, "DELETE_LOOKS_MAX", 5)
+def test_comparisons_of_delete_lines_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(line_formats, "DELETE_COMPARISONS_MAX", 5)
     rows = "A 1\nB 2\n"
     assert len(loads(f"{rows}@delete X\n@delete A\nC 3\n".encode(), source="a.parm").sets[0]) == 2
-    with pytest.raises(FileError, match=r"a\.parm:5: .* look at 5 parameters"):
+    with pytest.raises(FileError, match=r"a\.parm:5: .* at most 5 comparisons"):
         loads(f"{rows}@delete X\n@delete X\n@delete X\n".encode(), source="a.parm")

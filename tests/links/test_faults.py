@@ -1,4 +1,4 @@
-"""What befalls links from outside: networks that come and go, names that move, ports that others want."""
+"""External faults of links: network outages, changed addresses, ports used by other programs."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ GONE = [errno.ENETDOWN, errno.ENETUNREACH, errno.EADDRNOTAVAIL, errno.EINVAL]
 
 
 class Net:
-    """A network that can be unplugged: while it is, every datagram is refused for this reason."""
+    """A network that can be disconnected; then sending a datagram fails with the given error."""
 
     def __init__(self, patch: pytest.MonkeyPatch) -> None:
         self.reason: int | None = None
@@ -52,7 +52,7 @@ def net(monkeypatch: pytest.MonkeyPatch) -> Net:
 
 @pytest.fixture
 def names(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
-    """What names stand for: an address, or what happens when somebody asks."""
+    """Results of the resolver by name: an address, or a function that is called."""
     known: dict[str, Any] = {}
 
     async def getaddrinfo(host: str, port: int, **_: object) -> list[Any]:
@@ -74,21 +74,21 @@ def listening(host: str = "127.0.0.1", port: int = 0) -> socket.socket:
 
 
 async def failure(link: Link) -> LinkError:
-    with anyio.fail_after(PATIENCE), pytest.raises(LinkError) as caught:  # noqa: PT012 - after what has come
+    with anyio.fail_after(PATIENCE), pytest.raises(LinkError) as caught:  # noqa: PT012 - received data comes first
         while True:
             await link.receive()
     return caught.value
 
 
-# The network goes
+# Network outages
 
 
 @pytest.mark.parametrize("reason", GONE)
 @pytest.mark.asyncio
-async def test_a_network_that_is_away_for_moments_costs_what_is_sent_then(
+async def test_a_short_network_outage_loses_only_sent_datagrams(
     net: Net, reason: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(udp, "UNREACHABLE_PATIENCE", 0.0)
+    monkeypatch.setattr(udp, "UNREACHABLE_TIMEOUT", 0.0)
     with listening() as vehicle:
         link: Any = create_link(f"udpout:127.0.0.1:{vehicle.getsockname()[1]}")
         await link.open()
@@ -105,10 +105,10 @@ async def test_a_network_that_is_away_for_moments_costs_what_is_sent_then(
 @pytest.mark.parametrize("name", ["udpout:127.0.0.1:14999", "udpin:127.0.0.1:0"])
 @pytest.mark.parametrize("reason", GONE)
 @pytest.mark.asyncio
-async def test_a_socket_with_no_way_out_is_made_anew_on_its_port(
+async def test_a_socket_without_a_route_is_reopened_on_its_port(
     net: Net, name: str, reason: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(udp, "UNREACHABLE_PATIENCE", 0.0)
+    monkeypatch.setattr(udp, "UNREACHABLE_TIMEOUT", 0.0)
     link: Any = create_link(name)
     await link.open()
     address = link.address
@@ -126,7 +126,7 @@ async def test_a_socket_with_no_way_out_is_made_anew_on_its_port(
 
             tasks.start_soon(wait)
             await anyio.lowlevel.checkpoint()
-            with pytest.raises(LinkError, match=r"no way out from 127\.0\.0\.1 any more: ") as caught:
+            with pytest.raises(LinkError, match=r"no route from 127\.0\.0\.1 any more: ") as caught:
                 await link.send(b"2", None)
         assert str(errors[0]) == str(caught.value)
         assert isinstance(caught.value.__cause__, OSError)
@@ -138,9 +138,9 @@ async def test_a_socket_with_no_way_out_is_made_anew_on_its_port(
 
 
 @pytest.mark.asyncio
-async def test_a_socket_for_every_address_needs_no_other(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Linux sends with the address that it has by then."""
-    monkeypatch.setattr(udp, "UNREACHABLE_PATIENCE", 0.0)
+async def test_a_socket_for_every_address_is_not_reopened(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Linux sends with the current address of the computer."""
+    monkeypatch.setattr(udp, "UNREACHABLE_TIMEOUT", 0.0)
     link: Any = create_link("udpin:0.0.0.0:0")
     await link.open()
     with listening() as vehicle:
@@ -156,9 +156,9 @@ async def test_a_socket_for_every_address_needs_no_other(net: Net, monkeypatch: 
 
 
 @pytest.mark.asyncio
-async def test_an_address_that_goes_and_comes_back(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A whole session: `udpin` on an address that this computer loses for a while."""
-    monkeypatch.setattr(udp, "UNREACHABLE_PATIENCE", 0.0)
+async def test_an_address_that_is_lost_and_restored(net: Net, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A complete session: `udpin` on an address that this computer loses for a while."""
+    monkeypatch.setattr(udp, "UNREACHABLE_TIMEOUT", 0.0)
     monkeypatch.setattr(link_task, "FIRST_BACKOFF", 0.01)
     is_gone = [False]
     bind = udp.UdpIn._open
@@ -189,8 +189,8 @@ async def test_an_address_that_goes_and_comes_back(net: Net, monkeypatch: pytest
 
 @pytest.mark.parametrize("kind", ["udpin", "udpout"])
 @pytest.mark.asyncio
-async def test_a_socket_that_fails_is_opened_again(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever the system says; and what is only the answer to an earlier datagram is passed over."""
+async def test_a_failed_socket_is_reopened(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """For every error of the operating system; delayed errors of earlier datagrams are skipped."""
     script: list[int] = []
 
     class Faulty(socket.socket):
@@ -219,14 +219,14 @@ async def test_a_socket_that_fails_is_opened_again(kind: str, monkeypatch: pytes
         await link.close()
 
 
-# A name gets another address
+# Changed addresses of a host name
 
 
 @pytest.mark.asyncio
-async def test_udpout_follows_a_name_while_nothing_comes(
+async def test_udpout_resolves_a_silent_name_again(
     names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(udp, "LOOK_AGAIN", 0.02)
+    monkeypatch.setattr(udp, "RESOLVE_INTERVAL", 0.02)
     names["drone"] = "127.0.0.1"
     with listening() as before, listening("127.0.0.2", before.getsockname()[1]) as after:
         link: Any = create_link(f"udpout:drone:{before.getsockname()[1]}")
@@ -235,7 +235,7 @@ async def test_udpout_follows_a_name_while_nothing_comes(
         await link.send(HEARTBEAT, None)
         before.recv(100)
         names["drone"] = "127.0.0.2"
-        assert str(await failure(link)) == f"{link.name}: drone is at 127.0.0.2 now"
+        assert str(await failure(link)) == f"{link.name}: the address of drone changed to 127.0.0.2"
         await link.open()
         assert link.address[1] == local
         await link.send(HEARTBEAT, None)
@@ -244,10 +244,10 @@ async def test_udpout_follows_a_name_while_nothing_comes(
 
 
 @pytest.mark.asyncio
-async def test_a_name_that_nobody_knows_for_a_while_changes_nothing(
+async def test_a_temporary_resolver_failure_changes_nothing(
     names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(udp, "LOOK_AGAIN", 0.01)
+    monkeypatch.setattr(udp, "RESOLVE_INTERVAL", 0.01)
     asked = anyio.Event()
 
     async def unknown() -> str:
@@ -274,10 +274,10 @@ async def test_a_name_that_nobody_knows_for_a_while_changes_nothing(
 
 
 @pytest.mark.asyncio
-async def test_what_comes_does_not_wait_for_a_slow_resolver(
+async def test_a_slow_resolver_does_not_delay_received_data(
     names: dict[str, Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(udp, "LOOK_AGAIN", 0.01)
+    monkeypatch.setattr(udp, "RESOLVE_INTERVAL", 0.01)
     with listening() as far:
 
         async def slow() -> str:
@@ -295,7 +295,7 @@ async def test_what_comes_does_not_wait_for_a_slow_resolver(
 
 
 @pytest.mark.asyncio
-async def test_tcp_asks_for_a_name_at_each_opening(names: dict[str, Any]) -> None:
+async def test_tcp_resolves_a_name_at_each_opening(names: dict[str, Any]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as before:
         port = before.getsockname()[1]
         with socket.create_server(("127.0.0.2", port)) as after:
@@ -311,22 +311,22 @@ async def test_tcp_asks_for_a_name_at_each_opening(names: dict[str, Any]) -> Non
             await link.close()
 
 
-# Others want the port
+# Ports used by other programs
 
 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin", "udpout"])
 @pytest.mark.parametrize("theirs", ["127.0.0.1", "0.0.0.0"])
 @pytest.mark.parametrize("options", [[socket.SO_REUSEADDR], [socket.SO_REUSEADDR, socket.SO_REUSEPORT]])
 @pytest.mark.asyncio
-async def test_nobody_gets_a_port_that_we_have(kind: str, theirs: str, options: list[int]) -> None:
-    """Two programs on one port would each get a part of what comes, or the wrong one all of it."""
+async def test_no_program_can_share_an_open_port(kind: str, theirs: str, options: list[int]) -> None:
+    """Two programs on one port would each receive a part of the data, or the wrong one all of it."""
     link: Any = create_link(f"{kind}:127.0.0.1:{14999 if kind == 'udpout' else 0}")
     await link.open()
     transport = socket.SOCK_STREAM if kind == "tcpin" else socket.SOCK_DGRAM
     with socket.socket(socket.AF_INET, transport) as other:
         for option in options:
             other.setsockopt(socket.SOL_SOCKET, option, 1)
-        with pytest.raises(OSError, match="Address already in use"):  # noqa: PT012 - it may let itself be bound
+        with pytest.raises(OSError, match="Address already in use"):  # noqa: PT012 - binding may succeed
             other.bind((theirs, link.address[1]))
             other.listen()
     await link.close()
@@ -335,7 +335,7 @@ async def test_nobody_gets_a_port_that_we_have(kind: str, theirs: str, options: 
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
 @pytest.mark.parametrize("ours", ["127.0.0.1", "0.0.0.0"])
 @pytest.mark.asyncio
-async def test_nor_do_we_get_one_that_others_would_share(kind: str, ours: str) -> None:
+async def test_a_port_that_others_would_share_is_in_use(kind: str, ours: str) -> None:
     transport = socket.SOCK_STREAM if kind == "tcpin" else socket.SOCK_DGRAM
     with socket.socket(socket.AF_INET, transport) as other:
         for option in (socket.SO_REUSEADDR, socket.SO_REUSEPORT):
@@ -348,7 +348,7 @@ async def test_nor_do_we_get_one_that_others_would_share(kind: str, ours: str) -
             await create_link(f"{kind}:{ours}:{port}").open()
 
 
-# Listening where one file cannot stand for many sockets, as on Windows
+# Selectors without a file descriptor, as on Windows
 
 
 @pytest.fixture
@@ -358,7 +358,7 @@ def without_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("without_a_file")
 @pytest.mark.asyncio
-async def test_tcpin_hears_all_of_its_clients() -> None:
+async def test_tcpin_receives_from_all_connections_without_a_selector_file() -> None:
     link: Any = create_link("tcpin:127.0.0.1:0")
     await link.open()
     clients = [socket.create_connection(link.address, timeout=PATIENCE) for _ in range(3)]
@@ -393,7 +393,7 @@ async def test_tcpin_hears_all_of_its_clients() -> None:
 
 @pytest.mark.usefixtures("without_a_file")
 @pytest.mark.asyncio
-async def test_a_session_over_such_a_listener() -> None:
+async def test_a_session_over_a_listener_without_a_selector_file() -> None:
     vehicle = generic(stream=True, burst=50, period=0.001)
     with anyio.fail_after(PATIENCE):
         async with a_client("tcpin:127.0.0.1:0") as client, anyio.create_task_group() as tasks:
@@ -405,11 +405,11 @@ async def test_a_session_over_such_a_listener() -> None:
             tasks.cancel_scope.cancel()
 
 
-# An event loop that cannot wait for sockets, as that of Windows
+# Event loops without socket readiness, as on Windows
 
 
 class BlindLoop(asyncio.SelectorEventLoop):
-    """anyio then waits for them in a thread of its own."""
+    """A loop without `add_reader`; anyio then waits for sockets in a thread of its own."""
 
 
 def not_there(*_: object) -> None:
@@ -422,7 +422,7 @@ for name in ("add_reader", "add_writer", "remove_reader", "remove_writer"):
 
 @pytest.mark.usefixtures("without_a_file")
 @pytest.mark.parametrize(("ours", "theirs"), [("udpin", "udpout"), ("tcpin", "tcp"), ("tcp", "tcpin")])
-def test_a_session_on_a_loop_that_cannot_wait_for_sockets(ours: str, theirs: str) -> None:
+def test_a_session_on_a_loop_without_socket_readiness(ours: str, theirs: str) -> None:
     async def session() -> None:
         vehicle = generic(stream="tcp" in ours, burst=50, period=0.001)
         with anyio.fail_after(PATIENCE):

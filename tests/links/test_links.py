@@ -1,4 +1,4 @@
-"""Links: names, sockets on loopback, simulated vehicles in the process and on the wire."""
+"""Links: names, sockets on loopback, simulated vehicles in the process and on real links."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.cable import Cable
 
 HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
-PATIENCE = 20.0  # seconds after which a test gives up; nothing waits that long when all is well
+PATIENCE = 20.0  # seconds after which a test fails; a passing test never waits that long
 RMEM_MAX = int(Path("/proc/sys/net/core/rmem_max").read_text())
 
 
 def frame(number: int) -> bytes:
-    """A PARAM_VALUE that differs from every other by its index."""
+    """Return a PARAM_VALUE with this index."""
     value = wire.ParamValue("SYS_AUTOSTART", bytes(4), 6, 2000, number)
     return wire.encode(value, system=1, component=1, sequence=number % 256)
 
@@ -58,7 +58,7 @@ def open_files() -> int:
 
 
 async def collect(link: Link, count: int) -> list[tuple[Peer, bytes]]:
-    """Receive until so many chunks have come."""
+    """Receive until this many chunks have arrived."""
     found: list[tuple[Peer, bytes]] = []
     with anyio.fail_after(PATIENCE):
         while len(found) < count:
@@ -68,7 +68,7 @@ async def collect(link: Link, count: int) -> list[tuple[Peer, bytes]]:
 
 @asynccontextmanager
 async def opened(name: str) -> AsyncIterator[Any]:
-    """A link by its name, open. `Any`, because tests also look at what only some kinds have."""
+    """Open a link. `Any`, because tests also use attributes of single kinds."""
     link = create_link(name)
     await link.open()
     try:
@@ -79,7 +79,7 @@ async def opened(name: str) -> AsyncIterator[Any]:
 
 @contextmanager
 def udp_socket(to: tuple[str, int] | None = None, *, host: str = "127.0.0.1") -> Iterator[socket.socket]:
-    """The far side on UDP: bound to a port of its own, blocking, connected where an address is given."""
+    """The remote side on UDP: a blocking socket with its own port, connected if an address is given."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_DGRAM) as sock:
         sock.bind((host, 0))
@@ -115,7 +115,7 @@ LOOPBACKS = ["127.0.0.1", *(["::1"] if ipv6_works() else [])]
 
 @dataclass
 class Post:
-    """An endpoint that hands over what the test puts in, and keeps what it is given. Looks every ms."""
+    """An endpoint that sends the test's data and records received data; polls every millisecond."""
 
     inbox: list[bytes] = field(default_factory=list)
     outbox: list[bytes] = field(default_factory=list)
@@ -143,7 +143,7 @@ class Post:
 
 @asynccontextmanager
 async def connected(kind: str) -> AsyncIterator[tuple[Any, Any]]:
-    """An open link of a kind, and its far side (a socket or a `Post`); each has heard of the other."""
+    """Open a link of a kind and its remote side (a socket or a `Post`), after both have exchanged data."""
     with ExitStack() as stack:
         far: Any
         link: Any
@@ -182,7 +182,7 @@ async def connected(kind: str) -> AsyncIterator[tuple[Any, Any]]:
 
 
 def stream_of(far: Any, size: int) -> bytes:
-    """So many bytes, and what comes with the last of them; a stream gives them in pieces of any size."""
+    """Receive this many bytes, and all data of the last receive; a stream may split them anywhere."""
     heard = b""
     while len(heard) < size:
         heard += far.recv(1000)
@@ -193,7 +193,7 @@ KINDS = ["udpin", "udpout", "tcp", "tcpin", "serial", "sim"]
 
 
 def answer_with(patch: pytest.MonkeyPatch, *addresses: tuple[socket.AddressFamily, str, int]) -> None:
-    """Let every host name have these addresses."""
+    """Make the resolver return these addresses for every host name."""
 
     async def getaddrinfo(*_: object, **__: object) -> list[Any]:
         return [(family, 0, 0, "", (host, port)) for family, host, port in addresses]
@@ -275,7 +275,7 @@ def test_every_spelling_has_one_canonical_name(text: str, name: str) -> None:
     assert parse_link(name) == spec
 
 
-def test_a_spec_tells_what_the_name_says() -> None:
+def test_a_spec_has_the_parts_of_the_name() -> None:
     assert parse_link("udpout://[FE80::2]:14550") == LinkSpec(LinkKind.UDPOUT, "fe80::2", 14550)
     assert parse_link("COM5:115200") == LinkSpec(LinkKind.SERIAL, "COM5", 115200)
     assert parse_link("sim:px4?seed=3&loss=0.5").options == (("loss", 0.5), ("seed", 3))
@@ -284,38 +284,38 @@ def test_a_spec_tells_what_the_name_says() -> None:
 @pytest.mark.parametrize(
     ("text", "problem"),
     [
-        ("", "no kind of link"),
-        ("14550", "no kind of link"),
-        ("udpin", "no kind of link"),
-        ("vehicle.params", "no kind of link"),
-        ("/home/me/vehicle.params", "no kind of link"),
-        ("./px4:1", "no kind of link"),
-        ("http://127.0.0.1:80", "a service has links and is none"),
-        ("mavlink:px4", "'mavlink' is no|is no port"),
+        ("", "kind of link is missing"),
+        ("14550", "kind of link is missing"),
+        ("udpin", "kind of link is missing"),
+        ("vehicle.params", "kind of link is missing"),
+        ("/home/me/vehicle.params", "kind of link is missing"),
+        ("./px4:1", "kind of link is missing"),
+        ("http://127.0.0.1:80", "this is the address of a service"),
+        ("mavlink:px4", "'mavlink' is not|is not a port"),
         ("udpin:", "port is missing"),
         ("udpin:0.0.0.0", "port is missing"),
         ("udpin:0.0.0.0:", "port is missing"),
-        ("udpin:0.0.0.0:65536", "'65536' is no port"),
-        ("udpin:0.0.0.0:-1", "'-1' is no port"),
-        ("udpin:0.0.0.0:+5", "is no port"),
-        ("udpin:0.0.0.0:١٢", "is no port"),
-        ("udpin:٣", "is no port"),
+        ("udpin:0.0.0.0:65536", "'65536' is not a port"),
+        ("udpin:0.0.0.0:-1", "'-1' is not a port"),
+        ("udpin:0.0.0.0:+5", "is not a port"),
+        ("udpin:0.0.0.0:١٢", "is not a port"),
+        ("udpin:٣", "is not a port"),
         ("udpout:14550", "host is missing"),
         ("udpout::14550", "host is missing"),
-        ("udpout:10.0.0.1:0", "ports go from 1"),
+        ("udpout:10.0.0.1:0", "ports are 1"),
         ("tcp:14550", "host is missing"),
         ("tcp://:5760", "host is missing"),
-        ("udpin:::1:14550", "stands in brackets"),
-        ("udpin:[::g]:14550", "'::g' is no IPv6 address"),
-        ("udpin:[127.0.0.1]:14550", "is no IPv6 address"),
-        ("udpout:256.0.0.1:14550", "is no IPv4 address"),
-        ("udpout:10.1:14550", "is no IPv4 address"),
-        ("udpout:-x:14550", "is no host name"),
-        ("udpout:a..b:14550", "is no host name"),
-        (f"udpout:{'a' * 64}:14550", "is no host name"),
-        (f"udpout:{'a.' * 127}a:14550", "is no host name"),
-        ("udpout:me@host:14550", "is no host name"),
-        ("udpin:0.0.0.0:14550/", "is no port"),
+        ("udpin:::1:14550", "in brackets"),
+        ("udpin:[::g]:14550", "'::g' is not an IPv6 address"),
+        ("udpin:[127.0.0.1]:14550", "is not an IPv6 address"),
+        ("udpout:256.0.0.1:14550", "is not an IPv4 address"),
+        ("udpout:10.1:14550", "is not an IPv4 address"),
+        ("udpout:-x:14550", "is not a host name"),
+        ("udpout:a..b:14550", "is not a host name"),
+        (f"udpout:{'a' * 64}:14550", "is not a host name"),
+        (f"udpout:{'a.' * 127}a:14550", "is not a host name"),
+        ("udpout:me@host:14550", "is not a host name"),
+        ("udpin:0.0.0.0:14550/", "is not a port"),
         ("serial:ttyACM0:57600", "a device and a baud rate"),
         ("serial:/dev/tty ACM0", "a device and a baud rate"),
         ("/dev/ttyACM0:0", "from 300 to 20000000"),
@@ -324,9 +324,9 @@ def test_a_spec_tells_what_the_name_says() -> None:
         ("sim:", "px4 and ardupilot"),
         ("sim:ardupilot4", "px4 and ardupilot"),
         ("sim:px4?loss", "NAME=VALUE"),
-        ("sim:px4?colour=red", "'colour' is no option"),
+        ("sim:px4?colour=red", "'colour' is not an option"),
         ("sim:px4?loss=0.1&loss=0.2", "given twice"),
-        ("sim:px4?loss=", "no number"),
+        ("sim:px4?loss=", "not a number"),
         ("sim:px4?loss=1.1", "from 0 to 1"),
         ("sim:px4?loss=nan", "from 0 to 1"),
         ("sim:px4?delay=-1", "from 0 to 3600"),
@@ -337,16 +337,16 @@ def test_a_spec_tells_what_the_name_says() -> None:
         ("sim:px4?param_error=yes", "from 0 to 1"),
     ],
 )
-def test_a_bad_name_says_what_is_wrong_and_which_forms_exist(text: str, problem: str) -> None:
+def test_an_invalid_name_gives_the_problem_and_the_accepted_forms(text: str, problem: str) -> None:
     with pytest.raises(UsageError, match=problem) as caught:
         parse_link(text)
     for form in ("udpin:HOST:PORT", "udpout:", "tcp:", "tcpin:", "serial:", "sim:px4", "sim:ardupilot"):
         assert form in str(caught.value)
 
 
-def test_a_name_is_a_string_and_a_long_one_is_cut_in_the_error() -> None:
+def test_a_name_is_a_string_and_long_names_are_shortened_in_errors() -> None:
     with pytest.raises(UsageError, match="not int"):
-        parse_link(14550)  # type: ignore[arg-type]  # what is tested
+        parse_link(14550)  # type: ignore[arg-type]  # invalid on purpose
     with pytest.raises(UsageError) as caught:
         parse_link("x" * 100_000)
     assert len(str(caught.value)) < 2000
@@ -373,15 +373,15 @@ def test_any_text_is_a_link_or_a_usage_error(text: str) -> None:
 # Making links
 
 
-def test_what_is_a_link_already_is_taken_as_it_is() -> None:
+def test_create_link_returns_links_unchanged() -> None:
     link = SimLink(Post(), "sim:mine")
     assert create_link(link) is link
     assert isinstance(create_link(parse_link("udpin:14550")), Link)
     wrapped = create_link(PX4Vehicle())
     assert isinstance(wrapped, SimLink)
     assert wrapped.name == "sim:custom"
-    with pytest.raises(UsageError, match="not by object"):
-        create_link(object())  # type: ignore[arg-type]  # what is tested
+    with pytest.raises(UsageError, match="not as object"):
+        create_link(object())  # type: ignore[arg-type]  # invalid on purpose
 
 
 @pytest.mark.parametrize(
@@ -395,7 +395,7 @@ def test_what_is_a_link_already_is_taken_as_it_is() -> None:
         ("sim:px4", False, False),
     ],
 )
-def test_a_link_tells_its_kind(name: str, is_stream: bool, reconnects: bool) -> None:
+def test_properties_of_link_kinds(name: str, is_stream: bool, reconnects: bool) -> None:
     link = create_link(name)
     assert (link.name, link.is_stream, link.reconnects) == (name, is_stream, reconnects)
     assert repr(link).endswith(f"{name} closed>")
@@ -412,12 +412,12 @@ def test_the_simulators_are_imported_only_for_sim_links() -> None:
     subprocess.run([sys.executable, "-c", code], check=True)
 
 
-# What all kinds have in common
+# All kinds of links
 
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", KINDS)
-async def test_bytes_go_both_ways(kind: str) -> None:
+async def test_bytes_in_both_directions(kind: str) -> None:
     async with connected(kind) as (link, far):
         far.send(frame(1))
         [(peer, data)] = await collect(link, 1)
@@ -444,7 +444,7 @@ async def test_closing_wakes_the_receiver(kind: str) -> None:
             failures.append(caught.value)
 
         tasks.start_soon(receive)
-        for _ in range(10):  # the simulated end never lets all tasks come to rest
+        for _ in range(10):  # the simulated vehicle keeps tasks running
             await anyio.lowlevel.checkpoint()
         await link.close()
         with anyio.fail_after(PATIENCE):
@@ -455,7 +455,7 @@ async def test_closing_wakes_the_receiver(kind: str) -> None:
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", KINDS)
-async def test_a_closed_link_says_so_and_can_be_closed_again(kind: str) -> None:
+async def test_a_closed_link_raises_and_can_be_closed_again(kind: str) -> None:
     async with connected(kind) as (link, _):
         await link.close()
         await link.close()
@@ -467,7 +467,7 @@ async def test_a_closed_link_says_so_and_can_be_closed_again(kind: str) -> None:
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", KINDS)
-async def test_nothing_is_left_behind(kind: str) -> None:
+async def test_closing_leaves_no_descriptor_or_task(kind: str) -> None:
     await anyio.lowlevel.checkpoint()
     files, threads = open_files(), threading.enumerate()
     async with connected(kind) as (link, _):
@@ -482,7 +482,7 @@ async def test_nothing_is_left_behind(kind: str) -> None:
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", KINDS)
-async def test_a_receive_that_is_cancelled_at_any_moment_loses_nothing(kind: str) -> None:
+async def test_a_cancelled_receive_loses_nothing(kind: str) -> None:
     steps = 6
     sent: list[bytes] = []
     got: list[bytes] = []
@@ -510,7 +510,7 @@ async def test_a_receive_that_is_cancelled_at_any_moment_loses_nothing(kind: str
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", KINDS)
-async def test_a_send_that_is_cancelled_at_any_moment_sends_all_or_nothing(kind: str) -> None:
+async def test_a_cancelled_send_sends_all_or_nothing(kind: str) -> None:
     async with connected(kind) as (link, far):
         done: list[int] = []
 
@@ -532,7 +532,7 @@ async def test_a_send_that_is_cancelled_at_any_moment_sends_all_or_nothing(kind:
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", KINDS)
-async def test_an_open_that_is_cancelled_at_any_moment_leaves_nothing_and_can_be_repeated(kind: str) -> None:
+async def test_a_cancelled_open_leaves_nothing_and_can_be_repeated(kind: str) -> None:
     await anyio.lowlevel.checkpoint()
     files = open_files()
     async with connected(kind) as (link, _):
@@ -555,7 +555,7 @@ async def test_an_open_that_is_cancelled_at_any_moment_leaves_nothing_and_can_be
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("host", LOOPBACKS)
-async def test_udp_both_kinds_speak_to_each_other(host: str) -> None:
+async def test_udpin_and_udpout_communicate(host: str) -> None:
     shown = f"[{host}]" if ":" in host else host
     async with (
         opened(f"udpin:{shown}:0") as station,
@@ -578,8 +578,8 @@ async def test_udp_both_kinds_speak_to_each_other(host: str) -> None:
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("host", LOOPBACKS)
-async def test_one_address_is_spoken_to_from_one_port_in_each_session(host: str) -> None:
-    """PX4 answers only the address and port that it heard first."""
+async def test_udpout_uses_the_same_local_port_in_each_session(host: str) -> None:
+    """PX4 responds only to the first address and port from which it received data."""
     shown = f"[{host}]" if ":" in host else host
     async with opened(f"udpin:{shown}:0") as near, opened(f"udpin:{shown}:0") as far:
         name = f"udpout:{shown}:{near.address[1]}"
@@ -594,7 +594,7 @@ async def test_one_address_is_spoken_to_from_one_port_in_each_session(host: str)
 
 
 @pytest.mark.asyncio
-async def test_a_host_name_is_looked_up() -> None:
+async def test_a_host_name_is_resolved() -> None:
     async with opened("udpin:localhost:0") as link, opened(f"udpout:localhost:{link.address[1]}") as far:
         assert link.address[0] == "127.0.0.1"
         await far.send(HEARTBEAT, None)
@@ -602,7 +602,7 @@ async def test_a_host_name_is_looked_up() -> None:
 
 
 @pytest.mark.asyncio
-async def test_a_host_is_taken_by_its_ipv4_address(
+async def test_ipv4_addresses_are_preferred(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     answer_with(monkeypatch, (socket.AF_INET6, "::1", 0), (socket.AF_INET, "127.0.0.1", 0))
@@ -612,7 +612,7 @@ async def test_a_host_is_taken_by_its_ipv4_address(
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["udpin", "udpout", "tcp", "tcpin"])
-async def test_a_host_that_does_not_exist_is_a_link_error(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_unknown_host_is_a_link_error(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     async def getaddrinfo(*_: object, **__: object) -> None:
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
@@ -623,7 +623,7 @@ async def test_a_host_that_does_not_exist_is_a_link_error(kind: str, monkeypatch
 
 
 @pytest.mark.asyncio
-async def test_udpin_speaks_to_every_vehicle_that_has_spoken() -> None:
+async def test_udpin_sends_to_every_known_vehicle() -> None:
     async with opened("udpin:127.0.0.1:0") as link:
         await link.send(HEARTBEAT, None)
         with (
@@ -652,8 +652,8 @@ async def test_udpin_speaks_to_every_vehicle_that_has_spoken() -> None:
 
 
 @pytest.mark.asyncio
-async def test_udpin_forgets_who_was_silent_for_longest(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(udp, "PEERS", 3)
+async def test_udpin_forgets_the_address_silent_for_longest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(udp, "PEERS_MAX", 3)
     async with opened("udpin:127.0.0.1:0") as link:
         with ExitStack() as stack:
             far = [stack.enter_context(udp_socket(link.address)) for _ in range(4)]
@@ -674,7 +674,7 @@ TELEMETRY = wire.build_frame(30, bytes(range(1, 29)), system=1, component=1, seq
 
 
 async def got(sock: socket.socket) -> list[bytes]:
-    """What has come to a socket."""
+    """Return all data that a socket has received."""
     sock.setblocking(False)
     came = []
     with suppress(BlockingIOError):
@@ -685,7 +685,7 @@ async def got(sock: socket.socket) -> list[bytes]:
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("junk", [b"\xfd\xfe and so on", HEARTBEAT[:-1] + b"\0", b"\xfd" * 300])
-async def test_udpin_learns_nobody_from_bytes_that_are_no_frame(junk: bytes) -> None:
+async def test_udpin_ignores_senders_of_invalid_bytes(junk: bytes) -> None:
     async with opened("udpin:127.0.0.1:0") as link:
         with udp_socket(link.address) as odd, udp_socket(link.address) as vehicle:
             odd.send(junk)
@@ -697,7 +697,7 @@ async def test_udpin_learns_nobody_from_bytes_that_are_no_frame(junk: bytes) -> 
 
 
 @pytest.mark.asyncio
-async def test_udpin_forgets_whoever_sends_no_valid_frame_for_a_minute(
+async def test_udpin_forgets_senders_without_valid_frames_for_a_minute(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     async with opened("udpin:127.0.0.1:0") as link:
@@ -706,19 +706,19 @@ async def test_udpin_forgets_whoever_sends_no_valid_frame_for_a_minute(
                 sock.send(HEARTBEAT)
             await collect(link, 2)
             now = anyio.current_time()
-            monkeypatch.setattr(anyio, "current_time", lambda: now + udp.PEER_SILENCE - 1)
+            monkeypatch.setattr(anyio, "current_time", lambda: now + udp.PEER_TIMEOUT - 1)
             one.send(HEARTBEAT)
             two.send(b"\xfd and so on")
             await collect(link, 2)
             await link.send(frame(1), None)
-            monkeypatch.setattr(anyio, "current_time", lambda: now + udp.PEER_SILENCE + 1)
+            monkeypatch.setattr(anyio, "current_time", lambda: now + udp.PEER_TIMEOUT + 1)
             await link.send(frame(2), None)
             assert await got(one) == [frame(1), frame(2)]
             assert await got(two) == [frame(1)]
 
 
 @pytest.mark.asyncio
-async def test_those_without_heartbeats_share_one_of_ours_a_second(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_peers_without_heartbeats_share_a_heartbeat(monkeypatch: pytest.MonkeyPatch) -> None:
     async with opened("udpin:127.0.0.1:0") as link:
         with ExitStack() as stack:
             vehicle, *strangers = [stack.enter_context(udp_socket(link.address)) for _ in range(4)]
@@ -727,7 +727,7 @@ async def test_those_without_heartbeats_share_one_of_ours_a_second(monkeypatch: 
                 sock.send(TELEMETRY)
             await collect(link, 4)
             began = anyio.current_time()
-            for step in range(40):  # four a second, in ten seconds
+            for step in range(40):  # four per second, for ten seconds
                 at = began + step / 4
                 monkeypatch.setattr(anyio, "current_time", lambda at=at: at)
                 await link.send(HEARTBEAT, None)
@@ -743,10 +743,10 @@ async def test_those_without_heartbeats_share_one_of_ours_a_second(monkeypatch: 
 
 
 @pytest.mark.asyncio
-async def test_strangers_take_no_place_from_those_that_send_heartbeats(
+async def test_peers_with_heartbeats_are_kept_before_others(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(udp, "PEERS", 3)
+    monkeypatch.setattr(udp, "PEERS_MAX", 3)
     async with opened("udpin:127.0.0.1:0") as link:
         with ExitStack() as stack:
             vehicle = stack.enter_context(udp_socket(link.address))
@@ -761,7 +761,7 @@ async def test_strangers_take_no_place_from_those_that_send_heartbeats(
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
-async def test_a_busy_port_is_a_link_error_until_it_is_free(kind: str) -> None:
+async def test_a_port_in_use_is_a_link_error_until_it_is_free(kind: str) -> None:
     async with opened(f"{kind}:127.0.0.1:0") as first:
         second = create_link(f"{kind}:127.0.0.1:{first.address[1]}")
         files = open_files()
@@ -780,13 +780,13 @@ async def test_a_busy_port_is_a_link_error_until_it_is_free(kind: str) -> None:
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["udpin", "tcpin"])
-async def test_only_own_addresses_can_be_listened_on(kind: str) -> None:
-    with pytest.raises(LinkError, match=r"192\.0\.2\.1 is no address of this computer"):
+async def test_listening_needs_an_address_of_this_computer(kind: str) -> None:
+    with pytest.raises(LinkError, match=r"192\.0\.2\.1 is not an address of this computer"):
         await create_link(f"{kind}:192.0.2.1:0").open()
 
 
 @pytest.mark.asyncio
-async def test_udpout_hears_its_target_alone_and_keeps_its_port() -> None:
+async def test_udpout_receives_only_from_its_target_and_keeps_its_port() -> None:
     with udp_socket() as vehicle:
         async with opened(f"udpout:127.0.0.1:{vehicle.getsockname()[1]}") as link:
             with udp_socket(link.address) as stranger:
@@ -801,7 +801,7 @@ async def test_udpout_hears_its_target_alone_and_keeps_its_port() -> None:
 
 
 @pytest.mark.asyncio
-async def test_udpout_may_be_there_before_its_vehicle() -> None:
+async def test_udpout_may_start_before_its_vehicle() -> None:
     port = free_udp_port()
     async with opened(f"udpout:127.0.0.1:{port}") as link, anyio.create_task_group() as tasks:
         got: list[tuple[Peer, bytes]] = []
@@ -811,7 +811,7 @@ async def test_udpout_may_be_there_before_its_vehicle() -> None:
 
         tasks.start_soon(receive)
         for _ in range(3):
-            await link.send(HEARTBEAT, None)  # the system's answer to each is "connection refused"
+            await link.send(HEARTBEAT, None)  # each causes "connection refused"
             await anyio.wait_all_tasks_blocked()
         tasks.cancel_scope.cancel()
     assert got == []
@@ -821,14 +821,14 @@ async def test_udpout_may_be_there_before_its_vehicle() -> None:
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
             vehicle.bind(("127.0.0.1", port))
             vehicle.settimeout(PATIENCE)
-            await link.send(frame(2), None)  # must not be swallowed by the refusal of the first
+            await link.send(frame(2), None)  # must not be lost with the error of the first
             assert vehicle.recv(1000) == frame(2)
             vehicle.sendto(frame(3), link.address)
             assert [data for _, data in await collect(link, 1)] == [frame(3)]
 
 
 @pytest.mark.asyncio
-async def test_udpout_to_a_broadcast_address_hears_everyone() -> None:
+async def test_udpout_to_a_broadcast_address_receives_from_everyone() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
         vehicle.bind(("0.0.0.0", 0))
         vehicle.settimeout(PATIENCE)
@@ -859,8 +859,8 @@ async def test_a_burst_waits_for_a_late_reader(kind: str) -> None:
             await anyio.wait_all_tasks_blocked()
             for number in range(count):
                 far.send(frame(number))
-            time.sleep(0.1)  # noqa: ASYNC251 - the event loop itself is late
-            # Where the system grants less than was asked for, as much as fits must still be there.
+            time.sleep(0.1)  # noqa: ASYNC251 - blocks the event loop on purpose
+            # If the system grants a smaller buffer, the datagrams that fit must still be received.
             whole = link.receive_buffer >= udp.RECEIVE_BUFFER
             expected = count if whole else min(count, link.receive_buffer // 1280)
             with anyio.fail_after(PATIENCE):
@@ -875,11 +875,11 @@ async def test_the_receive_buffer_is_as_large_as_the_system_allows() -> None:
     async with opened("udpin:127.0.0.1:0") as link:
         assert link.receive_buffer >= 2 * min(
             RMEM_MAX, udp.RECEIVE_BUFFER
-        )  # Linux doubles what it is asked for
+        )  # Linux doubles the requested size
 
 
 @pytest.mark.asyncio
-async def test_a_burst_is_given_out_in_portions(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_burst_is_returned_in_several_receives(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(udp, "DATAGRAMS_PER_READ", 10)
     async with connected("udpin") as (link, far):
         for number in range(25):
@@ -890,7 +890,7 @@ async def test_a_burst_is_given_out_in_portions(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.asyncio
-async def test_empty_datagrams_are_passed_over() -> None:
+async def test_empty_datagrams_are_skipped() -> None:
     async with connected("udpin") as (link, far):
         far.send(b"")
         far.send(frame(1))
@@ -899,9 +899,7 @@ async def test_empty_datagrams_are_passed_over() -> None:
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("number", [errno.EAGAIN, errno.ENETUNREACH, errno.ENOBUFS, errno.EPERM])
-async def test_a_datagram_that_the_system_does_not_take_is_counted(
-    number: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_a_rejected_datagram_is_counted(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise OSError(number, os.strerror(number))
 
@@ -916,7 +914,7 @@ async def test_a_datagram_that_the_system_does_not_take_is_counted(
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["udpin", "udpout"])
-async def test_a_lasting_fault_of_the_socket_is_a_link_error(kind: str) -> None:
+async def test_a_permanent_socket_error_is_a_link_error(kind: str) -> None:
     async with connected(kind) as (link, _):
         with pytest.raises(LinkError, match="cannot send: Message too long"):
             await link.send(bytes(70_000), None)
@@ -924,7 +922,7 @@ async def test_a_lasting_fault_of_the_socket_is_a_link_error(kind: str) -> None:
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("name", ["udpout:[fe80::1]:14550", "tcp:255.255.255.255:5760"])
-async def test_an_address_that_cannot_be_reached_is_a_link_error(name: str) -> None:
+async def test_an_unreachable_address_is_a_link_error(name: str) -> None:
     files = open_files()
     with pytest.raises(LinkError, match="cannot open: ") as caught:
         await create_link(name).open()
@@ -934,7 +932,7 @@ async def test_an_address_that_cannot_be_reached_is_a_link_error(name: str) -> N
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", KINDS)
-async def test_waking_up_for_nothing_does_no_harm(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_spurious_wake_ups_are_harmless(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     wait_readable = anyio.wait_readable
     left = [3]
 
@@ -964,7 +962,7 @@ async def test_waking_up_for_nothing_does_no_harm(kind: str, monkeypatch: pytest
 
 
 @pytest.mark.asyncio
-async def test_tcp_refused_is_a_link_error_and_opens_once_somebody_listens() -> None:
+async def test_tcp_opens_after_a_refused_connection() -> None:
     with tcp_listener() as listener:
         port = listener.getsockname()[1]
     link = create_link(f"tcp:127.0.0.1:{port}")
@@ -991,7 +989,7 @@ async def test_tcp_tries_every_address_of_a_name(monkeypatch: pytest.MonkeyPatch
 
 @contextmanager
 def deaf_listener() -> Iterator[int]:
-    """A port on which connecting takes for ever: its queue is full and nobody accepts."""
+    """A port on which connecting never ends: its backlog is full and is never accepted."""
     with tcp_listener(backlog=0) as listener, ExitStack() as stack:
         for _ in range(4):
             sock = stack.enter_context(socket.socket())
@@ -1001,17 +999,17 @@ def deaf_listener() -> Iterator[int]:
 
 
 @pytest.mark.asyncio
-async def test_tcp_gives_up_connecting(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_tcp_connecting_times_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link, "OPEN_TIMEOUT", 0.05)
     with deaf_listener() as port:
         files = open_files()
-        with pytest.raises(LinkError, match=r"no answer from 127\.0\.0\.1"):
+        with pytest.raises(LinkError, match=r"no response from 127\.0\.0\.1"):
             await create_link(f"tcp:127.0.0.1:{port}").open()
         assert open_files() == files
 
 
 @pytest.mark.asyncio
-async def test_a_silent_address_leaves_time_for_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_an_unresponsive_address_leaves_time_for_the_next(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tcp, "OPEN_TIMEOUT", 0.1)
     with deaf_listener() as deaf, tcp_listener() as listener:
         port = listener.getsockname()[1]
@@ -1021,7 +1019,7 @@ async def test_a_silent_address_leaves_time_for_the_next(monkeypatch: pytest.Mon
 
 
 @pytest.mark.asyncio
-async def test_tcp_sends_at_once_and_notices_silence() -> None:
+async def test_tcp_socket_options() -> None:
     async with connected("tcp") as (link, _):
         sock = link._open_socket()
         assert sock.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
@@ -1030,7 +1028,7 @@ async def test_tcp_sends_at_once_and_notices_silence() -> None:
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["udpin", "udpout", "tcp", "tcpin"])
-async def test_looking_up_a_name_takes_no_longer_than_opening(
+async def test_resolving_a_name_is_limited_by_the_open_timeout(
     kind: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     async def getaddrinfo(*_: object, **__: object) -> None:
@@ -1038,12 +1036,12 @@ async def test_looking_up_a_name_takes_no_longer_than_opening(
 
     monkeypatch.setattr(anyio, "getaddrinfo", getaddrinfo)
     monkeypatch.setattr(link, "OPEN_TIMEOUT", 0.05)
-    with pytest.raises(LinkError, match="no answer"):
+    with pytest.raises(LinkError, match="no response"):
         await create_link(f"{kind}:some-vehicle:14550").open()
 
 
 @pytest.mark.asyncio
-async def test_closing_ends_an_open_that_is_under_way(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_closing_ends_an_open_in_progress(monkeypatch: pytest.MonkeyPatch) -> None:
     failures: list[str] = []
 
     async def open_it(link: Link) -> None:
@@ -1082,7 +1080,7 @@ async def test_closing_ends_an_open_that_is_under_way(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.asyncio
-async def test_tcp_dropped_by_its_peer_can_be_opened_again() -> None:
+async def test_a_dropped_tcp_connection_can_be_reopened() -> None:
     with tcp_listener() as listener:
         async with opened(f"tcp:127.0.0.1:{listener.getsockname()[1]}") as link:
             peers = []
@@ -1100,17 +1098,17 @@ async def test_tcp_dropped_by_its_peer_can_be_opened_again() -> None:
                 await link.open()
             listener.accept()[0].close()
             assert peers[0] != peers[1]
-            await link.send(frame(3), peers[0])  # to a connection that is gone: nothing happens
+            await link.send(frame(3), peers[0])  # to a dropped connection: does nothing
 
 
 def reset(sock: socket.socket) -> None:
-    """Close a connection so that the other side sees an error instead of an end."""
+    """Close a connection with a reset, so that the peer gets an error."""
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
     sock.close()
 
 
 @pytest.mark.asyncio
-async def test_tcp_notices_a_dropped_connection_when_sending() -> None:
+async def test_tcp_detects_a_dropped_connection_when_sending() -> None:
     async with connected("tcp") as (link, far):
         reset(far)
         with pytest.raises(LinkError, match="lost: Connection reset by peer"):
@@ -1118,11 +1116,11 @@ async def test_tcp_notices_a_dropped_connection_when_sending() -> None:
 
 
 @pytest.mark.asyncio
-async def test_tcp_does_not_wait_for_ever_for_a_peer_that_does_not_read(
+async def test_tcp_drops_a_peer_that_does_not_read(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(tcp, "SEND_TIMEOUT", 0.05)
-    problem = r"the other side has not read for 0\.05 s"
+    problem = r"the peer has not read any data for 0\.05 s"
     async with connected("tcp") as (link, _), anyio.create_task_group() as tasks:
 
         async def receive() -> None:
@@ -1138,7 +1136,7 @@ async def test_tcp_does_not_wait_for_ever_for_a_peer_that_does_not_read(
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("kind", ["tcp", "tcpin"])
-async def test_closing_ends_a_send_that_waits_for_room(kind: str) -> None:
+async def test_closing_ends_a_waiting_send(kind: str) -> None:
     async with connected(kind) as (link, _), anyio.create_task_group() as tasks:
 
         async def send() -> None:
@@ -1152,7 +1150,7 @@ async def test_closing_ends_a_send_that_waits_for_room(kind: str) -> None:
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("leave", [socket.socket.close, reset])
-async def test_tcpin_goes_on_when_one_of_its_clients_leaves(leave: Callable[[socket.socket], None]) -> None:
+async def test_tcpin_continues_when_a_client_disconnects(leave: Callable[[socket.socket], None]) -> None:
     async with opened("tcpin:127.0.0.1:0") as link:
         await link.send(HEARTBEAT, None)
         with (
@@ -1177,7 +1175,7 @@ async def test_tcpin_goes_on_when_one_of_its_clients_leaves(leave: Callable[[soc
 
 
 @pytest.mark.asyncio
-async def test_tcpin_ends_a_client_that_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_tcpin_closes_a_client_that_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
     async with connected("tcpin") as (link, far):
         with socket.create_connection(link.address, timeout=PATIENCE) as stuck:
             stuck.send(frame(1))
@@ -1191,8 +1189,8 @@ async def test_tcpin_ends_a_client_that_does_not_read(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.asyncio
-async def test_tcpin_holds_a_bounded_number_of_clients(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(tcp, "CLIENTS", 1)
+async def test_tcpin_limits_its_connections(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tcp, "CONNECTIONS_MAX", 1)
     async with connected("tcpin") as (link, far):
         with socket.create_connection(link.address, timeout=PATIENCE) as second:
             far.send(frame(1))
@@ -1208,7 +1206,7 @@ async def test_tcpin_holds_a_bounded_number_of_clients(monkeypatch: pytest.Monke
 
 
 @pytest.mark.asyncio
-async def test_tcpin_that_cannot_accept_any_more_is_a_link_error() -> None:
+async def test_tcpin_without_descriptors_is_a_link_error() -> None:
     async with connected("tcpin") as (link, _):
         with socket.create_connection(link.address, timeout=PATIENCE):
             lowest_free = os.dup(0)
@@ -1235,7 +1233,7 @@ def request_by_index(index: int, system: int = 1) -> bytes:
 
 
 async def answer(link: Link, request: bytes) -> tuple[wire.Frame, wire.ParamValue]:
-    """Ask, and wait for the first PARAM_VALUE."""
+    """Send a request, and wait for the first PARAM_VALUE."""
     framer = wire.Framer(stream=link.is_stream)
     with anyio.fail_after(PATIENCE):
         await link.send(request, None)
@@ -1249,7 +1247,7 @@ async def answer(link: Link, request: bytes) -> tuple[wire.Frame, wire.ParamValu
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("vehicle", ["px4", "ardupilot"])
-async def test_a_simulated_vehicle_answers_in_the_process(vehicle: str) -> None:
+async def test_a_simulated_vehicle_responds_in_the_process(vehicle: str) -> None:
     async with opened(f"sim:{vehicle}?system=7") as link:
         sender, value = await answer(link, request_by_index(5, system=7))
         assert (sender.system, value.param_index) == (7, 5)
@@ -1257,7 +1255,7 @@ async def test_a_simulated_vehicle_answers_in_the_process(vehicle: str) -> None:
 
 
 @pytest.mark.asyncio
-async def test_a_simulated_vehicle_gives_its_whole_list() -> None:
+async def test_a_simulated_vehicle_sends_its_complete_list() -> None:
     names: set[str] = set()
     framer = wire.Framer({22}, stream=False)
     async with opened("sim:px4") as link:
@@ -1271,12 +1269,12 @@ async def test_a_simulated_vehicle_gives_its_whole_list() -> None:
 
 
 @pytest.mark.asyncio
-async def test_the_faults_of_a_sim_link_are_those_of_its_name() -> None:
+async def test_a_sim_link_has_the_faults_of_its_name() -> None:
     async with opened("sim:px4?delay=0.03&seed=4&param_error=1") as link:
         assert isinstance(link.endpoint, Air)
         started = anyio.current_time()
         await answer(link, request_hash())
-        assert anyio.current_time() - started >= 0.06  # there and back
+        assert anyio.current_time() - started >= 0.06  # both directions
     async with opened("sim:px4?loss=1&seed=4") as link:
         for _ in range(5):
             await link.send(request_hash(), None)
@@ -1284,7 +1282,7 @@ async def test_the_faults_of_a_sim_link_are_those_of_its_name() -> None:
 
 
 @pytest.mark.asyncio
-async def test_a_programs_own_endpoint_is_woken_by_what_is_sent() -> None:
+async def test_sent_bytes_wake_a_custom_endpoint() -> None:
     class Echo(Post):
         def next_deadline(self) -> float | None:
             return None
@@ -1326,7 +1324,7 @@ async def test_a_simulated_vehicle_on_a_real_link(vehicle_link: str, station_lin
             async with opened(f"{station_link}:127.0.0.1:0") as link:
                 far = create_link(f"{vehicle_link}:127.0.0.1:{link.address[1]}")
                 served = await tasks.start(serve_endpoint, vehicle, far)
-                assert any(data for _, data in await collect(link, 1))  # its heartbeat comes unasked
+                assert any(data for _, data in await collect(link, 1))  # its heartbeat
                 _, value = await answer(link, request_hash())
                 tasks.cancel_scope.cancel()
         assert value.param_id == wire.HASH_CHECK
@@ -1336,7 +1334,7 @@ async def test_a_simulated_vehicle_on_a_real_link(vehicle_link: str, station_lin
 
 
 @pytest.mark.asyncio
-async def test_a_vehicle_that_is_always_late_still_listens() -> None:
+async def test_an_overdue_vehicle_still_receives() -> None:
     class Overdue(Post):
         def next_deadline(self) -> float | None:
             return self.now
@@ -1353,7 +1351,7 @@ async def test_a_vehicle_that_is_always_late_still_listens() -> None:
 
 
 @pytest.mark.asyncio
-async def test_serving_fails_with_its_link() -> None:
+async def test_serve_endpoint_fails_with_its_link() -> None:
     async with opened("udpin:127.0.0.1:0") as first:
         with pytest.raises(LinkError, match="in use"):
             await serve_endpoint(Post(), create_link(f"udpin:127.0.0.1:{first.address[1]}"))

@@ -1,4 +1,4 @@
-"""The list of serial ports: what is marked as an autopilot, and what the command prints."""
+"""The list of serial ports: detection of autopilots, and the output of the command line."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ BY_ID = "/dev/serial/by-id/usb-Hex_ProfiCNC_CubeOrange_2E0045-if00"
 
 
 def info(device: str, **known: Any) -> serialx.SerialPortInfo:
-    """A port as serialx tells of it."""
+    """Return a port as serialx describes it."""
     texts = ("serial_number", "manufacturer", "product", "interface_description")
     fields: dict[str, Any] = dict.fromkeys(("vid", "pid", "bcd_device", "interface_num", *texts))
     fields |= {"device": device, "resolved_device": device}
@@ -25,7 +25,7 @@ def info(device: str, **known: Any) -> serialx.SerialPortInfo:
 
 @pytest.fixture
 def plugged(monkeypatch: pytest.MonkeyPatch) -> list[serialx.SerialPortInfo]:
-    """What the system tells."""
+    """The ports that the system reports."""
     ports: list[serialx.SerialPortInfo] = []
     monkeypatch.setattr(serialx, "list_serial_ports", lambda: ports)
     return ports
@@ -49,7 +49,7 @@ def a_few() -> list[serialx.SerialPortInfo]:
     ]
 
 
-def test_autopilots_come_first_then_what_is_on_usb(plugged: list[serialx.SerialPortInfo]) -> None:
+def test_autopilots_come_first_then_usb_devices(plugged: list[serialx.SerialPortInfo]) -> None:
     plugged += a_few()
     found = list_ports()
     assert [port.device for port in found] == ["/dev/ttyACM1", "/dev/ttyUSB9", "/dev/ttyUSB10", "/dev/ttyS0"]
@@ -60,7 +60,7 @@ def test_autopilots_come_first_then_what_is_on_usb(plugged: list[serialx.SerialP
     assert found[-1] == SerialPort("/dev/ttyS0")
 
 
-def test_the_link_is_by_the_name_that_stays_the_same(plugged: list[serialx.SerialPortInfo]) -> None:
+def test_the_link_uses_the_stable_name(plugged: list[serialx.SerialPortInfo]) -> None:
     plugged += a_few()
     for port in list_ports():
         assert create_link(port.link).name == port.link
@@ -89,7 +89,7 @@ def test_the_link_is_by_the_name_that_stays_the_same(plugged: list[serialx.Seria
         (None, None, None, None),
     ],
 )
-def test_what_is_an_autopilot(
+def test_detection_of_autopilots(
     vendor: int | None, product: int | None, manufacturer: str | None, autopilot: str | None
 ) -> None:
     port = SerialPort("COM5", vendor_id=vendor, product_id=product, manufacturer=manufacturer)
@@ -143,7 +143,7 @@ def test_the_ports_of_this_computer() -> None:
 
 
 @pytest.mark.parametrize("arguments", [["ports"], ["fetch", "/dev/ttyACM0", "--no-cache"]])
-def test_without_the_extra_the_command_says_what_to_install(
+def test_without_the_extra_the_command_names_it(
     arguments: list[str], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "serialx", None)
@@ -155,9 +155,9 @@ def test_without_the_extra_the_command_says_what_to_install(
     assert err.count("\n") == 1
 
 
-def test_a_port_that_is_not_there_is_code_4(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_missing_port_is_exit_code_4(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["fetch", "/dev/nowhere,115200", "--no-cache"]) == 4
     assert capsys.readouterr().err == (
-        "paramclient: serial:/dev/nowhere:115200: there is no /dev/nowhere; "
-        "'paramclient ports' lists the ports that there are\n"
+        "paramclient: serial:/dev/nowhere:115200: /dev/nowhere does not exist; "
+        "'paramclient ports' lists the serial ports\n"
     )

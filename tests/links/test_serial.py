@@ -1,4 +1,4 @@
-"""Serial links over pseudo-terminals: whole sessions, unplugging, ports that refuse, stall or are taken."""
+"""Serial links over pseudo-terminals: sessions, unplugging, stalled ports, ports that cannot be opened."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from paramclient import ParamClient
 from paramclient.client import link_task
 from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link, serial
-from paramclient.links.transport import UNREAD_LIMIT, Transport
+from paramclient.links.transport import UNREAD_BYTES_MAX, Transport
 from paramclient.protocol import wire
 from tests.cable import PATIENCE, Cable
 from tests.shell import a_client, bits, generic, small_px4, until
 
 HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
 RATE = 40_000.0
-"""Bytes a second each way. 57600 baud are 5,760: these tests would take seconds."""
+"""Bytes per second in each direction. With 57600 baud (5,760 bytes per second), tests would take seconds."""
 
 TIOCGEXCL = 0x80045440  # Linux, asm-generic/ioctls.h; termios has no name for it
 
@@ -48,7 +48,7 @@ def cable(tmp_path: Path) -> Iterator[Cable]:
 
 @pytest.fixture(params=["descriptor", "transport"])
 def port(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Both ways to move bytes; the second is that of Windows, which works here too."""
+    """Both implementations; the second is that of Windows, which also works here."""
     if request.param == "transport":
         monkeypatch.setattr(serial, "_open_port", Transport.opened)
     return str(request.param)
@@ -66,7 +66,7 @@ async def opened(cable: Cable) -> AsyncIterator[Any]:
 
 
 async def received(link: Link, count: int) -> bytes:
-    """Receive until so many bytes have come."""
+    """Receive until this many bytes have arrived."""
     found = b""
     while len(found) < count:
         found += b"".join(data for _, data in await link.receive())
@@ -80,7 +80,7 @@ async def refusal(link: Link) -> LinkError:
     return caught.value
 
 
-# Whole sessions
+# Complete sessions
 
 
 @pytest.mark.asyncio
@@ -99,7 +99,7 @@ async def test_a_whole_session(cable: Cable, port: str) -> None:
 
 @pytest.mark.asyncio
 async def test_the_cache_knows_the_vehicle_by_its_port(cable: Cable, tmp_path: Path) -> None:
-    """A vehicle that has no hardware id is known by the link's canonical name, however it is spelt."""
+    """The key of a vehicle without a hardware id has the canonical name for every spelling of the link."""
     for spelling in (f"serial:{cable.device}:115200", f"serial://{cable.device},115200"):
         vehicle = small_px4(stream=True)
         async with (
@@ -141,7 +141,7 @@ async def test_unplugged_in_the_middle_of_a_download(
 
 
 @pytest.mark.asyncio
-async def test_unplugged_for_good(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_unplugged_permanently(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(link_task, "LINK_PATIENCE", 0.2)
     monkeypatch.setattr(link_task, "FIRST_BACKOFF", 0.05)
     monkeypatch.setattr(link_task, "LONGEST_BACKOFF", 0.1)
@@ -151,7 +151,7 @@ async def test_unplugged_for_good(cable: Cable, monkeypatch: pytest.MonkeyPatch)
         component = await client.component()
         cable.pull_out()
         with pytest.raises(
-            LinkError, match=f"there is no {cable.device}; 'paramclient ports' lists"
+            LinkError, match=f"{cable.device} does not exist; 'paramclient ports' lists"
         ) as caught:
             await component.get("PARAM_01")
         assert isinstance(caught.value.__cause__, FileNotFoundError)
@@ -166,8 +166,8 @@ async def test_unplugged_for_good(cable: Cable, monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.asyncio
-async def test_who_speaks_after_it_was_unplugged_is_another_one(cable: Cable, port: str) -> None:
-    """Half a frame of before is not continued, and what was for the old one is not sent to the new one."""
+async def test_a_replugged_device_is_another_peer(cable: Cable, port: str) -> None:
+    """Half a frame of the old peer is not continued, and data for the old peer is not sent to the new one."""
     async with opened(cable) as link:
         cable.send(b"\xfd")
         [(before, _)] = await link.receive()
@@ -191,17 +191,17 @@ async def test_unplugged_while_sending(cable: Cable, port: str) -> None:
     async with opened(cable) as link:
         cable.pull_out()
         with pytest.raises(LinkError, match=f"lost {cable.device}: unplugged, or reset") as caught:  # noqa: PT012
-            while True:  # a transport is told of it later
+            while True:  # a transport gets the error later
                 await link.send(HEARTBEAT, None)
         assert isinstance(caught.value.__cause__, OSError)
         assert caught.value.link == link.name
 
 
 @pytest.mark.asyncio
-async def test_a_device_that_takes_nothing_is_lost_and_what_waits_for_it_dropped(
+async def test_a_stalled_device_is_lost_and_its_data_dropped(
     cable: Cable, port: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(serial, "STALL_TIMEOUT", 0.0)  # what is left is what a buffer takes at the rate
+    monkeypatch.setattr(serial, "STALL_TIMEOUT", 0.0)  # leaves the time for a full buffer at the baud rate
     async with opened(cable) as link, anyio.create_task_group() as tasks:
         got: list[tuple[Peer, bytes]] = []
         failures: list[LinkError] = []
@@ -215,13 +215,13 @@ async def test_a_device_that_takes_nothing_is_lost_and_what_waits_for_it_dropped
 
         tasks.start_soon(receive)
         sent = 0
-        with pytest.raises(LinkError, match=f"{cable.device} has taken nothing for 0 s") as caught:  # noqa: PT012
-            while True:  # until the system's buffer is full
+        with pytest.raises(LinkError, match=f"{cable.device} has accepted no data for 0 s") as caught:  # noqa: PT012
+            while True:  # until the operating system's buffer is full
                 await link.send(bytes(1000), None)
                 sent += 1000
                 if sent == 5000:
                     cable.send(b"still here")
-        assert 5000 < sent < 60_000  # what Linux holds for a pseudo-terminal, and nothing here
+        assert 5000 < sent < 60_000  # Linux' buffer for a pseudo-terminal, and no queue in the link
         await until(lambda: failures)
         assert str(failures[0]) == str(caught.value)
         assert b"".join(data for _, data in got) == b"still here"
@@ -232,8 +232,8 @@ async def test_a_device_that_takes_nothing_is_lost_and_what_waits_for_it_dropped
 
 
 @pytest.mark.asyncio
-async def test_a_slow_device_sets_the_pace(cable: Cable, port: str) -> None:
-    """More than the system's buffer holds: what is sent waits, and comes whole and in order."""
+async def test_a_slow_device_limits_the_send_rate(cable: Cable, port: str) -> None:
+    """More than the system's buffer holds: data waits, and arrives complete and in order."""
     frames = [bytes([number]) * 1000 for number in range(60)]
     async with opened(cable) as link:
         heard = b""
@@ -251,12 +251,12 @@ async def test_a_slow_device_sets_the_pace(cable: Cable, port: str) -> None:
 
 
 @pytest.mark.asyncio
-async def test_a_transport_brings_no_more_than_is_read(cable: Cable) -> None:
+async def test_a_transport_pauses_at_its_limit(cable: Cable) -> None:
     port = await Transport.opened(str(cable.device), 115200)
     try:
         sent = 0
         with anyio.fail_after(PATIENCE):
-            while port._unread < UNREAD_LIMIT:
+            while port._unread < UNREAD_BYTES_MAX:
                 sent += cable.offer(bytes(500))
                 await anyio.sleep(0.0001)
             unread = port._unread
@@ -272,8 +272,8 @@ async def test_a_transport_brings_no_more_than_is_read(cable: Cable) -> None:
 
 
 @pytest.mark.asyncio
-async def test_how_a_port_is_set_up(cable: Cable) -> None:
-    """Raw bytes, 8N1, no flow control; DTR falls with the last program that closes it, as everywhere."""
+async def test_settings_of_an_open_port(cable: Cable) -> None:
+    """Raw bytes, 8N1, no flow control; DTR falls when the last program closes the port, as usual."""
     async with opened(cable) as link:
         iflag, oflag, cflag, lflag, _, ospeed, _ = termios.tcgetattr(link._port._file)
     assert (iflag, oflag, lflag, ospeed) == (0, 0, 0, termios.B115200)
@@ -286,13 +286,13 @@ async def test_how_a_port_is_set_up(cable: Cable) -> None:
 
 
 @pytest.mark.asyncio
-async def test_a_port_is_ours_alone_and_free_again_after(cable: Cable) -> None:
+async def test_an_open_port_is_exclusive_and_closing_frees_it(cable: Cable) -> None:
     def is_exclusive() -> bool:
         try:
             file = os.open(cable.device, os.O_RDWR | os.O_NOCTTY)
         except OSError as error:
             return error.errno == errno.EBUSY
-        try:  # the privileged get in, and can look
+        try:  # privileged programs can open and inspect it
             (flag,) = struct.unpack("i", fcntl.ioctl(file, TIOCGEXCL, bytes(4)))
         finally:
             os.close(file)
@@ -313,21 +313,21 @@ async def test_a_port_is_ours_alone_and_free_again_after(cable: Cable) -> None:
 @pytest.mark.parametrize(
     ("code", "text"),
     [
-        (errno.ENOENT, "there is no /dev/ttyACM0; 'paramclient ports' lists the ports that there are"),
-        (errno.ENODEV, "there is no /dev/ttyACM0; 'paramclient ports' lists the ports that there are"),
+        (errno.ENOENT, "/dev/ttyACM0 does not exist; 'paramclient ports' lists the serial ports"),
+        (errno.ENODEV, "/dev/ttyACM0 does not exist; 'paramclient ports' lists the serial ports"),
         (errno.EBUSY, "/dev/ttyACM0 is in use by another program"),
         (errno.EPERM, "no permission to open /dev/ttyACM0"),
-        (errno.ENOTTY, "/dev/ttyACM0 is no serial port"),
+        (errno.ENOTTY, "/dev/ttyACM0 is not a serial port"),
         (errno.EINVAL, "/dev/ttyACM0 cannot be set to 57600 baud"),
         (errno.EIO, "cannot open /dev/ttyACM0: Input/output error"),
     ],
 )
-async def test_why_a_port_cannot_be_opened(code: int, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_errors_of_opening_a_port(code: int, text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(_: object) -> None:
         raise OSError(code, os.strerror(code))
 
     monkeypatch.setattr(serialx.Serial, "open", refuse)
-    monkeypatch.setattr(serial, "_who_may", lambda _: "")
+    monkeypatch.setattr(serial, "_group_hint", lambda _: "")
     error = await refusal(create_link("/dev/ttyACM0"))
     assert str(error) == f"serial:/dev/ttyACM0:57600: {text}"
     assert isinstance(error.__cause__, OSError)
@@ -335,10 +335,10 @@ async def test_why_a_port_cannot_be_opened(code: int, text: str, monkeypatch: py
 
 @pytest.mark.asyncio
 @pytest.mark.parametrize("name", ["", "file", "missing"])
-async def test_what_is_no_port(tmp_path: Path, name: str) -> None:
+async def test_files_that_are_not_ports(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").touch()
     path = tmp_path / name
-    expected = f"there is no {path};" if name == "missing" else f"{path} is no serial port"
+    expected = f"{path} does not exist;" if name == "missing" else f"{path} is not a serial port"
     assert expected in str(await refusal(create_link(f"serial:{path}")))
 
 
@@ -346,7 +346,7 @@ async def test_what_is_no_port(tmp_path: Path, name: str) -> None:
 @pytest.mark.parametrize(
     ("mode", "is_member", "says_who"), [(0o660, False, True), (0o600, False, False), (0o660, True, False)]
 )
-async def test_without_permission_it_is_said_which_group_helps(
+async def test_without_permission_the_error_names_the_group(
     mode: int, is_member: bool, says_who: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def refuse(_: object) -> None:
@@ -363,25 +363,23 @@ async def test_without_permission_it_is_said_which_group_helps(
         patch.setattr(grp, "getgrgid", {20: Group}.__getitem__)
         patch.setattr(os, "getgroups", lambda: [20] if is_member else [100])
         error = await refusal(link)
-    who = ", which is for the group dialout: sudo usermod -aG dialout $USER, then log in again"
+    who = ", which needs the group dialout: sudo usermod -aG dialout $USER, then log in again"
     expected = f"no permission to open /dev/ttyUSB0{who if says_who else ''}"
     assert str(error) == f"serial:/dev/ttyUSB0:57600: {expected}"
 
 
 @pytest.mark.asyncio
-async def test_a_rate_that_the_system_does_not_have(
-    cable: Cable, port: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+async def test_an_unsupported_baud_rate(cable: Cable, port: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise serialx.UnsupportedSetting("Unsupported baudrate")
 
     monkeypatch.setattr(serialx.Serial, "_reconfigure_port", refuse)
-    with pytest.raises(UsageError, match="no serial port of this system has 115200 baud"):
+    with pytest.raises(UsageError, match="this system does not support 115200 baud"):
         await create_link(cable.link).open()
 
 
 @pytest.mark.asyncio
-async def test_a_driver_that_does_not_tell_its_rate(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_a_driver_that_does_not_report_its_rate(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise RuntimeError("termios2 speed fields are zero")
 
@@ -391,13 +389,13 @@ async def test_a_driver_that_does_not_tell_its_rate(cable: Cable, monkeypatch: p
 
 
 class Stuck:
-    """A driver that takes its time with opening or closing a port: the next one, or the one that is given."""
+    """A driver that delays opening or closing of a port: the next one, or the given one."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, call: str, port: object = None) -> None:
         self.is_in_it = threading.Event()
         self.may_go_on = threading.Event()
         self.is_closed = threading.Event()
-        self._port = None if port is None else id(port)  # not the port: it would end with the patch
+        self._port = None if port is None else id(port)  # keeping the port itself would keep it open
         self._slow = call
         self._real = {name: getattr(serialx.Serial, name) for name in ("open", "close")}
         monkeypatch.setattr(serialx.Serial, "open", lambda port: self._call("open", port))
@@ -406,7 +404,7 @@ class Stuck:
     def _call(self, name: str, port: object) -> None:
         if name == "open" and self._port is None:
             self._port = id(port)
-        is_it = id(port) == self._port  # the collector closes others, of tests before
+        is_it = id(port) == self._port  # the garbage collector closes ports of earlier tests
         if is_it and name == self._slow:
             self.is_in_it.set()
             assert self.may_go_on.wait(PATIENCE)
@@ -416,8 +414,8 @@ class Stuck:
 
 
 @pytest.mark.asyncio
-async def test_a_driver_that_does_not_open(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The loop goes on meanwhile, the call ends in time, and a port that comes late is closed again."""
+async def test_opening_a_stalled_driver_times_out(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The event loop keeps running, the call times out, and a port that opens later is closed again."""
     monkeypatch.setattr(serial, "OPEN_TIMEOUT", 0.01)
     monkeypatch.setattr(serial, "CLOSE_TIMEOUT", 0.01)
     stuck = Stuck(monkeypatch, "open")
@@ -434,7 +432,7 @@ async def test_a_driver_that_does_not_open(cable: Cable, monkeypatch: pytest.Mon
 
 
 @pytest.mark.asyncio
-async def test_closed_while_it_is_opened(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_closing_during_an_open(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
     stuck = Stuck(monkeypatch, "open")
     link = create_link(cable.link)
     async with anyio.create_task_group() as tasks:
@@ -450,7 +448,7 @@ async def test_closed_while_it_is_opened(cable: Cable, monkeypatch: pytest.Monke
 
 
 @pytest.mark.asyncio
-async def test_a_driver_that_does_not_close(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_closing_a_stalled_driver_times_out(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(serial, "CLOSE_TIMEOUT", 0.01)
     async with opened(cable) as link:
         stuck = Stuck(monkeypatch, "close", link._port._serial)
@@ -461,16 +459,14 @@ async def test_a_driver_that_does_not_close(cable: Cable, monkeypatch: pytest.Mo
 
 
 @pytest.mark.asyncio
-async def test_closing_does_not_wait_for_what_is_not_taken(
-    cable: Cable, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Whoever closes waits for no answer; Linux would wait 30 s for a device to take the rest."""
+async def test_closing_drops_unsent_bytes(cable: Cable, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Closing does not wait; Linux would wait 30 s for the device to accept unsent bytes."""
     calls: list[str] = []
     close = serialx.Serial.close
     monkeypatch.setattr(termios, "tcflush", lambda _, queue: calls.append(f"flush {queue}"))
 
     async with opened(cable) as link:
-        ours = id(link._port._serial)  # not the port: it would end with the patch, and call it
+        ours = id(link._port._serial)  # the port itself would end with the patch, and call it
 
         def closed(port: serialx.BaseSerial) -> None:
             if id(port) == ours:
@@ -500,14 +496,14 @@ def test_a_transport_needs_asyncio() -> None:
 # The extra
 
 
-def test_without_the_extra_the_command_that_installs_it_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_extra_the_error_names_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "serialx", None)
     with pytest.raises(UsageError) as caught:
         create_link("/dev/ttyACM0")
     assert str(caught.value) == "serial:/dev/ttyACM0:57600 needs serialx: pip install 'paramclient[serial]'"
 
 
-def test_serialx_is_loaded_when_a_port_is_opened_and_not_before() -> None:
+def test_serialx_is_loaded_on_the_first_open() -> None:
     program = (
         "import sys, anyio, paramclient.links as links\n"
         "link = links.create_link('serial:/dev/null')\n"
@@ -519,4 +515,4 @@ def test_serialx_is_loaded_when_a_port_is_opened_and_not_before() -> None:
         "assert 'serialx' in sys.modules\n"
     )
     run = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
-    assert run.stdout == "serial:/dev/null:57600: /dev/null is no serial port\n"
+    assert run.stdout == "serial:/dev/null:57600: /dev/null is not a serial port\n"

@@ -1,4 +1,4 @@
-"""Telemetry logs in the place of a link, and brought into a cache."""
+"""Telemetry logs as links, and their import into a cache."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from paramclient.cache import BY_US, StoredParam, TableUpdate
 from paramclient.cache.tables import HISTORY_LINES
 from paramclient.cli import run
 from paramclient.links import LinkKind, ReplayLink, create_link, parse_link
-from paramclient.links.replay import LONGEST_PAUSE
-from paramclient.links.tlog import FIRST_WITHIN
+from paramclient.links.replay import PAUSE_MAX
+from paramclient.links.tlog import FIRST_FRAME_OFFSET_MAX
 from paramclient.logs.telemetry import ImportedTable, import_log
 from paramclient.model.identity import Identity
 from paramclient.model.values import Param
@@ -37,7 +37,7 @@ from tests.telemetry import KEY, NOW, UID, Log
 
 
 def whole(**values: int) -> Log:
-    """A log in which a vehicle is identified and gives its table."""
+    """Return a log with a vehicle's identification and complete table."""
     return Log().beat().identify().list(**values).wait(1.0)
 
 
@@ -45,7 +45,7 @@ def a_replay(path: Path | str, **options: object) -> ParamClient:
     return ParamClient(f"replay:{path}", **options)  # type: ignore[arg-type]  # any
 
 
-# names
+# Names
 
 
 @pytest.mark.parametrize(
@@ -58,9 +58,7 @@ def a_replay(path: Path | str, **options: object) -> ParamClient:
         ("replay:what?.tlog", "replay:what?.tlog", "what?.tlog", ()),
     ],
 )
-def test_a_log_is_named_by_its_file(
-    text: str, name: str, path: str, options: tuple[tuple[str, float], ...]
-) -> None:
+def test_link_names_of_logs(text: str, name: str, path: str, options: tuple[tuple[str, float], ...]) -> None:
     spec = parse_link(text)
     assert (spec.kind, spec.name, spec.host, spec.options) == (LinkKind.REPLAY, name, path, options)
     assert parse_link(name) == spec
@@ -68,19 +66,19 @@ def test_a_log_is_named_by_its_file(
 
 
 @pytest.mark.parametrize("text", ["replay:", "replay:?speed=1", "replay:x?speed=-1", "replay:x?speed=fast"])
-def test_names_of_no_log(text: str) -> None:
+def test_invalid_link_names_of_logs(text: str) -> None:
     with pytest.raises(UsageError, match="accepted forms"):
         parse_link(text)
 
 
 @swiftly
-async def test_a_file_that_is_no_log(tmp_path: Path) -> None:
+async def test_a_file_that_is_not_a_log(tmp_path: Path) -> None:
     with pytest.raises(LinkError, match=r"cannot open .*nowhere\.tlog: No such file"):
         async with a_replay(tmp_path / "nowhere.tlog"):
             raise AssertionError("it was opened")
     for content in (b"", b"FRAME_CLASS 1\n" * 50):
         (tmp_path / "other.txt").write_bytes(content)
-        with pytest.raises(LinkError, match="is no telemetry log"):
+        with pytest.raises(LinkError, match="is not a telemetry log"):
             async with a_replay(tmp_path / "other.txt"):
                 raise AssertionError("it was opened")
     with pytest.raises(LinkError, match="Is a directory"):
@@ -88,29 +86,29 @@ async def test_a_file_that_is_no_log(tmp_path: Path) -> None:
             raise AssertionError("it was opened")
     os.mkfifo(tmp_path / "pipe")
     for endless in ("/dev/zero", tmp_path / "pipe"):
-        with pytest.raises(LinkError, match="is no regular file"):
+        with pytest.raises(LinkError, match="is not a regular file"):
             async with a_replay(endless):
                 raise AssertionError("it was opened")
 
 
-@pytest.mark.parametrize("before", [FIRST_WITHIN - 100, FIRST_WITHIN])
+@pytest.mark.parametrize("before", [FIRST_FRAME_OFFSET_MAX - 100, FIRST_FRAME_OFFSET_MAX])
 @swiftly
-async def test_a_log_begins_within_its_first_bytes(before: int, tmp_path: Path) -> None:
-    """Whatever stands before its first frame; what has none there may be a disk image."""
+async def test_the_first_frame_must_be_near_the_start(before: int, tmp_path: Path) -> None:
+    """For all bytes before the first frame; a file without a frame there may be a disk image."""
     path = tmp_path / "flight.tlog"
     path.write_bytes(bytes(before) + whole(A=1).data)
-    if before < FIRST_WITHIN:
+    if before < FIRST_FRAME_OFFSET_MAX:
         async with a_replay(path) as client:
             assert (await (await client.component()).fetch_all()).complete
         return
     with path.open("r+b") as file:
         file.truncate(1 << 40)
-    with pytest.raises(LinkError, match="is no telemetry log"):
+    with pytest.raises(LinkError, match="is not a telemetry log"):
         async with a_replay(path):
             raise AssertionError("it was opened")
 
 
-# as a link
+# As a link
 
 
 @pytest.mark.parametrize("speed", ["", "?speed=10", "?speed=0"])
@@ -118,7 +116,7 @@ async def test_a_log_begins_within_its_first_bytes(before: int, tmp_path: Path) 
     ("name", "crc"), [("px4_full_download", 0xCF579589), ("ardupilot_full_download", None)]
 )
 @swiftly
-async def test_a_table_comes_from_a_recording(name: str, crc: int | None, speed: str) -> None:
+async def test_a_recording_gives_a_complete_table(name: str, crc: int | None, speed: str) -> None:
     async with a_replay(f"{DATA / name}.tlog{speed}") as client:
         assert client.cache is None
         component = await client.component()
@@ -136,7 +134,7 @@ async def test_a_table_comes_from_a_recording(name: str, crc: int | None, speed:
 
 @pytest.mark.parametrize(("speed", "expected"), [("", 20.0), ("?speed=4", 5.0), ("?speed=0", 0.0)])
 @swiftly
-async def test_frames_come_at_the_times_of_the_log(speed: str, expected: float, tmp_path: Path) -> None:
+async def test_frames_have_the_times_of_the_log(speed: str, expected: float, tmp_path: Path) -> None:
     path = whole(A=1).wait(19.0).beat().write(tmp_path / "flight.tlog")
     began = anyio.current_time()
     async with a_replay(f"{path}{speed}") as client:
@@ -152,33 +150,33 @@ async def test_long_pauses_and_clocks_that_go_back(tmp_path: Path) -> None:
         component = await client.component()
         with pytest.raises(NoReply):
             await component.fetch_all()
-        assert anyio.current_time() - began == pytest.approx(LONGEST_PAUSE, abs=0.1)
+        assert anyio.current_time() - began == pytest.approx(PAUSE_MAX, abs=0.1)
 
 
 @swiftly
-async def test_what_is_missing_is_named_when_the_log_ends(tmp_path: Path) -> None:
+async def test_missing_parameters_are_reported_at_the_end_of_the_log(tmp_path: Path) -> None:
     log = Log().beat().tell("A", 0, A=1, B=2, C=3).tell("C", 2)
     async with a_replay(log.write(tmp_path / "flight.tlog")) as client:
         component = await client.component()
-        for _ in range(2):  # also when it has ended
+        for _ in range(2):  # also after its end
             result = await component.fetch_all()
             assert (result.missing, result.count) == ((1,), 3)
         together = await client.fetch_all()
         assert together.results[1, 1].missing == (1,)
         await anyio.sleep(60.0)
-        # time stands still at its end: nobody is lost
+        # the clock stops at the end of the log, so no component is lost
         assert component.state == "partial"
         assert component.params["A"].trust is Trust.LIVE
 
 
 @swiftly
-async def test_the_last_word_counts(tmp_path: Path) -> None:
+async def test_the_last_value_is_used(tmp_path: Path) -> None:
     log = whole(A=1, B=2).wait(5.0).set("A", 7).wait(5.0)
     async with a_replay(log.write(tmp_path / "flight.tlog")) as client:
         component = await client.component()
         changes, events = component.changes(), client.events()
         assert (await component.fetch_all()).params["A"].value == 7
-        # both end with the log, also for those who come late
+        # both end with the log, also for late subscribers
         assert [(each.name, each.by) async for each in changes] == [("A", "station 255/190")]
         assert [each async for each in events] == []
         assert [each async for each in component.changes()] == []
@@ -186,7 +184,7 @@ async def test_the_last_word_counts(tmp_path: Path) -> None:
 
 
 @swiftly
-async def test_a_log_cannot_be_asked(tmp_path: Path) -> None:
+async def test_requests_to_a_log_fail(tmp_path: Path) -> None:
     path = whole(A=1).write(tmp_path / "flight.tlog")
     async with a_replay(path) as client:
         component = await client.component()
@@ -231,7 +229,7 @@ async def test_a_replay_can_be_closed_at_any_moment(tmp_path: Path) -> None:
     await link.close()
 
 
-# into a cache
+# Import into a cache
 
 
 def imported(*paths: Path, cache: Path) -> list[ImportedTable]:
@@ -274,7 +272,7 @@ def test_a_log_fills_a_cache_with_its_own_times(tmp_path: Path) -> None:
         assert (round(vehicle.first_seen - NOW), round(vehicle.last_seen - NOW)) == (0, 200)
 
 
-def test_the_hash_that_a_log_carries_is_kept_with_its_table(tmp_path: Path) -> None:
+def test_the_hash_in_a_log_is_stored_with_its_table(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     [table] = imported(DATA / "px4_full_download.tlog", cache=cache)
     assert table.hash == 0xCF579589
@@ -284,7 +282,7 @@ def test_the_hash_that_a_log_carries_is_kept_with_its_table(tmp_path: Path) -> N
         assert len(found.volatile) == 58
 
 
-def test_to_import_again_changes_nothing(tmp_path: Path) -> None:
+def test_a_repeated_import_changes_nothing(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     log = whole(A=1, B=2).wait(9.0).set("B", 5).wait(9.0).change("A", 3).write(tmp_path / "flight.tlog")
     imported(log, cache=cache)
@@ -297,8 +295,8 @@ def test_to_import_again_changes_nothing(tmp_path: Path) -> None:
         assert repr(kept.component(KEY)) == table
 
 
-def test_to_import_again_changes_nothing_where_the_clock_was_set_back(tmp_path: Path) -> None:
-    """All that comes after that has one time, to the end of the log."""
+def test_a_repeated_import_changes_nothing_after_a_clock_jump(tmp_path: Path) -> None:
+    """All later frames have the same time, until the end of the log."""
     cache = tmp_path / "cache"
     log = Log().tell("A", A=1).wait(-60.0).change("A", 2).write(tmp_path / "flight.tlog")
     [table] = imported(log, cache=cache)
@@ -312,9 +310,10 @@ def test_to_import_again_changes_nothing_where_the_clock_was_set_back(tmp_path: 
     assert kept() == before
 
 
-def test_to_import_again_changes_nothing_where_a_name_went_and_came_back(tmp_path: Path) -> None:
+def test_a_repeated_import_changes_nothing_for_a_restored_name(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
-    log = whole(A=1, B=2).say(wire.AutopilotVersion(0, uid=0xDEADBEEF, flight_sw_version=8))  # an update
+    updated = wire.AutopilotVersion(0, uid=0xDEADBEEF, flight_sw_version=8)
+    log = whole(A=1, B=2).say(updated)
     del log.values["B"]
     log.list().wait(9.0).list(B=5).wait(9.0).change("A", 3).wait(1.0).beat()
     imported(log.write(tmp_path / "flight.tlog"), cache=cache)
@@ -350,7 +349,7 @@ def save(cache: Path, at: float, *params: Param, by: str = BY_US, firmware: int 
         kept.save(TableUpdate(identity=identity, component=1, autopilot=12, at=at, params=stored))
 
 
-def test_what_is_kept_of_a_later_time_stays(tmp_path: Path) -> None:
+def test_later_observations_in_the_cache_stay(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     save(cache, NOW + 5000.0, known("A", 77))
     imported(whole(A=1, B=2).write(tmp_path / "flight.tlog"), cache=cache)
@@ -363,8 +362,8 @@ def test_what_is_kept_of_a_later_time_stays(tmp_path: Path) -> None:
         assert kept.vehicles()[0].last_seen == NOW + 5000.0
 
 
-def test_a_log_that_spans_what_is_kept(tmp_path: Path) -> None:
-    """Before it, in the middle and behind it each observation finds its place."""
+def test_a_log_before_and_after_the_observations_in_the_cache(tmp_path: Path) -> None:
+    """Observations before, between and after those in the cache are sorted by time."""
     cache = tmp_path / "cache"
     log = whole(A=1, B=2).wait(199.0).change("A", 9).wait(1.0).beat()
     save(cache, NOW + 100.0, known("A", 5), known("B", 6, index=1))
@@ -373,7 +372,7 @@ def test_a_log_that_spans_what_is_kept(tmp_path: Path) -> None:
     assert sorted(each[:3] for each in lines(cache)) == [("A", 1, 5), ("A", 5, 9), ("B", 2, 6)]
 
 
-def test_a_change_that_was_heard_live_too_has_one_line(tmp_path: Path) -> None:
+def test_a_change_that_was_also_received_live_has_one_line(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     save(cache, NOW + 0.2, known("A", 1))
     save(cache, NOW + 10.25, known("A", 3))
@@ -383,7 +382,7 @@ def test_a_change_that_was_heard_live_too_has_one_line(tmp_path: Path) -> None:
     assert lines(cache) == [("A", 1, 3, BY_US, pytest.approx(10.25))]
 
 
-def test_a_name_that_a_later_table_lacks_stays_away(tmp_path: Path) -> None:
+def test_a_name_missing_in_a_later_table_is_not_restored(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     later = Log(NOW + 500.0).beat().identify().list(A=1).wait(1.0).beat()
     imported(later.write(tmp_path / "later.tlog"), cache=cache)
@@ -392,8 +391,8 @@ def test_a_name_that_a_later_table_lacks_stays_away(tmp_path: Path) -> None:
     assert lines(cache) == []
 
 
-def test_a_name_that_has_gone_since_stays_away(tmp_path: Path) -> None:
-    """Also from a table that is not whole: that it went is the later word."""
+def test_a_name_removed_later_is_not_restored(tmp_path: Path) -> None:
+    """Also from an incomplete table: the removal is the later observation."""
     cache = tmp_path / "cache"
     log = whole(A=1, OLD=2).write(tmp_path / "flight.tlog")
     save(cache, NOW + 100.0, known("A", 1), known("OLD", 2))
@@ -410,7 +409,7 @@ def test_a_name_that_has_gone_since_stays_away(tmp_path: Path) -> None:
     assert kept_values(cache) == {"A": 1, "OLD": 5}
 
 
-def test_vehicles_that_do_not_say_who_they_are_are_told_apart_by_the_log(tmp_path: Path) -> None:
+def test_unidentified_vehicles_are_distinguished_by_the_log(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     one = Log().beat().list(A=1).write(tmp_path / "1.tlog")
     two = Log().beat().tell("A", 0, A=2, B=3).write(tmp_path / "2.tlog")
@@ -419,7 +418,7 @@ def test_vehicles_that_do_not_say_who_they_are_are_told_apart_by_the_log(tmp_pat
     assert [table.complete for table in tables] == [True, False]
 
 
-def test_what_was_said_before_the_identity_has_its_own_time(tmp_path: Path) -> None:
+def test_values_before_the_identification_keep_their_times(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     log = Log().beat().list(A=1).wait(500.0).identify().beat()
     save(cache, NOW + 100.0, known("A", 5))
@@ -427,7 +426,7 @@ def test_what_was_said_before_the_identity_has_its_own_time(tmp_path: Path) -> N
     assert kept_values(cache) == {"A": 5}
 
 
-def test_history_keeps_its_newest_lines_by_their_time(tmp_path: Path) -> None:
+def test_history_keeps_the_newest_lines_by_time(tmp_path: Path) -> None:
     cache = tmp_path / "cache"
     names = [f"P{number}" for number in range(1000)]
     for step in range(HISTORY_LINES // 1000 + 1):
@@ -441,14 +440,14 @@ def test_history_keeps_its_newest_lines_by_their_time(tmp_path: Path) -> None:
     assert found[0][4] == 1001.0
 
 
-# the command
+# The command line
 
 
-def test_the_command_reads_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_reads_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = whole(A=1, B=2).wait(300.0).change("B", 4).write(tmp_path / "flight.tlog")
     began = time.monotonic()
     assert run(["fetch", f"replay:{path}", "--json"]) == 0
-    assert time.monotonic() - began < 60.0  # not the minutes of the log
+    assert time.monotonic() - began < 60.0  # less than the minutes of the log
     fetched = json.loads(capsys.readouterr().out)
     assert (fetched["count"], fetched["params"]["B"]["value"], fetched["bytes_sent"]) == (2, 4, 0)
     assert run(["show", f"replay:{path}", "--json"]) == 0
@@ -458,7 +457,7 @@ def test_the_command_reads_logs(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "where nothing is sent" in capsys.readouterr().err
     capsys.readouterr()
     for names in ([], ["B"]):
-        assert run(["watch", f"replay:{path}?speed=100", *names]) == 0  # it ends with the log
+        assert run(["watch", f"replay:{path}?speed=100", *names]) == 0  # ends with the log
         told = capsys.readouterr().out.splitlines()
         assert told == ["2023-11-14T22:18:21.000Z  B  2 -> 4  (vehicle)"], "with the time of the log"
     assert run(["watch", f"replay:{path}?speed=100", "A"]) == 0
@@ -467,7 +466,7 @@ def test_the_command_reads_logs(tmp_path: Path, capsys: pytest.CaptureFixture[st
     assert "cannot open" in capsys.readouterr().err
 
 
-def test_the_command_imports_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_line_imports_logs(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cache = tmp_path / "cache"
     good = whole(A=1, B=2).write(tmp_path / "flight.tlog")
     empty = Log().beat().write(tmp_path / "empty.tlog")
@@ -477,7 +476,7 @@ def test_the_command_imports_logs(tmp_path: Path, capsys: pytest.CaptureFixture[
     told = capsys.readouterr()
     [table] = json.loads(told.out)["tables"]
     assert (table["file"], table["key"], table["params"], table["complete"]) == (str(good), KEY, 2, True)
-    assert "bad.tlog is no telemetry log" in told.err
+    assert "bad.tlog is not a telemetry log" in told.err
     assert "empty.tlog holds no parameters" in told.err
     assert run(["import", str(good), "--cache", str(cache)]) == 0
     assert "flight.tlog  1/1        generic         2  yes" in capsys.readouterr().out
@@ -485,8 +484,8 @@ def test_the_command_imports_logs(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert run(["import"]) == 2
 
 
-def test_earlier_states_are_told_as_before_when_a_log_completes_the_history(tmp_path: Path) -> None:
-    """Lines of history get other numbers then, behind which names have appeared."""
+def test_earlier_states_are_unchanged_when_a_log_completes_the_history(tmp_path: Path) -> None:
+    """Lines of history are renumbered then, also those after which names have appeared."""
     cache = tmp_path / "cache"
     later = Log(NOW + 1000.0).beat().identify().list(A=1, B=2).wait(10.0).change("A", 3)
     later.wait(10.0).list(C=4).wait(10.0).change("B", 5).wait(1.0).beat()

@@ -1,4 +1,4 @@
-"""Descriptions of parameters: what they say of a value, and the files that they come from."""
+"""Parameter metadata: names and ranges of values, and the files."""
 
 from __future__ import annotations
 
@@ -28,37 +28,37 @@ SIGNED = ParamInfo("SIGNED", ParamType.INT32, bits={0: "GPS", 31: "Last"})
 GAIN = ParamInfo("GAIN", units="1/s", minimum=0.1, maximum=12)
 
 
-# what a value means
+# Names of values and bits
 
 
-def test_a_value_in_words() -> None:
+def test_text_of_a_value() -> None:
     assert MODE.text(5) == MODE.text(5.0) == "Loiter"
     assert MODE.text(0.5) == "Half"
     assert ParamInfo("A", values={0.1: "Low"}).text(0.10000000149011612) == "Low"  # 0.1 as a float32
     assert [MODE.text(value) for value in (1, math.nan, math.inf, b"abcd", 5.5)] == [None] * 5
 
 
-def test_a_mask_in_words() -> None:
+def test_text_of_a_mask() -> None:
     assert MASK.text(0b1011) == "GPS|Baro|Optical flow"
     assert MASK.text(1.0) == "GPS"
     assert MASK.text(0b10101) == "GPS|0x14"
-    assert MASK.text(1 << 7) == "0x80"  # its name would read as a number
+    assert MASK.text(1 << 7) == "0x80"  # its name looks like a number
     assert [MASK.text(value) for value in (0, -1, 1.5)] == [None] * 3
     assert SIGNED.text(-(2**31)) == "Last"
     assert SIGNED.text(-(2**31) + 1) == "GPS|Last"
 
 
 @pytest.mark.parametrize("text", ["Loiter", "loiter", " LOITER ", "5", "0x5"])
-def test_the_name_of_a_value_is_read(text: str) -> None:
+def test_parse_accepts_names_of_values(text: str) -> None:
     assert MODE.parse(text) == 5
 
 
-def test_names_are_read_whatever_their_spaces() -> None:
+def test_parse_ignores_spaces_in_names() -> None:
     assert MODE.parse("land now") == 9
     assert MODE.parse("half") == 0.5
 
 
-def test_numbers_are_read_exactly() -> None:
+def test_numbers_are_parsed_exactly() -> None:
     assert MODE.parse("-16777217") == -16777217
     assert isinstance(MODE.parse("4"), int)
     assert isinstance(MODE.parse("4.0"), float)
@@ -68,8 +68,8 @@ def test_numbers_are_read_exactly() -> None:
         MODE.parse("1e999")
 
 
-def test_a_number_is_never_a_name() -> None:
-    """ArduPilot has baud rates for names: 57 is called 57600."""
+def test_a_number_is_never_parsed_as_a_name() -> None:
+    """In ArduPilot, names of values are baud rates: 57 has the name 57600."""
     info = ParamInfo("SERIAL1_BAUD", values={57: "57600", 115: "111100"})
     assert info.parse("57600") == 57600
     assert info.parse("57") == 57
@@ -77,15 +77,15 @@ def test_a_number_is_never_a_name() -> None:
 
 
 @pytest.mark.parametrize("text", ["GPS|Baro", "gps+baro", "GPS, Baro", "baro | 1", "0x1|0x2", "0b11"])
-def test_names_of_bits_are_joined(text: str) -> None:
+def test_parse_joins_names_of_bits(text: str) -> None:
     if text == "0b11":
-        with pytest.raises(UsageError, match=r"MASK: '0b11' is no number, nor one of its bits: GPS \(0\)"):
+        with pytest.raises(UsageError, match=r"MASK: '0b11' is not a number, nor one of its bits: GPS \(0\)"):
             MASK.parse(text)
     else:
         assert MASK.parse(text) == 3
 
 
-def test_a_name_may_hold_what_joins_names() -> None:
+def test_names_may_contain_separators() -> None:
     info = ParamInfo("A", bits={0: "Roll, pitch", 1: "Roll", 2: "Pitch", 3: "Yaw"})
     assert info.parse("roll, pitch") == 1
     assert info.parse("Roll, pitch|Yaw") == 0b1001
@@ -94,55 +94,55 @@ def test_a_name_may_hold_what_joins_names() -> None:
         info.parse("Yaw+Roll, pitch")
 
 
-def test_the_last_bit_of_a_signed_type_makes_it_negative() -> None:
+def test_the_highest_bit_of_a_signed_type_is_negative() -> None:
     assert SIGNED.parse("Last") == -(2**31)
     assert SIGNED.parse("GPS|Last") == -(2**31) + 1
 
 
-def test_a_name_that_two_values_have_is_not_guessed() -> None:
+def test_an_ambiguous_name_is_rejected() -> None:
     info = ParamInfo("A", values={0: "Off", 2: "off"})
     with pytest.raises(UsageError, match="A: 'Off' is the name of 0 and 2; give the number"):
         info.parse("Off")
 
 
-def test_errors_say_what_could_have_been_meant() -> None:
+def test_errors_suggest_names() -> None:
     with pytest.raises(
-        UsageError, match=r"MODE: 'Loitr' is no number, nor one of its values: Stabilize \(0\), Lo"
+        UsageError, match=r"MODE: 'Loitr' is not a number, nor one of its values: Stabilize \(0\), Lo"
     ):
         MODE.parse("Loitr")
     with pytest.raises(
-        UsageError, match=r"'GPS\|Barro' is no number, nor is 'Barro' one of its bits: GPS \(0\)"
+        UsageError, match=r"'GPS\|Barro' is not a number, nor is 'Barro' one of its bits: GPS \(0\)"
     ):
         MASK.parse("GPS|Barro")
     with pytest.raises(UsageError, match="and its values have no names"):
         GAIN.parse("high")
     named: dict[int | float, str] = {number: f"Mode {number}" for number in range(40)}
     many = ParamInfo("MANY", values=named | {99: "Loiter"})
-    with pytest.raises(UsageError, match=r"nor one of its values; near it: Loiter$"):
+    with pytest.raises(UsageError, match=r"nor one of its values; similar: Loiter$"):
         many.parse("Loitr")
     with pytest.raises(UsageError, match=r"nor one of its values, of which there are 41$"):
         many.parse("xyzzy")
 
 
 @given(st.integers(0, 2**64 - 1), st.dictionaries(st.integers(0, 63), st.text(max_size=8), max_size=8))
-def test_a_mask_in_words_is_never_read_as_another_one(mask: int, bits: dict[int, str]) -> None:
+def test_text_of_a_mask_parses_to_the_same_mask(mask: int, bits: dict[int, str]) -> None:
     info = ParamInfo("A", bits={bit: name for bit, name in bits.items() if name})
     text = info.text(mask)
     if text is not None:
         try:
             again = info.parse(text)
         except UsageError:
-            return  # names that are the same, or hold what joins names
+            return  # equal names, or names with separators
         assert again == mask
 
 
-def test_the_range() -> None:
+def test_problem_reports_values_outside_the_range() -> None:
     assert GAIN.problem(6.5) is None
     assert GAIN.problem(0.10000000149011612) is None
     assert GAIN.problem(12.0) is None
     assert GAIN.problem(12.5) == "GAIN: 12.5 is above the maximum of 12 1/s"
     assert GAIN.problem(-1) == "GAIN: -1 is below the minimum of 0.1 1/s"
-    assert GAIN.problem(math.nan) == "GAIN: nan is in no range"
+    assert GAIN.problem(math.nan) == "GAIN: nan is outside every range"
     assert GAIN.problem(math.inf) == "GAIN: inf is above the maximum of 12 1/s"
     assert GAIN.problem(1e300) is not None
     assert GAIN.problem(b"abcd") is None
@@ -151,10 +151,10 @@ def test_the_range() -> None:
     assert ParamInfo("A", maximum=3.1415926535).problem(3.1415927410125732) is None  # pi as a float32
 
 
-# the files
+# Files
 
 
-def test_a_file_of_px4() -> None:
+def test_px4_file() -> None:
     read = read_metadata(PX4)
     assert len(read) == 5
     assert repr(read) == f"<Metadata of 5 params from {PX4}>"
@@ -186,7 +186,7 @@ def test_a_file_of_px4() -> None:
     assert count.is_volatile
 
 
-def test_a_group_is_found_by_the_names_in_it() -> None:
+def test_a_group_is_found_by_the_names_of_its_parameters() -> None:
     read = read_metadata(PX4)
     third = read["TST_OUT3_FUNC"]
     assert third.name == "TST_OUT3_FUNC"
@@ -200,14 +200,14 @@ def test_a_group_is_found_by_the_names_in_it() -> None:
     assert "TST_OUT{n}_FUNC" in list(read)
 
 
-def test_what_stands_under_its_own_name_counts_before_a_group() -> None:
+def test_a_parameters_own_entry_overrides_its_group() -> None:
     read = Metadata.of([ParamInfo("A{n}"), ParamInfo("A2", units="m")])
     assert read["A2"].units == "m"
     assert read["A3"].units == ""
 
 
 @pytest.mark.parametrize("path", [XML, JSON], ids=["xml", "json"])
-def test_a_file_of_ardupilot(path: Path) -> None:
+def test_ardupilot_files(path: Path) -> None:
     read = read_metadata(path)
     assert list(read) == ["FLTMODE1", "TST_ALT", "TST_EXPO", "TST_LOG", "TST_OLD", "TST_RUNTIME"]
     mode = read["FLTMODE1"]
@@ -230,7 +230,7 @@ def test_a_file_of_ardupilot(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", [PX4, XML, JSON], ids=["px4", "xml", "json"])
-def test_the_form_is_told_by_the_content(path: Path, tmp_path: Path) -> None:
+def test_the_format_is_detected_from_the_content(path: Path, tmp_path: Path) -> None:
     plain = read_metadata(path)
     for name, content in {
         "a.txt": path.read_bytes(),
@@ -242,7 +242,7 @@ def test_the_form_is_told_by_the_content(path: Path, tmp_path: Path) -> None:
         assert read_metadata(other).params == plain.params
 
 
-def test_what_two_vehicles_describe_differently_is_left_out() -> None:
+def test_parameters_with_different_descriptions_are_left_out() -> None:
     row = '<param name="{0}:{1}" humanName="{2}"/>'
     vehicles = ""
     for name in ("Copter", "Plane"):
@@ -259,10 +259,10 @@ def px4(*rows: dict[str, Any], **more: Any) -> bytes:
 WRONG = {
     "empty": (b"", "neither JSON nor XML"),
     "text": (b"MC_ROLL_P 6.5", "neither JSON nor XML; expected PX4's parameters.json, ArduPilot's"),
-    "cut json": (b'{"parameters": [', "no JSON: EOF"),
-    "deep json": (b'{"a":' * 100_000, "no JSON: recursion limit"),
+    "cut json": (b'{"parameters": [', "not JSON: EOF"),
+    "deep json": (b'{"a":' * 100_000, "not JSON: recursion limit"),
     "list": (b" [1]", "neither JSON"),
-    "other json": (b'{"a": {"b": {}}}', 'has no "json", which marks'),
+    "other json": (b'{"a": {"b": {}}}', 'has no "json" member'),
     "general": (b'{"version": 1, "metadataTypes": []}', "the general metadata file"),
     "no list": (b'{"version": 1, "parameters": {"A": 1}}', r"parameters: Input should be a valid list"),
     "no version": (b'{"parameters": []}', "version: Field required"),
@@ -280,22 +280,22 @@ WRONG = {
     "ardupilot list": (b'{"json": {}, "A": {"B": {"Values": [1]}}}', r"B.Values"),
     "ardupilot number": (b'{"json": {}, "A": {"B": {"DisplayName": 1}}}', "B.DisplayName"),
     "nothing in it": (b'{"json": {}}', "describes no parameters"),
-    "html": (b"<html><body/></html>", "begins with <html>, where the files of ArduPilot have <paramfile>"),
-    "cut xml": (b"<paramfile><vehicles>", "no XML: no element found"),
-    "encoding": (b'<?xml version="1.0" encoding="x-none"?><paramfile/>', "no XML: unknown encoding"),
+    "html": (b"<html><body/></html>", "begins with <html>, not with <paramfile>"),
+    "cut xml": (b"<paramfile><vehicles>", "not XML: no element found"),
+    "encoding": (b'<?xml version="1.0" encoding="x-none"?><paramfile/>', "not XML: unknown encoding"),
     "nameless": (b"<paramfile><param/></paramfile>", "a parameter without a name"),
     "nested": (
         b'<paramfile><param name="A"><param name="B"/></param></paramfile>',
-        "a parameter inside of A",
+        "a parameter inside A",
     ),
     "deep xml": (b"<paramfile>" + b"<a>" * 100, "more than 16 levels"),
     "no xz": (b"\xfd7zXZ\0" + bytes(50), "cannot be unpacked"),
-    "cut xz": (lzma.compress(px4())[:-8], "cannot be unpacked: it is cut short"),
+    "cut xz": (lzma.compress(px4())[:-8], "cannot be unpacked: the file is truncated"),
 }
 
 
 @pytest.mark.parametrize(("content", "said"), WRONG.values(), ids=WRONG)
-def test_what_is_wrong_with_a_file_is_said(content: bytes, said: str) -> None:
+def test_invalid_files_are_rejected_with_the_reason(content: bytes, said: str) -> None:
     with pytest.raises(MetadataError, match=f"^the file[,:] .*{said}|^the file, {said}") as caught:
         read_content(content, source="the file")
     assert caught.value.source == "the file"
@@ -311,57 +311,57 @@ ENTITIES = [
 
 @pytest.mark.parametrize("text", ENTITIES, ids=["expansion", "file", "address"])
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
-def test_a_document_type_is_refused(text: str, encoding: str) -> None:
+def test_a_document_type_is_rejected(text: str, encoding: str) -> None:
     content = text.encode(encoding)
     said = "document type" if encoding == "utf-8" else "neither JSON nor XML"
     with pytest.raises(MetadataError, match=said):
         read_content(content, source="the file")
 
 
-def test_an_entity_without_a_document_type_is_none() -> None:
-    with pytest.raises(MetadataError, match="no XML: undefined entity"):
+def test_an_undeclared_entity_is_rejected() -> None:
+    with pytest.raises(MetadataError, match="not XML: undefined entity"):
         read_content(b"<paramfile>&a;</paramfile>", source="the file")
 
 
-def test_a_file_that_unpacks_to_too_much_is_refused() -> None:
-    packed = lzma.compress(bytes(formats.LARGEST + 1), preset=1)
+def test_a_file_with_too_large_content_is_rejected() -> None:
+    packed = lzma.compress(bytes(formats.CONTENT_SIZE_MAX + 1), preset=1)
     assert len(packed) < 10_000
     with pytest.raises(MetadataError, match="too large"):
         read_content(packed, source="the file")
 
 
-def test_a_file_that_needs_too_much_memory_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    packed = lzma.compress(px4({"name": "A"}), preset=9)  # as PX4 packs
+def test_a_file_that_needs_too_much_memory_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
+    packed = lzma.compress(px4({"name": "A"}), preset=9)  # the preset of PX4
     assert list(read_content(packed, source="the file")) == ["A"]
-    monkeypatch.setattr(formats, "MOST_MEMORY", 32 << 20)
+    monkeypatch.setattr(formats, "UNPACKING_MEMORY_MAX", 32 << 20)
     with pytest.raises(MetadataError, match="cannot be unpacked: Memory usage limit exceeded"):
         read_content(packed, source="the file")
 
 
-def test_files_that_are_too_large_are_refused(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(formats, "LARGEST", 100)
-    monkeypatch.setattr(formats, "LARGEST_PACKED", 60)
+def test_too_large_files_are_rejected(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(formats, "CONTENT_SIZE_MAX", 100)
+    monkeypatch.setattr(formats, "PACKED_SIZE_MAX", 60)
     with pytest.raises(MetadataError, match="too large"):
         read_metadata(PX4)
     with pytest.raises(MetadataError, match="too large"):
         read_content(lzma.compress(px4()), source="the file")
 
 
-def test_more_parameters_than_a_vehicle_can_have_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_many_ardupilot_parameters_are_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     from paramclient.metadata import ardupilot
 
-    monkeypatch.setattr(ardupilot, "MOST_PARAMS", 5)
+    monkeypatch.setattr(ardupilot, "PARAMS_MAX", 5)
     for path in (XML, JSON):
         with pytest.raises(MetadataError, match="describes more than 5 parameters"):
             read_metadata(path)
 
 
-def test_more_parameters_than_that_are_refused_of_px4_too() -> None:
+def test_too_many_px4_parameters_are_rejected() -> None:
     with pytest.raises(MetadataError, match="parameters: List should have at most 65535 items"):
         read_content(px4(*[{"name": "A"}] * 65_536), source="the file")
 
 
-def test_a_range_without_room_and_a_value_that_is_none_are_left_out() -> None:
+def test_empty_ranges_and_invalid_values_are_left_out() -> None:
     rows = {"name": "A", "min": 2, "max": 1, "values": [{"value": math.nan, "description": "NaN"}]}
     info = read_content(px4(rows), source="the file")["A"]
     assert (info.minimum, info.maximum, dict(info.values)) == (None, None, {})
@@ -370,17 +370,17 @@ def test_a_range_without_room_and_a_value_that_is_none_are_left_out() -> None:
     assert (info.minimum, info.maximum) == (None, None)
 
 
-def test_no_more_is_read_or_unpacked_than_may_be(tmp_path: Path) -> None:
-    packed = lzma.compress(bytes(8 * formats.LARGEST), preset=1)
+def test_reading_and_unpacking_are_bounded(tmp_path: Path) -> None:
+    packed = lzma.compress(bytes(8 * formats.CONTENT_SIZE_MAX), preset=1)
     with (tmp_path / "huge").open("wb") as file:
-        file.truncate(20 * formats.LARGEST)  # takes no room on the disk
+        file.truncate(20 * formats.CONTENT_SIZE_MAX)  # a sparse file
     tracemalloc.start()
     try:
         with pytest.raises(MetadataError, match="too large"):
             read_content(packed, source="the file")
         with pytest.raises(MetadataError, match="too large"):
             read_metadata(tmp_path / "huge")
-        assert tracemalloc.get_traced_memory()[1] < 4 * formats.LARGEST
+        assert tracemalloc.get_traced_memory()[1] < 4 * formats.CONTENT_SIZE_MAX
     finally:
         tracemalloc.stop()
 
@@ -404,13 +404,13 @@ STARTS = [
 
 
 @given(st.sampled_from(STARTS), st.binary(max_size=200))
-def test_whatever_the_bytes_there_is_one_error(start: bytes, rest: bytes) -> None:
+def test_random_bytes_raise_metadata_error(start: bytes, rest: bytes) -> None:
     with suppress(MetadataError):
         read_content(start + rest, source="the file")
 
 
 @given(st.data())
-def test_a_file_that_was_damaged_is_read_or_refused(data: st.DataObject) -> None:
+def test_a_damaged_file_is_read_or_rejected(data: st.DataObject) -> None:
     content = bytearray(data.draw(st.sampled_from(SAMPLES)))
     for _ in range(data.draw(st.integers(1, 4))):
         at = data.draw(st.integers(0, len(content) - 1))
@@ -448,7 +448,7 @@ JSON_VALUES = st.recursive(
 
 
 @given(JSON_VALUES, st.sampled_from(["parameters", "metadataTypes", "A"]))
-def test_json_of_any_structure_is_read_or_refused(value: object, key: str) -> None:
+def test_json_of_any_structure_is_read_or_rejected(value: object, key: str) -> None:
     content = json.dumps({"version": 1, "json": {}, key: value}).encode()
     with suppress(MetadataError):
         read_content(content, source="the file")

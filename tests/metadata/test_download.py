@@ -1,4 +1,4 @@
-"""Descriptions that a vehicle gives of itself: the question, the files, what is kept of them."""
+"""Metadata of vehicles: the request, the files, and the metadata cache."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ IDENTITY = Identity(1, "link", "abcd", 12, 2, 0x01110000, "0123abcd", 1)
 
 @pytest.fixture(autouse=True)
 def _threads_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The clock of a `SwiftLoop` stands still while files are read in a thread."""
+    """Stop the clock of a `SwiftLoop` while a worker thread reads files."""
     in_thread = download._in_thread
 
     async def counted(*args: Any, **kwargs: Any) -> Any:
@@ -59,7 +59,7 @@ def _threads_are_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def describing(**options: Any) -> PX4Vehicle:
-    """A small vehicle that describes what it has."""
+    """Return a small vehicle with metadata of its parameters."""
     return small_px4(metadata=True, **options)
 
 
@@ -68,7 +68,7 @@ def file_of(document: object) -> bytes:
 
 
 def publish(vehicle: PX4Vehicle, **entry: Any) -> None:
-    """Let a vehicle's general file say this of the descriptions of its parameters."""
+    """Replace the entry of the parameter metadata in a vehicle's general file."""
     kinds = [
         {"type": 1, "uri": f"mftp://{PARAMETER_FILE}"} | entry,
         {"type": 4, "uri": "https://x.invalid/e"},
@@ -77,7 +77,7 @@ def publish(vehicle: PX4Vehicle, **entry: Any) -> None:
 
 
 def reads_of(tap: Tap) -> int:
-    """How many messages about files the station has sent."""
+    """Return the number of MAVFTP messages that the station has sent."""
     return len(tap.messages(FileTransfer))
 
 
@@ -85,7 +85,7 @@ async def files_in(folder: Path) -> list[Path]:
     return await anyio.to_thread.run_sync(lambda: sorted(folder.iterdir()))
 
 
-# the whole way
+# Complete downloads
 
 
 @swiftly
@@ -108,7 +108,7 @@ async def test_a_vehicle_describes_its_parameters() -> None:
 
 
 @swiftly
-async def test_the_link_may_lose_much() -> None:
+async def test_download_with_packet_loss() -> None:
     vehicle = describing(ftp_rate=10_000)
     link = Air([vehicle], uplink=FaultyLink(loss=0.3, seed=5), downlink=FaultyLink(loss=0.3, seed=6))
     async with a_client(link) as client:
@@ -118,7 +118,7 @@ async def test_the_link_may_lose_much() -> None:
 
 
 @swiftly
-async def test_what_is_kept_is_not_fetched_again(tmp_path: Path) -> None:
+async def test_a_cached_file_is_not_downloaded_again(tmp_path: Path) -> None:
     cache = tmp_path / "cache.sqlite3"
     for expected in (True, False):
         tap = Tap(describing())
@@ -139,7 +139,7 @@ async def test_what_is_kept_is_not_fetched_again(tmp_path: Path) -> None:
 
 
 @swiftly
-async def test_another_firmware_is_fetched_anew(tmp_path: Path) -> None:
+async def test_metadata_of_another_firmware_is_downloaded(tmp_path: Path) -> None:
     kept = MetadataStore(tmp_path)
     for units in ("m", "s"):
         vehicle = describing()
@@ -154,7 +154,7 @@ async def test_another_firmware_is_fetched_anew(tmp_path: Path) -> None:
 
 
 @swiftly
-async def test_without_a_cache_nothing_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+async def test_without_a_cache_nothing_is_stored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def forbidden(*_: object) -> None:
         raise AssertionError
 
@@ -166,7 +166,7 @@ async def test_without_a_cache_nothing_is_kept(tmp_path: Path, monkeypatch: pyte
 
 
 @swiftly
-async def test_what_may_change_is_neither_checked_nor_kept(tmp_path: Path) -> None:
+async def test_a_file_without_a_checksum_is_not_cached(tmp_path: Path) -> None:
     vehicle = describing()
     publish(vehicle)  # without a checksum
     kept = MetadataStore(tmp_path)
@@ -178,8 +178,8 @@ async def test_what_may_change_is_neither_checked_nor_kept(tmp_path: Path) -> No
 
 
 @swiftly
-async def test_the_checksum_may_be_that_of_what_is_packed(tmp_path: Path) -> None:
-    """PX4 announces that of its general file so."""
+async def test_the_checksum_may_be_that_of_the_unpacked_file(tmp_path: Path) -> None:
+    """PX4 announces this checksum for its general file."""
     vehicle = describing()
     unpacked = lzma.decompress(vehicle.files[PARAMETER_FILE])
     publish(vehicle, fileCrc=crc32_px4(unpacked))
@@ -193,12 +193,12 @@ async def test_the_checksum_may_be_that_of_what_is_packed(tmp_path: Path) -> Non
     assert known.params == read.params
 
 
-# what goes wrong
+# Errors
 
 
 @pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle, generic])
 @swiftly
-async def test_most_vehicles_describe_nothing(make: Any) -> None:
+async def test_vehicles_without_metadata(make: Any) -> None:
     async with a_client(make()) as client:
         component = await client.component()
         began = anyio.current_time()
@@ -216,19 +216,19 @@ async def test_a_general_file_without_parameters() -> None:
 
 
 @swiftly
-async def test_nothing_is_fetched_from_the_internet() -> None:
+async def test_nothing_is_downloaded_from_the_internet() -> None:
     vehicle = describing()
     publish(vehicle, uri="https://example.invalid/parameters.json.xz")
     async with a_client(vehicle) as client:
         with pytest.raises(
-            MetadataError, match=r"1/1 .* at https://example\.invalid/.*, and nothing is"
+            MetadataError, match=r"1/1 .* at https://example\.invalid/.*, which is not downloaded"
         ) as caught:
             await metadata_of(await client.component())
     assert caught.value.source == "https://example.invalid/parameters.json.xz"
 
 
 @swiftly
-async def test_what_is_on_board_goes_before_the_internet() -> None:
+async def test_a_file_on_board_is_preferred_to_the_internet() -> None:
     vehicle = describing()
     publish(vehicle, uri="https://example.invalid/p", uriFallback=f"mftp://{PARAMETER_FILE}")
     async with a_client(vehicle) as client:
@@ -263,10 +263,13 @@ async def test_files_that_are_not_as_announced(wrong: str, tmp_path: Path) -> No
         publish(vehicle, uri="mftp://" + "x" * 240)
     kept = MetadataStore(tmp_path)
     said = {
-        "checksum": (MetadataError, "does not have the checksum"),
+        "checksum": (MetadataError, "does not have the announced checksum"),
         "missing": (FileTransferError, "file not found"),
-        "damaged": (MetadataError, f"mftp://{PARAMETER_FILE} of 1/1: cannot be unpacked: it is cut short"),
-        "long": (MetadataError, r"1/1 says that its descriptions are at mftp://x*: .* 239 bytes"),
+        "damaged": (
+            MetadataError,
+            f"mftp://{PARAMETER_FILE} of 1/1: cannot be unpacked: the file is truncated",
+        ),
+        "long": (MetadataError, r"1/1 announces its metadata at mftp://x*: .* 239 bytes"),
     }[wrong]
     async with a_client(vehicle) as client:
         component = await client.component()
@@ -278,7 +281,7 @@ async def test_files_that_are_not_as_announced(wrong: str, tmp_path: Path) -> No
 
 
 @swiftly
-async def test_a_vehicle_that_does_not_answer() -> None:
+async def test_a_vehicle_that_does_not_respond() -> None:
     tap = Tap(describing())
     async with a_client(tap) as client:
         component = await client.component()
@@ -298,14 +301,14 @@ async def test_a_vehicle_that_does_not_answer() -> None:
         assert "lost" in str(result)
         result = await outcome(metadata_of(component))
         assert isinstance(result, NoReply)
-        assert result.attempts == 0  # nothing was asked
+        assert result.attempts == 0  # no request was sent
         tap.is_mute = tap.is_deaf = False
         await anyio.sleep(1.5)
         assert await metadata_of(component) is not None
 
 
 @swiftly
-async def test_a_client_that_is_closed_meanwhile() -> None:
+async def test_closing_the_client_during_a_download() -> None:
     tap = Tap(describing())
     async with anyio.create_task_group() as tasks:
         results: list[object] = []
@@ -324,8 +327,8 @@ async def test_a_client_that_is_closed_meanwhile() -> None:
 
 
 @swiftly
-async def test_cancellation_leaves_nothing_behind(tmp_path: Path) -> None:
-    """At whatever moment."""
+async def test_cancellation_closes_files_and_sessions(tmp_path: Path) -> None:
+    """At every point of the download."""
     for moment in (0.001, 0.012, 0.03, 0.05, 0.1, 0.2):
         vehicle = describing(ftp_rate=20_000)
         async with a_client(vehicle) as client:
@@ -339,7 +342,7 @@ async def test_cancellation_leaves_nothing_behind(tmp_path: Path) -> None:
 
 
 @swiftly
-async def test_those_who_ask_at_the_same_time_share_the_answer() -> None:
+async def test_concurrent_requests_share_a_response() -> None:
     tap = Tap(describing())
     async with a_client(tap) as client:
         component = await client.component()
@@ -350,7 +353,7 @@ async def test_those_who_ask_at_the_same_time_share_the_answer() -> None:
 
 
 @swiftly
-async def test_a_link_that_drops_meanwhile() -> None:
+async def test_a_link_that_drops_during_a_download() -> None:
     tap = Tap(describing())
     link = FlakyLink(tap)
     async with a_client(link) as client:
@@ -372,8 +375,8 @@ async def test_a_link_that_drops_meanwhile() -> None:
 
 
 @swiftly
-async def test_what_is_too_long_for_a_description_is_not_taken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(download, "LARGEST_PACKED", 400)
+async def test_a_too_large_file_is_not_downloaded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(download, "PACKED_SIZE_MAX", 400)
     vehicle = describing()
     assert len(vehicle.files[GENERAL_FILE]) < 400 < len(vehicle.files[PARAMETER_FILE])
     async with a_client(vehicle) as client:
@@ -382,7 +385,7 @@ async def test_what_is_too_long_for_a_description_is_not_taken(monkeypatch: pyte
 
 
 @swiftly
-async def test_nothing_is_noted_of_a_vehicle_that_another_one_has_followed(
+async def test_nothing_is_stored_after_the_vehicle_was_replaced(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     kept = MetadataStore(tmp_path)
@@ -401,11 +404,11 @@ async def test_nothing_is_noted_of_a_vehicle_that_another_one_has_followed(
         assert not kept.has_notes
 
 
-# the question
+# The request
 
 
 class Asked:
-    """Descriptions of a component, with what is sent."""
+    """The metadata request of a component, with the sent messages."""
 
     def __init__(self) -> None:
         self.sent: list[Any] = []
@@ -413,13 +416,13 @@ class Asked:
         self.machine = Descriptions(self.context)
 
 
-def test_the_question_and_its_answers() -> None:
+def test_the_request_and_its_responses() -> None:
     asked = Asked()
     ask = asked.machine.ask(0.0)
     assert asked.sent == [CommandLong(1, 1, 512, (397.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))]
     asked.machine.heard(ComponentMetadata("mftp://a", 7), 0.1)
     assert ask.result == ComponentMetadata("mftp://a", 7)
-    asked.machine.heard(ComponentMetadata("mftp://b", 8), 0.2)  # unasked
+    asked.machine.heard(ComponentMetadata("mftp://b", 8), 0.2)  # unsolicited
     assert asked.machine.next_deadline() == float("inf")
     ask = asked.machine.ask(1.0)
     asked.machine.heard(ComponentMetadata("", 0), 1.1)
@@ -430,27 +433,27 @@ def test_the_question_and_its_answers() -> None:
 @pytest.mark.parametrize(
     ("result", "is_answer"), [(0, False), (1, False), (2, True), (3, True), (4, True), (5, False)]
 )
-def test_refusals_are_answers(result: int, is_answer: bool) -> None:
+def test_refusals_end_the_request(result: int, is_answer: bool) -> None:
     asked = Asked()
     ask = asked.machine.ask(0.0)
     asked.machine.acknowledged(CommandAck(512, result, 255, 190), 0.1)
     assert ask.done is is_answer
 
 
-def test_the_refusal_of_another_question_is_none() -> None:
+def test_the_refusal_of_another_request_is_ignored() -> None:
     asked = Asked()
     ask = asked.machine.ask(0.0)
     asked.machine.acknowledged(CommandAck(511, 3, 255, 190), 0.1)
     asked.machine.acknowledged(CommandAck(512, 3, 254, 190), 0.1)  # another station's
     asked.context.is_identifying = True
-    asked.machine.acknowledged(CommandAck(512, 3, 255, 190), 0.1)  # perhaps of AUTOPILOT_VERSION
+    asked.machine.acknowledged(CommandAck(512, 3, 255, 190), 0.1)  # may belong to AUTOPILOT_VERSION
     assert not ask.done
     asked.context.is_identifying = False
-    asked.machine.acknowledged(CommandAck(512, 3), 0.1)  # MAVLink 1 does not say whom it is for
+    asked.machine.acknowledged(CommandAck(512, 3), 0.1)  # MAVLink 1 has no target in COMMAND_ACK
     assert ask.done
 
 
-def test_it_is_asked_again_until_there_is_no_hope() -> None:
+def test_the_request_is_repeated_until_it_is_given_up() -> None:
     asked = Asked()
     ask = asked.machine.ask(0.0)
     late = asked.machine.ask(0.5)
@@ -467,7 +470,7 @@ def test_it_is_asked_again_until_there_is_no_hope() -> None:
     asked.machine.release(ask)
 
 
-def test_it_is_asked_again_when_the_link_is_back() -> None:
+def test_the_request_is_repeated_when_the_link_is_restored() -> None:
     asked = Asked()
     asked.machine.resume(0.0)
     assert asked.sent == []
@@ -483,14 +486,14 @@ def test_it_is_asked_again_when_the_link_is_back() -> None:
     assert len(sent) == 2
 
 
-# what is kept
+# The metadata cache
 
 
 def described(name: str = "A") -> bytes:
     return file_of({"version": 1, "parameters": [{"name": name}]})
 
 
-def test_a_firmware_is_known_by_version_commit_and_board(tmp_path: Path) -> None:
+def test_a_firmware_is_identified_by_version_commit_and_board(tmp_path: Path) -> None:
     kept = MetadataStore(tmp_path / "a" / "b")
     assert kept.known(IDENTITY, 1) is None
     content = described()
@@ -511,7 +514,7 @@ def test_a_firmware_is_known_by_version_commit_and_board(tmp_path: Path) -> None
     assert repr(kept) == f"<MetadataStore {tmp_path / 'a' / 'b'}>"
 
 
-def test_a_firmware_that_has_not_said_its_commit_is_not_known(tmp_path: Path) -> None:
+def test_a_firmware_without_a_commit_is_not_identified(tmp_path: Path) -> None:
     kept = MetadataStore(tmp_path)
     unknown = replace(IDENTITY, git_hash="")
     kept.remember(unknown, 1, 7)
@@ -520,9 +523,7 @@ def test_a_firmware_that_has_not_said_its_commit_is_not_known(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("damage", [b"", b"x", b"\xff" * 100])
-def test_what_was_damaged_is_thrown_away(
-    damage: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_damaged_file_is_deleted(damage: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     kept = MetadataStore(tmp_path)
     content = described()
     crc = crc32_px4(content)
@@ -537,7 +538,7 @@ def test_what_was_damaged_is_thrown_away(
 
 
 @pytest.mark.parametrize("damage", [b"", b"zzzzzzzz\n", b"../../../x", b"0" * 100])
-def test_a_note_that_was_damaged_is_thrown_away(damage: bytes, tmp_path: Path) -> None:
+def test_a_damaged_firmware_file_is_deleted(damage: bytes, tmp_path: Path) -> None:
     kept = MetadataStore(tmp_path)
     kept.remember(IDENTITY, 1, 7)
     (path,) = tmp_path.iterdir()
@@ -546,9 +547,7 @@ def test_a_note_that_was_damaged_is_thrown_away(damage: bytes, tmp_path: Path) -
     assert not list(tmp_path.iterdir())
 
 
-def test_descriptions_that_cannot_be_read_are_forgotten(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_unreadable_metadata_is_forgotten(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     kept = MetadataStore(tmp_path)
     kept.put(b"{}", crc32_px4(b"{}"))
     kept.remember(IDENTITY, 1, crc32_px4(b"{}"))
@@ -558,20 +557,20 @@ def test_descriptions_that_cannot_be_read_are_forgotten(
     assert caplog.text.count("WARNING") == 1
 
 
-def test_only_so_much_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(metadata_cache, "MOST_FILES", 4)
+def test_the_number_of_files_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(metadata_cache, "CACHED_FILES_MAX", 4)
     kept = MetadataStore(tmp_path)
     contents = [described(f"P{number}") for number in range(6)]
     for number, content in enumerate(contents):
         kept.put(content, crc32_px4(content))
         os.utime(tmp_path / f"{crc32_px4(content):08x}.metadata", (number, number))
         if number == 3:
-            assert kept.get(crc32_px4(contents[0])) == contents[0]  # used, and so the newest
+            assert kept.get(crc32_px4(contents[0])) == contents[0]  # used most recently
     held = [kept.get(crc32_px4(content)) is not None for content in contents]
     assert held == [True, False, False, True, True, True]
 
 
-def test_a_disk_that_fails_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_disk_errors_are_logged_as_warnings(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     (tmp_path / "file").write_text("in the way")
     kept = MetadataStore(tmp_path / "file")
     content = described()
@@ -583,7 +582,7 @@ def test_a_disk_that_fails_is_warned_of(tmp_path: Path, caplog: pytest.LogCaptur
     assert "cannot be written" in caplog.text
 
 
-def test_a_write_that_fails_leaves_nothing_half_done(
+def test_a_failed_write_leaves_no_partial_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     kept = MetadataStore(tmp_path)
@@ -598,19 +597,19 @@ def test_a_write_that_fails_leaves_nothing_half_done(
     assert "No space left" in caplog.text
 
 
-def test_it_lies_beside_the_cache(tmp_path: Path) -> None:
+def test_the_store_is_beside_the_cache(tmp_path: Path) -> None:
     cache = ParamCache(tmp_path / "parameters.sqlite3")
     assert MetadataStore.beside(cache.path).folder == tmp_path / "parameters.metadata"
 
 
-# the simulated vehicle
+# The simulated vehicle
 
 
-def test_an_old_vehicle_cannot_describe_itself() -> None:
+def test_a_mavlink_1_vehicle_cannot_have_metadata() -> None:
     with pytest.raises(UsageError, match="MAVLink 1"):
         PX4Vehicle(metadata=True, mavlink_version=1)
 
 
-def test_a_vehicle_that_describes_nothing_has_no_such_files() -> None:
+def test_a_vehicle_without_metadata_has_no_files() -> None:
     assert not PX4Vehicle().files
     assert set(PX4Vehicle(metadata=True).files) == {GENERAL_FILE, PARAMETER_FILE}

@@ -1,4 +1,4 @@
-"""Two sets of parameters held against each other, and against a third."""
+"""Comparison of two parameter sets, with and without a base."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of,
 INT32, REAL32, REAL64 = ParamType.INT32, ParamType.REAL32, ParamType.REAL64
 NAN, OTHER_NAN = from_bits(0x7FC00000, REAL32), from_bits(0x7FC00001, REAL32)
 
-# near each other, so that draws of two are often about the same number
+# close together, so that two drawn numbers are often equal
 NUMBERS = (
     st.integers(-3, 3)
     | st.sampled_from([2**24 - 1, 2**24, 2**24 + 1, 2**31 - 1, 2**31, 2**63, 2**64, 10**400, 300, 44])
@@ -85,20 +85,20 @@ def float32(value: float) -> float:
         (written(b"\1\0\0\0", INT32), written(1, INT32), False),
     ],
 )
-def test_two_values_are_the_same_or_not(left: WrittenParam, right: WrittenParam, same: bool) -> None:
+def test_same_value_of_pairs(left: WrittenParam, right: WrittenParam, same: bool) -> None:
     assert same_value(left, right) is same
     assert same_value(right, left) is same
 
 
 @given(WRITTEN, WRITTEN)
-def test_sameness_knows_no_sides(left: WrittenParam, right: WrittenParam) -> None:
+def test_same_value_is_symmetric(left: WrittenParam, right: WrittenParam) -> None:
     assert same_value(left, left)
     assert same_value(left, right) == same_value(right, left)
 
 
 @given(VALUES, st.integers(0, 2**32 - 1), st.sampled_from([*ParamType, 77]), st.sampled_from(Encoding))
-def test_a_vehicle_holds_what_is_the_same(value: Value, raw: int, number: int, encoding: Encoding) -> None:
-    """`WrittenParam.is_held_by` says the same of a written value without a type, or with the vehicle's."""
+def test_is_held_by_agrees_with_same_value(value: Value, raw: int, number: int, encoding: Encoding) -> None:
+    """`WrittenParam.is_held_by` and `same_value` agree for values without a type or with the vehicle's."""
     held, bits = decode(raw.to_bytes(4, "little"), number, encoding)
     assume(number != REAL32 or bits == bits_of(held, number))  # Python has no signalling NaN for these bits
     agree(value, Param("P", held, number, 0, bits))
@@ -118,7 +118,7 @@ def agree(value: Value, param: Param) -> None:
 
 
 @given(SETS, SETS, st.none() | SETS)
-def test_a_comparison_is_whole_and_symmetrical(
+def test_a_comparison_is_complete_and_symmetric(
     left: ParamSet, right: ParamSet, base: ParamSet | None
 ) -> None:
     there, back = compare(left, right, base=base), compare(right, left, base=base)
@@ -134,13 +134,13 @@ def test_a_comparison_is_whole_and_symmetrical(
 
 
 @given(SETS)
-def test_a_set_is_the_same_as_itself(params: ParamSet) -> None:
+def test_a_set_equals_itself(params: ParamSet) -> None:
     alone = compare(params, params, base=params)
     assert alone.is_same
     assert {entry.moved for entry in alone.entries} <= {Moved.NEITHER}
 
 
-def test_each_name_has_its_standing() -> None:
+def test_standing_of_each_name() -> None:
     outcome = compare(of(B=1, A=1.5, D=4), of(C=3, A=1.25, D=4.0))
     assert {entry.name: entry.standing for entry in outcome.entries} == {
         "A": Standing.DIFFERENT,
@@ -168,19 +168,19 @@ def test_each_name_has_its_standing() -> None:
         (of(), of(A=2), Moved.RIGHT),
     ],
 )
-def test_it_is_told_who_has_moved_away_from_the_base(left: ParamSet, right: ParamSet, moved: Moved) -> None:
+def test_moved_tells_which_side_differs_from_the_base(left: ParamSet, right: ParamSet, moved: Moved) -> None:
     outcome = compare(left, right, base=of(A=1, B=7))
     (entry,) = outcome.entries
     assert (entry.moved, entry.base) == (moved, WrittenParam("A", 1))
     assert outcome.moves[moved] == 1
 
 
-def test_what_the_base_does_not_know_has_not_moved() -> None:
+def test_names_missing_in_the_base_have_no_move() -> None:
     outcome = compare(of(A=1), of(A=2), base=of(B=1))
     assert (outcome.entries[0].moved, sum(outcome.moves.values())) == (None, 0)
 
 
-def test_another_type_is_no_other_value() -> None:
+def test_a_different_type_is_not_a_different_value() -> None:
     outcome = compare(
         ParamSet({"A": WrittenParam("A", 1, INT32), "B": WrittenParam("B", 1, INT32)}),
         ParamSet({"A": WrittenParam("A", 1.0, REAL32), "B": WrittenParam("B", 1)}),
@@ -201,7 +201,7 @@ def test_another_type_is_no_other_value() -> None:
         (10**400, 10**401, False),
     ],
 )
-def test_what_a_casting_vehicle_may_have_rounded_is_told(left: int, right: int, is_rounding: bool) -> None:
+def test_is_rounding_of_c_cast_integers(left: int, right: int, is_rounding: bool) -> None:
     outcome = compare(of(A=left), of(A=right))
     assert outcome.is_same is (left == right)
     assert outcome.entries[0].is_rounding is is_rounding
@@ -211,20 +211,20 @@ def names_of(outcome: Comparison) -> list[str]:
     return [entry.name for entry in outcome.entries]
 
 
-def test_names_can_be_chosen_by_patterns() -> None:
+def test_names_can_be_selected_by_patterns() -> None:
     left, right = of(MC_ROLL_P=1, MC_YAW_P=1, BAT_N=1), of(MC_ROLL_P=1, MC_PITCH_P=1)
     assert names_of(compare(left, right, names=["MC_*_P"])) == ["MC_PITCH_P", "MC_ROLL_P", "MC_YAW_P"]
     assert names_of(compare(left, right, names=["MC_ROLL_P", "BAT_?"])) == ["BAT_N", "MC_ROLL_P"]
     assert compare(left, right, names="MC_ROLL_P").is_same
 
 
-def test_a_pattern_that_fits_nothing_is_a_mistake() -> None:
-    """A name that is misspelt would make any two vehicles the same."""
+def test_a_pattern_without_a_match_is_a_usage_error() -> None:
+    """Otherwise a misspelt name would make two vehicles compare as equal."""
     with pytest.raises(UsageError, match="called MC_PICTH_P or mc_\\*"):
         compare(of(MC_PITCH_P=1), of(MC_PITCH_P=2), names=["MC_PICTH_P", "mc_*", "MC_*"])
 
 
-def test_defaults_make_a_base_as_far_as_they_are_known_and_agreed() -> None:
+def test_defaults_of_leaves_out_unknown_and_differing_defaults() -> None:
     old = ParamSet(
         {
             "A": WrittenParam("A", 5, INT32, 1),

@@ -1,4 +1,4 @@
-"""Identity: the fields of real vehicles, and the key under which tables are kept."""
+"""Identity: AUTOPILOT_VERSION of recorded vehicles, and cache keys."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def identity_in(recording: str, autopilot: int) -> Identity:
     )
 
 
-def test_px4_gives_its_commit_as_a_number_and_a_hardware_id_that_all_its_simulators_share() -> None:
+def test_px4_git_hash_is_a_number_and_simulators_share_a_hardware_id() -> None:
     identity = identity_in("px4_full_download", 12)
     assert identity == Identity(
         system=1,
@@ -47,14 +47,14 @@ def test_px4_gives_its_commit_as_a_number_and_a_hardware_id_that_all_its_simulat
     assert identity.key == "uid:4954414c44494e4f/1"
 
 
-def test_ardupilot_gives_its_commit_as_text_and_the_longer_hardware_id() -> None:
+def test_ardupilot_git_hash_is_text_and_uid2_is_the_hardware_id() -> None:
     identity = identity_in("ardupilot_full_download", 3)
     assert identity.git_hash == "fbb78585"
     assert identity.uid == "336431323139633763346335343034616100"
     assert identity.key == "uid:336431323139633763346335343034616100"
 
 
-def test_the_longer_hardware_id_counts_before_the_older_one() -> None:
+def test_uid2_takes_precedence_over_uid() -> None:
     both = Identity.from_version(
         system=1, link="x", autopilot=3, vehicle_type=2, uid=7, uid2=b"\x01" + bytes(17)
     )
@@ -65,7 +65,7 @@ def test_the_longer_hardware_id_counts_before_the_older_one() -> None:
     assert none.git_hash == ""
 
 
-def test_a_hardware_id_names_the_vehicle_wherever_it_is_and_without_one_link_and_system_do() -> None:
+def test_key_is_the_hardware_id_or_else_system_and_link() -> None:
     with_id = Identity(1, "udpin:a", uid="abcd")
     assert replace(with_id, system=9, link="tcp:b").key == with_id.key
     without = Identity(1, "udpin:a")
@@ -76,11 +76,11 @@ def test_a_hardware_id_names_the_vehicle_wherever_it_is_and_without_one_link_and
     ("number", "name"),
     [(0, "generic"), (3, "ardupilot"), (8, "no autopilot"), (12, "px4"), (77, "autopilot 77")],
 )
-def test_autopilots_have_a_name(number: int, name: str) -> None:
+def test_autopilot_name(number: int, name: str) -> None:
     assert autopilot_name(number) == name
 
 
-def test_the_hardware_id_says_whether_it_is_the_same_vehicle() -> None:
+def test_same_hardware_id_is_the_same_vehicle() -> None:
     mine = Identity(1, "udp", uid="0a", autopilot=3, vehicle_type=2)
     assert mine.is_same_vehicle(replace(mine, system=9, link="tcp", vehicle_type=1))
     assert not mine.is_same_vehicle(replace(mine, uid="0b"))
@@ -89,10 +89,11 @@ def test_the_hardware_id_says_whether_it_is_the_same_vehicle() -> None:
 
 
 @pytest.mark.parametrize("uid", [None, *SHARED_UIDS])
-def test_where_it_says_nothing_the_kind_and_the_link_do(uid: str | None) -> None:
+def test_without_a_unique_hardware_id_link_and_types_are_compared(uid: str | None) -> None:
     mine = Identity(1, "udp", uid=uid, autopilot=3, vehicle_type=2)
     assert mine.is_same_vehicle(replace(mine, system=9))
     for other in ({"link": "tcp"}, {"autopilot": 12}, {"vehicle_type": 1}):
         assert not mine.is_same_vehicle(replace(mine, **other))
-    assert mine.is_same_vehicle(replace(mine, uid="0a")) is (uid is None)  # it may only now have said it
+    # A vehicle without a known hardware id may send it only later.
+    assert mine.is_same_vehicle(replace(mine, uid="0a")) is (uid is None)
     assert not mine.has_own_uid

@@ -1,4 +1,4 @@
-"""What tables keep of parameters, and what users see of a table."""
+"""The compact form of parameters in tables, and the read-only mapping."""
 
 from __future__ import annotations
 
@@ -15,20 +15,20 @@ from paramclient.model.params import (
     NOWHERE,
     ParamMap,
     Params,
+    as_params,
     held_of,
     is_listed,
-    kept,
+    pack_fields,
     param_of,
-    placed,
     same_held,
-    to_hold,
-    trusted,
+    with_index,
+    with_trust_number,
 )
 from paramclient.model.values import Encoding, Param, ParamType, Trust, decode, known_type
 from paramclient.protocol.params.change import Change
 
 
-def test_it_shows_the_table_as_it_is_now_and_cannot_be_written_to() -> None:
+def test_a_param_map_is_a_live_read_only_view() -> None:
     table = {"B": Param("B", 1, ParamType.INT32, 0, 1)}
     params = ParamMap(table)
     assert repr(params) == "<ParamMap 1 param>"
@@ -44,12 +44,12 @@ def test_it_shows_the_table_as_it_is_now_and_cannot_be_written_to() -> None:
     with pytest.raises(KeyError):
         params["C"]
     with pytest.raises(TypeError):
-        params["C"] = table["A"]  # type: ignore[index]  # that it is refused is the point
+        params["C"] = table["A"]  # type: ignore[index]  # must fail
     with pytest.raises(AttributeError):
-        params.anything = 1  # type: ignore[attr-defined]  # as above
+        params.anything = 1  # type: ignore[attr-defined]
 
 
-def test_what_differs_from_the_firmwares_defaults() -> None:
+def test_changed_returns_values_that_differ_from_defaults() -> None:
     nan = float("nan")
     table = {
         name: Param(name, value, ParamType.REAL32, 0, 0, default=default)
@@ -80,7 +80,7 @@ def test_what_differs_from_the_firmwares_defaults() -> None:
     trust=st.sampled_from(Trust),
     default=st.none() | st.floats(width=32, allow_nan=False) | st.integers(-5, 5),
 )
-def test_what_is_kept_of_a_parameter_is_all_of_it(
+def test_the_compact_form_loses_nothing(
     wire: tuple[int, bytes, Encoding], index: int | None, trust: Trust, default: float | None
 ) -> None:
     number, raw, encoding = wire
@@ -96,12 +96,12 @@ def test_what_is_kept_of_a_parameter_is_all_of_it(
     assert list(params.items()) == [("NAME", param)]
     assert params == {"NAME": param}
     assert repr(params) == f"Params({{'NAME': {param!r}}})"
-    assert kept(ParamMap(params)) is params
-    assert kept({"NAME": param}) == params
+    assert as_params(ParamMap(params)) is params
+    assert as_params({"NAME": param}) == params
     assert is_listed(params.held["NAME"]) == (index is not None)
 
 
-def test_what_is_kept_can_be_changed_by_name_and_copied() -> None:
+def test_params_can_be_changed_and_copied() -> None:
     params = Params()
     for at, name in enumerate("CAB"):
         params[name] = Param(name, at, ParamType.INT32, at, at, default=at)
@@ -117,13 +117,13 @@ def test_what_is_kept_can_be_changed_by_name_and_copied() -> None:
         params["A"]
 
 
-def test_a_place_and_a_trust_change_nothing_else() -> None:
+def test_setting_index_or_trust_changes_nothing_else() -> None:
     param = Param("A", -5, ParamType.INT16, 300, 0xFFFB, Trust.VERIFIED)
     held = held_of(param)
-    assert param_of("A", placed(held, 7)) == Param("A", -5, ParamType.INT16, 7, 0xFFFB, Trust.VERIFIED)
-    assert param_of("A", placed(held, NOWHERE)).index is None
-    assert param_of("A", trusted(held, CACHED)) == param.with_trust(Trust.CACHED)
-    assert same_held(held, trusted(placed(held, 9), CACHED))
+    assert param_of("A", with_index(held, 7)) == Param("A", -5, ParamType.INT16, 7, 0xFFFB, Trust.VERIFIED)
+    assert param_of("A", with_index(held, NOWHERE)).index is None
+    assert param_of("A", with_trust_number(held, CACHED)) == param.with_trust(Trust.CACHED)
+    assert same_held(held, with_trust_number(with_index(held, 9), CACHED))
 
 
 @given(
@@ -132,28 +132,28 @@ def test_a_place_and_a_trust_change_nothing_else() -> None:
     other=st.integers(0, 2**32 - 1) | st.sampled_from([0, 0x80000000]),
     raw=st.sampled_from([(False, False), (True, False)]),
 )
-def test_the_same_value_is_told_as_by_the_parameters(
+def test_same_held_agrees_with_same_value_of_params(
     number: int, one: int, other: int, raw: tuple[bool, bool]
 ) -> None:
     one, other = (each & ((1 << 8 * min(ParamType(number).size, 4)) - 1) for each in (one, other))
-    first, second = to_hold(one, number, raw[0], 0, 1), to_hold(other, number, raw[1], 1, 2)
+    first, second = pack_fields(one, number, raw[0], 0, 1), pack_fields(other, number, raw[1], 1, 2)
     assert same_held(first, second) == param_of("A", first).same_value(param_of("A", second))
 
 
-def test_the_garbage_collector_goes_through_nothing_that_is_kept() -> None:
+def test_the_garbage_collector_does_not_track_compact_params() -> None:
     params = Params()
     for at in range(100):
         params[f"P{at}"] = Param(f"P{at}", 1.5, ParamType.REAL32, at, 0x3FC00000, default=2.5)
     assert not any(map(gc.is_tracked, (*params.held.values(), *params.defaults.values())))
 
 
-def test_a_change_is_the_same_by_what_has_changed_and_can_be_copied() -> None:
+def test_changes_compare_by_content_and_can_be_copied() -> None:
     old = Param("A", 1, ParamType.INT8, 0, 1, default=3)
     new = Param("A", 2, ParamType.INT8, 0, 2, Trust.CACHED, 4)
     change = Change("A", old, new, "us")
     same = Change("A", Param("A", 1, ParamType.INT8, 0, 1), new, "us")
     assert change == same
-    assert not change != same  # noqa: SIM202 - what a tuple has of its own
+    assert not change != same  # noqa: SIM202 - tests __ne__, which tuple defines itself
     assert hash(change) == hash(same)
     assert change != Change("A", old, new, "vehicle")
     for copied in (copy.copy(change), copy.deepcopy(change), pickle.loads(pickle.dumps(change))):

@@ -1,4 +1,4 @@
-"""Parameters that no vehicle stands behind."""
+"""Parameter sets without a vehicle."""
 
 from __future__ import annotations
 
@@ -29,29 +29,29 @@ def held(value: Value, number: int, name: str = "P") -> Param:
         (16777217, 16777216, ParamType.INT32, False),
     ],
 )
-def test_a_written_value_is_compared_in_the_type_that_the_vehicle_gives_it(
+def test_a_written_value_is_compared_in_the_vehicles_type(
     written: Value, value: Value, number: int, same: bool
 ) -> None:
     assert WrittenParam("P", written).is_held_by(held(value, number)) is same
 
 
-def test_raw_bytes_are_held_by_raw_bytes_alone() -> None:
+def test_raw_bytes_equal_only_raw_bytes() -> None:
     raw = Param("P", b"\x01\0\0\0", ParamType.UINT64, 0, 1)
     number = Param("P", 1, ParamType.INT32, 0, 1)
     assert WrittenParam("P", b"\x01\0\0\0").is_held_by(raw)
     assert not WrittenParam("P", b"\x01\0\0\0").is_held_by(number)
-    assert not WrittenParam("P", 1).is_held_by(raw)  # nobody knows the other four bytes
+    assert not WrittenParam("P", 1).is_held_by(raw)  # the other four bytes are unknown
 
 
-def test_a_number_that_its_type_cannot_hold_is_held_by_itself_alone() -> None:
-    """A vehicle that casts may report 300 for an INT8."""
+def test_a_number_beyond_its_type_equals_only_itself() -> None:
+    """A C-casting vehicle may report 300 for an INT8."""
     odd, bits = decode(struct.pack("<f", 300), ParamType.INT8, Encoding.C_CAST)
     param = Param("P", odd, ParamType.INT8, 0, bits)
     assert WrittenParam.of(param).is_held_by(param)
     assert not WrittenParam("P", bits & 0x7F).is_held_by(param)
 
 
-def test_raw_bytes_count_with_all_four_also_in_a_small_type() -> None:
+def test_raw_bytes_of_a_small_type_have_four_bytes() -> None:
     """ArduPilot can send a float that its own integer type cannot hold."""
     raw = struct.pack("<f", 1e20)
     param = Param("P", raw, ParamType.INT8, 0, int.from_bytes(raw, "little"))
@@ -59,12 +59,12 @@ def test_raw_bytes_count_with_all_four_also_in_a_small_type() -> None:
     assert not WrittenParam("P", struct.pack("<f", 2e20)).is_held_by(param)
 
 
-def test_a_value_that_does_not_fit_the_type_says_so_when_its_bits_are_asked_for() -> None:
+def test_bits_as_raises_for_a_value_that_does_not_fit() -> None:
     with pytest.raises(UsageError, match="300 does not fit UINT8"):
         WrittenParam("P", 300).bits_as(ParamType.UINT8)
 
 
-def test_a_set_is_a_mapping_in_the_order_written() -> None:
+def test_a_param_set_keeps_the_order_of_its_source() -> None:
     params = ParamSet.of([held(2, ParamType.INT32, "B"), held(1.5, ParamType.REAL32, "A")], source="a test")
     assert list(params) == ["B", "A"]
     assert params["B"] == WrittenParam("B", 2, ParamType.INT32, line=7)

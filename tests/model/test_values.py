@@ -1,4 +1,4 @@
-"""Values: bits to number and back in both encodings, names, text, and the PX4 hash."""
+"""Values: both encodings, names, text, and the PX4 hash."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ WIDE = [ParamType.UINT64, ParamType.INT64, ParamType.REAL64]
 UNDEFINED = [0, 11, 77, 255]
 
 SIGNALLING = [(0xFF800001, 0xFFBFFFFF), (0x7F800001, 0x7FBFFFFF)]
-"""As INT32: −8388607 to −4194305 and 2139095041 to 2143289343."""
+"""Bit patterns of signalling NaNs. As INT32: −8388607 to −4194305 and 2139095041 to 2143289343."""
 
 EDGES = sorted(
     {
@@ -83,7 +83,7 @@ def param(bits: int = 0x3F800000, value: Value = 1.0, kind: int = ParamType.REAL
 # Types
 
 
-def test_the_ten_types_carry_mavlinks_numbers_and_names() -> None:
+def test_types_have_mavlinks_numbers_and_names() -> None:
     for kind in ParamType:
         assert getattr(dialect, f"MAV_PARAM_TYPE_{kind.name}") == kind
         assert known_type(int(kind)) is kind
@@ -116,7 +116,7 @@ def test_an_unknown_type_keeps_its_number(number: int) -> None:
 
 
 def check_four_bytes(pattern: int) -> None:
-    """Nothing of a 4-byte value is lost on the way in, nor, for a number that stands for itself, out."""
+    """Assert that decoding loses no bit of a 4-byte value, nor does encoding a value that is not raw."""
     raw = pattern.to_bytes(4, "little")
     for kind, layout in ((ParamType.UINT32, "<I"), (ParamType.INT32, "<i")):
         value, bits = decode(raw, kind, BYTEWISE)
@@ -128,25 +128,25 @@ def check_four_bytes(pattern: int) -> None:
         assert isinstance(value, float)
         assert bits == pattern
         if math.isnan(value):
-            assert math.isnan(from_bits(bits, ParamType.REAL32))  # type: ignore[arg-type]  # a float here
+            assert math.isnan(from_bits(bits, ParamType.REAL32))  # type: ignore[arg-type]  # float, as the type is REAL32
             assert encode(raw, ParamType.REAL32, encoding) == raw
         else:
             assert encode(value, ParamType.REAL32, encoding) == raw
             assert from_bits(bits, ParamType.REAL32) == value
 
 
-def test_four_bytes_survive_at_every_edge() -> None:
+def test_four_bytes_round_trip_at_edge_values() -> None:
     for pattern in EDGES:
         check_four_bytes(pattern)
 
 
 @thorough
 @given(patterns)
-def test_four_bytes_survive(pattern: int) -> None:
+def test_four_bytes_round_trip(pattern: int) -> None:
     check_four_bytes(pattern)
 
 
-def test_the_trap_that_this_avoids() -> None:
+def test_signalling_nan_bytes_are_not_decoded_through_a_float() -> None:
     raw = (-5000000).to_bytes(4, "little", signed=True)
     through_a_float = struct.pack("<f", struct.unpack("<f", raw)[0])
     assert int.from_bytes(through_a_float, "little", signed=True) == -805696
@@ -166,7 +166,7 @@ def test_the_trap_that_this_avoids() -> None:
         (ParamType.REAL32, "0000c040", 6.0, 0x40C00000),
     ],
 )
-def test_bytewise_lays_the_value_into_the_first_bytes(
+def test_bytewise_encodes_the_value_in_the_first_bytes(
     kind: ParamType, raw: str, value: float, bits: int
 ) -> None:
     assert decode(bytes.fromhex(raw), kind, BYTEWISE) == (value, bits)
@@ -175,7 +175,7 @@ def test_bytewise_lays_the_value_into_the_first_bytes(
 
 @thorough
 @given(st.sampled_from(SMALL), patterns)
-def test_bytes_behind_a_small_type_do_not_count(kind: ParamType, pattern: int) -> None:
+def test_bytewise_ignores_bytes_after_a_small_type(kind: ParamType, pattern: int) -> None:
     raw = pattern.to_bytes(4, "little")
     own = raw[: kind.size]
     value, bits = decode(raw, kind, BYTEWISE)
@@ -191,7 +191,7 @@ def test_bytewise_integers_are_packed_as_pymavlink_packs_them(kind: ParamType, d
     value = data.draw(st.integers(*kind.bounds))
     raw = encode(value, kind, BYTEWISE)
     if any(low <= int.from_bytes(raw, "little") <= high for low, high in SIGNALLING):
-        return  # pymavlink passes the bytes through a float and changes these
+        return  # pymavlink converts the bytes through a float, which changes these
     sent: list[bytes] = []
 
     def param_set_send(name: str, number: float, parm_type: int) -> None:
@@ -207,7 +207,7 @@ def test_bytewise_integers_are_packed_as_pymavlink_packs_them(kind: ParamType, d
 
 @pytest.mark.parametrize("kind", [*WIDE, *UNDEFINED])
 @pytest.mark.parametrize("pattern", [0, 1, 0x7F800001, 0xFFFFFFFF])
-def test_what_four_bytes_cannot_hold_is_kept_raw(kind: int, pattern: int) -> None:
+def test_bytewise_keeps_wide_and_unknown_types_raw(kind: int, pattern: int) -> None:
     raw = pattern.to_bytes(4, "little")
     assert decode(raw, kind, BYTEWISE) == (raw, pattern)
     assert encode(raw, kind, BYTEWISE) == raw
@@ -229,7 +229,7 @@ def test_an_unknown_type_is_kept_raw_in_c_cast_too(number: int) -> None:
 
 @pytest.mark.parametrize("kind", SMALL)
 @pytest.mark.parametrize("encoding", Encoding)
-def test_an_integer_outside_the_type_is_refused(kind: ParamType, encoding: Encoding) -> None:
+def test_encode_rejects_an_integer_outside_the_type(kind: ParamType, encoding: Encoding) -> None:
     low, high = kind.bounds
     for value in (low - 1, high + 1, float(low) - 1, float(high) + 1, 10**400):
         with pytest.raises(UsageError, match=kind.name):
@@ -239,13 +239,13 @@ def test_an_integer_outside_the_type_is_refused(kind: ParamType, encoding: Encod
 @pytest.mark.parametrize("kind", INTEGERS)
 @pytest.mark.parametrize("encoding", Encoding)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_what_is_no_number_is_no_integer(kind: ParamType, encoding: Encoding, value: float) -> None:
+def test_encode_rejects_non_finite_integers(kind: ParamType, encoding: Encoding, value: float) -> None:
     with pytest.raises(UsageError, match="not a whole number"):
         encode(value, kind, encoding)
 
 
 @pytest.mark.parametrize("kind", SMALL)
-def test_bytewise_takes_whole_floats_and_no_fractions(kind: ParamType) -> None:
+def test_bytewise_accepts_whole_floats_and_rejects_fractions(kind: ParamType) -> None:
     assert encode(6.0, kind, BYTEWISE) == b"\x06\0\0\0"
     assert encode(-0.0, kind, BYTEWISE) == bytes(4)
     with pytest.raises(UsageError, match=r"1\.5 is not a whole number"):
@@ -284,7 +284,7 @@ def test_bytewise_takes_whole_floats_and_no_fractions(kind: ParamType) -> None:
         *((kind, number, None) for kind in INTEGERS for number in (math.nan, math.inf, -math.inf)),
     ],
 )
-def test_a_c_cast_float_becomes_the_integer_or_stays_raw(
+def test_c_cast_decodes_to_the_integer_or_stays_raw(
     kind: ParamType, number: float, value: int | None
 ) -> None:
     raw = struct.pack("<f", number)
@@ -301,7 +301,7 @@ def test_a_c_cast_float_becomes_the_integer_or_stays_raw(
 
 @thorough
 @given(st.sampled_from(INTEGERS), st.data())
-def test_a_c_cast_integer_goes_exactly_or_not_at_all(kind: ParamType, data: st.DataObject) -> None:
+def test_c_cast_encodes_an_integer_exactly_or_rejects_it(kind: ParamType, data: st.DataObject) -> None:
     low, high = kind.bounds
     near = st.sampled_from([sign * 2**n + step for n in range(65) for sign in (-1, 1) for step in (-1, 0, 1)])
     value = data.draw(st.integers(low, high) | near.filter(lambda v: low <= v <= high))
@@ -325,7 +325,7 @@ def test_c_cast_is_exact_up_to_24_bits() -> None:
 
 
 @pytest.mark.parametrize("kind", INTEGERS)
-def test_c_cast_leaves_a_fraction_to_the_vehicle(kind: ParamType) -> None:
+def test_c_cast_sends_a_fraction_unchanged(kind: ParamType) -> None:
     assert encode(12.7, kind, C_CAST) == struct.pack("<f", 12.7)
     assert decode(encode(12.7, kind, C_CAST), kind, C_CAST) == (12, 12)
 
@@ -334,12 +334,12 @@ def test_c_cast_leaves_a_fraction_to_the_vehicle(kind: ParamType) -> None:
     ("value", "kind"),
     [(255.9999999, ParamType.UINT8), (-128.9999999, ParamType.INT8), (-0.99999999, ParamType.UINT16)],
 )
-def test_a_fraction_that_rounds_out_of_the_type_is_refused(value: float, kind: ParamType) -> None:
+def test_encode_rejects_a_fraction_that_rounds_out_of_the_type(value: float, kind: ParamType) -> None:
     with pytest.raises(UsageError, match="rounds to"):
         encode(value, kind, C_CAST)
 
 
-def test_c_cast_real64_travels_as_float32() -> None:
+def test_c_cast_encodes_real64_as_float32() -> None:
     raw = struct.pack("<f", 0.1)
     value, bits = decode(raw, ParamType.REAL64, C_CAST)
     assert value == as_float32(0.1)
@@ -358,7 +358,7 @@ def test_real32_is_packed_as_pymavlink_packs_it(value: float, encoding: Encoding
 
 
 @pytest.mark.parametrize("encoding", Encoding)
-def test_real32_rounds_keeps_infinities_and_refuses_what_is_too_large(encoding: Encoding) -> None:
+def test_real32_rounds_keeps_infinities_and_rejects_overflow(encoding: Encoding) -> None:
     assert encode(0.1, ParamType.REAL32, encoding) == bytes.fromhex("cdcccc3d")
     assert encode(1, ParamType.REAL32, encoding) == struct.pack("<f", 1.0)
     assert encode(-math.inf, ParamType.REAL32, encoding) == bytes.fromhex("000080ff")
@@ -368,11 +368,11 @@ def test_real32_rounds_keeps_infinities_and_refuses_what_is_too_large(encoding: 
             encode(value, ParamType.REAL32, encoding)
 
 
-# What callers give
+# Arguments of callers
 
 
 @pytest.mark.parametrize("name", ["A", "MC_ROLL_P", "_HASH_CHECK", "SIXTEEN_LETTERS_", "lower", "A B"])
-def test_good_names(name: str) -> None:
+def test_check_name_accepts(name: str) -> None:
     assert check_name(name) == name
 
 
@@ -389,7 +389,7 @@ def test_good_names(name: str) -> None:
         (None, "not NoneType"),
     ],
 )
-def test_bad_names(name: Any, words: str) -> None:
+def test_check_name_rejects(name: Any, words: str) -> None:
     with pytest.raises(UsageError, match=words):
         check_name(name)
 
@@ -412,7 +412,7 @@ class Indexable:
         (b"\x01\x02\x03\x04", b"\x01\x02\x03\x04"),
     ],
 )
-def test_numbers_of_every_kind_are_taken(given_value: Any, value: Value) -> None:
+def test_check_value_accepts_numbers_of_other_libraries(given_value: Any, value: Value) -> None:
     checked = check_value(given_value)
     assert checked == value
     assert type(checked) is type(value)
@@ -422,7 +422,7 @@ def test_numbers_of_every_kind_are_taken(given_value: Any, value: Value) -> None
     "given_value",
     [b"", b"\0\0\0", b"\0\0\0\0\0", "6", None, [1], 1j, Decimal("sNaN"), Fraction(10**400), bytearray(4)],
 )
-def test_what_is_no_number_is_refused(given_value: Any) -> None:
+def test_check_value_rejects(given_value: Any) -> None:
     with pytest.raises(UsageError, match="parameter"):
         check_value(given_value)
 
@@ -430,13 +430,13 @@ def test_what_is_no_number_is_refused(given_value: Any) -> None:
 # Param
 
 
-def test_a_param_cannot_be_changed() -> None:
+def test_a_param_is_immutable() -> None:
     with pytest.raises(FrozenInstanceError):
-        param().value = 2.0  # type: ignore[misc]  # that is the point
+        param().value = 2.0  # type: ignore[misc]  # must fail
     assert not hasattr(param(), "__dict__")
 
 
-def test_equality_goes_by_bits_so_that_nan_equals_itself() -> None:
+def test_equality_compares_bits_so_nan_equals_itself() -> None:
     one, other = param(0x7FC00000, math.nan), param(0x7FC00000, float("nan"))
     assert one == other
     assert hash(one) == hash(other)
@@ -445,7 +445,7 @@ def test_equality_goes_by_bits_so_that_nan_equals_itself() -> None:
         assert param() != param(**difference)
 
 
-def test_trust() -> None:
+def test_with_trust() -> None:
     live = param()
     assert live.trust is Trust.LIVE
     assert live.with_trust(Trust.LIVE) is live
@@ -467,7 +467,7 @@ def test_same_value() -> None:
     )
 
 
-def test_raw_is_told_and_shown() -> None:
+def test_is_raw_and_text_of_raw_values() -> None:
     raw = param(0x04030201, b"\x01\x02\x03\x04", 77)
     assert raw.is_raw
     assert str(raw) == "P = 0x04030201"
@@ -478,7 +478,7 @@ def test_raw_is_told_and_shown() -> None:
 
 @thorough
 @given(patterns, patterns)
-def test_same_bits_is_equality_of_numbers_and_identity_of_nans(a: int, b: int) -> None:
+def test_same_bits_compares_numbers_by_value_and_nans_by_bits(a: int, b: int) -> None:
     for one, other in ((a, b), (a, a), (a, a ^ 0x80000000)):
         first, second = float32(one), float32(other)
         equal = one == other if math.isnan(first) or math.isnan(second) else first == second
@@ -486,20 +486,20 @@ def test_same_bits_is_equality_of_numbers_and_identity_of_nans(a: int, b: int) -
         assert same_bits(ParamType.INT32, one, other) == (one == other)
 
 
-def test_zero_of_a_real64_has_two_forms_too() -> None:
+def test_same_bits_of_real64_zeros() -> None:
     assert same_bits(ParamType.REAL64, 0, 1 << 63)
     assert not same_bits(ParamType.REAL64, 0, 0x80000000)
     assert not same_bits(ParamType.REAL32, 0, 1 << 63)
 
 
 @pytest.mark.parametrize("number", [*ParamType])
-def test_a_number_beyond_every_type_has_no_bits(number: ParamType) -> None:
+def test_bits_of_rejects_a_number_beyond_the_type(number: ParamType) -> None:
     with pytest.raises(UsageError, match=number.name):
         bits_of(10**400, number)
 
 
 @pytest.mark.parametrize("number", INTEGERS)
-def test_a_whole_number_written_with_a_point_has_the_bits_of_the_integer(number: ParamType) -> None:
+def test_bits_of_a_whole_float_are_those_of_the_integer(number: ParamType) -> None:
     assert bits_of(44.0, number) == bits_of(44, number) == 44
     for value in (1.5, math.inf, math.nan):
         with pytest.raises(UsageError, match="not a whole number"):
@@ -510,7 +510,7 @@ def test_a_whole_number_written_with_a_point_has_the_bits_of_the_integer(number:
 
 
 def fewest_digits(value: float) -> int:
-    """How many decimal digits it takes to name this float32, found by trying the decimals on both sides."""
+    """Return the fewest decimal digits that identify a float32, by trying the decimals on both sides."""
     wanted = struct.pack("<f", value)
     for digits in range(1, 10):
         for rounding in (ROUND_FLOOR, ROUND_CEILING):
@@ -533,11 +533,11 @@ def check_text(pattern: int) -> None:
 
 @thorough
 @given(patterns)
-def test_text_is_the_shortest_that_reads_back(pattern: int) -> None:
+def test_format_value_is_the_shortest_round_trip(pattern: int) -> None:
     check_text(pattern)
 
 
-def test_text_at_powers_of_two_and_at_the_smallest_numbers() -> None:
+def test_format_value_at_powers_of_two_and_subnormals() -> None:
     for pattern in (*(exponent << 23 for exponent in range(256)), *range(64), 0x7F7FFFFF, 0x007FFFFF):
         check_text(pattern)
         check_text(pattern | 0x80000000)
@@ -562,11 +562,11 @@ def test_text_at_powers_of_two_and_at_the_smallest_numbers() -> None:
         (b"\x01\x00\x80\x7f", ParamType.INT64, "0x7f800001"),
     ],
 )
-def test_texts(value: Value, kind: ParamType, text: str) -> None:
+def test_format_value(value: Value, kind: ParamType, text: str) -> None:
     assert format_value(value, kind) == text
 
 
-def test_a_callers_own_float_is_shown_as_the_float32_it_becomes() -> None:
+def test_format_value_rounds_a_float_to_float32() -> None:
     assert shortest_float(0.1) == 0.1
     assert shortest_float(0.10000000149) == 0.1
     assert shortest_float(1 / 3) == 0.33333334
@@ -576,7 +576,7 @@ def test_a_callers_own_float_is_shown_as_the_float32_it_becomes() -> None:
 
 
 def bitwise_crc(data: bytes) -> int:
-    """The same CRC, bit by bit from its definition."""
+    """Return PX4's CRC-32, computed bit by bit from its definition."""
     crc = 0
     for byte in data:
         crc ^= byte
@@ -600,11 +600,11 @@ def test_crc_vectors(data: bytes, crc: int) -> None:
 
 @thorough
 @given(st.binary(max_size=64), st.binary(max_size=64))
-def test_crc_goes_on_where_it_stopped(first: bytes, second: bytes) -> None:
+def test_crc_can_be_computed_in_parts(first: bytes, second: bytes) -> None:
     assert crc32_px4(second, crc32_px4(first)) == bitwise_crc(first + second)
 
 
-def test_the_hash_takes_names_in_byte_order_and_leaves_volatile_ones_out() -> None:
+def test_px4_hash_sorts_names_and_excludes_volatile_ones() -> None:
     table = [
         param(4001, 4001, ParamType.INT32, name="SYS_AUTOSTART"),
         param(0x40C00000, 6.0, name="MC_ROLL_P"),

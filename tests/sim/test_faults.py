@@ -1,4 +1,4 @@
-"""What befalls simulated vehicles: dead indices, broken lists, reboots, other stations, satellite links."""
+"""Faults of simulated vehicles: dead indices, stopped lists, reboots, other stations, high latency."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ EVERY_KIND = pytest.mark.parametrize("kind", [GenericVehicle, PX4Vehicle, ArduPi
 
 
 def listed(station: Station, seconds: float = 0.5) -> list[int]:
-    """The indices that come of a list."""
+    """Return the indices that a list sends."""
     return [index for index in indices(station.ask(LIST, seconds=seconds)) if index != NO_INDEX]
 
 
@@ -54,14 +54,14 @@ def listed(station: Station, seconds: float = 0.5) -> list[int]:
         lambda: OtherStation(sets=[(math.inf, SimParam("A", ParamType.INT32, 1))]),
     ],
 )
-def test_what_cannot_be(make: Callable[[], object]) -> None:
+def test_invalid_arguments_are_rejected(make: Callable[[], object]) -> None:
     with pytest.raises(UsageError):
         make()
 
 
 @EVERY_KIND
 class TestDead:
-    def test_neither_listed_nor_read_but_counted(self, kind: Callable[..., Vehicle]) -> None:
+    def test_dead_parameters_are_counted_but_not_sent(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN, dead=[3, "P7", 500], param_error=True)
         station = Station(vehicle)
         values = station.ask(LIST, seconds=0.5)
@@ -75,14 +75,14 @@ class TestDead:
         assert len(station.ask(read(index=2), read("P6"))) == 2
         assert len(vehicle.params) == 10
 
-    def test_a_set_is_answered(self, kind: Callable[..., Vehicle]) -> None:
+    def test_a_set_of_a_dead_parameter_is_answered(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN, dead=["P7"])
         request = cast("P7", 70) if kind is ArduPilotVehicle else write("P7", 70, ParamType.INT32)
         assert set(names(Station(vehicle).ask(request))) == {"P7"}
         assert vehicle.values["P7"] == 70
 
 
-def test_an_index_stays_dead_when_others_move_there() -> None:
+def test_an_index_stays_dead_when_the_list_changes() -> None:
     vehicle = PX4Vehicle(table=TEN, dead=[3], not_in_use=["P0"])
     station = Station(vehicle)
     assert "P4" not in names(station.ask(LIST))
@@ -92,37 +92,37 @@ def test_an_index_stays_dead_when_others_move_there() -> None:
     assert "P4" in names(values)
 
 
-def test_dead_reads_take_no_place_among_those_of_a_slot() -> None:
+def test_dead_reads_use_no_place_in_a_slot() -> None:
     station = Station(ArduPilotVehicle(table=TEN, dead=[0, 1]))
     assert indices(station.ask(*(read(index=index) for index in range(7)), seconds=0.15)) == [2, 3, 4, 5, 6]
 
 
 @EVERY_KIND
 class TestListStops:
-    def test_once(self, kind: Callable[..., Vehicle]) -> None:
+    def test_a_list_stops_once(self, kind: Callable[..., Vehicle]) -> None:
         station = Station(kind(table=TEN, list_stops_at=4))
         assert listed(station) == [0, 1, 2, 3]
         assert indices(station.ask(read(index=8))) == [8]
         assert listed(station) == list(range(10))
 
-    def test_several_times(self, kind: Callable[..., Vehicle]) -> None:
+    def test_a_list_stops_several_times(self, kind: Callable[..., Vehicle]) -> None:
         station = Station(kind(table=TEN, list_stops_at=4, list_stops=2))
         assert [len(listed(station)) for _ in range(4)] == [4, 4, 10, 10]
 
-    def test_always_also_after_a_reboot(self, kind: Callable[..., Vehicle]) -> None:
+    def test_every_list_stops_also_after_a_reboot(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN, list_stops_at=4, list_stops=math.inf)
         station = Station(vehicle)
         for _ in range(5):
             assert len(listed(station)) == 4
             vehicle.reboot(station.now)
 
-    def test_from_the_start(self, kind: Callable[..., Vehicle]) -> None:
+    def test_a_list_stops_at_its_start(self, kind: Callable[..., Vehicle]) -> None:
         station = Station(kind(table=TEN, list_stops_at=0))
         assert listed(station) == []
         assert len(listed(station)) == 10
 
-    def test_it_counts_from_the_start_of_each_list(self, kind: Callable[..., Vehicle]) -> None:
-        """Asked for again in mid-stream, the list has all its values before it once more."""
+    def test_the_count_starts_with_each_list(self, kind: Callable[..., Vehicle]) -> None:
+        """A request during the list restarts it, and its count."""
         vehicle = kind(table=TEN, list_stops_at=4, burst=1, period=0.01)
         station = Station(vehicle).send(LIST)
         while len(station.times()) < 3:
@@ -130,13 +130,13 @@ class TestListStops:
         assert listed(station, 1.0)[-4:] == [0, 1, 2, 3]
 
 
-def test_px4_gives_its_hash_before_a_list_that_stops() -> None:
+def test_px4_sends_its_hash_before_a_list_that_stops() -> None:
     station = Station(PX4Vehicle(table=TEN, list_stops_at=2))
     assert names(station.ask(LIST)) == ["_HASH_CHECK", "P0", "P1"]
     assert names(station.ask(LIST))[:2] == ["_HASH_CHECK", "P0"]
 
 
-def test_a_list_that_ends_there_by_itself_has_not_stopped() -> None:
+def test_a_complete_list_does_not_count_as_stopped() -> None:
     vehicle = PX4Vehicle(table=TEN, not_in_use=["P9"], list_stops_at=9)
     station = Station(vehicle)
     assert len(listed(station)) == 9
@@ -146,7 +146,7 @@ def test_a_list_that_ends_there_by_itself_has_not_stopped() -> None:
 
 class TestWhenListed:
     @EVERY_KIND
-    def test_a_value_changes_in_mid_stream(self, kind: Callable[..., Vehicle]) -> None:
+    def test_a_value_changes_during_a_list(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN, burst=1)
         vehicle.when_listed(4, lambda: vehicle.set_param("P1", 100))
         vehicle.when_listed(4, lambda: vehicle.set_param("P8", 800))
@@ -158,7 +158,7 @@ class TestWhenListed:
         assert first[1] == write("P1", 1, ParamType.INT32, cast=encoding is Encoding.C_CAST).raw
         assert first[8] == write("P8", 800, ParamType.INT32, cast=encoding is Encoding.C_CAST).raw
 
-    def test_once_and_at_its_count(self) -> None:
+    def test_when_listed_calls_once_at_its_count(self) -> None:
         vehicle = GenericVehicle(TEN, burst=1)
         seen: list[float] = []
         vehicle.when_listed(3, lambda: seen.append(len(vehicle.data_to_send())))
@@ -190,7 +190,7 @@ class TestWhenListed:
 
     @EVERY_KIND
     @pytest.mark.parametrize("down", [0.0, 2.0, math.inf])
-    def test_a_reboot_in_mid_stream(self, kind: Callable[..., Vehicle], down: float) -> None:
+    def test_a_reboot_during_a_list(self, kind: Callable[..., Vehicle], down: float) -> None:
         vehicle = kind(table=TEN, burst=1)
         vehicle.when_listed(6, lambda: vehicle.reboot(down=down))
         station = Station(vehicle).wait(1.5).send(LIST).wait(0.5)
@@ -209,7 +209,7 @@ class TestSwitchingOn:
         vehicle.reboot(station.now, down=0.7)
         assert len(station.wait(2.0).heard(wire.Heartbeat)) == 2
 
-    def test_the_heartbeat_says_that_it_boots(self, kind: Callable[..., Vehicle]) -> None:
+    def test_the_heartbeat_has_the_boot_state(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN, boot_time=2.5)
         station = Station(vehicle).wait(4.5)
         beats = station.heard(wire.Heartbeat)
@@ -219,7 +219,7 @@ class TestSwitchingOn:
         vehicle.reboot(station.now)
         assert station.wait(0.5).heard(wire.Heartbeat)[0].system_status == 1
 
-    def test_without_a_boot_time_it_is_ready_at_once(self, kind: Callable[..., Vehicle]) -> None:
+    def test_without_a_boot_time_the_vehicle_is_ready_immediately(self, kind: Callable[..., Vehicle]) -> None:
         beats = Station(kind(table=TEN)).heard(wire.Heartbeat)
         assert beats[0].system_status != wire.MAV_STATE_BOOT
 
@@ -234,7 +234,7 @@ class TestClock:
         assert times == [wire.SystemTime(0, 0), wire.SystemTime(0, 1000)]
 
     @pytest.mark.parametrize("kind", [GenericVehicle, ArduPilotVehicle])
-    def test_telemetry_carries_it(self, kind: Callable[..., Vehicle]) -> None:
+    def test_telemetry_has_the_time_since_boot(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN, telemetry=10.0)
         vehicle.tick(5.0)
         clock: list[int] = []
@@ -251,15 +251,15 @@ class TestClock:
         assert len(falls) == 1
         assert clock[falls[0]] == pytest.approx(100, abs=1)
 
-    def test_it_has_32_bits(self) -> None:
+    def test_the_time_since_boot_has_32_bits(self) -> None:
         station = Station(GenericVehicle(table=TEN, telemetry=1.0))
         station.now = 2.0**32 / 1000 + 5.0
         (time,) = station.wait(0.0).heard(wire.SystemTime)[1:]
         assert time.time_boot_ms == 5000
 
     @pytest.mark.parametrize(("kind", "asked"), [("copter", [True]), ("plane", []), ("rover", [])])
-    def test_ardupilot_tells_it_when_its_main_loop_runs(self, kind: str, asked: list[bool]) -> None:
-        """A Copter on request alone; what is requested earlier is acknowledged, and sent then."""
+    def test_ardupilot_sends_system_time_when_its_main_loop_runs(self, kind: str, asked: list[bool]) -> None:
+        """A Copter only on request; an earlier request is acknowledged, and SYSTEM_TIME sent then."""
         vehicle = ArduPilotVehicle(table=TEN, kind=kind)
         station = Station(vehicle).wait(5.5)
         unasked = [time.time_boot_ms for time in station.heard(wire.SystemTime)]
@@ -273,7 +273,7 @@ class TestClock:
         station.send(CLOCK_REQUEST).wait(0.001)
         assert [time.time_boot_ms for time in station.heard(wire.SystemTime)] == [1500]
 
-    def test_px4_tells_it_with_its_telemetry(self) -> None:
+    def test_px4_sends_the_time_since_boot_with_telemetry(self) -> None:
         vehicle = PX4Vehicle(table=TEN)
         vehicle.tick(10.0)
         vehicle.receive(wire.encode(CLOCK_REQUEST, system=255, component=190, sequence=0), 10.1)
@@ -293,7 +293,7 @@ class TestClock:
             (partial(ArduPilotVehicle, kind="rover"), 2, 4),
         ],
     )
-    def test_the_state_after_a_restart(self, make: Callable[..., Vehicle], first: int, then: int) -> None:
+    def test_the_state_after_a_reboot(self, make: Callable[..., Vehicle], first: int, then: int) -> None:
         vehicle = make(table=TEN)
         station = Station(vehicle).wait(3.5)
         assert {beat.system_status for beat in station.heard(wire.Heartbeat)} == {then}
@@ -304,7 +304,7 @@ class TestClock:
         assert states == sorted(states, key=[first, then].index)
 
 
-def test_after_a_reboot_in_mid_stream_px4_counts_anew() -> None:
+def test_a_reboot_during_a_list_resets_px4s_count() -> None:
     vehicle = PX4Vehicle(table=TEN, not_in_use=["P5"], burst=1)
     station = Station(vehicle)
     vehicle.use("P5")
@@ -323,12 +323,12 @@ class TestRepeatedNames:
     )
 
     @EVERY_KIND
-    def test_only_where_they_are_asked_for(self, kind: Callable[..., Vehicle]) -> None:
+    def test_repeated_names_must_be_allowed(self, kind: Callable[..., Vehicle]) -> None:
         with pytest.raises(UsageError):
             kind(table=self.TABLE)
 
     @EVERY_KIND
-    def test_each_has_its_index_and_the_first_its_name(self, kind: Callable[..., Vehicle]) -> None:
+    def test_a_read_of_a_repeated_name_gets_the_first(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=self.TABLE, repeated_names=True)
         first, last = (0, 1) if kind is PX4Vehicle else (0, 2)
         station = Station(vehicle)
@@ -342,7 +342,7 @@ class TestRepeatedNames:
         assert vehicle.params["CAMERA_EXPOSURE_"] == vehicle.param("CAMERA_EXPOSURE_") == vehicle.listed[0]
         assert vehicle.values == {"CAMERA_EXPOSURE_": 1, "GAIN": 5}
 
-    def test_a_set_means_the_first(self) -> None:
+    def test_a_set_of_a_repeated_name_sets_the_first(self) -> None:
         vehicle = GenericVehicle(self.TABLE, repeated_names=True)
         Station(vehicle).ask(write("CAMERA_EXPOSURE_", 9, ParamType.INT32))
         assert [param.value for param in vehicle.listed] == [9, 5, 2.0]
@@ -381,7 +381,7 @@ class TestHighLatency:
         assert station.heard(wire.HighLatency2) == [wire.HighLatency2(ours.type, ours.autopilot)] * 3
 
     @EVERY_KIND
-    def test_on_and_off_in_flight(self, kind: Callable[..., Vehicle]) -> None:
+    def test_high_latency_can_be_switched_at_any_time(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN, telemetry=2.0)
         station = Station(vehicle).wait(3.5)
         assert vehicle.high_latency is False
@@ -395,7 +395,7 @@ class TestHighLatency:
         beats = [time for time, _, message in station.log if isinstance(message, wire.Heartbeat)]
         assert beats == [10.5, 11.5]
 
-    def test_the_telemetry_that_was_not_sent_does_not_come_later(self) -> None:
+    def test_suppressed_telemetry_is_not_sent_later(self) -> None:
         vehicle = GenericVehicle(TEN, telemetry=50.0)
         vehicle.tick(0.0)
         vehicle.high_latency = True
@@ -407,7 +407,7 @@ class TestHighLatency:
         assert ids == [0, 2, *[30] * 6]
 
     @EVERY_KIND
-    def test_it_outlives_a_reboot(self, kind: Callable[..., Vehicle]) -> None:
+    def test_high_latency_continues_after_a_reboot(self, kind: Callable[..., Vehicle]) -> None:
         vehicle = kind(table=TEN, high_latency=True)
         station = Station(vehicle).wait(1.0)
         vehicle.reboot(1.0, down=1.0)
@@ -423,7 +423,7 @@ class TestHighLatency:
         found = [index for index in indices(station.ask(seconds=0.5)) if index != NO_INDEX]
         assert found == list(range(10))
 
-    def test_a_list_that_had_begun_goes_on_at_its_pace(self) -> None:
+    def test_a_started_list_continues_at_its_rate(self) -> None:
         vehicle = GenericVehicle(TEN, burst=1, period=0.1)
         vehicle.when_listed(4, lambda: setattr(vehicle, "high_latency", True))
         station = Station(vehicle)
@@ -432,7 +432,7 @@ class TestHighLatency:
         station.wait(2.0)
         assert station.times() == pytest.approx([5.0 + step / 10 for step in range(6)])
 
-    def test_px4_pushes_nothing_meanwhile(self) -> None:
+    def test_px4_sends_no_changes_in_high_latency(self) -> None:
         vehicle = PX4Vehicle(table=TEN, high_latency=True, autosave=60.0)
         station = Station(vehicle)
         assert len(station.ask(write("P1", 5, ParamType.INT32), seconds=20.0)) == 1
@@ -441,14 +441,14 @@ class TestHighLatency:
 
 
 class TestOtherStation:
-    def test_it_restarts_the_list(self) -> None:
+    def test_another_station_restarts_the_list(self) -> None:
         vehicle = PX4Vehicle()
         air = Air([vehicle], others=[OtherStation(list_every=0.3)])
         values = Station(air).ask(LIST, seconds=1.0)
         assert indices(values).count(0) == 4
         assert vehicle.requests["PARAM_REQUEST_LIST"] == 4
 
-    def test_everybody_hears_it(self) -> None:
+    def test_another_station_is_received_by_all(self) -> None:
         vehicles = [GenericVehicle(SMALL, system=1), GenericVehicle(SMALL, system=2)]
         setting = SimParam("B_INT", ParamType.INT32, 8)
         other = OtherStation(target_system=2, list_every=1.0, sets=[(2.5, setting), (0.5, setting)])
@@ -471,13 +471,13 @@ class TestOtherStation:
         assert [frame.sequence for _, frame, _ in heard] == list(range(9))
         assert wire.ParamSet(2, 1, "B_INT", b"\x08\0\0\0", ParamType.INT32) in [each[2] for each in heard]
 
-    def test_its_values_in_the_encoding_of_the_vehicle(self) -> None:
+    def test_another_station_uses_the_vehicles_encoding(self) -> None:
         vehicle = ArduPilotVehicle()
         row = SimParam("RTL_ALT", ParamType.INT32, 2000)
         Station(Air([vehicle], others=[OtherStation(sets=[(0.5, row)], encoding=Encoding.C_CAST)])).wait(1.0)
         assert vehicle.values["RTL_ALT"] == 2000
 
-    def test_it_shares_the_links(self) -> None:
+    def test_another_station_shares_the_links(self) -> None:
         other = OtherStation(list_every=0.001)
         uplink = FaultyLink(rate=1000.0, queue=100)
         vehicle = GenericVehicle(SMALL)
@@ -487,7 +487,7 @@ class TestOtherStation:
         lossy = Air.symmetric([GenericVehicle(SMALL)], loss=1.0, others=[OtherStation(list_every=0.1)])
         assert Station(lossy).wait(5.0).log == []
 
-    def test_a_late_call_makes_up_for_nothing(self) -> None:
+    def test_a_late_call_skips_repeated_work(self) -> None:
         other = OtherStation(list_every=0.5)
         assert other.next_deadline() is None
         other.tick(0.0)
@@ -497,7 +497,7 @@ class TestOtherStation:
         assert other.data_to_send() == []
         assert other.next_deadline() == 1000.5
 
-    def test_our_station_takes_it_for_no_vehicle(self) -> None:
+    def test_another_station_is_not_a_vehicle(self) -> None:
         vehicle = PX4Vehicle(table=TEN)
         other = OtherStation(list_every=0.7, sets=[(2.0, SimParam("P1", ParamType.INT32, 50))])
         world = Simulation(air=Air.symmetric([vehicle], delay=0.05, others=[other]))

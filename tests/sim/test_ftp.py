@@ -1,4 +1,4 @@
-"""MAVFTP of the simulated vehicles, one request at a time, and what they do not do."""
+"""MAVFTP of the simulated vehicles, one request at a time, and its unsupported operations."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ PARAMS = b"@PARAM/param.pck"
 
 
 class Pilot:
-    """A ground station that asks one thing after the other, each with its own number."""
+    """A ground station that sends one request after the other, each with its own sequence number."""
 
     def __init__(self, vehicle: Vehicle, *, component: int = 190) -> None:
         self.vehicle = vehicle
@@ -33,7 +33,7 @@ class Pilot:
         self.vehicle.receive(file_request(packet, component=self.component), self.now)
 
     def listen(self, seconds: float) -> list[Packet]:
-        """What comes in so long a time."""
+        """Return the responses within this time."""
         end = self.now + seconds
         heard = []
         while (due := self.vehicle.next_deadline()) is not None and due <= end:
@@ -51,7 +51,7 @@ class Pilot:
     def ask(
         self, opcode: Opcode, data: bytes = b"", *, session: int = 3, offset: int = 0, size: int = 0
     ) -> Packet:
-        """One request, and its only answer."""
+        """Send one request; return its only response."""
         self.sequence += 2
         self.send(Packet(self.sequence, session, opcode, data, size, offset))
         (answer,) = self.listen(0.1)
@@ -76,7 +76,7 @@ def refusal(answer: Packet) -> tuple[int, ...]:
     return tuple(answer.data)
 
 
-def test_a_file_is_read_in_a_burst_to_its_end() -> None:
+def test_a_burst_reads_a_file_to_its_end() -> None:
     pilot = Pilot(ArduPilotVehicle())
     content = bytes(range(256)) * 3
     pilot.vehicle.files["logs/1.bin"] = content
@@ -91,7 +91,7 @@ def test_a_file_is_read_in_a_burst_to_its_end() -> None:
     assert sequences == list(range(sequences[0], sequences[0] + 5))
 
 
-def test_single_reads_go_anywhere() -> None:
+def test_single_reads_at_any_offset() -> None:
     pilot = Pilot(ArduPilotVehicle())
     pilot.vehicle.files["a"] = b"abcdefgh"
     pilot.ask(Opcode.OPEN_FILE_RO, b"a")
@@ -100,7 +100,7 @@ def test_single_reads_go_anywhere() -> None:
     assert refusal(pilot.ask(Opcode.READ_FILE, offset=8, size=30)) == (FileErrorCode.EOF,)
 
 
-def test_the_parameters_must_be_read_by_one_size() -> None:
+def test_param_pck_is_read_with_one_size() -> None:
     pilot = Pilot(ArduPilotVehicle())
     assert pilot.ask(Opcode.OPEN_FILE_RO, PARAMS).data == (12 * 1382).to_bytes(4, "little")
     first = pilot.ask(Opcode.READ_FILE, size=100).data
@@ -123,7 +123,7 @@ def content_of(pilot: Pilot, query: bytes) -> param_pck.Pack:
     return param_pck.decode(data)
 
 
-def test_a_part_of_the_parameters() -> None:
+def test_param_pck_with_start_and_count() -> None:
     pilot = Pilot(ArduPilotVehicle())
     everything = packed(pilot.vehicle)
     assert content_of(pilot, b"?start=5&count=3") == param_pck.Pack(tuple(everything[5:8]), 1382, False)
@@ -132,12 +132,12 @@ def test_a_part_of_the_parameters() -> None:
 
 
 @pytest.mark.parametrize("query", [b"?start=1382", b"?withdefaults=2", b"?count=x", b"?start=70000"])
-def test_queries_that_cannot_be(query: bytes) -> None:
+def test_invalid_queries_are_refused(query: bytes) -> None:
     pilot = Pilot(ArduPilotVehicle())
     assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, PARAMS + query)) == (FileErrorCode.FAIL_ERRNO, 22)
 
 
-def test_the_file_is_made_of_what_the_vehicle_holds_at_the_moment() -> None:
+def test_param_pck_has_the_current_values() -> None:
     pilot = Pilot(ArduPilotVehicle(live_period=0.0))
     before = {each.name: each for each in content_of(pilot, b"?withdefaults=1").entries}
     pilot.vehicle.set_param("RTL_ALT", 1234.0)
@@ -149,7 +149,7 @@ def test_the_file_is_made_of_what_the_vehicle_holds_at_the_moment() -> None:
     assert after["COMPASS_DEC"].default is None
 
 
-def test_a_value_that_is_almost_the_default_counts_as_it() -> None:
+def test_a_value_close_to_its_default_has_no_separate_default() -> None:
     rows = [
         SimParam("A", ParamType.REAL32, 1e-7, default=0.0),
         SimParam("B", ParamType.REAL32, 2e-7, default=0.0),
@@ -161,12 +161,12 @@ def test_a_value_that_is_almost_the_default_counts_as_it() -> None:
     assert [each.default for each in entries] == [None, 0, None, None, None]
 
 
-def test_a_table_that_no_file_can_hold_has_none() -> None:
+def test_a_table_with_other_types_has_no_param_pck() -> None:
     pilot = Pilot(ArduPilotVehicle(table={"A": (ParamType.UINT16, 1)}))
     assert refusal(pilot.ask(Opcode.OPEN_FILE_RO, PARAMS)) == (FileErrorCode.FILE_NOT_FOUND,)
 
 
-def test_a_file_is_written_and_stands_when_it_is_closed() -> None:
+def test_a_written_file_exists_after_closing() -> None:
     pilot = Pilot(ArduPilotVehicle())
     pilot.vehicle.files["a"] = b"old and long"
     assert pilot.ask(Opcode.CREATE_FILE, b"a").opcode == Opcode.ACK
@@ -186,7 +186,7 @@ def upload(pilot: Pilot, data: bytes) -> Packet:
     return pilot.ask(Opcode.TERMINATE_SESSION)
 
 
-def test_parameters_are_set_by_a_file_when_it_is_closed() -> None:
+def test_an_uploaded_param_pck_sets_parameters_on_closing() -> None:
     pilot = Pilot(ArduPilotVehicle(read_only=["RTL_SPEED"]))
     rows = [
         PackedParam("RTL_ALT", ParamType.REAL32, 0x449A4000),  # 1234, for an INT16 or an INT32
@@ -205,7 +205,7 @@ def test_parameters_are_set_by_a_file_when_it_is_closed() -> None:
     assert len(pilot.vehicle.params) == 1434
 
 
-def test_a_file_that_is_none_sets_nothing() -> None:
+def test_an_invalid_param_pck_sets_nothing() -> None:
     pilot = Pilot(ArduPilotVehicle())
     before = pilot.vehicle.values
     data = param_pck.encode_upload([PackedParam("RTL_ALT", ParamType.INT16, 5)])
@@ -226,7 +226,7 @@ def test_directories_and_checksums() -> None:
     assert refusal(pilot.ask(Opcode.CALC_FILE_CRC32, b"nothing")) == (FileErrorCode.FILE_NOT_FOUND,)
 
 
-def test_what_it_cannot_do() -> None:
+def test_unsupported_operations_are_refused() -> None:
     pilot = Pilot(ArduPilotVehicle())
     pilot.send(Packet(1, 3, 12))
     (answer,) = pilot.listen(1.0)
@@ -234,7 +234,7 @@ def test_what_it_cannot_do() -> None:
     assert answer.requested == 12
 
 
-def test_a_long_directory_comes_in_pieces() -> None:
+def test_a_long_directory_is_listed_in_parts() -> None:
     pilot = Pilot(ArduPilotVehicle())
     names = [f"file{number:03d}" for number in range(60)]
     pilot.vehicle.files.update(dict.fromkeys((f"d/{name}" for name in names), b""))
@@ -246,7 +246,7 @@ def test_a_long_directory_comes_in_pieces() -> None:
 
 
 class TestSessions:
-    def test_ardupilot_has_one(self) -> None:
+    def test_ardupilot_has_one_session(self) -> None:
         pilot = Pilot(ArduPilotVehicle())
         pilot.vehicle.files["a"] = b"a"
         pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
@@ -260,7 +260,7 @@ class TestSessions:
         assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
 
     @pytest.mark.parametrize("opcode", [Opcode.TERMINATE_SESSION, Opcode.RESET_SESSIONS])
-    def test_ardupilot_acknowledges_to_others_and_closes_nothing(self, opcode: Opcode) -> None:
+    def test_ardupilot_acknowledges_closing_other_sessions(self, opcode: Opcode) -> None:
         pilot = Pilot(ArduPilotVehicle())
         pilot.vehicle.files["a"] = b"a"
         pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
@@ -274,7 +274,7 @@ class TestSessions:
         "opcode",
         [Opcode.OPEN_FILE_RO, Opcode.CREATE_FILE, Opcode.LIST_DIRECTORY, Opcode.CALC_FILE_CRC32],
     )
-    def test_ardupilot_has_one_for_all_stations(self, opcode: Opcode) -> None:
+    def test_ardupilot_has_one_session_for_all_stations(self, opcode: Opcode) -> None:
         pilot = Pilot(ArduPilotVehicle())
         pilot.vehicle.files["a"] = b"a"
         pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
@@ -283,7 +283,7 @@ class TestSessions:
         assert refusal(other.ask(opcode, b"a", session=4)) == (FileErrorCode.INVALID_SESSION,)
         assert other.ask(Opcode.READ_FILE, session=3, size=1).data == b"a"
 
-    def test_ardupilot_gives_up_one_after_3_s_without_an_answer(self) -> None:
+    def test_ardupilots_session_ends_after_3_s_without_a_response(self) -> None:
         pilot = Pilot(ArduPilotVehicle())
         pilot.vehicle.files["a"] = b"a"
         pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
@@ -293,7 +293,7 @@ class TestSessions:
         assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4).opcode == Opcode.ACK
         assert refusal(pilot.ask(Opcode.READ_FILE, session=3, size=1)) == (FileErrorCode.INVALID_SESSION,)
 
-    def test_ardupilot_is_kept_from_giving_it_up_by_each_refusal(self) -> None:
+    def test_refusals_extend_ardupilots_session(self) -> None:
         pilot = Pilot(ArduPilotVehicle())
         pilot.vehicle.files["a"] = b"a"
         pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3)
@@ -302,7 +302,7 @@ class TestSessions:
             answer = pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=4)
             assert refusal(answer) == (FileErrorCode.INVALID_SESSION,)
 
-    def test_what_is_written_stands_when_the_session_is_given_up(self) -> None:
+    def test_a_written_file_is_kept_when_the_session_times_out(self) -> None:
         pilot = Pilot(ArduPilotVehicle())
         pilot.ask(Opcode.CREATE_FILE, b"a", session=3)
         pilot.ask(Opcode.WRITE_FILE, b"abc", session=3)
@@ -321,7 +321,7 @@ class TestSessions:
         frames = [frame for data in vehicle.data_to_send() for frame in framer.receive(data)]
         assert sum(isinstance(wire.decode(frame), wire.StatusText) for frame in frames) == texts
 
-    def test_px4_closes_one_after_11_s(self) -> None:
+    def test_px4_closes_a_session_after_11_s(self) -> None:
         pilot = Pilot(PX4Vehicle())
         pilot.vehicle.files["a"] = b"a"
         pilot.ask(Opcode.OPEN_FILE_RO, b"a")
@@ -331,7 +331,7 @@ class TestSessions:
         assert refusal(pilot.ask(Opcode.READ_FILE, session=0, size=1)) == (FileErrorCode.INVALID_SESSION,)
         assert pilot.ask(Opcode.OPEN_FILE_RO, b"a").opcode == Opcode.ACK
 
-    def test_px4_numbers_its_own(self) -> None:
+    def test_px4_assigns_session_numbers(self) -> None:
         pilot = Pilot(PX4Vehicle(ftp=True))
         pilot.vehicle.files["a"] = b"a"
         assert pilot.ask(Opcode.OPEN_FILE_RO, b"a", session=3).session == 0
@@ -344,7 +344,7 @@ class TestSessions:
         assert pilot.ask(Opcode.RESET_SESSIONS, session=9).opcode == Opcode.ACK
         assert pilot.ask(Opcode.OPEN_FILE_RO, b"a").opcode == Opcode.ACK
 
-    def test_a_reboot_closes_all(self) -> None:
+    def test_a_reboot_closes_all_sessions(self) -> None:
         pilot = Pilot(ArduPilotVehicle())
         pilot.vehicle.files["a"] = bytes(5000)
         pilot.ask(Opcode.OPEN_FILE_RO, b"a")
@@ -356,7 +356,7 @@ class TestSessions:
 
 
 class TestPace:
-    def test_a_request_that_comes_again_gets_the_same_answer(self) -> None:
+    def test_a_repeated_request_gets_the_same_response(self) -> None:
         pilot = Pilot(ArduPilotVehicle())
         pilot.vehicle.files["a"] = b"a"
         request = Packet(7, 3, Opcode.OPEN_FILE_RO, b"a")
@@ -379,7 +379,7 @@ class TestPace:
             pilot.send(Packet(100 + 2 * number, 3, Opcode.READ_FILE, size=10, offset=10 * number))
         assert [each.offset for each in pilot.listen(1.0)] == [0, 10, 20, 30, 40]
 
-    def test_what_comes_while_a_burst_runs_waits_for_its_end(self) -> None:
+    def test_requests_during_a_burst_wait_for_its_end(self) -> None:
         pilot = Pilot(ArduPilotVehicle())
         pilot.vehicle.files["a"] = bytes(5000)
         pilot.ask(Opcode.OPEN_FILE_RO, b"a")
@@ -391,7 +391,7 @@ class TestPace:
         assert answer.sequence == 201
 
     @pytest.mark.parametrize("size", [239, 110])
-    def test_a_burst_takes_a_third_of_the_link(self, size: int) -> None:
+    def test_a_burst_uses_a_third_of_the_link(self, size: int) -> None:
         pilot = Pilot(ArduPilotVehicle(ftp_rate=1920.0))
         pilot.vehicle.files["a"] = bytes(10 * size)
         pilot.ask(Opcode.OPEN_FILE_RO, b"a")
@@ -401,8 +401,8 @@ class TestPace:
         assert len(heard) == 10
         assert len(heard + pilot.listen(frame / 1920)) == 11
 
-    def test_on_a_serial_port_the_first_block_comes_behind_the_banner(self) -> None:
-        """On a real one at 57600 baud 0.095 to 0.105 s after open and burst were asked for."""
+    def test_on_a_serial_port_the_banner_precedes_the_first_block(self) -> None:
+        """On a real one at 57600 baud, 0.095 to 0.105 s after the requests for open and burst."""
         air = Air.symmetric([ArduPilotVehicle(ftp_rate=5760.0)], rate=5760.0)
         framer = wire.Framer(stream=False)
         air.tick(0.0)
@@ -425,7 +425,7 @@ class TestPace:
         gaps = [later - earlier for earlier, later in pairwise(blocks)]
         assert gaps == pytest.approx([(MOST_DATA + 27) / 5760] * 3, abs=0.01)
 
-    def test_px4_ends_a_burst_early_and_says_so(self) -> None:
+    def test_px4_ends_a_burst_after_168_blocks(self) -> None:
         pilot = Pilot(PX4Vehicle())
         pilot.vehicle.files["a"] = bytes(50_000)
         pilot.ask(Opcode.OPEN_FILE_RO, b"a")
@@ -435,7 +435,7 @@ class TestPace:
         rest = pilot.burst(session=0, offset=168 * 239)
         assert sum(len(each.data) for each in (*blocks, *rest) if each.opcode == Opcode.ACK) == 50_000
 
-    def test_px4_sends_a_burst_in_its_loop_and_answers_meanwhile(self) -> None:
+    def test_px4_answers_requests_during_a_burst(self) -> None:
         pilot = Pilot(PX4Vehicle())
         pilot.vehicle.files["a"] = bytes(50_000)
         pilot.ask(Opcode.OPEN_FILE_RO, b"a")
@@ -453,14 +453,14 @@ class TestPace:
 
 
 class TestSwitches:
-    def test_px4_has_the_parameters_as_a_file_if_it_is_new(self) -> None:
+    def test_newer_px4_has_a_param_pck(self) -> None:
         old, new = Pilot(PX4Vehicle()), Pilot(PX4Vehicle(ftp=True))
         assert refusal(old.ask(Opcode.OPEN_FILE_RO, PARAMS)) == (FileErrorCode.FILE_NOT_FOUND,)
         assert new.ask(Opcode.OPEN_FILE_RO, PARAMS).opcode == Opcode.ACK
         data = b"".join(each.data for each in new.burst(session=0) if each.opcode == Opcode.ACK)
         assert list(param_pck.decode(data).entries) == packed(new.vehicle)
 
-    def test_px4_takes_parameters_of_the_right_type(self) -> None:
+    def test_px4_sets_uploaded_parameters_of_the_right_type(self) -> None:
         pilot = Pilot(PX4Vehicle(ftp=True))
         rows = [
             PackedParam("MC_ROLL_P", ParamType.REAL32, 0x40E00000),
@@ -476,18 +476,18 @@ class TestSwitches:
     @pytest.mark.parametrize(
         "vehicle", [ArduPilotVehicle(ftp=False), GenericVehicle({"A": 1})], ids=["ardupilot", "generic"]
     )
-    def test_without_it_there_is_silence(self, vehicle: Vehicle) -> None:
+    def test_without_mavftp_requests_are_not_answered(self, vehicle: Vehicle) -> None:
         pilot = Pilot(vehicle)
         pilot.send(Packet(1, 0, Opcode.OPEN_FILE_RO, PARAMS))
         assert pilot.listen(1.0) == []
-        with pytest.raises(UsageError, match="does not speak MAVFTP"):
+        with pytest.raises(UsageError, match="this vehicle has no MAVFTP"):
             assert vehicle.files
 
     @pytest.mark.parametrize(
         ("vehicle", "has_it"),
         [(ArduPilotVehicle(), True), (ArduPilotVehicle(ftp=False), False), (PX4Vehicle(), True)],
     )
-    def test_the_capabilities_tell(self, vehicle: Vehicle, has_it: bool) -> None:
+    def test_capabilities_have_the_ftp_bit(self, vehicle: Vehicle, has_it: bool) -> None:
         vehicle.tick(0.0)
         ask = wire.CommandLong(1, 1, wire.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, (1.0,) + (0.0,) * 6)
         vehicle.receive(wire.encode(ask, system=255, component=190, sequence=0), 0.1)
@@ -497,18 +497,18 @@ class TestSwitches:
         assert bool(version.capabilities & wire.CAPABILITY_FTP) is has_it
 
     @pytest.mark.parametrize("rate", [0.0, -1.0, float("nan"), float("inf")])
-    def test_rates_that_cannot_be(self, rate: float) -> None:
+    def test_invalid_rates_are_rejected(self, rate: float) -> None:
         with pytest.raises(UsageError, match="rate of MAVFTP"):
             ArduPilotVehicle(ftp_rate=rate)
 
-    def test_answers_are_no_requests(self) -> None:
+    def test_responses_are_not_answered(self) -> None:
         pilot = Pilot(ArduPilotVehicle())
         pilot.send(Packet(1, 0, Opcode.ACK))
         pilot.send(Packet(1, 0, Opcode.NAK))
         assert pilot.listen(1.0) == []
 
 
-def test_files_wait_for_the_end_of_the_high_latency_mode() -> None:
+def test_files_wait_in_high_latency_mode() -> None:
     pilot = Pilot(ArduPilotVehicle())
     pilot.vehicle.files["a"] = b"abcdefgh"
     pilot.vehicle.high_latency = True

@@ -1,4 +1,4 @@
-"""The list of the simulated ArduPilot: what else it does while one is being sent."""
+"""The list of the simulated ArduPilot, and its handling of other requests during a list."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from tests.ground import LIST, Station, cast, indices, read
 
 SET = cast("RTL_ALT", 1234.0)
 LOOP = 0.006
-"""Seconds from one turn of the vehicle's loop to the next."""
+"""Period of the vehicle's loop in seconds."""
 
 quiet = partial(ArduPilotVehicle, live_period=0.0)
 near = partial(pytest.approx, abs=LOOP)
 
 
 def listing(seconds: float, vehicle: ArduPilotVehicle | None = None) -> Station:
-    """A station that has requested the list, so long ago. The first slot begins at 0.1 s."""
+    """Return a station that requested the list this long ago. The first slot starts at 0.1 s."""
     return Station(quiet() if vehicle is None else vehicle).send(LIST).wait(seconds)
 
 
 def acknowledged(station: Station) -> list[float]:
-    """When the set was acknowledged."""
+    """Return when the set was acknowledged."""
     return [
         time
         for time, _, message in station.log
@@ -39,7 +39,7 @@ def acknowledged(station: Station) -> list[float]:
 
 
 def answered(station: Station, wanted: Container[int]) -> list[float]:
-    """When reads of these indices, far ahead of the list, were answered."""
+    """Return when reads of these indices, far ahead of the list, were answered."""
     return [
         time
         for time, _, message in station.log
@@ -48,7 +48,7 @@ def answered(station: Station, wanted: Container[int]) -> list[float]:
 
 
 def pauses(station: Station, without: Container[int] = ()) -> list[tuple[float, float]]:
-    """From when to when no value of the list came, where that was longer than 20 ms."""
+    """Return the pauses of the list longer than 20 ms, each with start and end."""
     times = [
         time
         for time, _, message in station.log
@@ -57,20 +57,20 @@ def pauses(station: Station, without: Container[int] = ()) -> list[tuple[float, 
     return [pair for pair in itertools.pairwise(times) if pair[1] - pair[0] > 0.02]
 
 
-def test_nothing_received_is_looked_at_while_it_runs() -> None:
+def test_received_messages_wait_while_a_list_runs() -> None:
     station = listing(0.15).send(SET).wait(0.3)
     assert acknowledged(station) == near([0.23])
     assert pauses(station) == []
 
 
-def test_nothing_waits_when_it_has_ended() -> None:
+def test_nothing_waits_after_the_list() -> None:
     station = listing(0.9).send(SET).wait(0.1)
     assert acknowledged(station) == near([0.924])
     assert station.values()[-2].param_index == 1381
     assert acknowledged(station.send(SET).wait(0.1)) == near([1.006])
 
 
-def test_a_second_request_begins_at_0_and_makes_it_pause() -> None:
+def test_a_second_request_restarts_and_pauses_the_list() -> None:
     station = listing(0.25).send(LIST).wait(2.0)
     (pause,) = pauses(station)
     assert pause == near((0.375, 0.4))
@@ -82,20 +82,20 @@ def test_a_second_request_begins_at_0_and_makes_it_pause() -> None:
     assert times[-1] == pytest.approx(1.2, abs=0.02)
 
 
-def test_a_request_just_before_a_slot_makes_it_pause_as_well() -> None:
+def test_a_request_just_before_a_slot_pauses_the_list() -> None:
     station = Station(quiet()).wait(0.095).send(LIST).wait(2.0)
     (pause,) = pauses(station)
     assert pause == near((0.11, 0.2))
 
 
-def test_up_to_10_reads_do_not_make_it_pause_the_first_time() -> None:
+def test_the_first_10_reads_do_not_pause_the_list() -> None:
     station = listing(0.15).send(*(read(index=index) for index in range(1300, 1310))).wait(0.4)
     assert answered(station, range(1300, 1310)) == near([0.23] * 5 + [0.36] * 5)
     assert [first for first, _ in pauses(station, range(1300, 1310))] == near([0.36])
 
 
-def test_reads_make_it_pause() -> None:
-    """So many a second: 5 are answered in each 100 ms, and it runs for 130 of every 300 ms."""
+def test_reads_pause_the_list() -> None:
+    """Of many reads per second, 5 are answered in each 100 ms; the list runs for 130 of every 300 ms."""
     station = listing(0.15)
     for index in range(1200, 1380, 5):
         station.send(*(read(index=each) for each in range(index, index + 5))).wait(0.1)
@@ -114,7 +114,7 @@ def test_40_reads_at_once_lose_15() -> None:
     assert times == near([0.23] * 5 + [0.3] * 5 + [0.4] * 5 + [0.53] * 5 + [0.6] * 5)
 
 
-def test_on_a_slow_link_it_takes_nothing_from_others() -> None:
+def test_on_a_slow_link_a_list_does_not_delay_responses() -> None:
     station = listing(0.15, quiet(burst=1, period=0.025)).send(SET, read(index=1000)).wait(0.1)
     assert acknowledged(station) == near([0.156])
     assert answered(station, [1000]) == near([0.2])
@@ -124,8 +124,8 @@ def ask_for_file(station: Station, packets: Sequence[Packet]) -> Station:
     return station.send(*(wire.FileTransfer(0, 1, 1, packet.pack()) for packet in packets))
 
 
-def test_a_burst_of_a_file_stands_still() -> None:
-    """20 blocks can wait. They come when it looks at the link, and the list goes on."""
+def test_a_list_pauses_a_file_burst() -> None:
+    """20 blocks can wait. They are sent in the next pause, and the list continues."""
     station = Station(quiet())
     ask_for_file(station, [Packet(2, 3, Opcode.OPEN_FILE_RO, b"@PARAM/param.pck")]).wait(0.02)
     burst = Packet(4, 3, Opcode.BURST_READ_FILE, size=239)
@@ -139,7 +139,7 @@ def test_a_burst_of_a_file_stands_still() -> None:
     assert pauses(station) == []
 
 
-def test_a_restart_forgets_what_waits() -> None:
+def test_a_reboot_drops_waiting_requests() -> None:
     vehicle = quiet()
     station = listing(0.15, vehicle).send(SET)
     vehicle.reboot(station.now)
@@ -148,7 +148,7 @@ def test_a_restart_forgets_what_waits() -> None:
     assert struct.unpack("<f", cast("RTL_ALT", 1234.0).raw) == (1234.0,)
 
 
-def test_in_high_latency_what_waits_is_looked_at_and_the_list_waits() -> None:
+def test_high_latency_processes_waiting_requests_and_pauses_the_list() -> None:
     vehicle = quiet()
     station = listing(0.15, vehicle).send(SET)
     vehicle.high_latency = True

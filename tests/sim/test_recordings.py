@@ -1,4 +1,4 @@
-"""The recordings of real autopilots: decoded, and held against the simulated ones."""
+"""Recordings of real autopilots: decoded, and compared with the simulated ones."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from tests.recordings import (
 
 PX4_HASH = 0xCF579589
 BAROMETER = ("CAL_BARO0_ID", "CAL_BARO0_OFF", "CAL_BARO0_PRIO")
-"""What the PX4 vehicle's firmware sets while it boots, and saves only after the first change by a user."""
+"""Parameters that the recorded PX4 sets during boot, and saves only after the first change by a user."""
 
 UNKNOWN_IDS = {8, 380, 410, 411}
 """Messages in the logs that pymavlink's dialect does not define."""
@@ -48,7 +48,7 @@ def message_id(data: bytes) -> int:
 
 
 def params(values: Iterable[wire.ParamValue], encoding: Encoding) -> list[Param]:
-    """What a full download says, without the hash."""
+    """Return the values of a full download, without the hash."""
     found = []
     for value in values:
         if value.param_index != wire.NO_INDEX:
@@ -58,7 +58,7 @@ def params(values: Iterable[wire.ParamValue], encoding: Encoding) -> list[Param]
 
 
 class TestDecoding:
-    def test_there_are_nineteen(self) -> None:
+    def test_there_are_19_recordings(self) -> None:
         assert len(NAMES) == 19
 
     @pytest.mark.parametrize("name", NAMES)
@@ -72,7 +72,7 @@ class TestDecoding:
         assert {record.system for record in records} == {1, 255}
 
     @pytest.mark.parametrize("name", NAMES)
-    def test_the_session_as_one_stream_gives_the_same_frames(self, name: str) -> None:
+    def test_a_session_as_one_stream_has_the_same_frames(self, name: str) -> None:
         records = [record for record in read(name) if record.frame is not None]
         framer = wire.Framer()
         stream = b"".join(record.data for record in records)
@@ -83,8 +83,8 @@ class TestDecoding:
         assert framer.skipped == 0
 
     @pytest.mark.parametrize("name", NAMES)
-    def test_encoding_what_was_decoded_gives_the_bytes_of_the_log(self, name: str) -> None:
-        """For the messages of the protocol itself, which `wire` holds in full."""
+    def test_decoded_messages_encode_to_the_same_bytes(self, name: str) -> None:
+        """For the messages of the parameter protocol, which `wire` decodes completely."""
         values = wire.ParamValue | wire.ParamSet | wire.ParamRequestRead | wire.ParamRequestList
         kinds = values | wire.FileTransfer
         for record in read(name):
@@ -97,7 +97,7 @@ class TestDecoding:
                 )
                 assert again == record.data
 
-    def test_px4_gives_the_table_and_its_hash(self) -> None:
+    def test_px4s_table_and_hash(self) -> None:
         values = param_values(from_vehicle("px4_full_download"))
         first = next(at for at, value in enumerate(values) if value.param_id == wire.HASH_CHECK)
         announced = values[first]
@@ -114,7 +114,7 @@ class TestDecoding:
         assert px4_hash(found, leave_out=volatile) == PX4_HASH
         assert px4_hash(found) != PX4_HASH
 
-    def test_ardupilot_gives_the_table(self) -> None:
+    def test_ardupilots_table(self) -> None:
         values = param_values(from_vehicle("ardupilot_full_download"))
         found = params(values, Encoding.C_CAST)
         assert len(found) == len(values) == 1382
@@ -125,19 +125,19 @@ class TestDecoding:
         assert {value.param_count for value in values} == {1382}
 
 
-# What a replay leaves out, and why
+# Messages that a replay leaves out
 
 OTHER_TEXTS = ("GPS 1:", "EKF", "Field Elevation", "[logger]")
-"""How texts begin that other parts of the firmware send; no client of parameters reads them."""
+"""Prefixes of texts that other parts of the firmware send; parameter clients ignore them."""
 UNASKED = (
     *("STAT_RUNTIME", "BARO1_GND_PRESS", "BARO2_GND_PRESS"),
     *("CAL_BARO0_ID", "CAL_BARO0_OFF", "CAL_BARO0_PRIO"),
 )
-"""Values that the firmware itself changes and tells of at moments of its own; those in a list count."""
+"""Values that the firmware changes and announces on its own; only those in a list are compared."""
 
 
 def compared(messages: Messages) -> Messages:
-    """What of a session a replay has to reproduce, but for the values that are told of unasked.
+    """Return the messages that a replay must reproduce, without unsolicited values.
 
     The first 3 s after a start PX4's heartbeat has the state 0; the simulated one has been on for longer.
     """
@@ -151,11 +151,11 @@ def compared(messages: Messages) -> Messages:
     return kept
 
 
-# What the vehicles had on board, where it differs from the tables that are shipped
+# Values of the recorded vehicles that differ from the packaged tables
 
 
 def px4_of(name: str) -> PX4Vehicle:
-    """PX4 with the parameters of a list: five more are in use with its logger on, none of them volatile."""
+    """Return a PX4 with the parameters of a list: its logger uses five more, none of them volatile."""
     volatile = {row.name for row in px4_table() if row.volatile}
     rows = []
     for value in last_list(name):
@@ -165,7 +165,7 @@ def px4_of(name: str) -> PX4Vehicle:
 
 
 def ardupilot_of(name: str) -> ArduPilotVehicle:
-    """ArduPilot with the values of a list."""
+    """Return an ArduPilot with the values of a list."""
     vehicle = ArduPilotVehicle(live_period=0.0)
     for value in last_list(name):
         take(vehicle, value)
@@ -173,7 +173,7 @@ def ardupilot_of(name: str) -> ArduPilotVehicle:
 
 
 def take(vehicle: ArduPilotVehicle, value: wire.ParamValue) -> None:
-    """Hold a value as it was sent, if it is another one."""
+    """Store a received value, if it differs."""
     param = vehicle.param(value.param_id)
     if encode(param.value, param.type, Encoding.C_CAST) != value.raw:
         (number,) = struct.unpack("<f", value.raw)
@@ -181,7 +181,7 @@ def take(vehicle: ArduPilotVehicle, value: wire.ParamValue) -> None:
 
 
 def ardupilot_of_file(name: str) -> ArduPilotVehicle:
-    """ArduPilot with the values and defaults of a file that the log has."""
+    """Return an ArduPilot with the values and defaults of a file in the log."""
     blocks = {}
     for _, message in from_vehicle(name):
         if isinstance(message, wire.FileTransfer):
@@ -202,7 +202,7 @@ def ardupilot_of_file(name: str) -> ArduPilotVehicle:
 
 
 def with_groups(name: str) -> ArduPilotVehicle:
-    """ArduPilot before two groups are shown: what the list has, and the shipped table has not."""
+    """Return an ArduPilot before two groups are shown, with parameters that the packaged table lacks."""
     shipped = {row.name for row in ardupilot_table()}
     groups: dict[str, list[SimParam]] = {"GRIP_ENABLE": [], "SCR_ENABLE": []}
     for value in last_list(name):
@@ -219,7 +219,7 @@ def with_groups(name: str) -> ArduPilotVehicle:
 
 
 def without_pushes(name: str, messages: Messages, start: float) -> Messages:
-    """All but the PARAM_VALUEs after a time that are not the first ones after a set of their names."""
+    """Leave out PARAM_VALUEs after a time, except the first one after a set of its name."""
     sets = [record.message for record in from_ground(name) if record.time >= start]
     awaited = {message.param_id for message in sets if isinstance(message, wire.ParamSet)}
     kept: Messages = []
@@ -252,7 +252,7 @@ ARDUPILOT: dict[str, tuple[Callable[[str], ArduPilotVehicle], float]] = {
     "ardupilot_list_beside_ftp": (ardupilot_of_file, 0.0010),
     "ardupilot_list_restarted": (ardupilot_of, 0.0080),
 }
-"""With the vehicle, and the phase of its loop."""
+"""Recordings with their vehicle, and the phase of its loop."""
 
 PX4: dict[str, tuple[Callable[[str], PX4Vehicle], float]] = {
     "px4_hash_hit_and_stop": (px4, 0.7681),
@@ -263,7 +263,7 @@ PX4: dict[str, tuple[Callable[[str], PX4Vehicle], float]] = {
 
 
 class TestDifferences:
-    """What a replay is judged by finds what is wrong; the messages are those of the log, changed."""
+    """The comparison detects wrong replays; the replays are modified messages of the log."""
 
     NAME = "ardupilot_get_set"
 
@@ -271,7 +271,7 @@ class TestDifferences:
         return differences(self.NAME, compared(from_vehicle(self.NAME)), changed, burst=10)
 
     def changed(self, at: int, *instead: tuple[float, wire.Message]) -> Messages:
-        """The log with other messages in the place of one that answers a read or set."""
+        """Return the log with other messages in place of one response to a read or set."""
         messages = compared(from_vehicle(self.NAME))
         place = [place for place, (_, each) in enumerate(messages) if isinstance(each, wire.ParamValue)][at]
         return sorted([*messages[:place], *instead, *messages[place + 1 :]], key=lambda item: item[0])
@@ -280,18 +280,18 @@ class TestDifferences:
         messages = compared(from_vehicle(self.NAME))
         return [(time, each) for time, each in messages if isinstance(each, wire.ParamValue)][at]
 
-    def test_the_log_itself_is_right(self) -> None:
+    def test_the_original_log_passes(self) -> None:
         assert self.found(compared(from_vehicle(self.NAME))) == []
 
     @pytest.mark.parametrize("at", [0, 1, -1])
-    def test_a_message_that_is_missing(self, at: int) -> None:
+    def test_a_missing_message_fails(self, at: int) -> None:
         assert self.found(self.changed(at))
 
-    def test_a_message_more(self) -> None:
+    def test_an_additional_message_fails(self) -> None:
         time, value = self.answer(1)
         assert self.found(self.changed(1, (time, value), (time + 0.001, value)))
 
-    def test_another_value_or_count_or_type(self) -> None:
+    def test_another_value_count_or_type_fails(self) -> None:
         time, value = self.answer(0)
         for other in (
             value._replace(raw=b"\0\0\0\0"),
@@ -300,16 +300,16 @@ class TestDifferences:
         ):
             assert self.found(self.changed(0, (time, other)))
 
-    def test_a_message_that_is_late_or_early(self) -> None:
-        """The first read was answered 41 ms after its request: 20 ms count, not 20 %."""
+    def test_a_late_or_early_message_fails(self) -> None:
+        """The first read was answered 41 ms after its request: the tolerance is 20 ms, not 20 %."""
         time, value = self.answer(0)
         assert self.found(self.changed(0, (time + 0.019, value))) == []
         assert self.found(self.changed(0, (time - 0.019, value))) == []
         assert self.found(self.changed(0, (time + 0.021, value)))
         assert self.found(self.changed(0, (time - 0.021, value)))
 
-    def test_a_list_that_is_slower(self) -> None:
-        """By 25 %; a burst of 10 more or less would not count."""
+    def test_a_slower_list_fails(self) -> None:
+        """Slower by 25 %; a burst of 10 more or less would be tolerated."""
         name = "ardupilot_full_download"
         recorded = compared(from_vehicle(name))
 
@@ -322,8 +322,8 @@ class TestDifferences:
         assert differences(name, recorded, slowed(1.15), burst=10) == []
         assert differences(name, recorded, slowed(1.25), burst=10)
 
-    def test_messages_of_two_kinds_in_another_order(self) -> None:
-        """The end of a file comes 0.54 s after its request. 0.1 s more are within 20 %, but out of order."""
+    def test_another_order_of_two_kinds_of_messages_fails(self) -> None:
+        """The end of a file is sent after 0.54 s. Sending it 0.1 s later is within 20 %, but out of order."""
         name = "ardupilot_list_beside_ftp"
         recorded = compared(from_vehicle(name))
         ends = max(time for time, each in recorded if isinstance(each, wire.FileTransfer) and time < 1.0)
@@ -338,9 +338,9 @@ class TestDifferences:
 
 
 class TestReplay:
-    """The same messages, in the same order, at the same times; `tests.recordings` says what that means."""
+    """The same messages, in the same order, at the same times; see `tests.recordings` for tolerances."""
 
-    def test_none_is_left_out(self) -> None:
+    def test_every_recording_is_replayed(self) -> None:
         alone = {name for name in NAMES if hasattr(TestReplay, f"test_{name}")}
         assert set(NAMES) == set(ARDUPILOT) | set(PX4) | alone
 
@@ -361,7 +361,7 @@ class TestReplay:
         )
 
     def test_px4_full_download(self) -> None:
-        """The barometer, found 1.4 s into the log and told of unasked, is replayed as an event."""
+        """The barometer, found 1.4 s into the log and sent unsolicited, is replayed as an event."""
         name = "px4_full_download"
         vehicle = PX4Vehicle()
         found = [vehicle.param(each) for each in BAROMETER]
@@ -382,8 +382,8 @@ class TestReplay:
         assert int.from_bytes(last.raw, "little") == vehicle.announced_hash() != PX4_HASH
 
     def test_px4_20_sets(self) -> None:
-        """From 3.34 s on the real one repeats no set: pushes of sets that follow each other closely are
-        missing now and then, other ones in each session. So only the acknowledgements count there."""
+        """From 3.34 s on, the real vehicle pushes no set again. Pushes of sets in quick succession are
+        missing at random, so only the acknowledgements are compared there."""
         name = "px4_20_sets"
         recorded = without_pushes(name, compared(from_vehicle(name)), 3.34)
         vehicle = px4_of("px4_list_beside_reads")
@@ -406,7 +406,7 @@ class TestReplay:
         assert differences(name, recorded, sent, burst=10) == []
 
     def test_ardupilot_ftp_download(self) -> None:
-        """Both files, every block of them, and the end of each."""
+        """Both files, with every block, and the end of each."""
         name = "ardupilot_ftp_download"
         recorded = compared(from_vehicle(name))
         sent = compared(replay(ArduPilotVehicle(live_period=0.0), name, phase=0.003))

@@ -1,4 +1,4 @@
-"""How simulated vehicles start again when they are told to, and what takes effect with that."""
+"""Reboots of simulated vehicles by command, and changes that take effect with them."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class Desk:
         self._take()
 
     def run(self, until: float) -> None:
-        """Let time pass; everything happens when it is due."""
+        """Advance the time; all work is done when it is due."""
         while True:
             self._take()
             due = self.vehicle.next_deadline()
@@ -53,7 +53,7 @@ class Desk:
         self._take()
 
     def command(self, mode: float = 1.0) -> list[int]:
-        """Tell it to start again; what it answers at once."""
+        """Send the reboot command; return the immediate responses."""
         self.heard.clear()
         self.send(wire.CommandLong(self.vehicle.system, 1, REBOOT, (mode, *[0.0] * 6)))
         acks = self.messages(wire.CommandAck)
@@ -78,7 +78,7 @@ class Desk:
 
 
 @pytest.mark.parametrize(("make", "delay"), [(PX4Vehicle, 0.4), (ArduPilotVehicle, 0.2), (generic, 0.3)])
-def test_it_acknowledges_goes_off_and_comes_back(make: Any, delay: float) -> None:
+def test_a_vehicle_acknowledges_switches_off_and_returns(make: Any, delay: float) -> None:
     desk = Desk(make(reboot_down=5.0))
     version = desk.vehicle._version
     desk.run(10.25)
@@ -93,7 +93,7 @@ def test_it_acknowledges_goes_off_and_comes_back(make: Any, delay: float) -> Non
     assert desk.vehicle.system == 1
 
 
-def test_one_that_stays_off_is_off() -> None:
+def test_a_vehicle_may_stay_off() -> None:
     desk = Desk(generic(reboot_down=math.inf))
     desk.command()
     desk.run(100.0)
@@ -102,7 +102,7 @@ def test_one_that_stays_off_is_off() -> None:
 
 
 @pytest.mark.parametrize("make", [PX4Vehicle, ArduPilotVehicle, generic])
-def test_it_need_not_acknowledge(make: Any) -> None:
+def test_reboot_without_acknowledgement(make: Any) -> None:
     desk = Desk(make(reboot_ack=False))
     assert desk.command() == []
     desk.run(0.9)
@@ -110,7 +110,7 @@ def test_it_need_not_acknowledge(make: Any) -> None:
     desk.run(5.0)
     assert desk.messages(wire.Heartbeat)
     desk.vehicle.armed = True
-    assert len(desk.command()) == 1  # what it does not obey, it says
+    assert len(desk.command()) == 1  # refusals are acknowledged
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_it_need_not_acknowledge(make: Any) -> None:
         (generic, {0: CommandResult.UNSUPPORTED}),
     ],
 )
-def test_what_is_no_restart(make: Any, answers: Mapping[int, int]) -> None:
+def test_other_reboot_commands(make: Any, answers: Mapping[int, int]) -> None:
     desk = Desk(make())
     for mode, answer in answers.items():
         assert desk.command(mode) == [answer]
@@ -139,7 +139,7 @@ def test_what_is_no_restart(make: Any, answers: Mapping[int, int]) -> None:
         (generic, CommandResult.DENIED),
     ],
 )
-def test_armed_it_says_so_and_refuses(make: Any, answer: int) -> None:
+def test_an_armed_vehicle_refuses_a_reboot(make: Any, answer: int) -> None:
     desk = Desk(make(armed=True))
     assert desk.messages(wire.Heartbeat)[-1].base_mode & 128
     assert desk.command() == [answer]
@@ -152,7 +152,7 @@ def test_armed_it_says_so_and_refuses(make: Any, answer: int) -> None:
     assert desk.command() == [CommandResult.ACCEPTED]
 
 
-def test_px4_takes_its_system_id_with_the_start() -> None:
+def test_px4s_system_id_takes_effect_after_a_reboot() -> None:
     desk = Desk(PX4Vehicle(uid=7))
     desk.set("MAV_SYS_ID", 9, ParamType.INT32, Encoding.BYTEWISE)
     desk.run(10.0)
@@ -169,7 +169,7 @@ def test_px4_takes_its_system_id_with_the_start() -> None:
 
 
 @pytest.mark.parametrize("value", [0, -1, 256])
-def test_an_id_that_cannot_be_is_not_taken(value: int) -> None:
+def test_an_invalid_system_id_is_ignored(value: int) -> None:
     desk = Desk(PX4Vehicle())
     desk.set("MAV_SYS_ID", value, ParamType.INT32, Encoding.BYTEWISE)
     desk.command()
@@ -178,7 +178,7 @@ def test_an_id_that_cannot_be_is_not_taken(value: int) -> None:
 
 
 @pytest.mark.parametrize(("make", "name"), [(PX4Vehicle, "MAV_SYS_ID"), (ArduPilotVehicle, "SYSID_THISMAV")])
-def test_the_tables_of_real_ones_hold_the_system_id(make: Any, name: str) -> None:
+def test_recorded_tables_have_the_system_id(make: Any, name: str) -> None:
     vehicle = make(system=7)
     assert vehicle.param(name).value == 7
     vehicle.tick(0.0)
@@ -187,12 +187,12 @@ def test_the_tables_of_real_ones_hold_the_system_id(make: Any, name: str) -> Non
     assert vehicle.system == 7
 
 
-def test_a_table_of_ones_own_says_the_system_id_too() -> None:
+def test_custom_tables_have_the_system_id() -> None:
     assert ArduPilotVehicle(system=7, table={"SYSID_THISMAV": 1}).param("SYSID_THISMAV").value == 7
     assert PX4Vehicle(system=7, table={"A": 1}).values == {"A": 1}
 
 
-def test_sys_autoconfig_resets_what_it_does_not_keep() -> None:
+def test_sys_autoconfig_resets_all_but_kept_parameters() -> None:
     vehicle = PX4Vehicle(first_start_only=(), system=3)
     desk = Desk(vehicle)
     before = vehicle.values
@@ -204,7 +204,7 @@ def test_sys_autoconfig_resets_what_it_does_not_keep() -> None:
         vehicle.set_param(name, value)
     desk.command()
     desk.run(5.0)
-    assert vehicle.values == before | kept | reset  # not without SYS_AUTOCONFIG
+    assert vehicle.values == before | kept | reset  # unchanged without SYS_AUTOCONFIG
     announced = vehicle.announced_hash()
     vehicle.set_param("SYS_AUTOCONFIG", 1)
     desk.command()
@@ -215,10 +215,10 @@ def test_sys_autoconfig_resets_what_it_does_not_keep() -> None:
     vehicle.set_param("SYS_HAS_MAG", 0)
     desk.command()
     desk.run(15.0)
-    assert vehicle.param("SYS_HAS_MAG").value == 0  # once only
+    assert vehicle.param("SYS_HAS_MAG").value == 0  # resets only once
 
 
-def test_px4_no_longer_uses_from_its_second_start_on_what_it_has_stored() -> None:
+def test_first_start_only_parameters_are_unused_from_the_second_start_on() -> None:
     px4 = PX4Vehicle()
     count, announced = len(px4.params), px4.announced_hash()
     px4.reboot(5.0, down=1.0)
@@ -232,7 +232,7 @@ def test_px4_no_longer_uses_from_its_second_start_on_what_it_has_stored() -> Non
 
 
 @pytest.mark.parametrize("by_file", [True, False])
-def test_plane_and_rover_take_their_system_id_within_a_second(by_file: bool) -> None:
+def test_plane_and_rover_change_their_system_id_within_a_second(by_file: bool) -> None:
     desk = Desk(ArduPilotVehicle(kind="plane"))
     desk.run(10.25)
     if by_file:
@@ -250,7 +250,7 @@ def test_plane_and_rover_take_their_system_id_within_a_second(by_file: bool) -> 
     assert desk.vehicle.system == 9
 
 
-def test_copter_takes_its_system_id_with_the_next_start() -> None:
+def test_copters_system_id_takes_effect_after_a_reboot() -> None:
     desk = Desk(ArduPilotVehicle())
     desk.set("SYSID_THISMAV", 9, ParamType.INT16, Encoding.C_CAST)
     desk.run(5.0)
@@ -260,7 +260,7 @@ def test_copter_takes_its_system_id_with_the_next_start() -> None:
     assert desk.vehicle.system == 9
 
 
-def test_a_group_that_waits_for_the_start() -> None:
+def test_a_reboot_group_appears_after_a_reboot() -> None:
     vehicle = ArduPilotVehicle(
         table={"A_ENABLE": 0, "B_ENABLE": 1, "C_ENABLE": 0},
         groups={"A_ENABLE": {"A_X": 1}, "B_ENABLE": {"B_X": 1}, "C_ENABLE": {"C_X": 1}},
@@ -276,7 +276,7 @@ def test_a_group_that_waits_for_the_start() -> None:
     assert list(vehicle.params) == ["A_ENABLE", "A_X", "B_ENABLE", "C_ENABLE", "C_X"]
 
 
-def test_a_late_call_does_not_change_when_it_is_back() -> None:
+def test_a_late_call_does_not_change_the_end_of_a_reboot() -> None:
     vehicle = generic(reboot_down=2.0)
     desk = Desk(vehicle)
     desk.command()
@@ -289,7 +289,7 @@ def test_a_late_call_does_not_change_when_it_is_back() -> None:
     assert [each.time_boot_ms for each in desk.messages(wire.SystemTime)] == [7000]
 
 
-def test_arguments_that_cannot_be() -> None:
+def test_invalid_reboot_arguments_are_rejected() -> None:
     with pytest.raises(UsageError, match="copter, plane, rover"):
         ArduPilotVehicle(kind="blimp")
     with pytest.raises(UsageError, match="reboot_down"):
@@ -298,7 +298,7 @@ def test_arguments_that_cannot_be() -> None:
         ArduPilotVehicle(table={"A_ENABLE": 0}, reboot_groups=["A_ENABLE"])
 
 
-def test_the_command_passes_them_on() -> None:
+def test_sim_options_reach_the_vehicle() -> None:
     options = Misfortunes(armed=True, reboot_down=7.0).options
     assert (options["armed"], options["reboot_down"]) == (True, 7.0)
     assert Misfortunes().options["armed"] is False

@@ -1,4 +1,4 @@
-"""The simulated vehicles and the faulty link, clause by clause, in a time that is passed in."""
+"""The simulated vehicles and the faulty link, property by property, with simulated time."""
 
 from __future__ import annotations
 
@@ -34,20 +34,20 @@ NO_INDEX = wire.NO_INDEX
 
 
 class TestTables:
-    def test_shipped(self) -> None:
+    def test_recorded_tables(self) -> None:
         assert len(px4_table()) == 903
         assert len(ardupilot_table()) == 1382
         assert px4_table() is px4_table()
         assert PX4Vehicle().announced_hash() == 0xCF579589
 
-    def test_a_mapping(self) -> None:
+    def test_a_table_from_a_mapping(self) -> None:
         vehicle = GenericVehicle(SMALL)
         assert vehicle.param("A_FLOAT") == Param("A_FLOAT", 1.5, ParamType.REAL32, 0, 0x3FC00000)
         assert vehicle.param("D_SHORT") == Param("D_SHORT", -3, ParamType.INT16, 3, 0xFFFD)
         assert vehicle.values == {"A_FLOAT": 1.5, "B_INT": 7, "C_BYTE": 200, "D_SHORT": -3}
         assert list(vehicle.params.values()) == [vehicle.param(name) for name in SMALL]
 
-    def test_all_types(self) -> None:
+    def test_a_table_with_all_types(self) -> None:
         rows = [SimParam(f"T{kind}", kind, 1) for kind in ParamType]
         assert [row.bits for row in rows] == [1] * 8 + [0x3F800000, 0x3FF0000000000000]
         assert SimParam("N", ParamType.INT64, -2).bits == 2**64 - 2
@@ -90,11 +90,11 @@ class TestTables:
             lambda: PX4Vehicle().use("NO_SUCH"),
         ],
     )
-    def test_what_cannot_be(self, make: Callable[[], object]) -> None:
+    def test_invalid_arguments_are_rejected(self, make: Callable[[], object]) -> None:
         with pytest.raises(UsageError):
             make()
 
-    def test_the_public_names_are_there(self) -> None:
+    def test_public_names(self) -> None:
         assert all(hasattr(sim, name) for name in sim.__all__)
 
 
@@ -108,9 +108,7 @@ class TestEveryVehicle:
         assert vehicle.next_deadline() is None
         assert vehicle.data_to_send() == []
 
-    def test_a_value_changed_before_the_first_call_is_told_to_nobody(
-        self, kind: Callable[[], Vehicle]
-    ) -> None:
+    def test_a_change_before_the_first_call_is_not_announced(self, kind: Callable[[], Vehicle]) -> None:
         vehicle = kind()
         name = next(iter(vehicle.params))
         vehicle.set_param(name, 5)
@@ -125,7 +123,7 @@ class TestEveryVehicle:
         beats = [time - start for time, _, message in station.log if isinstance(message, wire.Heartbeat)]
         assert beats == pytest.approx([0.0, 1.0, 2.0, 3.0])
 
-    def test_a_late_call_makes_up_for_no_heartbeats(self, kind: Callable[[], Vehicle]) -> None:
+    def test_a_late_call_skips_heartbeats(self, kind: Callable[[], Vehicle]) -> None:
         vehicle = kind()
         station = Station(vehicle)
         station.now = 1000.0
@@ -146,7 +144,7 @@ class TestEveryVehicle:
         station = Station(kind()).send(*requests)
         assert [ack.result for ack in station.heard(wire.CommandAck)] == [3, 3]
 
-    def test_what_is_for_others_is_left_alone(self, kind: Callable[[], Vehicle]) -> None:
+    def test_messages_for_others_are_ignored(self, kind: Callable[[], Vehicle]) -> None:
         vehicle = kind()
         station = Station(vehicle).wait(0.5)
         name = next(iter(vehicle.params))
@@ -159,12 +157,12 @@ class TestEveryVehicle:
         )
         assert not vehicle.requests
 
-    def test_component_0_is_everyone(self, kind: Callable[[], Vehicle]) -> None:
+    def test_component_0_addresses_every_component(self, kind: Callable[[], Vehicle]) -> None:
         vehicle = kind()
         assert len(Station(vehicle).ask(read(index=0, component=0))) == 1
         assert vehicle.requests == {"PARAM_REQUEST_READ": 1}
 
-    def test_counts_what_it_was_asked(self, kind: Callable[[], Vehicle]) -> None:
+    def test_requests_are_counted(self, kind: Callable[[], Vehicle]) -> None:
         vehicle = kind()
         Station(vehicle).send(
             LIST,
@@ -183,7 +181,7 @@ class TestEveryVehicle:
             "HEARTBEAT": 1,
         }
 
-    def test_frames_are_numbered(self, kind: Callable[[], Vehicle]) -> None:
+    def test_frames_have_sequence_numbers(self, kind: Callable[[], Vehicle]) -> None:
         vehicle = kind()
         vehicle.receive(wire.encode(LIST, system=255, component=190, sequence=0), 0.0)
         vehicle.tick(1.0)
@@ -191,7 +189,7 @@ class TestEveryVehicle:
         assert [frame.sequence for frame in frames] == [number % 256 for number in range(len(frames))]
         assert {(frame.system, frame.component) for frame in frames} == {(1, 1)}
 
-    def test_a_reboot_ends_everything_but_keeps_the_values(self, kind: Callable[[], Vehicle]) -> None:
+    def test_a_reboot_keeps_only_the_values(self, kind: Callable[[], Vehicle]) -> None:
         vehicle = kind()
         name = next(iter(vehicle.params))
         station = Station(vehicle).send(LIST)
@@ -208,13 +206,13 @@ class TestEveryVehicle:
         assert vehicle.param(name).value == 3
         assert len(station.ask(LIST, seconds=1.5)) >= len(vehicle.params)
 
-    def test_what_was_not_yet_fetched_is_gone_after_a_reboot(self, kind: Callable[[], Vehicle]) -> None:
+    def test_a_reboot_drops_unsent_data(self, kind: Callable[[], Vehicle]) -> None:
         vehicle = kind()
         vehicle.receive(wire.encode(LIST, system=255, component=190, sequence=0), 0.0)
         vehicle.reboot(0.5)
         assert len(vehicle.data_to_send()) <= len(SIGNS_OF_LIFE)
 
-    def test_switched_off_for_good(self, kind: Callable[[], Vehicle]) -> None:
+    def test_switched_off_permanently(self, kind: Callable[[], Vehicle]) -> None:
         vehicle = kind()
         station = Station(vehicle).send(LIST)
         vehicle.reboot(0.0, down=math.inf)
@@ -239,7 +237,7 @@ class TestEveryVehicle:
 
     @given(data=st.lists(st.binary(max_size=300), max_size=5))
     @settings(max_examples=30, deadline=None)
-    def test_noise_does_no_harm(self, kind: Callable[[], Vehicle], data: list[bytes]) -> None:
+    def test_noise_is_harmless(self, kind: Callable[[], Vehicle], data: list[bytes]) -> None:
         vehicle = _SHARED.setdefault(kind, kind())
         for piece in data:
             vehicle.receive(piece, 0.0)
@@ -263,10 +261,10 @@ _requests = st.one_of(
 @pytest.mark.parametrize("kind", [GenericVehicle, PX4Vehicle, ArduPilotVehicle])
 @given(script=st.lists(st.tuples(st.floats(0, 1e4), _requests), max_size=40))
 @settings(max_examples=30, deadline=None)
-def test_no_request_does_harm(
+def test_random_requests_are_harmless(
     kind: Callable[..., Vehicle], error: bool, script: list[tuple[float, wire.Message]]
 ) -> None:
-    """Whatever is asked and however time jumps: no exception, and all pending work ends."""
+    """For all requests and clock jumps: no exception, and all pending work ends."""
     vehicle = kind(table=SMALL, param_error=error, telemetry=7.0, stream=True)
     now = 0.0
     for pause, message in script:
@@ -279,7 +277,7 @@ def test_no_request_does_harm(
     Station(vehicle, start=now + 10).wait(10)
 
 
-def test_what_nobody_fetches_is_bounded() -> None:
+def test_unsent_data_is_bounded() -> None:
     vehicle = GenericVehicle(SMALL, burst=1000)
     request = wire.encode(read(index=0), system=255, component=190, sequence=0) * 1000
     for _ in range(30):
@@ -308,7 +306,7 @@ class TestOptions:
         assert seen == {30: 100, 0: 3, 2: 3}
         assert framer.skipped == 0
 
-    def test_telemetry_is_made_up_for_one_second_at_most(self) -> None:
+    def test_a_late_call_sends_telemetry_for_at_most_one_second(self) -> None:
         vehicle = GenericVehicle(SMALL, telemetry=50.0)
         vehicle.tick(0.0)
         vehicle.tick(1e5)
@@ -322,7 +320,7 @@ class TestOptions:
             station.send_bytes(bytes((byte,)))
         assert names(station.values()) == ["B_INT"]
 
-    def test_ids_of_its_own(self) -> None:
+    def test_custom_ids(self) -> None:
         vehicle = PX4Vehicle(system=7, component=42)
         station = Station(vehicle)
         (value,) = station.ask(read("SYS_AUTOSTART", system=7, component=42))
@@ -351,8 +349,8 @@ class TestOptions:
                 (5, bytes(18), 8192),
             ]
 
-    def test_hot_enough(self) -> None:
-        """A full list costs 5 ms of processor time; the best of three runs stays below ten times that."""
+    def test_processor_time_of_a_full_list(self) -> None:
+        """A full list takes 5 ms of processor time; the best of three runs takes less than ten times that."""
         request = wire.encode(LIST, system=255, component=190, sequence=0)
         spent = []
         for _ in range(3):
@@ -366,7 +364,7 @@ class TestOptions:
 
 
 class TestGeneric:
-    def test_every_type_goes_and_comes_byte_wise(self) -> None:
+    def test_every_type_byte_wise(self) -> None:
         vehicle = GenericVehicle({f"T{int(kind)}": (kind, 1) for kind in ParamType} | {"T77": (77, b"abcd")})
         station = Station(vehicle)
         by_name = {value.param_id: value for value in station.ask(LIST)}
@@ -381,7 +379,7 @@ class TestGeneric:
         assert vehicle.values["T77"] == value.raw == b"wxyz"
 
     @pytest.mark.parametrize("bits", [0xFFB3B4C0, 0x7F800001, 0xFF800001, 0x7FBFFFFF])
-    def test_signalling_nans_survive(self, bits: int) -> None:
+    def test_signalling_nans_are_kept(self, bits: int) -> None:
         vehicle = GenericVehicle({"N": 0})
         raw = bits.to_bytes(4, "little")
         (value,) = Station(vehicle).ask(wire.ParamSet(1, 1, "N", raw, ParamType.INT32))
@@ -399,7 +397,7 @@ class TestGeneric:
         (value,) = Station(vehicle).ask(write("B_INT", 3.0, ParamType.REAL32))
         assert value == wire.ParamValue("B_INT", b"\x07\0\0\0", ParamType.INT32, 4, 1)
 
-    def test_errors(self) -> None:
+    def test_param_error(self) -> None:
         station = Station(GenericVehicle(SMALL, param_error=True))
         station.send(
             read("NO_SUCH"),
@@ -414,7 +412,7 @@ class TestGeneric:
             wire.ParamError(255, 190, "B_INT", -1, ParamErrorCode.TYPE_MISMATCH),
         ]
 
-    def test_system_0_is_everyone(self) -> None:
+    def test_system_0_addresses_every_system(self) -> None:
         assert len(Station(GenericVehicle(SMALL)).ask(wire.ParamRequestList(0, 0))) == 4
 
     def test_an_empty_table(self) -> None:
@@ -431,7 +429,7 @@ def hash_set(value: int = 0) -> wire.ParamSet:
 
 
 class TestPX4:
-    def test_the_list_begins_with_the_hash(self) -> None:
+    def test_the_list_starts_with_the_hash(self) -> None:
         vehicle = PX4Vehicle()
         values = Station(vehicle).ask(LIST, seconds=2.0)
         raw = (0xCF579589).to_bytes(4, "little")
@@ -444,22 +442,22 @@ class TestPX4:
         assert [len(list(group)) for _, group in itertools.groupby(times)] == [20] * 45 + [4]
         assert times[-1] - times[0] == pytest.approx(0.9)
 
-    def test_other_paces(self) -> None:
+    def test_other_list_rates(self) -> None:
         station = Station(PX4Vehicle(burst=1, period=0.125)).send(LIST).wait(200.0)
         assert station.times()[-1] == pytest.approx(903 * 0.125)
 
-    def test_asked_again_it_starts_again_without_the_hash(self) -> None:
+    def test_a_repeated_request_restarts_the_list_without_the_hash(self) -> None:
         station = Station(PX4Vehicle())
         assert len(station.ask(LIST, seconds=0.29)) == 15 * 20
         values = station.ask(LIST, seconds=2.0)
         assert indices(values) == list(range(903))
 
-    def test_after_the_end_the_hash_comes_again(self) -> None:
+    def test_a_request_after_the_end_starts_with_the_hash(self) -> None:
         station = Station(PX4Vehicle(table=SMALL))
         for _ in range(2):
             assert names(station.ask(LIST)) == ["_HASH_CHECK", *SMALL]
 
-    def test_a_read_of_the_hash_starts_nothing(self) -> None:
+    def test_a_read_of_the_hash_starts_no_list(self) -> None:
         (value,) = Station(PX4Vehicle()).ask(HASH, seconds=1.0)
         assert (value.param_id, value.param_index, value.param_type) == ("_HASH_CHECK", NO_INDEX, 5)
         assert indices(Station(PX4Vehicle()).ask(read("_HASH_CHECK", index=3))) == [3]
@@ -493,7 +491,7 @@ class TestPX4:
         volatile = [row.name for row in px4_table() if row.volatile]
         assert after == px4_hash(vehicle.params.values(), leave_out=volatile)
 
-    def test_silence(self) -> None:
+    def test_invalid_requests_are_not_answered(self) -> None:
         vehicle = PX4Vehicle()
         before = vehicle.values
         station = Station(vehicle)
@@ -547,7 +545,7 @@ class TestPX4:
             ("MPC_THR_HOVER", 0.0625, {"MPC_THR_HOVER": 0.12}),
         ],
     )
-    def test_its_position_controller_keeps_values_within_limits(
+    def test_the_position_controller_enforces_limits(
         self, name: str, value: float, changed: dict[str, float]
     ) -> None:
         vehicle = PX4Vehicle()
@@ -591,7 +589,7 @@ class TestPX4:
         station.wait(1.0)
         assert names(station.ask(write("SYS_AUTOSTART", 7, ParamType.INT32))) == ["SYS_AUTOSTART"] * 2
 
-    def test_further_changes_put_off_neither_the_push_nor_the_save(self) -> None:
+    def test_further_changes_delay_neither_push_nor_save(self) -> None:
         station = Station(PX4Vehicle(unsaved=["WV_GAIN"]))
         for value in range(5000, 5040):
             station.send(write("SYS_AUTOSTART", value, ParamType.INT32)).wait(0.015)
@@ -611,7 +609,7 @@ class TestPX4:
         assert [len(list(group)) for _, group in itertools.groupby(times)] == [20, 20, 10]
         assert names(station.values()) == changed
 
-    def test_a_change_behind_the_place_of_a_running_push_is_told_to_nobody(self) -> None:
+    def test_a_change_behind_a_running_push_is_not_announced(self) -> None:
         vehicle = PX4Vehicle(autosave=60.0)
         changed = [row.name for row in px4_table() if row.type is ParamType.INT32][:50]
         station = Station(vehicle)
@@ -627,8 +625,8 @@ class TestPX4:
         station.wait(1.0)
         assert names(station.values()) == [changed[0], *changed[5:]], "with the next change it is"
 
-    def test_what_is_saved_is_not_pushed(self) -> None:
-        """Saved 0.3 s after a change, and 2 s after the last time."""
+    def test_saved_values_are_not_pushed(self) -> None:
+        """Values are saved 0.3 s after a change, and 2 s after the last save."""
         vehicle = PX4Vehicle()
         changed = [row.name for row in px4_table() if row.type is ParamType.INT32][:400]
         station = Station(vehicle)
@@ -646,7 +644,7 @@ class TestPX4:
         station.wait(0.5)
         assert names(station.values()) == [changed[2]]
 
-    def test_what_is_loaded_or_reset_is_told_to_nobody(self) -> None:
+    def test_loaded_and_reset_values_are_not_announced(self) -> None:
         vehicle = PX4Vehicle(table=SMALL)
         station = Station(vehicle)
         before, bits = vehicle.announced_hash(), {name: each.bits for name, each in vehicle.params.items()}
@@ -672,7 +670,7 @@ class TestPX4:
         assert names(station.ask()) == ["SYS_AUTOSTART"]
         vehicle.set_param("SYS_AUTOSTART", 9)
         assert not station.ask()
-        vehicle.set_param("ASPD_SCALE_1", 2.0)  # the first of the list
+        vehicle.set_param("ASPD_SCALE_1", 2.0)  # the first in the list
         assert "ASPD_SCALE_1" in names(station.ask())
 
     def test_a_push_waits_for_the_end_of_the_list(self) -> None:
@@ -682,7 +680,7 @@ class TestPX4:
         assert names(values)[0] == names(values)[-1] == "BAT1_SOURCE"
         assert len(values) == 2 + 904 - 120
 
-    def test_what_is_not_in_use(self) -> None:
+    def test_parameters_not_in_use(self) -> None:
         vehicle = PX4Vehicle(table=SMALL, not_in_use=["B_INT"])
         before = vehicle.announced_hash()
         station = Station(vehicle)
@@ -714,7 +712,7 @@ class TestPX4:
         assert names(values[1:]) == sorted(names(values[1:]))
 
     def test_use_in_the_middle_of_a_list(self) -> None:
-        """What is used for the first time behind the list's place makes one come twice; the count moves."""
+        """A parameter that joins before the list's position makes one repeat; the count changes."""
         vehicle = PX4Vehicle(not_in_use=["ATT_EN", "WV_EN"])
         station = Station(vehicle)
         first = station.ask(LIST, seconds=0.01)
@@ -726,7 +724,7 @@ class TestPX4:
         assert rest[0].param_index == first[-1].param_index + 1 == 19
         assert indices(rest) == list(range(19, 903))
 
-    def test_a_list_asked_for_while_it_boots_comes_later(self) -> None:
+    def test_a_list_requested_during_boot_is_sent_after_it(self) -> None:
         station = Station(PX4Vehicle(table=SMALL, boot_time=2.0))
         assert not station.ask(LIST, seconds=1.9)
         assert len(station.ask(seconds=0.2)) == 5
@@ -763,7 +761,7 @@ class TestArduPilot:
 
     @pytest.mark.parametrize("name", ["EK3_IMU_MASK", "INS_GYRO_FILTER"])
     def test_a_set_to_the_default_is_answered_with_another_type(self, name: str) -> None:
-        """Until the parameter has had another value once; measured on a real one."""
+        """Until the parameter has had another value; measured on a real vehicle."""
         vehicle = ArduPilotVehicle()
         param = vehicle.param(name)
         assert isinstance(param.value, int)
@@ -802,7 +800,7 @@ class TestArduPilot:
         assert raws[3:] == [struct.pack("<f", 0.1), b"abcd"]
         assert vehicle.values["BIG"] == 16777217
 
-    def test_a_read_by_name_has_no_index_and_the_spelling_asked_for(self) -> None:
+    def test_a_read_by_name_has_no_index_and_the_requested_spelling(self) -> None:
         station = Station(ArduPilotVehicle())
         (value,) = station.ask(read("rtl_Alt"))
         assert value == wire.ParamValue("rtl_Alt", struct.pack("<f", 1500), ParamType.INT32, 1382, NO_INDEX)
@@ -827,7 +825,7 @@ class TestArduPilot:
         assert indices(station.values()) == list(range(15))
 
     @pytest.mark.parametrize(("asked", "answered"), [(25, 25), (40, 25), (300, 25)])
-    def test_the_queue_overflows_without_a_word(self, asked: int, answered: int) -> None:
+    def test_the_read_queue_drops_silently(self, asked: int, answered: int) -> None:
         station = Station(ArduPilotVehicle())
         assert indices(station.ask(*(read(index=index) for index in range(asked)), seconds=5.0)) == list(
             range(answered)
@@ -841,7 +839,7 @@ class TestArduPilot:
         assert indices(station.ask(*unknown, *(read(index=index) for index in range(5)))) == list(range(5))
         assert not station.heard(wire.ParamError)
 
-    def test_a_read_may_answer_with_the_value_before_a_set(self) -> None:
+    def test_a_read_may_return_the_value_before_a_set(self) -> None:
         station = Station(ArduPilotVehicle())
         first, second = station.ask(read("RTL_ALT"), cast("RTL_ALT", 2000))
         assert first.raw == struct.pack("<f", 2000)
@@ -862,9 +860,7 @@ class TestArduPilot:
         ],
     )
     @pytest.mark.parametrize("kind", [ParamType.REAL32, ParamType.INT32, 0, 255])
-    def test_a_set_is_converted_and_kept_in_range(
-        self, name: str, value: float, stored: float, kind: int
-    ) -> None:
+    def test_a_set_is_converted_and_clamped(self, name: str, value: float, stored: float, kind: int) -> None:
         vehicle = ArduPilotVehicle(table=[*ardupilot_table(), SimParam("DOUBLE", ParamType.REAL64, 0.0)])
         station = Station(vehicle).wait(0.0301).send(cast(name, value, kind)).wait(0.1)
         (time,) = station.times()
@@ -883,7 +879,7 @@ class TestArduPilot:
     def test_an_unchanged_value_is_answered_too_by_its_own_name(self) -> None:
         assert names(Station(ArduPilotVehicle()).ask(cast("rtl_alt", 1500))) == ["RTL_ALT"]
 
-    def test_sets_in_quick_succession_share_an_answer(self) -> None:
+    def test_sets_in_quick_succession_share_a_response(self) -> None:
         vehicle = ArduPilotVehicle()
         station = Station(vehicle)
         for number in range(100):
@@ -917,13 +913,11 @@ class TestArduPilot:
         vehicle.set_param("RTL_ALT", 8)
         assert vehicle.values["RTL_ALT"] == 8
 
-    def test_a_name_that_does_not_exist_takes_its_time_and_no_place(self) -> None:
+    def test_an_unknown_name_takes_time_but_no_slot(self) -> None:
         vehicle = ArduPilotVehicle()
         unknown = [read(f"NO_SUCH_{number}") for number in range(19)]
         station = Station(vehicle).send(*unknown, *[read("RTL_ALT")] * 3).wait(0.5)
-        assert (
-            len(station.heard(wire.ParamValue)) == 2
-        )  # one looked up, 20 that wait: the last one is dropped
+        assert len(station.heard(wire.ParamValue)) == 2  # one in look-up, 20 waiting: the last one is dropped
         station = Station(ArduPilotVehicle()).send(*unknown[:14], *[read("RTL_ALT")] * 5).wait(0.11)
         assert len(station.heard(wire.ParamValue)) == 5
 
@@ -962,7 +956,7 @@ class TestArduPilot:
         assert vehicle.values["G_GAIN"] == 3.0
 
     def test_during_a_list_two_counts_alternate(self) -> None:
-        """The list goes on with its first count, answers give the new one, and the new ones are not lost."""
+        """The list keeps its first count, responses have the new count, and new parameters are not lost."""
         vehicle = ArduPilotVehicle()
         station = Station(vehicle)
         values = station.ask(LIST, seconds=0.3)
@@ -983,14 +977,14 @@ class TestArduPilot:
         vehicle.set_param("G_ENABLE", 0)
         assert names(station.ask()) == ["G_ENABLE"]
 
-    def test_a_change_on_board_is_told(self) -> None:
+    def test_a_change_on_board_is_announced(self) -> None:
         vehicle = ArduPilotVehicle()
         station = Station(vehicle)
         vehicle.set_param("RTL_ALT", 77)
         (value,) = station.ask()
         assert (value.param_id, value.param_index) == ("RTL_ALT", NO_INDEX)
 
-    def test_live_values_come_unasked(self) -> None:
+    def test_live_values_are_sent_unsolicited(self) -> None:
         vehicle = ArduPilotVehicle(live_period=10.0)
         before = vehicle.values
         station = Station(vehicle).wait(35.0)
@@ -998,7 +992,7 @@ class TestArduPilot:
         values = station.values()
         assert names(values) == ["BARO1_GND_PRESS", "STAT_RUNTIME"] * 3
         assert set(indices(values)) == {NO_INDEX}
-        assert vehicle.values["STAT_RUNTIME"] == before["STAT_RUNTIME"] + 30  # type: ignore[operator]  # ints
+        assert vehicle.values["STAT_RUNTIME"] == before["STAT_RUNTIME"] + 30  # type: ignore[operator]  # both are int
         assert vehicle.values["BARO1_GND_PRESS"] == pytest.approx(before["BARO1_GND_PRESS"])
         assert values[0].raw != values[2].raw
 
@@ -1026,7 +1020,7 @@ class TestArduPilot:
 
 
 def pass_through(link: FaultyLink, count: int = 5000, gap: float = 0.001) -> list[tuple[float, int]]:
-    """Send numbered datagrams at an even pace: when each that arrives does, and its number."""
+    """Send numbered datagrams at a constant rate; return arrival time and number of each that arrives."""
     for number in range(count):
         link.send(number.to_bytes(4, "big"), number * gap)
     arrived = []
@@ -1036,7 +1030,7 @@ def pass_through(link: FaultyLink, count: int = 5000, gap: float = 0.001) -> lis
 
 
 class TestFaultyLink:
-    def test_perfect(self) -> None:
+    def test_a_link_without_faults(self) -> None:
         link = FaultyLink()
         assert link.next_deadline() is None
         assert pass_through(link, 10) == [(number * 0.001, number) for number in range(10)]
@@ -1161,13 +1155,13 @@ class TestFaultyLink:
             {"rate": 100.0, "queue": -1},
         ],
     )
-    def test_what_cannot_be(self, arguments: dict[str, float]) -> None:
+    def test_invalid_arguments_are_rejected(self, arguments: dict[str, float]) -> None:
         with pytest.raises(UsageError):
-            FaultyLink(**arguments)  # type: ignore[arg-type]  # one dict for arguments of several types
+            FaultyLink(**arguments)  # type: ignore[arg-type]  # arguments of several types in one dict
 
 
 class TestAir:
-    def test_several_vehicles_hear_and_are_heard(self) -> None:
+    def test_several_vehicles_receive_and_send(self) -> None:
         air = Air([PX4Vehicle(system=1), ArduPilotVehicle(system=2), GenericVehicle(SMALL, system=3)])
         assert air.next_deadline() is None
         station = Station(air)
@@ -1183,7 +1177,7 @@ class TestAir:
         station.send(read("B_INT")).wait(0.5)
         assert station.times() == pytest.approx([0.6])
 
-    def test_the_directions_draw_different_numbers(self) -> None:
+    def test_the_directions_use_different_random_numbers(self) -> None:
         air = Air.symmetric(
             [], loss=0.5, jitter=0.1, duplicate=0.1, reorder=0.1, bit_errors=0.01, rate=1e6, queue=99, seed=7
         )
@@ -1219,7 +1213,7 @@ class TestAir:
         assert vehicle.requests == {"PARAM_REQUEST_LIST": 1}
         assert mute.log == []
 
-    def test_what_happens_to_a_vehicle_from_outside_is_seen(self) -> None:
+    def test_changes_made_directly_on_a_vehicle_are_sent(self) -> None:
         vehicle = ArduPilotVehicle()
         air = Air([vehicle])
         station = Station(air).wait(0.5)
@@ -1227,7 +1221,7 @@ class TestAir:
         assert air.next_deadline() == pytest.approx(0.5, abs=0.006)
         assert names(station.ask()) == ["RTL_ALT"]
 
-    def test_what_nobody_fetches_is_bounded(self) -> None:
+    def test_unsent_data_is_bounded(self) -> None:
         air = Air([GenericVehicle(SMALL, telemetry=10_000.0)])
         for second in range(4):
             air.tick(float(second))

@@ -14,16 +14,16 @@ from paramclient.model.params import (
     VERIFIED,
     Held,
     Params,
+    as_params,
     is_listed,
-    kept,
     number_of,
+    pack_fields,
     param_of,
-    parts_of,
-    placed,
     same_held,
-    to_hold,
     trust_of,
-    trusted,
+    unpack_fields,
+    with_index,
+    with_trust_number,
 )
 from paramclient.model.values import (
     Encoding,
@@ -224,7 +224,7 @@ class Table:
             room.taken += 1
             place = NOWHERE if given >= count or count > MOST_PARAMETERS else given
             bits, is_raw = bits_of_wire(raw, number, self._encoding)
-            new = everything[name] = to_hold(bits, number, is_raw, LIVE, place)
+            new = everything[name] = pack_fields(bits, number, is_raw, LIVE, place)
             self._wire[name] = raw
             self._moments[name] = moment
             self.dirty[name] = by
@@ -245,7 +245,7 @@ class Table:
         held = self._held.get(name)
         if held is None:
             return message
-        _, number, _, trust, _ = parts_of(held)
+        _, number, _, trust, _ = unpack_fields(held)
         if trust == CACHED and name not in self._wire:
             return message
         known = known_type(number)
@@ -260,8 +260,8 @@ class Table:
         name, _, _, count, given = message
         held = self._held[name]
         is_index = given < count <= MOST_PARAMETERS and given not in self.passed_over.get(name, ())
-        if is_index and placed(held, given) != held:
-            self._held[name] = placed(held, given)
+        if is_index and with_index(held, given) != held:
+            self._held[name] = with_index(held, given)
             self.dirty.setdefault(name, "vehicle")
 
     def _hear_again(
@@ -269,15 +269,15 @@ class Table:
     ) -> Change | None:
         """Take a PARAM_VALUE of a parameter that is known."""
         _, raw, number, count, given = message
-        old_bits, old_number, old_is_raw, _, place = parts_of(old)
+        old_bits, old_number, old_is_raw, _, place = unpack_fields(old)
         if given != NO_INDEX:
             place = NOWHERE if given >= count or count > MOST_PARAMETERS else given
         seen_at = self._moments.get(name, moment)
         self._moments[name] = moment
         is_same_type = old_number == number
         if is_same_type and self._wire.get(name) == raw and not is_exact:
-            if placed(old, place) != old:
-                self._held[name] = to_hold(old_bits, number, old_is_raw, LIVE, place)
+            if with_index(old, place) != old:
+                self._held[name] = pack_fields(old_bits, number, old_is_raw, LIVE, place)
                 self.dirty.setdefault(name, by)
             return None
         if is_same_type and not is_exact and self._rounds(old, raw):
@@ -286,10 +286,10 @@ class Table:
             bits, is_raw = bits_of_wire(raw, number, self._encoding)
             self._filed.discard(name)
         before = self._defaults.get(name) if is_same_type else self._defaults.pop(name, None)
-        new = self._held[name] = to_hold(bits, number, is_raw, LIVE, place)
+        new = self._held[name] = pack_fields(bits, number, is_raw, LIVE, place)
         self._wire[name] = raw
         if same_held(old, new):
-            if placed(old, place) != old:
+            if with_index(old, place) != old:
                 self.dirty.setdefault(name, by)
             return None
         self._news(name, old, by, before, seen_at)
@@ -328,11 +328,11 @@ class Table:
             self._room.taken += 1
         raw = as_sent(bits, number, self._encoding)
         before = self._defaults.get(name)
-        is_same_type = old is None or parts_of(old)[1] == number
+        is_same_type = old is None or unpack_fields(old)[1] == number
         if is_older and old is not None and not (is_same_type and self._wire.get(name) == raw):
             if is_same_type:  # else it is the default of something else
                 self._set_default(name, initial)
-            self._held[name] = placed(old, index)
+            self._held[name] = with_index(old, index)
             self.dirty.setdefault(name, "vehicle")
             return None
         self._set_default(name, initial)
@@ -340,10 +340,10 @@ class Table:
         seen_at = self._moments.get(name, moment)
         self._moments[name] = max(moment, seen_at)
         self._latest = max(self._latest, moment)
-        new = self._held[name] = to_hold(bits, number, is_raw, LIVE, index)
+        new = self._held[name] = pack_fields(bits, number, is_raw, LIVE, index)
         self._wire[name] = raw
         self._filed.add(name)
-        if old is None or placed(old, index) != old or initial != before:
+        if old is None or with_index(old, index) != old or initial != before:
             self.dirty.setdefault(name, "vehicle")
         if old is not None and same_held(old, new):
             return None
@@ -382,12 +382,12 @@ class Table:
         changes = []
         for name, raw in self._wire.items():
             old = self._held[name]
-            bits, number, _, trust, place = parts_of(old)
+            bits, number, _, trust, place = unpack_fields(old)
             if name in self._filed:
                 self._wire[name] = as_sent(bits, number, encoding)
                 continue
             bits, is_raw = bits_of_wire(raw, number, encoding)
-            new = self._held[name] = to_hold(bits, number, is_raw, trust, place)
+            new = self._held[name] = pack_fields(bits, number, is_raw, trust, place)
             if not same_held(old, new):
                 self.dirty.setdefault(name, "vehicle")
                 changes.append(self._change(name, old, new))
@@ -418,7 +418,7 @@ class Table:
             complete, volatile, volatile_known: as the attributes.
             moments: as in `fill`.
         """
-        known = kept(params)
+        known = as_params(params)
         if any(is_listed(held) and not is_portable_name(name) for name, held in known.held.items()):
             complete = placed = False
         changes = self.fill(known, are_placed=placed and self.count in (None, count), moments=moments)
@@ -456,16 +456,16 @@ class Table:
         """
         seen = {} if moments is None else moments
         changes = []
-        known = kept(params)
+        known = as_params(params)
         for name, cached in known.held.items():
             old = self._held.get(name)
             default = known.defaults.get(name)
             if old is not None:
-                if parts_of(old)[1] == parts_of(cached)[1] and name not in self._filed:
+                if unpack_fields(old)[1] == unpack_fields(cached)[1] and name not in self._filed:
                     changes += self._complement(name, old, cached, default)
             elif is_portable_name(name) and self._room.has_some(len(self._held)):
                 self._room.taken += 1
-                new = trusted(cached, CACHED)
+                new = with_trust_number(cached, CACHED)
                 if not are_placed and is_listed(new):
                     new = self._displaced(name, new)
                 self._held[name] = new
@@ -485,14 +485,14 @@ class Table:
         """
         seen = {} if moments is None else moments
         changes = []
-        for name, cached in kept(params).held.items():
+        for name, cached in as_params(params).held.items():
             old = self._held.get(name)
             if old is None or trust_of(old) != CACHED or name in self.dirty or same_held(old, cached):
                 continue
-            _, number, _, _, place = parts_of(old)
-            is_same_type = parts_of(cached)[1] == number
+            _, number, _, _, place = unpack_fields(old)
+            is_same_type = unpack_fields(cached)[1] == number
             before = self._defaults.get(name) if is_same_type else self._defaults.pop(name, None)
-            new = self._held[name] = placed(trusted(cached, CACHED), place)
+            new = self._held[name] = with_index(with_trust_number(cached, CACHED), place)
             if name in seen:
                 self._moments[name] = seen[name]
             self._wire.pop(name, None)  # should the vehicle say that again, it is a change
@@ -525,7 +525,7 @@ class Table:
             held = everything.get(name)
             if held is None or (passed_over and index in passed_over.get(name, ())):
                 continue
-            now = placed(held, index)
+            now = with_index(held, index)
             if now != held:
                 everything[name] = now
                 self.dirty.setdefault(name, "vehicle")
@@ -547,7 +547,7 @@ class Table:
         names: dict[int, str] = {}
         twice = set()
         for name, held in self._held.items():
-            index = parts_of(held)[4]
+            index = unpack_fields(held)[4]
             if index != NOWHERE and names.setdefault(index, name) != name:
                 twice.add(index)
         count = self.count or 0
@@ -559,7 +559,7 @@ class Table:
             return  # the hash may say nothing of any of them
         for name, held in self._held.items():
             if trust_of(held) == CACHED and is_listed(held) and name not in self.volatile:
-                self._held[name] = trusted(held, VERIFIED)
+                self._held[name] = with_trust_number(held, VERIFIED)
 
     def doubt(self, *trusts: Trust) -> None:
         """It may have moved unheard: what was trusted like this is no more than *cached*."""
@@ -568,14 +568,14 @@ class Table:
         for name, held in self._held.items():
             if trust_of(held) in doubted:
                 self._wire.pop(name, None)  # the next value counts, also if it is the same
-                self._held[name] = trusted(held, CACHED)
+                self._held[name] = with_trust_number(held, CACHED)
 
     def doubt_value(self, name: str) -> None:
         """One value may have changed unheard: it is no more than *cached*."""
         held = self._held.get(name)
         if held is not None:
             self._wire.pop(name, None)  # the next value counts, also if it is the same
-            self._held[name] = trusted(held, CACHED)
+            self._held[name] = with_trust_number(held, CACHED)
 
     def remove(self, condition: Callable[[Param], bool]) -> list[Change]:
         """Take out the parameters that meet a condition."""
@@ -607,7 +607,7 @@ class Table:
 
     def listed_bits(self) -> dict[str, int]:
         """The bits of those that have an index, which the count and the hash are about, by name."""
-        return {name: parts_of(held)[0] for name, held in self._held.items() if is_listed(held)}
+        return {name: unpack_fields(held)[0] for name, held in self._held.items() if is_listed(held)}
 
     @property
     def size(self) -> int:
@@ -621,7 +621,7 @@ class Table:
 
     def gaps(self) -> tuple[int, tuple[int, ...]]:
         """How many parameters there should be, and the indices of those that are not known."""
-        present = {parts_of(held)[4] for held in self._held.values()}
+        present = {unpack_fields(held)[4] for held in self._held.values()}
         present.discard(NOWHERE)
         count = len(present) if self.count is None else self.count
         return count, tuple(index for index in range(count) if index not in present)
@@ -756,13 +756,13 @@ class Table:
 
     def _complement(self, name: str, heard: Held, cached: Held, default: Value | None) -> list[Change]:
         """Add to what was heard what its message does not say."""
-        bits, number, is_raw, trust, place = parts_of(heard)
+        bits, number, is_raw, trust, place = unpack_fields(heard)
         if self._rounds(cached, self._wire.get(name, b"")):
-            bits, _, is_raw, *_ = parts_of(cached)
+            bits, _, is_raw, *_ = unpack_fields(cached)
         if default is not None and name not in self._defaults:
             self._defaults[name] = default
             self.dirty.setdefault(name, "vehicle")
-        new = self._held[name] = to_hold(bits, number, is_raw, trust, place)
+        new = self._held[name] = pack_fields(bits, number, is_raw, trust, place)
         if same_held(heard, new):
             return []
         self.dirty.setdefault(name, "vehicle")
@@ -772,13 +772,13 @@ class Table:
         """Whether a message rounds what is known exactly: an integer beyond the 24 bits of a float32."""
         if self._encoding is not Encoding.C_CAST:
             return False
-        bits, number, is_raw, *_ = parts_of(known)
+        bits, number, is_raw, *_ = unpack_fields(known)
         value = from_bits(bits, number, is_raw=is_raw)
         return isinstance(value, int) and abs(value) > _EXACT and as_sent(bits, number, self._encoding) == raw
 
     def _displaced(self, name: str, held: Held) -> Held:
         self.displaced.add(name)
-        return placed(held, NOWHERE)
+        return with_index(held, NOWHERE)
 
     def _moved(self, name: str) -> None:
         if name in self.volatile:
