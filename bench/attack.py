@@ -60,7 +60,7 @@ BLOCKED: Final = 50.0
 MEMORY: Final = 64.0
 """Megabytes by which the memory of the service grows at most."""
 MEMORY_OF_COMPONENTS: Final = 80.0
-"""The same where it follows as many components as it may, by docs/bounds.md."""
+"""The same where it follows as many components as it may, by docs/internals/bounds.md."""
 LOG: Final = 10.0
 """Kilobytes in the log."""
 ENDED: Final = 3.0

@@ -1,4 +1,4 @@
-"""How the pages are built; the command is `make docs`."""
+"""Sphinx configuration of the pages; `make docs` builds them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ autodoc_preserve_defaults = True
 autodoc_class_signature = "mixed"
 autodoc_default_options = {"members": True}
 napoleon_numpy_docstring = False
-# one field may stand for several names, as in "system, component: who we are", which only this form takes
+# one field may document several names, as in "system, component: own ids", which only this form supports
 napoleon_use_param = False
 napoleon_custom_sections = [("Attributes", "params_style"), ("Args of every vehicle", "params_style")]
 
@@ -32,17 +32,17 @@ html_show_sphinx = False
 
 
 STAND_IN = "\ue000"
-"""For a colon, which napoleon takes for the end of a type in an attribute's first line."""
+"""Replaces a colon, which napoleon reads as the end of a type in an attribute's first line."""
 
 
 def setup(app: Any) -> None:
-    """Called by Sphinx; napoleon's own work has the priority 500."""
+    """Called by Sphinx. napoleon has priority 500."""
     app.connect("autodoc-process-docstring", hide_colons, priority=400)
     app.connect("autodoc-process-docstring", show_colons, priority=600)
 
 
 def hide_colons(app: Any, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
-    """Let a docstring such as "Who it is: px4, ardupilot, …" stay a sentence."""
+    """Let a docstring such as "The autopilot: px4, ardupilot, …" remain a sentence."""
     if what in ("attribute", "data", "property") and lines:
         lines[0] = lines[0].replace(": ", f"{STAND_IN} ")
 

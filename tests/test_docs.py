@@ -29,8 +29,15 @@ from paramclient.cli.exit_codes import ExitCode
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted(DOCS.glob("*.md"))]
-EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
+GUIDES_AND_INTERNALS = [*sorted(DOCS.glob("*.md")), *sorted(DOCS.glob("internals/*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *GUIDES_AND_INTERNALS]
+
+
+def name_of(page: Path) -> str:
+    return page.relative_to(DOCS if page.is_relative_to(DOCS) else ROOT).with_suffix("").as_posix()
+
+
+EVERY_PAGE = pytest.mark.parametrize("page", PAGES, ids=name_of)
 
 FENCE = re.compile(r"^```(\w+)\n(.*?)^```$", re.MULTILINE | re.DOTALL)
 DIRECTIVE = re.compile(r"^\.\. (\w+):: ([\w.]+)(?:\(\))?$", re.MULTILINE)
@@ -62,7 +69,7 @@ def programs() -> Iterator[object]:
     for page in PAGES:
         for number, code in enumerate(blocks(page, "python"), start=1):
             if not code.startswith("async with"):
-                yield pytest.param(code, id=f"{page.stem}-{number}")
+                yield pytest.param(code, id=f"{name_of(page)}-{number}")
 
 
 def commands() -> list[list[str]]:
@@ -124,8 +131,8 @@ def test_links_lead_somewhere(page: Path) -> None:
 
 def test_every_page_is_in_the_table_of_contents() -> None:
     index = (DOCS / "index.md").read_text(encoding="utf-8")
-    for page in [*DOCS.glob("*.md"), *DOCS.glob("api/*.rst")]:
-        name = page.relative_to(DOCS).with_suffix("").as_posix()
+    for page in [*GUIDES_AND_INTERNALS, *DOCS.glob("api/*.rst")]:
+        name = name_of(page)
         assert name == "index" or re.search(rf"^{name}$", index, re.MULTILINE), name
 
 
@@ -151,7 +158,7 @@ def test_every_public_name_is_in_the_pages(module: ModuleType) -> None:
 
 
 def test_the_page_of_the_design_names_every_room() -> None:
-    text = (DOCS / "design.md").read_text(encoding="utf-8")
+    text = (DOCS / "internals/design.md").read_text(encoding="utf-8")
     package = ROOT / "paramclient"
     core = package / "protocol"
     told_as_a_whole = {core / "wire", core / "ftp"}

@@ -203,7 +203,7 @@ def test_a_flood_of_random_systems_from_random_peers_stays_within_the_page_of_th
     held, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert len(session.station.components) == station_room.MOST_COMPONENTS
-    assert held < station_room.MOST_COMPONENTS * 28_000, "as docs/bounds.md says"
+    assert held < station_room.MOST_COMPONENTS * 28_000, "as docs/internals/bounds.md says"
 
 
 def test_changes_that_nobody_takes_are_so_many_and_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -491,7 +491,7 @@ CONSTANT = re.compile(r"`([a-z_.]+)\.([A-Z_]+)`")
 
 
 def test_the_page_of_the_bounds_says_what_they_are() -> None:
-    rows = BOUND.findall((ROOT / "docs" / "bounds.md").read_text(encoding="utf-8"))
+    rows = BOUND.findall((ROOT / "docs" / "internals" / "bounds.md").read_text(encoding="utf-8"))
     named = 0
     for most, names in rows:
         for room, name in CONSTANT.findall(names):
