@@ -75,13 +75,13 @@ async def check(
     deadline = Deadline(CHECK_TIME if timeout is None else timeout)
     async with listen(url, options.signing, tlog=tlog) as client:
         if client.listens_only:
-            raise UsageError(f"{client.link.name} is a log: nothing can be measured there")
+            raise UsageError(f"{client.link.name} is a log: check needs a link to a vehicle")
         patience = HEARING_PATIENCE if timeout is None else deadline.left()
         vehicle = await client.component(system, component, timeout=patience)
         left = deadline.left()
         assert left is not None
         measured = await check_vehicle(
-            client, vehicle, timeout=left, tell=_tell if sys.stderr.isatty() else None
+            client, vehicle, timeout=left, progress=_show_progress if sys.stderr.isatty() else None
         )
     findings = findings_of(measured)
     if json or report is not None:
@@ -111,8 +111,8 @@ def _check_is_new(path: Path) -> None:
         raise UsageError(f"{path} exists already; name a file that does not")
 
 
-def _tell(what: str) -> None:
-    say(f"measuring: {what}")
+def _show_progress(measurement: str) -> None:
+    say(f"measuring: {measurement}")
 
 
 # for people

@@ -77,7 +77,7 @@ def show_applied(results: Mapping[Vehicle, ApplyResult], *, full: bool) -> None:
             say(f"{vehicle.system}/{vehicle.component} is {result.system}/{result.component} now")
         if result.reboot_required:
             names = _listed(result.reboot_required)
-            say(printable(f"{vehicle.who}: counts only from the next start of the vehicle on: {names}"))
+            say(printable(f"{vehicle.who}: takes effect after a reboot: {names}"))
         if result.error is not None:
             report(f"{vehicle.who}: {result.error}; run it again to go on from here")
 
@@ -141,7 +141,7 @@ def show_planned(plans: Mapping[Vehicle, Plan], *, reboot: bool, full: bool) -> 
         say(printable(f"{vehicle.who}: {_counted(plan.counts, PlanStatus, _PLAN_WORDS)}; nothing was sent"))
         if plan.reboot_for and not reboot:
             names = _listed(plan.reboot_for)
-            say(printable(f"{vehicle.who}: would count only from the next start of the vehicle on: {names}"))
+            say(printable(f"{vehicle.who}: would take effect after a reboot: {names}"))
 
 
 def planned_code(plan: Plan, *, skip_invalid: bool) -> ExitCode:
@@ -165,13 +165,13 @@ def _planned_rows(plan: Plan, *, reboot: bool, full: bool) -> Iterator[Cells]:
     has_started = False
     for number, stage in enumerate(plan.stages, start=1):
         for step in stage.steps:
-            reason = stage.purpose + (", counts from the next start on" if step.needs_reboot else "")
+            reason = stage.purpose + (", takes effect after a reboot" if step.needs_reboot else "")
             yield [number, *_planned_cells(plan.rows[step.name])[:-1], reason]
         if reboot and stage.reboot_first:
             has_started = True
-            yield [number, None, None, None, Coloured("restart", "yellow"), "the vehicle starts again"]
+            yield [number, None, None, None, Coloured("reboot", "yellow"), "the vehicle reboots"]
     if reboot and not has_started and (plan.reboot_for or plan.unstarted):
-        yield [None, None, None, None, Coloured("restart", "yellow"), "the vehicle starts again"]
+        yield [None, None, None, None, Coloured("reboot", "yellow"), "the vehicle reboots"]
     for row in plan.rows.values():
         if row.status is not PlanStatus.SET and (full or _is_worth_telling(row)):
             yield [None, *_planned_cells(row)]

@@ -23,7 +23,7 @@ from paramclient.files.param_file import AUTOPILOT, address, form_of_name
 from paramclient.model.paramset import ParamSet
 from paramclient.model.values import Param
 from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.provision.vehicle_params import differing, set_of
+from paramclient.provision.vehicle_params import cached_param_set, select_non_defaults
 
 __all__ = ["save"]
 
@@ -143,14 +143,14 @@ def _from_cache(
                 f"{table.size}{of} parameters are in the cache"
             )
             continue
-        faults += _add(sets, set_of(table), table.params.values(), changed=changed)
+        faults += _add(sets, cached_param_set(table), table.params.values(), changed=changed)
     return sets, faults
 
 
 def _add(sets: list[ParamSet], whole: ParamSet, params: Iterable[Param], *, changed: bool) -> Sequence[str]:
     """Take a set in, or what of it differs from the defaults; say what keeps that from being done."""
     try:
-        sets.append(differing(whole, params) if changed else whole)
+        sets.append(select_non_defaults(whole, params) if changed else whole)
     except UsageError as error:
         return [f"{address(whole)}: {error}"]
     return []

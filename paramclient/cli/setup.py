@@ -55,9 +55,9 @@ from paramclient.protocol.params.fetch_result import Progress
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, verify_all
 from paramclient.provision import apply_all as apply_to_all
 from paramclient.provision import restore as restore_to
-from paramclient.provision.inspection import identified
-from paramclient.provision.set_up import restored
-from paramclient.provision.vehicle_params import before_last_apply
+from paramclient.provision.inspection import wait_for_identity
+from paramclient.provision.set_up import restore_categories
+from paramclient.provision.vehicle_params import load_state_before_apply
 
 if TYPE_CHECKING:
     from paramclient.documents.setup import SetUpDoc
@@ -251,7 +251,7 @@ async def restore(
         address = (vehicle.system, vehicle.component)
 
         async def plans() -> tuple[dict[Vehicle, Plan], dict[Vehicle, ParamClientError]]:
-            whole = (*await restored(vehicle, state), *include)
+            whole = (*await restore_categories(vehicle, state), *include)
             fleet = await _within(found, verify_all([vehicle], state, include=whole, info=info, force=force))
             return show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors)
 
@@ -288,7 +288,7 @@ async def _state(found: Targets, vehicle: Component, when: str | None, options: 
     cache = found.client.cache
     if cache is None:
         raise UsageError("earlier states are in the cache, and --no-cache excludes that; or name a file")
-    await identified(vehicle)
+    await wait_for_identity(vehicle)
     await found.client._writer.write_all()
     key, component = vehicle.identity.key, vehicle.component
     return await anyio.to_thread.run_sync(lambda: _kept(cache, key, component, moment))
@@ -296,7 +296,7 @@ async def _state(found: Targets, vehicle: Component, when: str | None, options: 
 
 def _kept(cache: ParamCache, key: str, component: int, moment: float | None) -> ParamSet:
     if moment is None:
-        return before_last_apply(cache, key, component)
+        return load_state_before_apply(cache, key, component)
     try:
         return cache.state_at(key, component, moment)
     except UnknownVehicle:  # the user named no vehicle of the cache: this one was heard on the link

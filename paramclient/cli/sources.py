@@ -32,7 +32,7 @@ from paramclient.links import FORMS, parse_link
 from paramclient.links.names import names_service
 from paramclient.model.paramset import ParamSet
 from paramclient.protocol.params.fetch_result import FetchResult
-from paramclient.provision.vehicle_params import Taken, cached_set, incomplete, taken
+from paramclient.provision.vehicle_params import FetchedSet, collect_set, incomplete_error, load_cached_set
 
 __all__ = [
     "check_link",
@@ -142,15 +142,15 @@ def check_link(text: str) -> None:
         ) from None
 
 
-async def confirmed(component: Component, result: FetchResult, link: str, deadline: Deadline) -> Taken:
-    """What of a fetched table was given or confirmed in this session; see `taken`.
+async def confirmed(component: Component, result: FetchResult, link: str, deadline: Deadline) -> FetchedSet:
+    """What of a fetched table was given or confirmed in this session; see `collect_set`.
 
     Raises:
         LinkError: the link failed.
     """
     for note in result.notes:
         report(f"{component.system}/{component.component} {component.autopilot} on {link}: {note}")
-    return await taken(component, result, source=f"link {link}", timeout=deadline.left())
+    return await collect_set(component, result, source=f"link {link}", timeout=deadline.left())
 
 
 def open_file(path: str) -> ParamFile:
@@ -215,7 +215,7 @@ def _from_cache(vehicle: str, options: LinkOptions) -> ParamSet:
         if options.component is None and len(tables) > 1 and table.component != AUTOPILOT:
             known = ", ".join(f"{each.system}/{each.component}" for each in tables)
             raise UsageError(f"no autopilot is among {known}; choose with --component")
-        return cached_set(cache, table.key, table.component, note=report)
+        return load_cached_set(cache, table.key, table.component, note=report)
 
 
 async def _from_link(url: str, options: LinkOptions, *, is_alone: bool, only: bool) -> ParamSet:
@@ -227,5 +227,5 @@ async def _from_link(url: str, options: LinkOptions, *, is_alone: bool, only: bo
             result = await component.fetch_all(timeout=deadline.left(), progress=progress)
         found = await confirmed(component, result, link, deadline)
         if found.missing:
-            raise incomplete(component, found.missing)
+            raise incomplete_error(component, found.missing)
         return found.set

@@ -19,7 +19,7 @@ from paramclient.errors import FileError, NoReply, UsageError
 from paramclient.files import ParamFile
 from paramclient.model.paramset import ParamSet
 from paramclient.provision import overlay
-from paramclient.provision.inspection import identified
+from paramclient.provision.inspection import wait_for_identity
 
 __all__ = ["Address", "Source", "Targets", "check_new", "check_pattern", "of_vehicle", "targets", "who"]
 
@@ -149,7 +149,7 @@ async def of_vehicle(pattern: str, vehicle: Component) -> str:
         UsageError: it wants the hardware id, and the vehicle does not give one.
     """
     if "{uid}" in pattern:
-        await identified(vehicle)
+        await wait_for_identity(vehicle)
         uid = vehicle.identity.uid
         if uid is None:
             raise UsageError(f"{who(vehicle)} does not say its hardware id, which {pattern} needs")

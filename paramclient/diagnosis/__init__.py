@@ -1,4 +1,9 @@
-"""Diagnosis of a link: what a vehicle is, what it serves and how quickly. Nothing is changed."""
+"""Diagnosis of a vehicle and its link: measurements, report and findings. It changes nothing on the vehicle.
+
+- `measure`: `check_vehicle`, which takes the measurements.
+- `report`: the report, as plain data.
+- `findings`: slow or unusual results in a report, with their likely cause and advice.
+"""
 
 from paramclient.diagnosis.findings import Finding, Severity, findings_of
 from paramclient.diagnosis.measure import check_vehicle

@@ -1,4 +1,4 @@
-"""What in a diagnosis is slow or unusual, why, and what to do about it."""
+"""Findings of a diagnosis: slow or unusual results, their likely cause, and advice."""
 
 from __future__ import annotations
 
@@ -14,27 +14,28 @@ from paramclient.model.identity import SHARED_UIDS
 __all__ = ["Finding", "Severity", "findings_of"]
 
 NOTABLE_LOSS: Final = 0.005
+"""Share of lost frames from which downloads noticeably repeat requests."""
 SEVERE_LOSS: Final = 0.1
-"""Shares of frames lost: with the first one, downloads repeat requests; with the second one, they take
-several times as long."""
-LONG_ROUND_TRIP: Final = 0.5
-"""Seconds: each repeat of a lost request costs at least one round trip."""
-SLOW_LIST: Final = 200.0
-"""Values per second. ArduPilot sends 1,680 and PX4 1,000 over UDP or USB (measured); a 57600 baud radio
-carries 40."""
-LONG_PAUSE: Final = 0.6
-"""Seconds. ArduPilot's list pauses for 0.2 to 0.4 s while it answers reads (measured)."""
-TYPICAL_ARDUPILOT_READS: Final = (35.0, 60.0)
+"""Share of lost frames from which downloads take several times as long."""
+ROUND_TRIP_LONG: Final = 0.5
+"""Seconds from which a round trip is reported as long: each repeat of a lost request costs at least one."""
+LIST_RATE_SLOW: Final = 200.0
+"""Values per second below which a list is reported as slow. ArduPilot sends 1,680 and PX4 1,000 over UDP or
+USB (measured); a 57600 baud radio carries 40."""
+LIST_PAUSE_LONG: Final = 0.6
+"""Seconds from which a pause of the list is reported: ArduPilot pauses its list for 0.2 to 0.4 s while it
+answers reads (measured)."""
+ARDUPILOT_READ_RATES: Final = (35.0, 60.0)
 """Reads per second of an ArduPilot on a clean link: five in each 100 ms (measured: 49)."""
-FULL_BUFFER: Final = 30
-"""Percent free of a radio's transmit buffer below which it holds frames back."""
+RADIO_BUFFER_LOW: Final = 30
+"""Percent of free transmit buffer below which a radio delays frames."""
 
 
 class Severity(StrEnum):
-    """How much a finding matters.
+    """The severity of a finding.
 
     Attributes:
-        NOTE: explains what is seen; nothing is wrong.
+        NOTE: explains a result; nothing is wrong.
         SLOW: costs time.
         PROBLEM: can give wrong or missing results, or stop the vehicle from answering.
     """
@@ -46,11 +47,11 @@ class Severity(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Finding:
-    """One thing that is slow or unusual.
+    """One slow or unusual result.
 
     Attributes:
-        severity: how much it matters.
-        text: what was measured, and the likely cause.
+        severity: the severity.
+        text: the result, and its likely cause.
         advice: what to do, or an empty text.
     """
 
@@ -60,7 +61,7 @@ class Finding:
 
 
 def findings_of(report: VehicleReport) -> list[Finding]:
-    """Return what is slow or unusual in a report: problems first, notes last."""
+    """Return the slow and unusual results in a report: problems first, notes last."""
     order = (Severity.PROBLEM, Severity.SLOW, Severity.NOTE)
     found = [*_about_link(report.link), *_about_vehicle(report), *_about_services(report)]
     return sorted(found, key=lambda each: order.index(each.severity))
@@ -98,7 +99,7 @@ def _about_link(link: LinkReport) -> Iterator[Finding]:
         yield Finding(
             Severity.NOTE,
             f"{_count(link.unknown, 'frame')} had message ids that the dialect does not have. They are "
-            "passed over.",
+            "ignored.",
         )
     if link.mavlink == 1:
         yield Finding(
@@ -106,7 +107,7 @@ def _about_link(link: LinkReport) -> Iterator[Finding]:
             "The vehicle speaks MAVLink 1: no signatures, and no message ids above 255.",
             "Set the port to MAVLink 2 (ArduPilot: SERIALn_PROTOCOL 2; PX4: MAV_PROTO_VER 2).",
         )
-    if link.round_trips and median(link.round_trips) >= LONG_ROUND_TRIP:
+    if link.round_trips and median(link.round_trips) >= ROUND_TRIP_LONG:
         yield Finding(
             Severity.SLOW,
             f"The round trip is {median(link.round_trips):.2f} s. Each repeat of a lost request takes at "
@@ -145,10 +146,11 @@ def _about_link(link: LinkReport) -> Iterator[Finding]:
             f"Other autopilots are on this link: {named}. They share its bandwidth.",
             "Name the vehicle with --system in every command that writes.",
         )
-    if link.radio_free is not None and link.radio_free < FULL_BUFFER:
+    if link.radio_free is not None and link.radio_free < RADIO_BUFFER_LOW:
         yield Finding(
             Severity.SLOW,
-            f"The radio's transmit buffer is {100 - link.radio_free} % full: it gets more than it can send.",
+            f"The radio's transmit buffer is {100 - link.radio_free} % full: the vehicle sends more than the "
+            "radio can transmit.",
             "Lower the vehicle's stream rates on this port.",
         )
 
@@ -163,12 +165,15 @@ def _about_vehicle(report: VehicleReport) -> Iterator[Finding]:
         )
     elif report.identity.uid is None or report.identity.uid in SHARED_UIDS:
         is_shared = report.identity.uid is not None
-        what = "the hardware id that all simulated ones have" if is_shared else "no hardware id"
-        yield Finding(Severity.NOTE, f"The vehicle has {what}: its cached table is kept with its system id.")
+        uid = "the hardware id that all simulated ones have" if is_shared else "no hardware id"
+        yield Finding(
+            Severity.NOTE, f"The vehicle has {uid}: the cache identifies it by system id and link instead."
+        )
     if report.encoding_reason.startswith("the standard's"):
         yield Finding(
             Severity.PROBLEM,
-            f"Neither heartbeat nor capabilities tell how values are encoded; {report.encoding} is assumed.",
+            "Neither heartbeat nor capabilities indicate the encoding of values; "
+            f"{report.encoding} is assumed.",
             "Compare one integer parameter with its known value; if it is wrong, use --encoding c-cast.",
         )
     if report.is_armed:
@@ -191,7 +196,7 @@ def _about_services(report: VehicleReport) -> Iterator[Finding]:
         missing = reads.in_flight - reads.answered
         yield Finding(Severity.PROBLEM, f"{missing} of {reads.in_flight} reads stayed unanswered.")
     elif reads is not None and reads.rate is not None and is_ardupilot:
-        low, high = TYPICAL_ARDUPILOT_READS
+        low, high = ARDUPILOT_READ_RATES
         if low <= reads.rate <= high:
             yield Finding(
                 Severity.NOTE,
@@ -209,28 +214,28 @@ def _about_services(report: VehicleReport) -> Iterator[Finding]:
     elif listed is not None and listed.missing:
         yield Finding(
             Severity.PROBLEM,
-            f"{_count(listed.missing, 'index', 'indices')} of {listed.count} never came: the vehicle counts "
-            "parameters that it does not send.",
+            f"{_count(listed.missing, 'index', 'indices')} of {listed.count} stayed missing: the vehicle "
+            "counts parameters that it does not send.",
         )
-    if listed is not None and listed.rate is not None and listed.rate < SLOW_LIST:
+    if listed is not None and listed.rate is not None and listed.rate < LIST_RATE_SLOW:
         yield Finding(
             Severity.SLOW,
-            f"The list comes at {listed.rate:.0f} values per second: a slow port, a radio, or a "
+            f"The list is received at {listed.rate:.0f} values per second: a slow port, a radio, or a "
             "low-bandwidth mode.",
             "Raise the port's baud rate or data rate (PX4: MAV_n_RATE, ArduPilot: SERIALn_BAUD).",
         )
-    if listed is not None and not listed.lost and listed.longest_pause >= LONG_PAUSE:
+    if listed is not None and not listed.lost and listed.longest_pause >= LIST_PAUSE_LONG:
         yield Finding(
             Severity.SLOW,
-            f"The list paused for {listed.longest_pause:.1f} s though nothing was lost: the vehicle is busy, "
-            "or another station is being served.",
+            f"The list paused for {listed.longest_pause:.1f} s without packet loss: the vehicle is busy, or "
+            "serves another station.",
         )
     yield from _about_files(report, is_ardupilot=is_ardupilot)
     yield from _about_hash(report)
     if files is not None and not files.defaults and report.descriptions is None:
         yield Finding(
             Severity.NOTE,
-            "The vehicle tells neither defaults nor descriptions of its parameters.",
+            "The vehicle provides neither defaults nor descriptions of its parameters.",
             "Give the firmware's own file with --metadata.",
         )
 
@@ -248,13 +253,14 @@ def _about_files(report: VehicleReport, *, is_ardupilot: bool) -> Iterator[Findi
     elif is_ardupilot:
         yield Finding(
             Severity.SLOW,
-            f"The packed parameter file cannot be read ({files.error}), so tables come by list and without "
-            "defaults.",
+            f"The packed parameter file cannot be read ({files.error}), so tables are downloaded as lists, "
+            "without defaults.",
             "Check that BRD_OPTIONS does not turn MAVFTP off (bit 1), and that the firmware is 4.1 or newer.",
         )
     elif report.autopilot == "px4":
         yield Finding(
-            Severity.NOTE, f"This PX4 has no packed parameter file ({files.error}), so tables come by list."
+            Severity.NOTE,
+            f"This PX4 has no packed parameter file ({files.error}), so tables are downloaded as lists.",
         )
 
 
@@ -273,7 +279,7 @@ def _about_hash(report: VehicleReport) -> Iterator[Finding]:
         yield Finding(
             Severity.NOTE,
             f"The hash changed from {found.before:08x} to {found.after:08x} within {found.seconds:.1f} s: "
-            "parameters were written, or came into use, meanwhile.",
+            "parameters were written or came into use in between.",
         )
     elif found.confirms_list is False:
         yield Finding(

@@ -1,4 +1,4 @@
-"""The measurements of a diagnosis: requests only, nothing that changes the vehicle."""
+"""The measurements of a diagnosis: round trips, reads, list and file downloads, hash. Only reads."""
 
 from __future__ import annotations
 
@@ -47,19 +47,21 @@ from paramclient.protocol.wire import (
 __all__ = ["check_vehicle"]
 
 PARAMETER_FILE: Final = "@PARAM/param.pck?withdefaults=1"
-HEARING_TIME: Final = 2.2
-"""Seconds in which every component has been heard twice, as each sends a heartbeat once a second."""
-IDENTITY_TIME: Final = 3.0
+"""MAVFTP path of the packed parameter file, with the firmware's defaults."""
+DIAGNOSIS_LISTENING_TIME: Final = 2.2
+"""Seconds in which every component is heard twice, as each sends a heartbeat once a second."""
+VERSION_TIMEOUT: Final = 3.0
 """Seconds for AUTOPILOT_VERSION: four attempts at the initial timeout."""
-ANSWER_TIME: Final = 3.0
-"""Seconds for one small request. Longer than any measured round trip with repeats."""
-COMMANDS: Final = 10
-"""Round trips that are measured: enough for a median and a worst one."""
-SINGLE_READS: Final = 5
-READS_IN_FLIGHT: Final = 30
-"""Reads requested at once: ArduPilot serves five in 100 ms, so that its rate shows in 0.6 s."""
+RESPONSE_TIMEOUT: Final = 3.0
+"""Seconds for one small request: longer than any measured round trip with repeats."""
+ROUND_TRIP_COUNT: Final = 10
+"""Number of round trips that are measured: enough for a median and a maximum."""
+SINGLE_READ_COUNT: Final = 5
+"""Number of sequential reads that are measured: enough for a median."""
+CONCURRENT_READ_COUNT: Final = 30
+"""Number of concurrent reads: ArduPilot serves five in 100 ms, so 30 show its rate within 0.6 s."""
 STEADY_SHARE: Final = 0.9
-"""The share of the list after which its rate is taken: what follows are repeats of lost values."""
+"""Share of the list up to which its rate is measured: after it come the repeats of lost values."""
 
 Result = TypeVar("Result")
 
@@ -69,62 +71,66 @@ async def check_vehicle(
     component: Component,
     *,
     timeout: float = 60.0,
-    tell: Callable[[str], None] | None = None,
+    progress: Callable[[str], None] | None = None,
 ) -> VehicleReport:
-    """Measure what a vehicle serves, and how quickly.
+    """Measure which services a vehicle offers, and how fast they are.
 
-    Nothing is written: no PARAM_SET, no command but MAV_CMD_REQUEST_MESSAGE, no file. What the measurements
-    download fills the client's table, as any download does.
+    Writes nothing: sends no PARAM_SET, no command except MAV_CMD_REQUEST_MESSAGE, and writes no file. The
+    downloads fill the client's table, as any download does.
 
     Args:
-        client: open, made with `traffic=True` and without a cache, so that nothing is known beforehand.
+        client: an open client, made with `traffic=True` and without a cache, so that no values are known
+            before.
         component: one of its components.
-        timeout: seconds for everything. A measurement that has no time left is None in the report, and a list
-            that takes longer is cut short.
-        tell: is called with what is measured next, in words.
+        timeout: seconds for the whole diagnosis. A measurement without time left is None in the report, and a
+            list download that takes longer is cut short.
+        progress: called with the name of the next measurement, in words.
 
     Raises:
-        UsageError: the client counts no traffic, or sends nothing.
+        UsageError: the client does not count traffic, or sends nothing.
         LinkError: the link failed, or the client was closed.
     """
-    return await _Diagnosis(client, component, timeout, tell or _silent).run()
+    return await _Diagnosis(client, component, timeout, progress or _ignore).run()
 
 
 class _Diagnosis:
-    """One diagnosis, step by step."""
+    """One diagnosis: the measurements in their order."""
 
     def __init__(
-        self, client: ParamClient, component: Component, timeout: float, tell: Callable[[str], None]
+        self, client: ParamClient, component: Component, timeout: float, progress: Callable[[str], None]
     ) -> None:
         self._client = client
         self._component = component
         self._began = anyio.current_time()
-        self._ends = self._began + timeout
-        self._tell = tell
+        self._deadline = self._began + timeout
+        self._report_progress = progress
         self._unanswered = 0
 
     async def run(self) -> VehicleReport:
+        """Take all measurements and return the report."""
         component = self._component
-        self._tell("listening")
+        self._report_progress("listening")
         self._client.traffic_report()
-        await anyio.sleep(max(0.0, HEARING_TIME - (anyio.current_time() - self._client._opened_at)))
-        self._tell("identification")
-        await self._identified()
-        self._tell("round trip")
-        round_trips = await self._round_trips()
-        self._tell("hash")
+        await anyio.sleep(
+            max(0.0, DIAGNOSIS_LISTENING_TIME - (anyio.current_time() - self._client._opened_at))
+        )
+        self._report_progress("identification")
+        await self._wait_for_identity()
+        self._report_progress("round trip")
+        round_trips = await self._measure_round_trips()
+        self._report_progress("hash")
         hash_began = anyio.current_time()
-        before = await self._within(self._hash)
-        self._tell("single reads")
-        reads = await self._within(self._reads)
-        self._tell("list download")
-        listed = await self._within(self._list)
-        self._tell("MAVFTP")
-        files = await self._within(self._files)
-        self._tell("descriptions")
-        descriptions = await self._within(self._descriptions)
-        self._tell("hash again")
-        after = await self._within(self._hash)
+        before = await self._within(self._read_hash)
+        self._report_progress("single reads")
+        reads = await self._within(self._measure_reads)
+        self._report_progress("list download")
+        listed = await self._within(self._measure_list)
+        self._report_progress("MAVFTP")
+        files = await self._within(self._check_files)
+        self._report_progress("descriptions")
+        descriptions = await self._within(self._find_descriptions)
+        self._report_progress("hash again")
+        after = await self._within(self._read_hash)
         identity = component.identity
         machine = component._machine
         return VehicleReport(
@@ -138,34 +144,34 @@ class _Diagnosis:
             encoding_reason=component.encoding_reason,
             is_armed=component.is_armed,
             descriptions=descriptions,
-            link=self._link(round_trips),
+            link=self._make_link_report(round_trips),
             reads=reads,
             list=listed,
             files=files,
-            hash=None if before is None else self._hash_service(before, after, hash_began),
+            hash=None if before is None else self._make_hash_service(before, after, hash_began),
             elapsed=anyio.current_time() - self._began,
         )
 
     def _left(self, at_most: float) -> float:
-        """Seconds for one request: not more than are left of all."""
-        return max(0.0, min(at_most, self._ends - anyio.current_time()))
+        """Return the timeout of one request in seconds: `at_most`, or the time left of the diagnosis."""
+        return max(0.0, min(at_most, self._deadline - anyio.current_time()))
 
     async def _within(self, measure: Callable[[], Awaitable[Result]]) -> Result | None:
-        """What a measurement gives; None where there is no time for it."""
-        return await measure() if self._left(ANSWER_TIME) > 0 else None
+        """Return the result of a measurement; None if no time is left for it."""
+        return await measure() if self._left(RESPONSE_TIMEOUT) > 0 else None
 
-    async def _identified(self) -> None:
-        """Wait until AUTOPILOT_VERSION came, or was refused for good."""
-        with anyio.move_on_after(self._left(IDENTITY_TIME)):
+    async def _wait_for_identity(self) -> None:
+        """Wait until AUTOPILOT_VERSION was received or finally refused, at most `VERSION_TIMEOUT`."""
+        with anyio.move_on_after(self._left(VERSION_TIMEOUT)):
             while not self._component._machine.who.settled:
                 await self._client._carrier.news.wait()
 
-    async def _round_trips(self) -> tuple[float, ...]:
-        """Seconds from command to acknowledgement, of those that were sent once."""
+    async def _measure_round_trips(self) -> tuple[float, ...]:
+        """Return the seconds from command to acknowledgement, for commands that were sent once, sorted."""
         component, machine = self._component, self._component._machine
-        taken: list[float] = []
-        for _ in range(COMMANDS):
-            left = self._left(ANSWER_TIME)
+        round_trips: list[float] = []
+        for _ in range(ROUND_TRIP_COUNT):
+            left = self._left(RESPONSE_TIMEOUT)
             if not left:
                 break
             began = anyio.current_time()
@@ -174,70 +180,70 @@ class _Diagnosis:
             try:
                 await component._wait(command, left, lambda what=what: (what, 0))  # type: ignore[misc]
             except CommandRefused:
-                pass  # an answer too
+                pass  # a refusal is an acknowledgement too
             except NoReply:
                 self._unanswered += 1
-                if not taken:
-                    break  # it acknowledges no commands
+                if not round_trips:
+                    break  # the vehicle acknowledges no commands
                 continue
             finally:
                 machine.commands.cancel(command, anyio.current_time())
             if command.attempts == 1:
-                taken.append(anyio.current_time() - began)
+                round_trips.append(anyio.current_time() - began)
             else:
                 self._unanswered += 1
-        return tuple(sorted(taken))
+        return tuple(sorted(round_trips))
 
-    async def _hash(self) -> int | str:
-        """The vehicle's hash now, or why there is none."""
+    async def _read_hash(self) -> int | str:
+        """Return the vehicle's present hash, or the reason why there is none."""
         if self._component._machine.who.autopilot == MAV_AUTOPILOT_ARDUPILOTMEGA:
             return "ArduPilot has no parameter hash"
         try:
-            param = await self._component.get(HASH_CHECK, timeout=self._left(ANSWER_TIME))
+            param = await self._component.get(HASH_CHECK, timeout=self._left(RESPONSE_TIMEOUT))
         except (NoReply, VehicleError) as error:
             return str(error)
         return param.bits
 
-    async def _reads(self) -> ReadService:
+    async def _measure_reads(self) -> ReadService:
         component = self._component
         single = []
-        for index in range(SINGLE_READS):
+        for index in range(SINGLE_READ_COUNT):
             began = anyio.current_time()
             if await self._is_answered(index):
                 single.append(anyio.current_time() - began)
             elif not single:
                 return ReadService(None, None, 0, 0, 0)
         count = component.count or 0
-        # spread over the table, and none of those that were just read
-        step = max((count - SINGLE_READS) // READS_IN_FLIGHT, 1)
-        wanted = range(SINGLE_READS, count, step)[:READS_IN_FLIGHT]
+        # indices spread over the table, without those that were just read
+        step = max((count - SINGLE_READ_COUNT) // CONCURRENT_READ_COUNT, 1)
+        wanted = range(SINGLE_READ_COUNT, count, step)[:CONCURRENT_READ_COUNT]
         if not wanted:
             return ReadService(median(single), None, 0, 0, 0)
         reads = component._machine.reads
         requests = reads.retries
         began = anyio.current_time()
-        answers: list[float] = []
+        answered_at: list[float] = []
 
         async def read(index: int) -> None:
             if await self._is_answered(index):
-                answers.append(anyio.current_time())
+                answered_at.append(anyio.current_time())
 
         async with anyio.create_task_group() as tasks:
             for index in wanted:
                 tasks.start_soon(read, index)
-        rate = len(answers) / (max(answers) - began) if answers else None
+        rate = len(answered_at) / (max(answered_at) - began) if answered_at else None
         requests = len(wanted) + reads.retries - requests
-        return ReadService(median(single), rate, len(wanted), len(answers), requests)
+        return ReadService(median(single), rate, len(wanted), len(answered_at), requests)
 
     async def _is_answered(self, index: int) -> bool:
         try:
-            await self._component.get(index, timeout=self._left(ANSWER_TIME))
+            await self._component.get(index, timeout=self._left(RESPONSE_TIMEOUT))
         except (NoReply, VehicleError):
             return False
         return True
 
-    async def _list(self) -> ListService:
-        """One download by PARAM_REQUEST_LIST, also where the file would be quicker."""
+    async def _measure_list(self) -> ListService:
+        """Measure one list download, also if a file download would be faster."""
         component, machine = self._component, self._component._machine
         began = anyio.current_time()
         arrivals: list[tuple[float, int]] = []
@@ -246,8 +252,8 @@ class _Diagnosis:
             if state.received and (not arrivals or state.received > arrivals[-1][1]):
                 arrivals.append((anyio.current_time(), state.received))
 
-        # the vehicle sends the list to its end whatever is measured behind it
-        deadline = max(began, self._ends - ANSWER_TIME)
+        # the vehicle sends the whole list even if later measurements have begun
+        deadline = max(began, self._deadline - RESPONSE_TIMEOUT)
         try:
             fetch = machine.begin_fetch(began, refresh=True, by_list=True)
             try:
@@ -275,7 +281,7 @@ class _Diagnosis:
             error=None,
         )
 
-    async def _files(self) -> FileService:
+    async def _check_files(self) -> FileService:
         machine = self._component._machine
         capabilities = machine.who.capabilities
         is_announced = None if capabilities is None else bool(capabilities & CAPABILITY_FTP)
@@ -301,21 +307,21 @@ class _Diagnosis:
             error = str(failure)
         if is_serving:
             try:
-                listed = await ftp.list("/", timeout=self._left(ANSWER_TIME))
+                listed = await ftp.list("/", timeout=self._left(RESPONSE_TIMEOUT))
                 named = (each for each in listed if each.name not in (".", ".."))  # ArduPilot lists both
                 entries = tuple(sorted(each.name + "/" * each.is_directory for each in named))
             except (NoReply, VehicleError):
                 entries = None
         return FileService(is_announced, is_serving, entries, size, elapsed, parameters, defaults, error)
 
-    async def _descriptions(self) -> str | None:
+    async def _find_descriptions(self) -> str | None:
         try:
-            announced = await announced_metadata(self._component, self._left(ANSWER_TIME))
+            announced = await announced_metadata(self._component, self._left(RESPONSE_TIMEOUT))
         except (NoReply, VehicleError):
             return None
         return None if announced is None else announced.uri
 
-    def _hash_service(self, before: int | str, after: int | str | None, began: float) -> HashService:
+    def _make_hash_service(self, before: int | str, after: int | str | None, began: float) -> HashService:
         seconds = anyio.current_time() - began
         if isinstance(before, str):
             return HashService(None, None, seconds, None, before)
@@ -323,7 +329,7 @@ class _Diagnosis:
         confirms = None if last is None or last.missing else last.hash is not None
         return HashService(before, after if isinstance(after, int) else None, seconds, confirms, None)
 
-    def _link(self, round_trips: tuple[float, ...]) -> LinkReport:
+    def _make_link_report(self, round_trips: tuple[float, ...]) -> LinkReport:
         client, component = self._client, self._component
         report = client.traffic_report()
         own = client._station.own
@@ -370,7 +376,7 @@ def _vehicle_type(number: int | None) -> str | None:
 
 
 def _steady_rate(first: float, arrivals: list[tuple[float, int]], received: int) -> float | None:
-    """Values per second up to the moment at which most of them had come."""
+    """Return values per second up to the time at which `STEADY_SHARE` of them were received, or None."""
     for at, number in arrivals:
         if number >= STEADY_SHARE * received and at > first:
             return number / (at - first)
@@ -382,5 +388,5 @@ def _longest_pause(first: float, arrivals: list[tuple[float, int]]) -> float:
     return max((later - earlier for earlier, later in pairwise(moments)), default=0.0)
 
 
-def _silent(_: str) -> None:
-    """For a caller who wants to hear nothing."""
+def _ignore(_: str) -> None:
+    """Report nothing: the default of `progress`."""

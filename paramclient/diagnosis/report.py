@@ -1,4 +1,4 @@
-"""What a diagnosis has measured: plain data."""
+"""The report of a diagnosis: results of the measurements of a vehicle and its link, as plain data."""
 
 from __future__ import annotations
 
@@ -20,10 +20,11 @@ __all__ = [
 
 @dataclass(frozen=True, slots=True)
 class Station:
-    """A ground station other than this client, by its heartbeats.
+    """Another ground station, detected by its heartbeats.
 
     Attributes:
-        system, component: its address.
+        system: its system id.
+        component: its component id.
         has_our_address: whether it uses the ids of this client.
     """
 
@@ -34,28 +35,29 @@ class Station:
 
 @dataclass(frozen=True, slots=True)
 class LinkReport:
-    """The link, from its opening to the end of the diagnosis.
+    """The state of the link, from its opening to the end of the diagnosis.
 
     Attributes:
         name: the link's name.
-        seconds: how long it was listened to.
-        round_trips: seconds from a command to its acknowledgement, sorted; empty where none was answered.
-        unanswered: commands that were repeated or not answered at all.
-        loss: share of the vehicle's frames that were lost on the way to this client, 0 to 1, by the gaps in
-            their sequence numbers; None where no frame came.
-        lost: how many frames that are.
-        repeated: frames that arrived more than once.
-        damaged: frames with a wrong checksum.
-        unusable_names: messages of the vehicle that were left out, as no parameter file can hold the name in
-            them.
-        unknown: frames with an id that the dialect does not have.
-        other_bytes: bytes received that belong to no frame.
-        bytes_received, bytes_sent: totals.
-        mavlink: version of the vehicle's frames, 1 or 2; 0 where none came.
-        signed: frames of the vehicle with a signature.
+        seconds: time since its opening.
+        round_trips: seconds from a command to its acknowledgement, sorted; empty if none was acknowledged.
+        unanswered: number of commands that were repeated or not acknowledged.
+        loss: share of the vehicle's frames that were lost, 0 to 1, by the gaps in their sequence numbers;
+            None if no frame was received.
+        lost: number of these frames.
+        repeated: number of frames that arrived more than once.
+        damaged: number of frames with a wrong checksum.
+        unusable_names: number of messages of the vehicle that were left out, because no parameter file can
+            hold their parameter name.
+        unknown: number of frames with a message id that the dialect does not have.
+        other_bytes: received bytes that belong to no frame.
+        bytes_received: bytes received in total.
+        bytes_sent: bytes sent in total.
+        mavlink: version of the vehicle's frames, 1 or 2; 0 if no frame was received.
+        signed: number of the vehicle's frames with a signature.
         autopilots: addresses of the other autopilots on the link.
-        stations: ground stations other than this client.
-        radio_free: the percentage of the radio's transmit buffer that is free, where a radio reports it.
+        stations: other ground stations.
+        radio_free: free share of the radio's transmit buffer in percent; None if no radio reports it.
     """
 
     name: str
@@ -80,13 +82,13 @@ class LinkReport:
 
 @dataclass(frozen=True, slots=True)
 class ReadService:
-    """PARAM_REQUEST_READ.
+    """Results for PARAM_REQUEST_READ.
 
     Attributes:
-        single: median seconds of reads that were made one after the other; None where none was answered.
-        rate: reads answered per second with `in_flight` of them requested at once; None likewise.
-        in_flight: how many were requested at once.
-        answered: how many of these were answered.
+        single: median seconds of sequential reads; None if none was answered.
+        rate: reads answered per second with `in_flight` concurrent reads; None if none was answered.
+        in_flight: number of concurrent reads.
+        answered: number of these that were answered.
         requests: requests sent for them, repeats included.
     """
 
@@ -99,19 +101,19 @@ class ReadService:
 
 @dataclass(frozen=True, slots=True)
 class ListService:
-    """PARAM_REQUEST_LIST.
+    """Results for PARAM_REQUEST_LIST.
 
     Attributes:
-        count: parameters that the vehicle says it has; None where no value came.
-        received: how many of them came.
-        elapsed: seconds until the download was over, or ended by its time limit.
-        first: seconds to the first value; None where none came.
-        rate: values per second while the list was sent; None where too few came.
-        longest_pause: seconds between two moments at which values had come, to 0.1 s.
-        lost: values that the list did not bring and that were requested again.
-        missing: indices that did not come at all.
-        is_cut_short: whether the time limit ended it.
-        error: why nothing came, or None.
+        count: number of parameters that the vehicle announces; None if no value was received.
+        received: number of parameters received.
+        elapsed: seconds until the download was complete, or ended by its time limit.
+        first: seconds to the first value; None if no value was received.
+        rate: values per second while the list was sent; None if too few values were received.
+        longest_pause: longest time between two received values in seconds, with a resolution of 0.1 s.
+        lost: number of values that were lost from the list and requested again.
+        missing: number of indices that were never received.
+        is_cut_short: whether the time limit ended the download.
+        error: the error if nothing was received, or None.
     """
 
     count: int | None
@@ -128,18 +130,18 @@ class ListService:
 
 @dataclass(frozen=True, slots=True)
 class FileService:
-    """MAVFTP and the packed parameter file.
+    """Results for MAVFTP and the packed parameter file.
 
     Attributes:
-        is_announced: whether the capabilities in AUTOPILOT_VERSION include MAVFTP; None where unknown.
-        is_serving: whether a request was answered with anything but silence.
+        is_announced: whether the capabilities in AUTOPILOT_VERSION include MAVFTP; None if unknown.
+        is_serving: whether the vehicle answered a request, also with a refusal.
         entries: names of the files and directories in the root, directories with a `/` at the end; None
-            where it could not be listed.
-        size: bytes of `@PARAM/param.pck`; None where it could not be read.
-        elapsed: seconds in which that was read.
-        parameters: entries in it.
-        defaults: entries for which it tells the firmware's default.
-        error: why it could not be read.
+            if the root could not be listed.
+        size: size of `@PARAM/param.pck` in bytes; None if it could not be read.
+        elapsed: seconds that the read of it took.
+        parameters: number of entries in it.
+        defaults: number of entries with the firmware's default.
+        error: the error of the read, or None.
     """
 
     is_announced: bool | None
@@ -154,15 +156,15 @@ class FileService:
 
 @dataclass(frozen=True, slots=True)
 class HashService:
-    """PX4's `_HASH_CHECK`.
+    """Results for PX4's `_HASH_CHECK`.
 
     Attributes:
-        before, after: the hash at the beginning and at the end of the diagnosis; None where it was not
-            answered.
-        seconds: between the two.
-        confirms_list: whether it was the same before and after the list download, so that the next session
-            can do without one; None where the list is not complete.
-        error: why there is none.
+        before: the hash at the beginning of the diagnosis; None if the request was not answered.
+        after: the hash at the end of the diagnosis; None if the request was not answered.
+        seconds: time between the two.
+        confirms_list: whether the hash was the same before and after the list download, so that the next
+            session needs no download; None if the list is not complete.
+        error: the reason why there is no hash, or None.
     """
 
     before: int | None
@@ -174,20 +176,26 @@ class HashService:
 
 @dataclass(frozen=True, slots=True)
 class VehicleReport:
-    """One vehicle and the link to it. A part that was not measured, for want of time, is None.
+    """The diagnosis of one vehicle and its link. Parts that were not measured, for lack of time, are None.
 
     Attributes:
-        system, component: its address.
-        autopilot: in a word: px4, ardupilot, generic, …
+        system: its system id.
+        component: its component id.
+        autopilot: its firmware in a word: px4, ardupilot, generic, …
         vehicle_type: MAV_TYPE of its heartbeat in words.
-        identity: hardware id, firmware, capabilities as far as known.
+        identity: hardware id, firmware and capabilities as far as known.
         has_version: whether it answered the request for AUTOPILOT_VERSION.
-        encoding, encoding_reason: how it lays out values, and the evidence for it.
-        is_armed: whether its motors may turn; None where that is not known.
-        descriptions: address of the general metadata file that it names in COMPONENT_METADATA; None where it
-            names none.
-        link, reads, list, files, hash: what was measured.
-        elapsed: seconds that everything took.
+        encoding: the encoding of its values.
+        encoding_reason: the evidence for that encoding.
+        is_armed: whether its motors may turn; None if unknown.
+        descriptions: URI of the general metadata file that it names in COMPONENT_METADATA; None if it names
+            none.
+        link: the state of the link.
+        reads: results for PARAM_REQUEST_READ.
+        list: results for PARAM_REQUEST_LIST.
+        files: results for MAVFTP.
+        hash: results for the hash.
+        elapsed: duration of the diagnosis in seconds.
     """
 
     system: int

@@ -1,7 +1,15 @@
-"""What is told as JSON: the command prints these documents, the service sends them.
+"""The JSON documents that the command line prints and the service sends, as pydantic models.
 
-Each is built by `of(…)` from what the library gives. `param` is one parameter; `component`, `link`, `job`,
-`call` and `problem` are what the service tells of those; `setup` are plans and what became of them; `diff`,
-`written`, `past`, `cached` and `fleet` what is compared and kept; `traffic` is a link; `command` what the
-command tells of its own doing. They load pydantic: import one where JSON is made, and no other.
+Each document is built by its `of(…)` from an object of the library.
+
+- `document`: the base classes of documents and request bodies.
+- `param`, `paramset`: one parameter; parameters of a file or a snapshot.
+- `component`, `link`, `job`, `problem`: components, links, running work and errors of the service.
+- `results`: results of fetches and writes. `setup`: plans and results of set-ups.
+- `diff`, `fleet`: comparisons of two sets and of many vehicles.
+- `cached`, `history`: tables, changes and snapshots in the cache.
+- `traffic`, `check`: traffic of a link; the diagnosis of a vehicle.
+- `command`: results and events of single subcommands.
+
+The modules load pydantic, which takes time: import only the one that is needed, where JSON is made.
 """

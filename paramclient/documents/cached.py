@@ -1,4 +1,4 @@
-"""What the cache holds: tables, and the vehicles whose they are."""
+"""Documents of the cache: tables and vehicles, and results of copying and removing."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ __all__ = [
 
 
 class CachedSummaryDoc(Document):
-    """One component's table, without its parameters; see `CachedSummary`."""
+    """The table of one component without its parameters; see `CachedSummary`."""
 
     key: str
     system: int
@@ -45,7 +45,7 @@ class CachedSummaryDoc(Document):
 
     @classmethod
     def of(cls, summary: CachedSummary) -> CachedSummaryDoc:
-        """What a user has of it."""
+        """Return the document of a `CachedSummary`."""
         return cls(
             key=summary.key,
             system=summary.system,
@@ -62,14 +62,14 @@ class CachedSummaryDoc(Document):
 
 
 class CachedListDoc(Document):
-    """The tables in the cache at a place."""
+    """The tables of the cache at `path`."""
 
     path: str
     components: list[CachedSummaryDoc]
 
 
 class CachedTableDoc(Document):
-    """One component's table as it was last known."""
+    """The cached table of one component."""
 
     system: int
     component: int
@@ -89,21 +89,21 @@ class CachedTableDoc(Document):
         whole: bool = False,
         kept: bool = False,
     ) -> CachedTableDoc:
-        """A table.
+        """Return the document of a cached table.
 
         Args:
-            table: which one.
-            params: these of it; None for all.
-            metadata: what is known of them.
-            whole: whether to give everything that is known of them.
-            kept: whether to say how far each can be trusted, and when it was heard.
+            table: the table.
+            params: the parameters of it to include; None for all.
+            metadata: the metadata of the parameters, or None.
+            whole: whether to include all metadata of each parameter.
+            kept: whether to include trust and time of reception of each parameter.
         """
         shown = table.params.values() if params is None else params
-        told = {}
+        members = {}
         for param in shown:
             info = None if metadata is None else metadata.find(param.name)
             heard_at = table.heard_at.get(param.name)
-            told[param.name] = (
+            members[param.name] = (
                 ParamDoc.kept(param, info, heard_at=heard_at, whole=whole)
                 if kept
                 else ParamDoc.of(param, info, whole=whole)
@@ -115,18 +115,18 @@ class CachedTableDoc(Document):
             uid=table.identity.uid,
             hash=hash_text(table.hash),
             synced_at=time_or_none(table.synced_at),
-            params=told,
+            params=members,
         )
 
 
 class CachedTablesDoc(Document):
-    """The tables of a vehicle, or of all."""
+    """The tables of one vehicle or of all vehicles."""
 
     components: list[CachedTableDoc]
 
 
 class VehicleDoc(Document):
-    """A vehicle of which tables are kept; see `CachedVehicle`. Times are in unix seconds."""
+    """A vehicle with cached tables; see `CachedVehicle`. Times are in unix seconds."""
 
     key: str
     system: int
@@ -138,7 +138,7 @@ class VehicleDoc(Document):
 
     @classmethod
     def of(cls, vehicle: CachedVehicle, tables: Iterable[CachedSummary]) -> VehicleDoc:
-        """A vehicle with those of these tables that are its own."""
+        """Return the document of a vehicle and of those of `tables` that are its own."""
         return cls(
             key=vehicle.key,
             system=vehicle.identity.system,
@@ -151,19 +151,19 @@ class VehicleDoc(Document):
 
 
 class VehiclesDoc(Document):
-    """Every vehicle that was ever heard."""
+    """All vehicles in the cache."""
 
     vehicles: list[VehicleDoc]
 
 
 class PlaceDoc(Document):
-    """Where the cache is kept."""
+    """The place of the cache."""
 
     path: str
 
 
 class CopiedDoc(Document):
-    """What came of copying a cache: see `CopyResult`."""
+    """The result of copying a cache; see `CopyResult`."""
 
     path: str
     tables: int
@@ -174,7 +174,7 @@ class CopiedDoc(Document):
 
 
 class RemovedDoc(Document):
-    """How many tables of a vehicle were removed."""
+    """The number of tables of a vehicle that were removed."""
 
     key: str
     removed: int

@@ -1,4 +1,4 @@
-"""The diagnosis of a link and a vehicle."""
+"""Documents of the diagnosis of a vehicle and its link; see `paramclient.diagnosis`."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ class VersionsDoc(Document):
 
 
 class FindingDoc(Document):
-    """One thing that is slow or unusual; `advice` is empty where there is nothing to do."""
+    """One finding of the diagnosis; `advice` is empty if there is nothing to do."""
 
     severity: Literal["note", "slow", "problem"]
     text: str
@@ -53,12 +53,12 @@ class FindingDoc(Document):
 
     @classmethod
     def of(cls, finding: Finding) -> FindingDoc:
-        """All of it."""
+        """Return the document of a `Finding`."""
         return cls(severity=finding.severity.value, text=finding.text, advice=finding.advice)
 
 
 class RoundTripsDoc(Document):
-    """Round trips in seconds, and how many were measured."""
+    """Measured round-trip times in seconds, and their number."""
 
     count: int
     min_s: float
@@ -75,7 +75,7 @@ class StationDoc(Document):
 
 
 class CheckedLinkDoc(Document):
-    """What the link did; see `LinkReport`. Addresses are written `system/component`."""
+    """The state of the link; see `LinkReport`. Addresses are written `system/component`."""
 
     name: str
     seconds: float
@@ -98,7 +98,7 @@ class CheckedLinkDoc(Document):
 
     @classmethod
     def of(cls, link: LinkReport) -> CheckedLinkDoc:
-        """All of it."""
+        """Return the document of a `LinkReport`."""
         plain = (
             *("name", "unanswered", "lost", "repeated", "damaged", "unusable_names"),
             *("unknown", "other_bytes", "bytes_received", "bytes_sent", "mavlink", "signed", "radio_free"),
@@ -135,7 +135,7 @@ class CheckedReadsDoc(Document):
 
     @classmethod
     def of(cls, reads: ReadService) -> CheckedReadsDoc:
-        """All of it."""
+        """Return the document of a `ReadService`."""
         return cls(
             single_s=rounded(reads.single),
             per_s=rounded(reads.rate),
@@ -161,7 +161,7 @@ class CheckedListDoc(Document):
 
     @classmethod
     def of(cls, listed: ListService) -> CheckedListDoc:
-        """All of it."""
+        """Return the document of a `ListService`."""
         return cls(
             count=listed.count,
             received=listed.received,
@@ -190,7 +190,7 @@ class CheckedFilesDoc(Document):
 
     @classmethod
     def of(cls, files: FileService) -> CheckedFilesDoc:
-        """All of it."""
+        """Return the document of a `FileService`."""
         return cls(
             is_announced=files.is_announced,
             is_serving=files.is_serving,
@@ -214,7 +214,7 @@ class CheckedHashDoc(Document):
 
     @classmethod
     def of(cls, found: HashService) -> CheckedHashDoc:
-        """All of it."""
+        """Return the document of a `HashService`."""
         return cls(
             before=hash_text(found.before),
             after=hash_text(found.after),
@@ -225,7 +225,7 @@ class CheckedHashDoc(Document):
 
 
 class CheckDoc(Document):
-    """What a vehicle is and serves, measured; see `VehicleReport`. A part that was not measured is null."""
+    """The diagnosis of one vehicle; see `VehicleReport`. A part that was not measured is null."""
 
     system: int
     component: int
@@ -248,7 +248,7 @@ class CheckDoc(Document):
 
     @classmethod
     def of(cls, report: VehicleReport, findings: Iterable[Finding], versions: VersionsDoc) -> CheckDoc:
-        """A report with what is slow or unusual in it, and what it was made with."""
+        """Return the document of a report, its findings, and the versions of the programs."""
         plain = ("system", "component", "autopilot", "vehicle_type", "has_version", "encoding_reason")
         return cls(
             **{name: getattr(report, name) for name in (*plain, "is_armed", "descriptions")},

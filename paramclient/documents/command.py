@@ -1,4 +1,4 @@
-"""What the command tells of its own doing: what it fetched, set, wrote and read, and what it saw happen."""
+"""Documents of single subcommands: fetched tables, writes, saved and imported files, events, serial ports."""
 
 from __future__ import annotations
 
@@ -44,12 +44,16 @@ __all__ = [
     "TrustedSampleDoc",
 ]
 
-SUPPOSED: Final = (1, 10, 100)
-"""Parameters that may have changed: of these numbers it is said how probably a sample shows it."""
+ASSUMED_CHANGES: Final = (1, 10, 100)
+"""Numbers of changed parameters for which the probability is given that a sample detects the change."""
 
 
 class TrustedSampleDoc(Document):
-    """A sample that agreed, and the chance that it would not have if so many others had changed."""
+    """A sample that agreed with the cache.
+
+    `confidence` is the probability that the sample would have shown a change, by the number of parameters
+    that changed.
+    """
 
     size: int
     count: int
@@ -57,15 +61,15 @@ class TrustedSampleDoc(Document):
 
     @classmethod
     def of(cls, sample: Sample) -> TrustedSampleDoc:
-        """What it is worth."""
-        chances = {str(each): round(sample.confidence(each), 4) for each in SUPPOSED}
-        return cls(size=sample.size, count=sample.count, confidence=chances)
+        """Return the document of a `Sample`."""
+        confidence = {str(each): round(sample.confidence(each), 4) for each in ASSUMED_CHANGES}
+        return cls(size=sample.size, count=sample.count, confidence=confidence)
 
 
 class FetchedDoc(Document):
-    """A whole table, and how it came.
+    """A fetched table, and the details of the fetch.
 
-    `missing` are indices that did not come, `cached` names whose values nobody has confirmed.
+    `missing` are indices that were not received, `cached` names whose values are cached and not confirmed.
     """
 
     system: int
@@ -99,7 +103,16 @@ class FetchedDoc(Document):
         bytes_received: int,
         bytes_sent: int,
     ) -> FetchedDoc:
-        """What a fetch of a component brought."""
+        """Return the document of a fetch of a component.
+
+        Args:
+            component: the component.
+            result: the result of the fetch.
+            params: the parameters to include.
+            missing: indices that were not received.
+            cached: names whose values are cached and not confirmed.
+            bytes_received, bytes_sent: totals of the link.
+        """
         return cls(
             system=component.system,
             component=component.component,
@@ -123,7 +136,7 @@ class FetchedDoc(Document):
 
 
 class SetDoneDoc(Document):
-    """What became of one value that was set; `reason` says why it was not, `note` what there is to know."""
+    """The outcome of one write; `reason` is the cause of a failure, `note` a remark on it."""
 
     name: str
     requested: Scalar
@@ -147,7 +160,18 @@ class SetDoneDoc(Document):
         note: str = "",
         info: ParamInfo | None = None,
     ) -> SetDoneDoc:
-        """A value of this type, and what is known of the parameter."""
+        """Return the document of a write.
+
+        Args:
+            name: param_id.
+            kind: the vehicle's type of the parameter.
+            requested: the value that was requested.
+            actual: the value that the vehicle has now, or None if unknown.
+            status: the outcome in a word.
+            reason: the cause of a failure, or "".
+            note: a remark on the outcome, or "".
+            info: the metadata of the parameter, or None.
+        """
         return cls(
             name=name,
             requested=value_json(requested, ParamType.REAL64),
@@ -161,13 +185,13 @@ class SetDoneDoc(Document):
 
 
 class SetsDoneDoc(Document):
-    """What became of each, in the order in which they were set."""
+    """The outcomes of several writes, in their order."""
 
     results: list[SetDoneDoc]
 
 
 class ChangeLineDoc(Document):
-    """A value that has changed, as it happened."""
+    """One line of `watch`: a changed value."""
 
     time: str
     name: str
@@ -177,7 +201,7 @@ class ChangeLineDoc(Document):
 
     @classmethod
     def of(cls, change: Change, at: float) -> ChangeLineDoc:
-        """A change that was heard at this unix time."""
+        """Return the document of a change that was received `at` this unix time in seconds."""
         old, new = (
             None if param is None else value_json(param.value, param.type)
             for param in (change.old, change.new)
@@ -186,7 +210,7 @@ class ChangeLineDoc(Document):
 
 
 class EventLineDoc(Document):
-    """What has become of a component, as it happened."""
+    """One line of `watch`: an event of a component."""
 
     time: str
     event: str
@@ -197,43 +221,43 @@ class EventLineDoc(Document):
     def of(
         cls, event: Lost | Found | Rebooted | Resynced | Contested | Uncontested, at: float
     ) -> EventLineDoc:
-        """An event of this unix time."""
-        told: dict[str, Any] = {
+        """Return the document of an event `at` this unix time in seconds."""
+        members: dict[str, Any] = {
             "time": time_text(at),
             "event": type(event).__name__.lower(),
             "system": event.component.system,
             "component": event.component.component,
         }
         if isinstance(event, Lost | Found):
-            return SilenceLineDoc(**told, silence_s=round(event.silence, 4))
+            return SilenceLineDoc(**members, silence_s=round(event.silence, 4))
         if isinstance(event, Contested):
-            return ContestedLineDoc(**told, contest=ContestDoc.of(event.contest))
+            return ContestedLineDoc(**members, contest=ContestDoc.of(event.contest))
         if isinstance(event, Resynced):
-            return ResyncedLineDoc(**told, changed=list(event.changed), hash=hash_text(event.hash))
-        return EventLineDoc(**told)
+            return ResyncedLineDoc(**members, changed=list(event.changed), hash=hash_text(event.hash))
+        return EventLineDoc(**members)
 
 
 class SilenceLineDoc(EventLineDoc):
-    """A component that was lost or found, and for how long it was not heard."""
+    """A component that was lost or found, and the time in seconds in which it was not heard."""
 
     silence_s: float
 
 
 class ContestedLineDoc(EventLineDoc):
-    """A component whose address several vehicles have."""
+    """A component whose address several vehicles use."""
 
     contest: ContestDoc
 
 
 class ResyncedLineDoc(EventLineDoc):
-    """A table that agrees with the vehicle's again, and which of its values had moved."""
+    """A table that matches the vehicle again, and the names of the values that had changed."""
 
     changed: list[str]
     hash: str | None
 
 
 class SignsDoc(Document):
-    """Whether a vehicle signs now, and with which key."""
+    """Whether a vehicle signs its frames now, and the fingerprint of the key."""
 
     system: int
     component: int
@@ -243,7 +267,7 @@ class SignsDoc(Document):
 
 
 class SavedSetDoc(Document):
-    """A component whose parameters were written."""
+    """A component whose parameters were written to a file."""
 
     system: int | None
     component: int | None
@@ -251,7 +275,7 @@ class SavedSetDoc(Document):
 
 
 class SavedDoc(Document):
-    """A file that was written."""
+    """A parameter file that was written; `form` is the file format."""
 
     path: str
     form: str
@@ -259,13 +283,13 @@ class SavedDoc(Document):
 
     @classmethod
     def of(cls, path: str, form: str, sets: Iterable[ParamSet]) -> SavedDoc:
-        """Where, in which form, and what."""
+        """Return the document of a file: its path, its format, and the sets in it."""
         held = [SavedSetDoc(system=each.system, component=each.component, params=len(each)) for each in sets]
         return cls(path=path, form=form, components=held)
 
 
 class ImportedDoc(Document):
-    """A table that a telemetry log held; see `ImportedTable`."""
+    """A table imported from a log; see `ImportedTable`."""
 
     file: str
     key: str
@@ -279,7 +303,7 @@ class ImportedDoc(Document):
 
     @classmethod
     def of(cls, file: str, table: ImportedTable) -> ImportedDoc:
-        """A table of a log of this name."""
+        """Return the document of a table of the log `file`."""
         return cls(
             file=file,
             key=table.key,
@@ -294,7 +318,7 @@ class ImportedDoc(Document):
 
 
 class ImportDoc(Document):
-    """All tables that were brought into the cache."""
+    """All tables that were imported into the cache."""
 
     tables: list[ImportedDoc]
 
@@ -315,7 +339,7 @@ class PortDoc(Document):
 
     @classmethod
     def of(cls, port: SerialPort) -> PortDoc:
-        """All of it."""
+        """Return the document of a `SerialPort`."""
         return cls(
             device=port.device,
             by_id=port.by_id,

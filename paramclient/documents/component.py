@@ -1,4 +1,4 @@
-"""A component as the service tells of it: who it is, how it stands, and how far a fetch of it is."""
+"""Documents of a component in the service: its identity, its state, and the progress of a fetch."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ __all__ = ["ComponentDoc", "ComponentsDoc", "ContestDoc", "IdentityDoc", "LastFe
 
 
 class IdentityDoc(Document):
-    """Who a vehicle is; the members are those of `Identity`."""
+    """The identity of a vehicle; the members are those of `Identity`."""
 
     system: int
     link: str
@@ -33,12 +33,12 @@ class IdentityDoc(Document):
 
     @classmethod
     def of(cls, identity: Identity) -> IdentityDoc:
-        """All of it."""
+        """Return the document of an `Identity`."""
         return cls(**{name: getattr(identity, name) for name in cls.model_fields})
 
 
 class ProgressDoc(Document):
-    """How far a fetch is: parameters that have come, of how many, a second, and the seconds left."""
+    """The progress of a fetch: parameters received, their total, rate per second, and seconds left."""
 
     received: int
     total: int | None
@@ -47,7 +47,7 @@ class ProgressDoc(Document):
 
     @classmethod
     def of(cls, progress: Progress) -> ProgressDoc:
-        """As `Progress` has it."""
+        """Return the document of a `Progress`."""
         return cls(
             received=progress.received,
             total=progress.total,
@@ -57,30 +57,30 @@ class ProgressDoc(Document):
 
 
 class LastFetchDoc(Document):
-    """How the last fetch of a component ended."""
+    """The source and duration of the last fetch of a component."""
 
     source: str
     elapsed_s: float
 
 
 class ContestDoc(Document):
-    """Several vehicles have the address of a component: what each says, and what tells them apart."""
+    """Several vehicles use the address of a component: the vehicles, and the difference between them."""
 
     claimants: list[str]
     difference: str
 
     @classmethod
     def of(cls, contest: Contest) -> ContestDoc:
-        """As `Contest` has it."""
+        """Return the document of a `Contest`."""
         return cls(claimants=list(contest.claimants), difference=contest.difference)
 
 
 class ComponentDoc(Document):
     """One component on one link.
 
-    `key` is the name under which its table is kept, null until the vehicle has said who it is. `peer` is
-    where its messages come from. `params` is how many are known, `count` how many it says it has, `fetch` how
-    far one is that is under way. `contest` says which vehicles have the address where these are several.
+    `key` is the cache key of its table, null until the vehicle is identified. `peer` is the source address of
+    its messages. `params` is the number of known parameters, `count` the number that the component announces,
+    `fetch` the progress of a running fetch. `contest` names the vehicles if several use the address.
     """
 
     link: str
@@ -118,14 +118,15 @@ class ComponentDoc(Document):
         progress: Progress | None,
         last: FetchResult | None,
     ) -> ComponentDoc:
-        """As it stands at this moment.
+        """Return the document of the present state of a component.
 
         Args:
-            component: which one.
-            link: the name of its link, and `link_state` its state in a word.
-            key: under which its table is kept, or None while that is open.
-            progress: of the fetch under way, or None.
-            last: the result of the fetch that ended last, or None.
+            component: the component.
+            link: the name of its link.
+            link_state: the state of the link in a word.
+            key: the cache key of its table, or None while the vehicle is not identified.
+            progress: the progress of a running fetch, or None.
+            last: the result of the last fetch, or None.
         """
         identity = component.identity
         sync = component.sync_state
@@ -159,7 +160,7 @@ class ComponentDoc(Document):
 
 
 class ComponentsDoc(Document):
-    """All components, and the place in the list of events up to which that holds."""
+    """All components, with the run of the service and the number of the last event that they include."""
 
     run: str
     seq: int

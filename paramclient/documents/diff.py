@@ -1,4 +1,4 @@
-"""How two sets of parameters stand to each other."""
+"""Documents of the comparison of two parameter sets."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["ComparedDoc", "DiffDoc", "DifferenceDoc"]
 
 
 class ComparedDoc(Document):
-    """A value of one side; `text` is what it means in a word, where that is known."""
+    """The value of one side; `text` is its meaning in a word, if known."""
 
     value: Scalar
     type: str | None
@@ -30,7 +30,7 @@ class ComparedDoc(Document):
 
     @classmethod
     def of(cls, param: WrittenParam, metadata: Metadata | None = None) -> ComparedDoc:
-        """A parameter of this side, and what is known there of what values mean."""
+        """Return the document of a parameter of one side, with the metadata of that side."""
         info = None if metadata is None else metadata.find(param.name)
         return cls(
             value=value_written(param.value, param),
@@ -41,7 +41,7 @@ class ComparedDoc(Document):
 
 
 class DifferenceDoc(Document):
-    """How one name stands; see `Difference`."""
+    """The comparison of one name; see `Difference`."""
 
     standing: Standing = Field(validation_alias="is", serialization_alias="is")
     types_differ: bool
@@ -60,7 +60,7 @@ class DifferenceDoc(Document):
         right: Metadata | None = None,
         base: Metadata | None = None,
     ) -> DifferenceDoc:
-        """An entry, and what is known of the parameters of each side."""
+        """Return the document of a `Difference`, with the metadata of each side."""
         infos = [side.find(entry.name) for side in (left, right) if side is not None]
         return cls(
             standing=entry.standing,
@@ -75,7 +75,7 @@ class DifferenceDoc(Document):
 
 
 class DiffDoc(Document):
-    """What came of a comparison; see `Comparison`. `params` has what is not the same, or all on demand."""
+    """A comparison; see `Comparison`. `params` has the names that differ, or all names."""
 
     same: bool
     left: OriginDoc
@@ -95,7 +95,13 @@ class DiffDoc(Document):
         *,
         everything: bool = False,
     ) -> DiffDoc:
-        """A comparison, and what is known of the parameters of each side."""
+        """Return the document of a `Comparison`.
+
+        Args:
+            outcome: the comparison.
+            left, right, base: the metadata of each side, or None.
+            everything: include names that do not differ.
+        """
         return cls(
             same=outcome.is_same,
             left=OriginDoc.of(outcome.left),

@@ -1,4 +1,4 @@
-"""What all documents have in common."""
+"""Base classes of all documents and request bodies, and the validation of long objects."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from pydantic import BaseModel, ConfigDict, Field, WrapValidator, model_validato
 
 from paramclient.model.notation import Scalar
 
-__all__ = ["Body", "Document", "InParts", "Maybe", "Scalar", "without_strangers"]
+__all__ = ["Body", "Document", "InParts", "Maybe", "Scalar", "limit_unknown_members"]
 
 T = TypeVar("T")
 
 PART_SIZE: Final = 64
-"""Members of a long object that are validated at once."""
+"""Members of a long object that are validated in one call; see `InParts`."""
 
 
 def _is_none(value: object) -> bool:
@@ -23,53 +23,54 @@ def _is_none(value: object) -> bool:
 
 
 Maybe = Annotated[T | None, Field(exclude_if=_is_none)]
-"""A member that is left out where there is nothing to say. It has None for a default; a member that stands as
-null instead has no default."""
+"""A member that is left out if it is None, which is its default. A member that is null instead has no
+default."""
 
 
 class Document(BaseModel):
-    """What is told: it does not change, and members stand in the order in which they are declared."""
+    """A document that is printed or sent: immutable, with members in the order of their declaration."""
 
     model_config = ConfigDict(
         frozen=True,
         allow_inf_nan=False,
-        defer_build=True,  # each command needs a few of them
+        defer_build=True,  # each subcommand needs only a few documents
         serialize_by_alias=True,
         validate_by_name=True,
         validate_by_alias=True,
     )
 
     def as_json(self) -> dict[str, Any]:
-        """The same as `json.dumps` takes it."""
+        """Return the document as objects that `json.dumps` accepts."""
         return self.model_dump(mode="json")
 
 
 class Body(BaseModel):
-    """What is asked: a member that nobody knows is refused, so that a misspelt one is not passed over."""
+    """A request body. An unknown member is refused, so that a misspelt one is not ignored."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     @model_validator(mode="before")
     @classmethod
-    def _first_stranger(cls, content: object) -> object:
-        return without_strangers(cls, content)
+    def _limit_unknown_members(cls, content: object) -> object:
+        return limit_unknown_members(cls, content)
 
 
-def without_strangers(model: type[BaseModel], content: object) -> object:
-    """The members that a model knows, and the first one that it does not.
+def limit_unknown_members(model: type[BaseModel], content: object) -> object:
+    """Return `content` with the members that a model knows, and only the first unknown one.
 
-    pydantic makes an error of each unknown member: megabytes of them would be many times as many of errors.
+    pydantic creates an error for each unknown member: megabytes of members would become many times as many
+    megabytes of errors.
     """
     known = model.model_fields
     if not isinstance(content, dict) or len(content) <= len(known):
         return content
-    stranger = next(name for name in content if name not in known)
+    unknown = next(name for name in content if name not in known)
     kept = {name: content[name] for name in known if name in content}
-    return {**kept, stranger: content[stranger]}
+    return {**kept, unknown: content[unknown]}
 
 
-def _in_parts(content: object, validate: Callable[[object], Any]) -> Any:
-    """Validate a long object part by part, up to the first part with an error in it."""
+def _validate_in_parts(content: object, validate: Callable[[object], Any]) -> Any:
+    """Validate a long object in parts of `PART_SIZE` members, up to the first part with an error."""
     if not isinstance(content, dict) or len(content) <= PART_SIZE:
         return validate(content)
     members = iter(content.items())
@@ -79,6 +80,6 @@ def _in_parts(content: object, validate: Callable[[object], Any]) -> Any:
     return found
 
 
-InParts: Final = WrapValidator(_in_parts)
-"""Stands with an object of many members, and before a limit of their number. pydantic collects every error of
-an object, and lets no other thread run while it validates one: of a part both are little."""
+InParts: Final = WrapValidator(_validate_in_parts)
+"""Annotates an object with many members; it comes before a limit of their number. pydantic collects all
+errors of an object, and lets no other thread run while it validates one: in parts, both stay small."""

@@ -1,4 +1,4 @@
-"""Many vehicles beside each other."""
+"""Documents of the comparison of many vehicles."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ __all__ = ["FleetDiffDoc", "FleetValueDoc", "HolderDoc", "NameSpreadDoc"]
 
 
 class HolderDoc(Document):
-    """A vehicle with what it has; see `Holder`."""
+    """A vehicle with a given value; see `Holder`."""
 
     key: str
     system: int
@@ -24,7 +24,7 @@ class HolderDoc(Document):
 
     @classmethod
     def of(cls, holder: Holder) -> HolderDoc:
-        """All of it."""
+        """Return the document of a `Holder`."""
         return cls(
             key=holder.vehicle.key,
             system=holder.vehicle.system,
@@ -34,7 +34,7 @@ class HolderDoc(Document):
 
 
 class FleetValueDoc(Document):
-    """A value, and who has it; see `FleetValue`."""
+    """A value, and the vehicles that have it; see `FleetValue`."""
 
     value: Scalar
     type: str
@@ -44,7 +44,7 @@ class FleetValueDoc(Document):
 
     @classmethod
     def of(cls, value: FleetValue) -> FleetValueDoc:
-        """All of it."""
+        """Return the document of a `FleetValue`."""
         return cls(
             value=value_json(value.param.value, value.param.type),
             type=type_name(value.param.type),
@@ -66,7 +66,7 @@ class NameSpreadDoc(Document):
 
     @classmethod
     def of(cls, each: NameSpread) -> NameSpreadDoc:
-        """All of it."""
+        """Return the document of a `NameSpread`."""
         wanted = each.wanted
         return cls(
             name=each.name,
@@ -79,7 +79,7 @@ class NameSpreadDoc(Document):
 
 
 class FleetDiffDoc(Document):
-    """How vehicles stand to each other, or to what is wanted of them; see `FleetDiff`."""
+    """The comparison of vehicles with each other, or with wanted values; see `FleetDiff`."""
 
     component: int
     vehicles: int
@@ -88,7 +88,7 @@ class FleetDiffDoc(Document):
 
     @classmethod
     def of(cls, found: FleetDiff) -> FleetDiffDoc:
-        """All of it, with the number of vehicles."""
+        """Return the document of a `FleetDiff`, with the number of vehicles."""
         return cls(
             component=found.component,
             vehicles=len(found.vehicles),

@@ -1,4 +1,4 @@
-"""What was: changes of values, and tables that were set down."""
+"""Documents of the history: changes of values, snapshots, and interrupted set-ups."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = [
 
 
 class ExactDoc(Document):
-    """A value to the last bit."""
+    """The exact value: its type and bits."""
 
     type: str
     bits: str
@@ -36,7 +36,7 @@ class ExactDoc(Document):
 class HistoryEntryDoc(Document):
     """One change of a value; see `HistoryEntry`.
 
-    `at` (unix seconds) and the exact values are said to programs that go on with them.
+    `at` (unix seconds) and the exact values are for programs that process the change further.
     """
 
     time: str
@@ -51,7 +51,7 @@ class HistoryEntryDoc(Document):
 
     @classmethod
     def of(cls, entry: HistoryEntry, *, exact: bool = False) -> HistoryEntryDoc:
-        """A line of history."""
+        """Return the document of a change; with `exact`, including the time as a number and exact values."""
         old, new = entry.old, entry.new
         return cls(
             time=time_text(entry.at),
@@ -69,9 +69,9 @@ class HistoryEntryDoc(Document):
 
 
 class CutOffDoc(Document):
-    """A set-up that was cut off, as the service ended while it ran; see `CutOff`.
+    """A set-up that was interrupted by the end of the service; see `CutOff`.
 
-    `at` (unix seconds) is when it was last known to run.
+    `at` (unix seconds) is the last time at which it was known to run.
     """
 
     time: str
@@ -84,7 +84,7 @@ class CutOffDoc(Document):
 
     @classmethod
     def of(cls, note: CutOff) -> CutOffDoc:
-        """All of it that is of the past of a vehicle."""
+        """Return the document of a `CutOff`."""
         return cls(
             time=time_text(note.at),
             component=note.component,
@@ -97,9 +97,9 @@ class CutOffDoc(Document):
 
 
 class HistoryDoc(Document):
-    """Changes of values, the newest last. `before` is what to ask with for those that came before them.
+    """Changes of values, the newest last. `before` is the argument of a request for earlier changes.
 
-    `cut_off` has the set-ups of this time that were cut off, where there are any.
+    `cut_off` has the interrupted set-ups of this time, if there are any.
     """
 
     history: list[HistoryEntryDoc]
@@ -124,7 +124,7 @@ class HistoryDoc(Document):
 
 
 class SnapshotDoc(Document):
-    """A table as it was set down at a moment, without its parameters; see `SnapshotSummary`."""
+    """A snapshot of a table, without its parameters; see `SnapshotSummary`."""
 
     id: int
     time: str
@@ -137,7 +137,7 @@ class SnapshotDoc(Document):
 
     @classmethod
     def of(cls, summary: SnapshotSummary, *, exact: bool = False) -> SnapshotDoc:
-        """All of it but the vehicle's key; with the time as a number where a program goes on with it."""
+        """Return the document of a `SnapshotSummary`; with `exact`, including the time as a number."""
         return cls(
             id=summary.id,
             time=time_text(summary.at),
@@ -157,12 +157,12 @@ class SnapshotsDoc(Document):
 
     @classmethod
     def of(cls, kept: Iterable[SnapshotSummary], *, exact: bool = False) -> SnapshotsDoc:
-        """Those of a vehicle."""
+        """Return the document of the snapshots of a vehicle."""
         return cls(snapshots=[SnapshotDoc.of(each, exact=exact) for each in kept])
 
 
 class WholeSnapshotDoc(SnapshotDoc):
-    """A snapshot with its parameters by name, and who the vehicle was then."""
+    """A snapshot with its parameters by name, and the identity of the vehicle at that time."""
 
     source: str
     system: int | None
@@ -172,7 +172,7 @@ class WholeSnapshotDoc(SnapshotDoc):
 
     @classmethod
     def whole(cls, summary: SnapshotSummary, params: ParamSet) -> WholeSnapshotDoc:
-        """All of it."""
+        """Return the document of a snapshot with its parameters."""
         identity = params.identity
         return cls(
             **SnapshotDoc.of(summary, exact=True).model_dump(),

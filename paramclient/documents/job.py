@@ -1,4 +1,4 @@
-"""What is under way for somebody: a fetch, a set-up."""
+"""Documents of jobs of the service: fetches and set-ups that run, or have ended."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ from paramclient.documents.problem import Problem
 if TYPE_CHECKING:
     from paramclient.cache import CutOff
 
-__all__ = ["JobDoc", "JobsDoc", "far_text"]
+__all__ = ["JobDoc", "JobsDoc", "progress_text"]
 
 
 class JobDoc(Document):
-    """One piece of work. `result` is the document of its kind, null until it is done, and in events.
+    """One job. `result` is the document of its kind; it is null until the job is done, and in events.
 
-    Times are in unix seconds. A set-up is `cut-off` where the service ended while it ran: `ended` is then
-    when it was last known to run.
+    Times are in unix seconds. A set-up is `cut-off` if the service ended while it ran: `ended` is then the
+    last time at which it was known to run.
     """
 
     id: str
@@ -36,10 +36,10 @@ class JobDoc(Document):
 
     @classmethod
     def of_cut_off(cls, note: CutOff) -> JobDoc:
-        """A set-up that an earlier run of the service has not brought to its end."""
+        """Return the document of a set-up that was interrupted when an earlier run of the service ended."""
         detail = (
-            f"The service ended while it ran, {far_text(note)}. What was written is in the history, and the "
-            "state before it among the snapshots: apply again, or restore."
+            f"The service ended while the set-up ran, {progress_text(note)}. The written values are in the "
+            "history, and the state before is among the snapshots: apply again, or restore."
         )
         return cls(
             id=note.id,
@@ -58,11 +58,11 @@ class JobDoc(Document):
 
 
 class JobsDoc(Document):
-    """Those that are under way, and the last ones that were."""
+    """The running jobs, and the last ones that have ended."""
 
     jobs: list[JobDoc]
 
 
-def far_text(note: CutOff) -> str:
-    """How far a set-up was, in words."""
+def progress_text(note: CutOff) -> str:
+    """Return the progress of an interrupted set-up in words."""
     return f"after {note.done} of {note.total} values" if note.total else "before anything was written"

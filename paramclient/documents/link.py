@@ -1,4 +1,4 @@
-"""A link that the service holds, and the service itself."""
+"""Documents of the links of a service, of its health, and of the caller's role."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ __all__ = ["HealthDoc", "HealthLinkDoc", "LinkDoc", "LinksDoc", "MeDoc", "StatsD
 
 
 class StatsDoc(Document):
-    """What has gone over a link since it was opened; the members are those of `ClientStats`.
+    """The traffic of a link since it was opened; the members are those of `ClientStats`.
 
     `round_trips` are in seconds, by `system/component`.
     """
@@ -36,17 +36,18 @@ class StatsDoc(Document):
 
     @classmethod
     def of(cls, stats: ClientStats) -> StatsDoc:
-        """All of it."""
+        """Return the document of a `ClientStats`."""
         members = {name: getattr(stats, name) for name in cls.model_fields if name != "round_trips"}
         trips = {f"{system}/{number}": trip for (system, number), trip in stats.round_trips.items()}
         return cls(**members, round_trips=trips)
 
 
 class LinkDoc(Document):
-    """One link: open; away, and being opened again by itself; failed, and tried again; or a log that is over.
+    """One link: open; away and reconnecting; failed and retried; or a log that has ended.
 
-    `error` is the reason for the last two, `name` what the service calls it, `stats` null while it is not
-    open. `openings` counts how often it was opened anew: everything that was known of it began again then.
+    `name` is its name in the service, `error` the reason for the last two states, `stats` null while it is
+    not open. `openings` counts how often it was opened again; each time its components and counters start
+    anew.
     """
 
     name: str
@@ -72,7 +73,7 @@ class HealthLinkDoc(Document):
 
 
 class HealthDoc(Document):
-    """That the service answers, and since when, in seconds."""
+    """The health of the service; `up_s` is the time since its start in seconds."""
 
     status: str
     version: str
@@ -81,9 +82,9 @@ class HealthDoc(Document):
 
 
 class MeDoc(Document):
-    """Who asks, by the name of the token, and what that allows; where it is `read_only`, nobody may write.
+    """The caller: the name of the token and its role. If `read_only`, the service allows no writes.
 
-    `asker` is how they stand in the history.
+    `asker` is the author of the caller's changes in the history.
     """
 
     name: str

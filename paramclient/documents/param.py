@@ -1,4 +1,4 @@
-"""One parameter: as a vehicle or the cache has it, as a file has it, and what its firmware says of it."""
+"""Documents of one parameter: of a vehicle or the cache, of a file, and of its metadata."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ __all__ = ["DescribedDoc", "GotDoc", "InfoDoc", "InfosDoc", "ParamDoc", "Written
 
 
 class InfoDoc(Document):
-    """What a firmware says of a parameter, without what it does not say."""
+    """The metadata of a parameter; members without a value are left out."""
 
     short_description: Maybe[str] = None
     long_description: Maybe[str] = None
@@ -38,7 +38,7 @@ class InfoDoc(Document):
 
     @classmethod
     def of(cls, info: ParamInfo) -> InfoDoc:
-        """Everything of a description."""
+        """Return the document of a `ParamInfo`."""
         return cls(
             short_description=info.short_description or None,
             long_description=info.long_description or None,
@@ -59,10 +59,10 @@ class InfoDoc(Document):
 
 
 class ParamDoc(Document):
-    """One parameter of a vehicle; in the command's JSON its name is the key under which it stands.
+    """One parameter of a vehicle; in the JSON of the command line its name is the key of the document.
 
-    `text` is what the value means in a word. `trust`, `is_default` and `heard_at` (unix seconds) are of a
-    table that somebody keeps; `metadata` is everything that is known beside the value.
+    `text` is the meaning of the value in a word. `trust`, `is_default` and `heard_at` (unix seconds) come
+    with parameters of a table; `metadata` has all metadata of the parameter.
     """
 
     name: Maybe[str] = None
@@ -80,12 +80,12 @@ class ParamDoc(Document):
 
     @classmethod
     def of(cls, param: Param, info: ParamInfo | None = None, *, whole: bool = False) -> ParamDoc:
-        """What stands under a parameter's name.
+        """Return the document of a parameter, without its name.
 
         Args:
             param: the parameter.
-            info: what is known of it, or None.
-            whole: whether to give everything that the description says.
+            info: its metadata, or None.
+            whole: whether to include all metadata.
         """
         return cls(
             value=value_json(param.value, param.type),
@@ -107,7 +107,12 @@ class ParamDoc(Document):
         heard_at: float | None = None,
         whole: bool = False,
     ) -> ParamDoc:
-        """The same with its name, and how far it can be trusted."""
+        """Return the document of a parameter of a table: with name, trust and the time of its reception.
+
+        Args:
+            param, info, whole: as in `of`.
+            heard_at: unix time in seconds at which the value was received, or None.
+        """
         return cls.of(param, info, whole=whole).model_copy(
             update={
                 "name": param.name,
@@ -119,9 +124,9 @@ class ParamDoc(Document):
 
 
 class WrittenParamDoc(Document):
-    """A parameter as a file has it; its name is the key under which it stands.
+    """A parameter of a file; its name is the key of the document.
 
-    Without a type, `value` is the number as it is written, and there are no `bits`.
+    Without a type, `value` is the number as the file has it, and `bits` is null.
     """
 
     value: Scalar
@@ -132,7 +137,7 @@ class WrittenParamDoc(Document):
 
     @classmethod
     def of(cls, param: WrittenParam) -> WrittenParamDoc:
-        """Everything of it but its line."""
+        """Return the document of a `WrittenParam`, without its line number."""
         return cls(
             value=value_written(param.value, param),
             type=None if param.type is None else type_name(param.type),
@@ -143,7 +148,7 @@ class WrittenParamDoc(Document):
 
 
 class GotDoc(Document):
-    """Parameters that were asked for, by name, and why some did not come."""
+    """Requested parameters by name, and the errors of those that were not received."""
 
     params: dict[str, ParamDoc]
     errors: Maybe[dict[str, str]] = None
@@ -152,7 +157,7 @@ class GotDoc(Document):
     def of(
         cls, params: Iterable[Param], metadata: Metadata | None, errors: Mapping[str, ParamClientError]
     ) -> GotDoc:
-        """What came, with all that is known of it, and the errors by name."""
+        """Return the document of parameters with all their metadata, and of errors by name."""
         return cls(
             params={
                 param.name: ParamDoc.of(
@@ -165,14 +170,14 @@ class GotDoc(Document):
 
 
 class InfosDoc(Document):
-    """What is known of parameters, by name; `source` is where it comes from."""
+    """Metadata of parameters by name; `source` is its origin."""
 
     source: str
     params: dict[str, InfoDoc]
 
     @classmethod
     def of(cls, metadata: Metadata, names: Iterable[str]) -> InfosDoc:
-        """What there is of these names."""
+        """Return the document of the metadata of these names; names without metadata are left out."""
         found = {name: metadata.find(name) for name in names}
         return cls(
             source=metadata.source,
@@ -181,7 +186,7 @@ class InfosDoc(Document):
 
 
 class DescribedDoc(Document):
-    """How many parameters, or groups of them, are described, and where that comes from."""
+    """The number of parameters, or groups of them, with metadata, and the origin of the metadata."""
 
     count: int
     source: str

@@ -1,4 +1,4 @@
-"""Parameters that no vehicle stands behind: whose they are, and what a file of them says."""
+"""Documents of parameter sets and parameter files: origin, parameters, file formats."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["FileDoc", "FormDoc", "FormsDoc", "OriginDoc", "SetDoc", "UploadedDoc
 
 
 class OriginDoc(Document):
-    """Whose parameters a set has. `at` is when it was so."""
+    """The origin of a set: source, vehicle, and the time `at` which the vehicle had these values."""
 
     source: str
     system: int | None
@@ -31,7 +31,7 @@ class OriginDoc(Document):
 
     @classmethod
     def of(cls, params: ParamSet) -> OriginDoc:
-        """What a set says of itself."""
+        """Return the document of the origin of a `ParamSet`."""
         identity = params.identity
         return cls(
             source=params.source,
@@ -45,19 +45,19 @@ class OriginDoc(Document):
 
 
 class SetDoc(OriginDoc):
-    """A set with its parameters, by name."""
+    """A set with its parameters by name."""
 
     params: dict[str, WrittenParamDoc]
 
     @classmethod
     def of(cls, params: ParamSet) -> SetDoc:
-        """All of it."""
+        """Return the document of a `ParamSet`."""
         written = {name: WrittenParamDoc.of(param) for name, param in params.items()}
         return cls(**OriginDoc.of(params).model_dump(), params=written)
 
 
 class FileDoc(Document):
-    """What a parameter file holds: a set for each component."""
+    """The content of a parameter file: a set for each component. `form` is the file format."""
 
     file: str
     form: str
@@ -65,16 +65,16 @@ class FileDoc(Document):
 
     @classmethod
     def of(cls, file: ParamFile, sets: Iterable[ParamSet] | None = None) -> FileDoc:
-        """A file as it was read; only some sets of it where they are given."""
+        """Return the document of a file; with `sets`, only of these sets of it."""
         shown = file.sets if sets is None else sets
         return cls(file=file.source, form=file.form, components=[SetDoc.of(each) for each in shown])
 
 
 class UploadedDoc(Document):
-    """What a parameter file says to those who have sent it.
+    """The content of an uploaded parameter file.
 
-    `notes` are what its reader should know, `components` whose parameters it holds, `params` those that were
-    chosen.
+    `form` is the file format, `notes` are remarks for the user, `components` the origins of the sets in the
+    file, `params` the parameters of the chosen set.
     """
 
     file: str
@@ -85,7 +85,7 @@ class UploadedDoc(Document):
 
     @classmethod
     def of(cls, file: ParamFile, chosen: ParamSet) -> UploadedDoc:
-        """A file as it was read."""
+        """Return the document of a file and the set chosen from it."""
         return cls(
             file=file.source,
             form=file.form,
@@ -96,7 +96,7 @@ class UploadedDoc(Document):
 
 
 class FormDoc(Document):
-    """A form of parameter files: the endings that stand for it, and whether it is written too."""
+    """A format of parameter files: its file name endings, and whether it can be written."""
 
     name: str
     title: str
@@ -105,7 +105,7 @@ class FormDoc(Document):
 
     @classmethod
     def of(cls, form: FileForm) -> FormDoc:
-        """One of those that there are."""
+        """Return the document of a file format."""
         return cls(
             name=form.value,
             title=_TITLES[form],
@@ -115,7 +115,7 @@ class FormDoc(Document):
 
 
 class FormsDoc(Document):
-    """The forms of parameter files."""
+    """The formats of parameter files."""
 
     forms: list[FormDoc]
 
@@ -129,3 +129,4 @@ _TITLES: Final = {
     FileForm.JSON: "paramclient, JSON",
     FileForm.YAML: "paramclient, YAML",
 }
+"""The title of each file format for users: the programs that use it."""

@@ -1,4 +1,4 @@
-"""Why something was not done, as RFC 9457 has it."""
+"""Problem documents: errors of the service in the format of RFC 9457."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ __all__ = ["Problem"]
 
 
 class Problem(Document):
-    """A problem document: `type` is a name for programs, `detail` the sentence for people.
+    """A problem document: `type` is a name for programs, `detail` a sentence for users.
 
-    `error` is the name of the library's exception where there is one; what that knows besides stands beside
-    it under its own names.
+    `error` is the name of the library's exception, if there is one; its attributes are further members.
     """
 
     model_config = ConfigDict(extra="allow")

@@ -1,4 +1,4 @@
-"""What became of a call: of a fetch, of a value that was set."""
+"""Documents of the results of fetches and writes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ __all__ = [
 
 
 class SampleDoc(Document):
-    """What a sample of a cached table has shown."""
+    """The result of a sample of a cached table; see `Sample`."""
 
     size: int
     count: int
@@ -35,12 +35,12 @@ class SampleDoc(Document):
 
     @classmethod
     def of(cls, sample: Sample) -> SampleDoc:
-        """All of it."""
+        """Return the document of a `Sample`."""
         return cls(size=sample.size, count=sample.count, differing=list(sample.differing))
 
 
 class FetchResultDoc(Document):
-    """What a fetch brought; see `FetchResult`. The parameters are in the component's table."""
+    """The result of a fetch; see `FetchResult`. The parameters are in the component's table."""
 
     link: str
     system: int
@@ -60,7 +60,7 @@ class FetchResultDoc(Document):
 
     @classmethod
     def of(cls, result: FetchResult, *, link: str) -> FetchResultDoc:
-        """All of it but the parameters."""
+        """Return the document of a `FetchResult`, without the parameters."""
         return cls(
             link=link,
             system=result.system,
@@ -81,7 +81,7 @@ class FetchResultDoc(Document):
 
 
 class SilentDoc(Document):
-    """A component that did not answer a fetch of all."""
+    """A component that did not answer a fetch of several components."""
 
     link: str
     system: int
@@ -90,14 +90,14 @@ class SilentDoc(Document):
 
 
 class FetchedAllDoc(Document):
-    """What a fetch of several components brought."""
+    """The results of a fetch of several components."""
 
     results: list[FetchResultDoc]
     silent: list[SilentDoc]
 
 
 class SetResultDoc(Document):
-    """What became of a value that was set: accepted, or adjusted by the vehicle; see `SetResult`."""
+    """The result of a write: accepted, or adjusted by the vehicle; see `SetResult`."""
 
     name: str
     status: str
@@ -109,7 +109,7 @@ class SetResultDoc(Document):
 
     @classmethod
     def of(cls, result: SetResult) -> SetResultDoc:
-        """All of it."""
+        """Return the document of a `SetResult`."""
         requested = result.requested
         kind = ParamType.REAL64 if isinstance(requested, float) else result.param.type
         return cls(
@@ -124,12 +124,12 @@ class SetResultDoc(Document):
 
 
 class NotSetDoc(Document):
-    """Why a value was not set."""
+    """The error of a write that failed."""
 
     problem: Problem
 
 
 class SetManyDoc(Document):
-    """What became of each of several values, by name."""
+    """The results of several writes by name."""
 
     results: dict[str, SetResultDoc | NotSetDoc]

@@ -1,4 +1,4 @@
-"""Set-ups: what is to be done, what became of it, and how a vehicle compares."""
+"""Documents of set-ups: plans, results of `apply` and `restore`, comparisons, progress."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class StepDoc(Document):
 
     @classmethod
     def of(cls, step: Step) -> StepDoc:
-        """All of it."""
+        """Return the document of a `Step`."""
         return cls(
             name=step.name,
             value=value_json(step.value, step.type),
@@ -58,7 +58,7 @@ class StepDoc(Document):
 
 
 class StageDoc(Document):
-    """Values that are written side by side, before those of the next stage; see `Stage`."""
+    """Values that are written concurrently, before those of the next stage; see `Stage`."""
 
     purpose: str
     reboot_first: bool
@@ -66,7 +66,7 @@ class StageDoc(Document):
 
     @classmethod
     def of(cls, stage: Stage) -> StageDoc:
-        """What a user has of it."""
+        """Return the document of a `Stage`."""
         return cls(
             purpose=stage.purpose,
             reboot_first=stage.reboot_first,
@@ -75,7 +75,7 @@ class StageDoc(Document):
 
 
 class PlanRowDoc(Document):
-    """What is meant to be done with one parameter; see `PlanRow`."""
+    """The planned action for one parameter; see `PlanRow`."""
 
     status: PlanStatus
     type: str | None
@@ -87,12 +87,12 @@ class PlanRowDoc(Document):
 
     @classmethod
     def of(cls, row: PlanRow) -> PlanRowDoc:
-        """All of it."""
+        """Return the document of a `PlanRow`."""
         return cls(status=row.status, **_members(row))
 
 
 class PlanDoc(Document):
-    """What a set-up means to do; see `Plan`. `extra` is how many parameters the vehicle has besides."""
+    """The plan of a set-up; see `Plan`. `extra` is the number of the vehicle's other parameters."""
 
     system: int
     component: int
@@ -105,7 +105,10 @@ class PlanDoc(Document):
 
     @classmethod
     def of(cls, plan: Plan, *, system: int, component: int, full: bool = False) -> PlanDoc:
-        """A plan for a vehicle; what it has already only where everything is asked for."""
+        """Return the document of a plan for the vehicle `system`/`component`.
+
+        Unchanged parameters are included only if `full`.
+        """
         return cls(
             system=system,
             component=component,
@@ -123,7 +126,7 @@ class PlanDoc(Document):
 
 
 class VerifiedRowDoc(Document):
-    """How one parameter compares with what is wanted; see `PlanRow.standing`."""
+    """The comparison of one parameter with the wanted one; see `PlanRow.standing`."""
 
     standing: RowStanding = Field(validation_alias="is", serialization_alias="is")
     type: str | None
@@ -135,12 +138,12 @@ class VerifiedRowDoc(Document):
 
     @classmethod
     def of(cls, row: PlanRow) -> VerifiedRowDoc:
-        """All of it."""
+        """Return the document of a `PlanRow`."""
         return cls(standing=row.standing, **_members(row))
 
 
 class VerifiedDoc(Document):
-    """How one vehicle compares with what is wanted."""
+    """The comparison of one vehicle with the wanted parameters."""
 
     system: int
     component: int
@@ -150,7 +153,10 @@ class VerifiedDoc(Document):
 
     @classmethod
     def of(cls, plan: Plan, *, system: int, component: int, full: bool = False) -> VerifiedDoc:
-        """What a plan says of it; what is as it should be only where everything is asked for."""
+        """Return the document of the comparison in a plan.
+
+        Parameters that have the wanted value, or are left out, are included only if `full`.
+        """
         rows = list(plan.rows.values())
         return cls(
             system=system,
@@ -162,7 +168,7 @@ class VerifiedDoc(Document):
 
 
 class AppliedRowDoc(Document):
-    """What became of one parameter; see `ApplyRow`."""
+    """The outcome for one parameter; see `ApplyRow`."""
 
     status: ApplyStatus
     type: str | None
@@ -175,22 +181,22 @@ class AppliedRowDoc(Document):
 
     @classmethod
     def of(cls, row: ApplyRow) -> AppliedRowDoc:
-        """All of it."""
+        """Return the document of an `ApplyRow`."""
         return cls(status=row.status, actual=_value(row.actual, row), **_members(row))
 
 
 class AddressDoc(Document):
-    """Where a vehicle is heard."""
+    """The MAVLink address of a vehicle."""
 
     system: int
     component: int
 
 
 class ApplyResultDoc(Document):
-    """What came of a set-up; see `ApplyResult`.
+    """The result of a set-up; see `ApplyResult`.
 
-    `system` and `component` are the vehicle's address when it began, `now` when it ended. `extra` is how many
-    parameters the vehicle has besides.
+    `system` and `component` are the vehicle's address at the start, `now` is its address at the end. `extra`
+    is the number of the vehicle's other parameters.
     """
 
     system: int
@@ -207,7 +213,10 @@ class ApplyResultDoc(Document):
 
     @classmethod
     def of(cls, result: ApplyResult, *, system: int, component: int, full: bool = False) -> ApplyResultDoc:
-        """The result for a vehicle that had this address; what it had already only on demand."""
+        """Return the document of the result for a vehicle that had this address at the start.
+
+        Unchanged parameters, and left-out ones that do not differ, are included only if `full`.
+        """
         return cls(
             system=system,
             component=component,
@@ -226,7 +235,7 @@ class ApplyResultDoc(Document):
 
 
 class InterruptedDoc(Document):
-    """What had become of each value when somebody ended a set-up."""
+    """The outcome for each value up to the interruption of a set-up."""
 
     system: int
     component: int
@@ -236,7 +245,7 @@ class InterruptedDoc(Document):
 
     @classmethod
     def of(cls, rows: Iterable[ApplyRow], *, system: int, component: int) -> InterruptedDoc:
-        """The rows so far, of a vehicle that had this address."""
+        """Return the document of the rows so far, for a vehicle that had this address at the start."""
         return cls(
             system=system,
             component=component,
@@ -247,7 +256,7 @@ class InterruptedDoc(Document):
 
 
 class FailedVehicleDoc(Document):
-    """A vehicle on which nothing was done, and why."""
+    """A vehicle to which nothing was written, and the error."""
 
     system: int
     component: int
@@ -255,11 +264,11 @@ class FailedVehicleDoc(Document):
 
 
 SetUpDoc: TypeAlias = ApplyResultDoc | PlanDoc | VerifiedDoc | InterruptedDoc
-"""What a set-up tells of one vehicle."""
+"""The document of a set-up of one vehicle."""
 
 
 class FleetSetupDoc(Document):
-    """What came of a command for several vehicles."""
+    """The result of a set-up or comparison of several vehicles."""
 
     vehicles: list[SetUpDoc]
     errors: list[FailedVehicleDoc]
@@ -268,7 +277,7 @@ class FleetSetupDoc(Document):
     def of(
         cls, vehicles: Iterable[SetUpDoc], errors: Mapping[tuple[int, int], ParamClientError]
     ) -> FleetSetupDoc:
-        """What is told of each, and the errors by address."""
+        """Return the document of the documents of the vehicles, and the errors by address."""
         failed = [
             FailedVehicleDoc(system=system, component=component, error=str(error))
             for (system, component), error in errors.items()
@@ -277,7 +286,7 @@ class FleetSetupDoc(Document):
 
 
 class ApplyProgressDoc(Document):
-    """How far a set-up is; see `ApplyProgress`. `row` is what has just become of the parameter `name`."""
+    """The progress of a set-up; see `ApplyProgress`. `row` is the latest outcome, for `name`."""
 
     phase: str
     done: int
@@ -287,7 +296,7 @@ class ApplyProgressDoc(Document):
 
     @classmethod
     def of(cls, progress: ApplyProgress) -> ApplyProgressDoc:
-        """All of it."""
+        """Return the document of an `ApplyProgress`."""
         row = progress.row
         return cls(
             phase=progress.phase,
@@ -299,7 +308,7 @@ class ApplyProgressDoc(Document):
 
 
 def _members(row: ApplyRow | PlanRow) -> dict[str, Any]:
-    """What every row tells of its parameter."""
+    """Return the members that the documents of all rows share."""
     return {
         "type": None if row.type is None else type_name(row.type),
         "before": _value(row.before, row),

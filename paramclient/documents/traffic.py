@@ -1,4 +1,4 @@
-"""What goes over a link: who is heard, how much comes, and what is lost on the way."""
+"""Documents of the traffic on a link: components, message rates, packet loss, signatures, radios."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ __all__ = ["ComponentTrafficDoc", "MessageTrafficDoc", "RadioDoc", "SigningDoc",
 
 
 class SigningDoc(Document):
-    """How the signatures on a link stand; see `SigningReport`."""
+    """The state of signing on a link; see `SigningReport`."""
 
     fingerprint: str
     policy: str
@@ -33,7 +33,7 @@ class SigningDoc(Document):
 
     @classmethod
     def of(cls, report: SigningReport) -> SigningDoc:
-        """What a user has of it."""
+        """Return the document of a `SigningReport`."""
         return cls(
             fingerprint=report.fingerprint,
             policy=report.policy,
@@ -54,7 +54,7 @@ class MessageTrafficDoc(Document):
 
 
 class RadioDoc(Document):
-    """What a telemetry radio says of itself; see `RadioStatus`."""
+    """The state that a telemetry radio reports; see `RadioStatus`."""
 
     rssi: int
     noise: int
@@ -66,7 +66,7 @@ class RadioDoc(Document):
 
 
 class ComponentTrafficDoc(Document):
-    """What was heard of one component; see `ComponentTraffic`."""
+    """The traffic of one component; see `ComponentTraffic`."""
 
     system: int
     component: int
@@ -91,7 +91,7 @@ class ComponentTrafficDoc(Document):
 
     @classmethod
     def of(cls, each: ComponentTraffic, round_trip: float | None = None) -> ComponentTrafficDoc:
-        """All of it, and the round trip where that was measured."""
+        """Return the document of a `ComponentTraffic`; `round_trip` in seconds, None if not measured."""
         beat = each.heartbeat
         return cls(
             system=each.system,
@@ -123,7 +123,7 @@ class ComponentTrafficDoc(Document):
 
 
 class TrafficDoc(Document):
-    """What has gone over a link; see `TrafficReport`."""
+    """The traffic of a link; see `TrafficReport`."""
 
     link: str
     seconds: float
@@ -146,7 +146,14 @@ class TrafficDoc(Document):
         signing: SigningReport | None,
         round_trips: Mapping[tuple[int, int], float | None],
     ) -> TrafficDoc:
-        """A report of the link of this name, with the signatures on it and round trips by address."""
+        """Return the document of a report.
+
+        Args:
+            link: the name of the link.
+            report: its traffic.
+            signing: the state of signing on the link, or None without a key.
+            round_trips: round-trip times in seconds by (system, component).
+        """
         return cls(
             link=link,
             seconds=round(report.seconds, 3),
@@ -167,5 +174,5 @@ class TrafficDoc(Document):
 
 
 def _type(number: int) -> str:
-    """MAV_TYPE in a word or two."""
+    """Return a MAV_TYPE in words."""
     return "ground station" if number == MAV_TYPE_GCS else enum_word("MAV_TYPE", number)

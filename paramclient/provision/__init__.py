@@ -1,4 +1,12 @@
-"""Scripted set-up of vehicles: plan what a parameter file would change, apply it, verify it, undo it."""
+"""Setting up vehicles from parameter files: plan, apply, verify and restore, for one vehicle or several.
+
+- `planning`: the values to write, their order, and the reason for each parameter that is not written.
+- `inspection`: read what a vehicle has; `prepare` and `verify`.
+- `set_up`: `apply` and `restore`; `execution` runs them, `results` holds their results.
+- `fleet`: `apply_all` and `verify_all` for several vehicles.
+- `vehicle_params`: parameters of a vehicle or of the cache as a set.
+- `cautions`, `similar_names`, `runner`: special parameters, mistyped names, long computations.
+"""
 
 from __future__ import annotations
 

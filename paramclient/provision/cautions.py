@@ -1,4 +1,4 @@
-"""What a set-up has to know of particular parameters, read from `cautions.toml`."""
+"""Parameters that `apply` leaves out, orders specially or reboots for, read from `cautions.toml`."""
 
 from __future__ import annotations
 
@@ -17,26 +17,30 @@ from paramclient.model.patterns import NameChoice
 __all__ = ["CATEGORIES", "OUT_OF_RANGE", "READ_ONLY", "Caution", "Cautions", "Choice", "cautions_for"]
 
 READ_ONLY: Final = "read-only"
+"""The category of parameters that the vehicle lets no client write."""
 OUT_OF_RANGE: Final = "out-of-range"
+"""The category of values outside of the range in the metadata."""
 CATEGORIES: Final = (
     *("identity", "hardware", "calibration", "measured", "counter", "action"),
     *(READ_ONLY, OUT_OF_RANGE),
 )
-"""What a choice of what to include may name besides globs. The last two come from metadata too."""
+"""The categories that `include` accepts besides globs. The last two are also assigned from metadata."""
 
 
 @dataclass(frozen=True, slots=True)
 class Caution:
-    """One entry of the list.
+    """One entry of `cautions.toml`.
 
     Attributes:
         names: globs, in the case of param_id.
-        reason: why it is there; a sentence that begins with what the parameter is or does.
-        category: for what is left out, one of `CATEGORIES`; else "".
+        reason: the predicate of a sentence whose subject is the parameter, such as "is counted by the
+            vehicle".
+        category: one of `CATEGORIES` for a parameter that is left out; else "".
         autopilot: "px4" or "ardupilot".
-        unless: other parameters with values; the entry does not count while one of them has its value.
-        elsewhere: by glob, where those belong that the tables of the simulated vehicles do not have.
-        vehicle_types: the MAV_TYPEs for which it holds; empty for all.
+        unless: values of other parameters; the entry does not apply while one of them has its value.
+        elsewhere: by glob, the vehicles or settings that have the parameter, for globs that match nothing in
+            the tables of the simulated vehicles.
+        vehicle_types: the MAV_TYPEs to which the entry applies; empty for all.
     """
 
     names: tuple[str, ...]
@@ -49,10 +53,10 @@ class Caution:
 
 
 class Cautions:
-    """The list for one autopilot.
+    """The entries of `cautions.toml` for one autopilot.
 
     Attributes:
-        entries: by section of the file.
+        entries: the entries by section of the file.
     """
 
     def __init__(self, entries: Mapping[str, Sequence[Caution]]) -> None:
@@ -63,11 +67,12 @@ class Cautions:
         }
 
     def left_out(self, name: str, value_of: Callable[[str], object] | None = None) -> Caution | None:
-        """Why a parameter is left out unless asked for, or None.
+        """Return the entry that leaves a parameter out by default, or None.
 
         Args:
             name: param_id.
-            value_of: the value that another parameter has, or is to have; by default none has a value.
+            value_of: returns the value of another parameter, or the value it is to get; by default no other
+                parameter has a value.
         """
         for pattern, caution in self._patterns["left_out"]:
             if pattern.match(name) and (
@@ -77,29 +82,33 @@ class Cautions:
         return None
 
     def chooses_frame(self, name: str) -> bool:
+        """Return whether the parameter selects the airframe."""
         return self._first("frame", name) is not None
 
     def resets(self, name: str) -> bool:
-        """Whether a change of it gives others other values at the next start."""
+        """Return whether a change of the parameter resets other parameters at the next reboot."""
         return self._first("resets", name) is not None
 
     def reveals(self, name: str) -> bool:
-        """Whether others may appear, or go, when it changes."""
+        """Return whether a change of the parameter may show or hide other parameters."""
         return self._first("reveals", name) is not None
 
     def is_last(self, name: str) -> bool:
-        """Whether a change of it may cut us off."""
+        """Return whether a change of the parameter may end the connection, so that it is written last."""
         return self._first("last", name) is not None
 
     def is_system_id(self, name: str) -> bool:
+        """Return whether the parameter is the MAVLink system id."""
         return self._first("system_id", name) is not None
 
     def needs_reboot(self, name: str, vehicle_type: int | None = None) -> bool:
-        """Whether it is known to take effect after a reboot; metadata may know better.
+        """Return whether the parameter is listed as one that takes effect after a reboot.
+
+        Metadata may name further parameters.
 
         Args:
-            name: of the parameter.
-            vehicle_type: MAV_TYPE of the vehicle; None where it is not known.
+            name: param_id.
+            vehicle_type: MAV_TYPE of the vehicle; None if unknown.
         """
         return any(
             pattern.match(name) and (not caution.vehicle_types or vehicle_type in caution.vehicle_types)
@@ -114,13 +123,13 @@ class Cautions:
 
 
 class Choice:
-    """What is included although the list leaves it out.
+    """The parameters that are included although `cautions.toml` leaves them out.
 
     Args:
-        include: names of `CATEGORIES`, and globs of parameter names; one alone may be a string.
+        include: names of `CATEGORIES`, and globs of parameter names; a single one may be a string.
 
     Raises:
-        UsageError: one of them is neither.
+        UsageError: an element is neither a category nor an upper-case glob.
     """
 
     def __init__(self, include: str | Iterable[str]) -> None:
@@ -136,15 +145,15 @@ class Choice:
         self._names = NameChoice(globs)
 
     def has(self, name: str, category: str) -> bool:
-        """Whether a parameter of this category is included."""
+        """Return whether the parameter `name`, which is left out for `category`, is included."""
         return category in self._categories or self._names.has(name)
 
 
 @cache
 def cautions_for(autopilot: str) -> Cautions:
-    """The list for "px4" or "ardupilot"; for any other autopilot, both.
+    """Return the entries for "px4" or "ardupilot"; for any other autopilot, the entries of both.
 
-    Of a parameter that several entries name, the first counts.
+    If several entries match a parameter, the first one applies.
     """
     found: dict[str, list[Caution]] = {}
     known = autopilot in ("px4", "ardupilot")

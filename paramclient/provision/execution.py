@@ -1,4 +1,4 @@
-"""One set-up: store what the vehicle has, write what is wanted in an order that works, prove it."""
+"""One run of `apply`: store the vehicle's state, write the stages of the plan, reboot, verify."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ from paramclient.model.values import Value
 from paramclient.protocol.params.change_origin import check_asker
 from paramclient.provision.cautions import READ_ONLY, cautions_for
 from paramclient.provision.inspection import (
-    LOOKING_PACE,
-    Seen,
-    identified,
-    look,
-    look_again,
-    look_for,
+    POLL_INTERVAL,
+    Inspection,
+    inspect,
     plan_for,
+    read_hidden,
+    reread,
+    wait_for_identity,
 )
 from paramclient.provision.planning import (
     MISSING,
@@ -52,43 +52,47 @@ from paramclient.provision.planning import (
 )
 from paramclient.provision.results import ApplyProgress, ApplyResult, ApplyRow, ApplyStatus
 
-__all__ = ["Run"]
+__all__ = ["ApplyRun"]
 
-WRITES_AT_ONCE: Final = 10
-"""Writes that are under way side by side: what ArduPilot's queue takes of reads without dropping any."""
-MOST_WRITES: Final = 2
-"""Times that a value is written which the vehicle has taken, and does not have any more when it is looked at:
-another one that was set may have changed it."""
-MOST_SILENT: Final = 3
-"""Writes without an answer, and none with one between them, after which no further is begun."""
-RESET_SYSTEM: Final = 1
-"""The system id that a PX4 has after SYS_AUTOCONFIG: MAV_SYS_ID is not among what its start script keeps."""
-LASTING_TIME: Final = 1.2
-"""Seconds after the last write before the vehicle is looked at for proof: modules of PX4 clamp values up to
-815 ms after the acknowledgement, and set others up to 1 s after it (measured)."""
-HEARTBEAT_PATIENCE: Final = 3.0
-"""Seconds for a heartbeat to say whether the vehicle is armed; there is one a second, and some are lost."""
-FOLLOW_PATIENCE: Final = 10.0
-"""Seconds for a vehicle to be heard under its new system id; ArduPilot sends its next heartbeat under it."""
+CONCURRENT_WRITES_MAX: Final = 10
+"""Writes in flight at a time: the number of reads that ArduPilot's queue holds without dropping any."""
+WRITE_ATTEMPTS_MAX: Final = 2
+"""Times that a value is written if the vehicle acknowledges it and later holds another value: a write of
+another parameter may have changed it."""
+UNANSWERED_WRITES_MAX: Final = 3
+"""Consecutive writes without an acknowledgement after which the run ends."""
+DEFAULT_SYSTEM_ID: Final = 1
+"""The system id of a PX4 after SYS_AUTOCONFIG: its start script does not keep MAV_SYS_ID."""
+VERIFY_DELAY: Final = 1.2
+"""Seconds between the last write and the read that verifies it: modules of PX4 clamp values up to 815 ms
+after the acknowledgement, and set other parameters up to 1 s after it (measured)."""
+HEARTBEAT_TIMEOUT: Final = 3.0
+"""Seconds to wait for a heartbeat with the armed flag: heartbeats come once a second, and some are lost."""
+SYSTEM_CHANGE_TIMEOUT: Final = 10.0
+"""Seconds to wait for the vehicle under its new system id; ArduPilot sends its next heartbeat under it."""
+SYSTEM_CHANGE_DELAY: Final = 2.5
+"""Seconds after the acknowledgement of SYSID_THISMAV: a vehicle whose heartbeats still have the old id then
+changes it after a reboot, as ArduCopter does. ArduPlane and Rover change it within a second (measured with
+4.6-dev)."""
 
-ID_CHANGE_TIME: Final = 2.5
-"""Seconds after the acknowledgement of SYSID_THISMAV: a vehicle whose heartbeats have the old id then takes
-the new one with the next start, as ArduCopter does. ArduPlane and Rover take it within a second (measured
-with 4.6-dev)."""
 
+class ApplyRun:
+    """One run of `apply` or `restore`; the arguments are those of `apply`.
 
-class Run:
-    """One `apply`.
+    Args:
+        reason: the reason of the snapshot of the state before the first write.
+        skips_read_only: skip a parameter that the vehicle refuses as read-only, rather than report it as
+            refused.
 
     Attributes:
-        seen: the vehicle as it was looked at last.
-        plan: what is to be done then.
-        rows: what became of those on which the last word is spoken before the proof.
-        sent: to which a PARAM_SET may have gone out.
-        written: what has taken the value, and how often.
+        inspection: the latest inspection of the vehicle.
+        plan: the plan that follows from it.
+        rows: rows of parameters whose outcome is known before the vehicle is read again.
+        sent: parameters for which a PARAM_SET may have been sent.
+        written: number of acknowledged writes by parameter.
     """
 
-    seen: Seen
+    inspection: Inspection
     plan: Plan
     _first_identity: Identity
 
@@ -109,12 +113,12 @@ class Run:
         progress: Callable[[ApplyProgress], None] | None,
         before_writing: Callable[[], Awaitable[object]] | None,
         reason: str,
-        leaves_read_only: bool = False,
+        skips_read_only: bool = False,
     ) -> None:
         self._component = component
-        self._planned_for: Identity | None = None
+        self._plan_identity: Identity | None = None
         if isinstance(wanted, Plan):
-            self._planned_for = wanted.identity
+            self._plan_identity = wanted.identity
             include = (*wanted.include, *include)
             force = force or wanted.force
             wanted = wanted.wanted
@@ -131,39 +135,39 @@ class Run:
         self._progress = progress
         self._before_writing = before_writing
         self._reason = reason
-        self._leaves_read_only = leaves_read_only
+        self._skips_read_only = skips_read_only
         self._cautions = cautions_for("")
         self._began = anyio.current_time()
         self.rows: dict[str, ApplyRow] = {}
         self.sent: set[str] = set()
         self.written: dict[str, int] = {}
-        self._first: Seen | None = None
+        self._first: Inspection | None = None
         self._first_plan: Plan | None = None
-        self._is_proven = True  # nothing was written since it was looked at
+        self._is_verified = True  # nothing was written since the last inspection
         self._written_at = -math.inf  # when the last write ended
-        self._looked_at = -math.inf  # when the vehicle began to be looked at
-        self._notes: dict[str, str] = {}  # of what was written, what else is to be known
+        self._inspected_at = -math.inf  # when the last inspection began
+        self._notes: dict[str, str] = {}  # notes of the acknowledged writes
         self._reboot_for: dict[str, None] = {}
         self._reboots = 0
-        self._kept_over: set[str] = set()  # what was written before the last start, and should be there
-        self._new_system: int | None = None  # its id from the next start on
-        self._silent = 0
+        self._written_before_reboot: set[str] = set()  # values that the last reboot should have kept
+        self._next_system_id: int | None = None  # the vehicle's system id after the next reboot
+        self._unanswered = 0  # consecutive writes without an acknowledgement
         self._error: ParamClientError | None = None
 
     async def prepare(self) -> None:
-        """Look at the vehicle, plan, and store what it has. Nothing is written if that fails."""
+        """Inspect the vehicle, plan, and store its state. A failure is raised before the first write."""
         if self._durable and self._component._client.cache is None:
             raise UsageError("durable needs a cache, and the client keeps none")
         check_component(self._wanted, self._component.component)
         plan({}, self._wanted, include=self._include, autopilot=self._component.autopilot)
-        await identified(self._component)
+        await wait_for_identity(self._component)
         self._cautions = cautions_for(self._component.autopilot)
-        whose, own = self._planned_for, self._component.identity
-        if whose is not None and not whose.is_same_vehicle(own):
-            raise UsageError(f"the plan is one for another vehicle: {whose}; this one is {own}")
+        planned, own = self._plan_identity, self._component.identity
+        if planned is not None and not planned.is_same_vehicle(own):
+            raise UsageError(f"the plan is for another vehicle: {planned}; this vehicle is {own}")
         await self._check_armed()
-        await self._look()
-        self._first, self._first_plan = self.seen, self.plan
+        await self._inspect()
+        self._first, self._first_plan = self.inspection, self.plan
         self._first_identity = self._component.identity
         invalid = {row.name: row.reason for row in self.plan.of(PlanStatus.INVALID)}
         if invalid and not self._skip_invalid:
@@ -171,27 +175,27 @@ class Run:
         self._check_resets()
         if self._before_writing is not None:
             await self._before_writing()
-        await self._store()
+        await self._store_state()
 
-    async def work(self) -> None:
-        """Write and prove until there is nothing left to do. Failures end it; see `result`."""
+    async def write_and_verify(self) -> None:
+        """Write and verify until no stage is pending. `result` reports a failure after the first write."""
         sync = self._component._machine.sync
-        sync.holds += 1  # a moved count leads to no download beside those of the run
+        sync.holds += 1  # a changed count starts no download besides those of the run
         try:
             while True:
-                stages = self._to_do()
+                stages = self._pending_stages()
                 for stage in stages:
                     await self._check_armed()
                     await self._write_stage(stage)
-                if self._has_to_start(stages):
-                    await self._restart()
-                    await self._look()
-                    self._settle_lost()
-                elif self._may_reveal(stages):
-                    await self._look_for_more(stages[-1])
-                elif stages or self._looked_at < self._written_at + LASTING_TIME:
-                    await anyio.sleep_until(self._written_at + LASTING_TIME)
-                    await self._prove()
+                if self._must_reboot(stages):
+                    await self._reboot_vehicle()
+                    await self._inspect()
+                    self._record_lost_values()
+                elif self._reveals_more(stages):
+                    await self._read_revealed(stages[-1])
+                elif stages or self._inspected_at < self._written_at + VERIFY_DELAY:
+                    await anyio.sleep_until(self._written_at + VERIFY_DELAY)
+                    await self._verify()
                 else:
                     break
             if self._durable and self.sent:
@@ -204,13 +208,13 @@ class Run:
             sync.holds -= 1
 
     def result(self) -> ApplyResult:
-        """What came of it."""
+        """Return the result of the run."""
         assert self._first is not None
         assert self._first_plan is not None
         return ApplyResult(
             self._component.system,
             self._component.component,
-            {name: self._row(row) for name, row in self.plan.rows.items()},
+            {name: self._final_row(row) for name, row in self.plan.rows.items()},
             self._first_plan,
             self._first.table,
             self.plan.extra,
@@ -220,8 +224,12 @@ class Run:
             anyio.current_time() - self._began,
         )
 
-    def ended_by_time(self) -> ApplyResult:
-        """What came of it so far."""
+    def timed_out_result(self) -> ApplyResult:
+        """Return the result of a run that has reached its timeout.
+
+        Raises:
+            NoReply: nothing was sent.
+        """
         waited = anyio.current_time() - self._began
         error = NoReply(f"the set-up of {self._address}", attempts=0, waited=waited)
         if not self.sent:
@@ -229,111 +237,111 @@ class Run:
         self._error = error
         return self.result()
 
-    # What is to be done
+    # Next stages
 
-    def _to_do(self) -> list[Stage]:
-        """The stages up to and with the one after which the vehicle has to be looked at."""
+    def _pending_stages(self) -> list[Stage]:
+        """Return the next stages, up to and including the one after which the vehicle must be inspected."""
         stages = []
         may_appear = bool(self.plan.of(PlanStatus.LATER))
         for stage in self.plan.stages:
-            steps = tuple(step for step in stage.steps if self._is_open(step.name))
+            steps = tuple(step for step in stage.steps if self._may_write(step.name))
             if steps:
                 stages.append(replace(stage, steps=steps))
                 if (stage.reveals and may_appear) or (stage.reboot_first and self._reboot):
                     break
         return stages
 
-    def _may_reveal(self, done: list[Stage]) -> bool:
-        """Whether more is to be written as soon as the vehicle has been looked at, now that this is done."""
+    def _reveals_more(self, done: list[Stage]) -> bool:
+        """Return whether the stages that are done may have revealed wanted parameters."""
         return bool(done) and done[-1].reveals and bool(self.plan.of(PlanStatus.LATER))
 
-    def _has_to_start(self, done: list[Stage]) -> bool:
-        """Whether the vehicle has to start again, now that these stages are done."""
+    def _must_reboot(self, done: list[Stage]) -> bool:
+        """Return whether the vehicle must reboot after the stages that are done."""
         if not self._reboot:
             return False
         if done:
             return done[-1].reboot_first and bool(self._reboot_for)
-        has_not_started = bool(self.plan.unstarted) or self._system_to_come() is not None
-        return bool(self._reboot_for) or (has_not_started and not self._reboots)
+        is_reboot_due = bool(self.plan.unstarted) or self._pending_system_id() is not None
+        return bool(self._reboot_for) or (is_reboot_due and not self._reboots)
 
-    def _system_to_come(self) -> int | None:
-        """The system id that the vehicle has been given, and will only have from its next start on."""
+    def _pending_system_id(self) -> int | None:
+        """Return the system id that is set and takes effect after a reboot, or None."""
         for name, row in self.plan.rows.items():
             is_set = row.status is PlanStatus.UNCHANGED and self._cautions.is_system_id(name)
             if is_set and isinstance(row.before, int) and row.before != self._component.system:
                 return row.before
         return None
 
-    def _is_open(self, name: str) -> bool:
-        """Whether it is to be written, now that the vehicle does not have the value."""
+    def _may_write(self, name: str) -> bool:
+        """Return whether a parameter whose value differs is written, or written again."""
         if name in self.rows:
             return False
-        most = 1 if self._is_action(name) else MOST_WRITES
-        return self.written.get(name, 0) < most
+        attempts_max = 1 if self._is_action(name) else WRITE_ATTEMPTS_MAX
+        return self.written.get(name, 0) < attempts_max
 
     def _is_action(self, name: str) -> bool:
         caution = self._cautions.left_out(name)
         return caution is not None and caution.category == "action"
 
-    # What is asked of the vehicle
+    # Reads, writes and reboots of the vehicle
 
-    async def _look(self) -> None:
-        self._tell("reading")
-        absent = self.seen.absent if self._first is not None else frozenset[str]()
-        self._looked_at = anyio.current_time()
-        self.seen = await look(self._component, self._wanted, absent, whole=self._first is None)
-        self._check_it_is_the_same()
-        self._plan_again()
-        self._is_proven = True
+    async def _inspect(self) -> None:
+        self._report("reading")
+        absent = self.inspection.absent if self._first is not None else frozenset[str]()
+        self._inspected_at = anyio.current_time()
+        self.inspection = await inspect(self._component, self._wanted, absent, whole=self._first is None)
+        self._check_same_vehicle()
+        self._replan()
+        self._is_verified = True
 
-    async def _prove(self) -> None:
-        """Look at what is wanted, by name where that takes less time than the whole table.
+    async def _verify(self) -> None:
+        """Read the wanted parameters: by name if that is faster than the whole table, else the table.
 
-        Not where a switch may have shown more than is known by name.
+        Always reads the table if a switch may have revealed parameters whose names are not known.
         """
         rows = [*self.plan.of(PlanStatus.SET), *self.plan.of(PlanStatus.UNCHANGED)]
         names = [row.name for row in rows]
-        if self.plan.of(PlanStatus.LATER) or not self.seen.reads_are_quicker(len(names)):
-            await self._look()
+        if self.plan.of(PlanStatus.LATER) or not self.inspection.is_reading_faster(len(names)):
+            await self._inspect()
             return
-        self._tell("reading")
-        self._looked_at = anyio.current_time()
-        self.seen = await look_again(self._component, self.seen, names)
-        self._check_it_is_the_same()
-        self._plan_again()
-        self._is_proven = True
+        self._report("reading")
+        self._inspected_at = anyio.current_time()
+        self.inspection = await reread(self._component, self.inspection, names)
+        self._check_same_vehicle()
+        self._replan()
+        self._is_verified = True
 
-    async def _look_for_more(self, done: Stage) -> None:
-        """See by name what may have appeared after a stage. Nothing that was written is proven by that."""
-        self._tell("reading")
+    async def _read_revealed(self, done: Stage) -> None:
+        """Read by name the parameters that a stage may have revealed. This verifies no write."""
+        self._report("reading")
         names = [row.name for row in self.plan.of(PlanStatus.LATER)]
-        if self._component.autopilot == "ardupilot":  # a switch shows its own group, and all begin alike
+        if self._component.autopilot == "ardupilot":  # a switch reveals the names with its own prefix
             groups = tuple(step.name.rpartition("_")[0] for step in done.steps)
             names = [name for name in names if name.startswith(groups)]
-        self.seen = await look_for(self._component, self.seen, names)
-        self._check_it_is_the_same()
-        self._plan_again()
+        self.inspection = await read_hidden(self._component, self.inspection, names)
+        self._check_same_vehicle()
+        self._replan()
 
-    def _plan_again(self) -> None:
-        """Work out what is to be done, now that the vehicle has been looked at."""
+    def _replan(self) -> None:
+        """Plan again from the latest inspection."""
         self.plan = plan_for(
-            self._component, self.seen.table, self._wanted, self._include, self._info, force=self._force
+            self._component, self.inspection.table, self._wanted, self._include, self._info, force=self._force
         )
 
     async def _write_stage(self, stage: Stage) -> None:
-        """Write its values, side by side but for what may end the conversation."""
+        """Write the values of a stage: concurrently, or one by one if they may end the connection."""
         steps = iter(stage.steps)
         if stage.is_last:
-            await self._write_each(steps)
+            await self._write_steps(steps)
         else:
             async with anyio.create_task_group() as writing:
-                for _ in range(WRITES_AT_ONCE):
-                    writing.start_soon(self._write_each, steps)
+                for _ in range(CONCURRENT_WRITES_MAX):
+                    writing.start_soon(self._write_steps, steps)
         if self._error is not None:
             raise self._error
 
-    async def _write_each(self, steps: Iterator[Step]) -> None:
-        """Write what nobody else has taken, until it is the end."""
+    async def _write_steps(self, steps: Iterator[Step]) -> None:
+        """Write the steps that the iterator still has, until a write fails."""
         for step in steps:
             if self._error is not None:
                 return
@@ -346,202 +354,220 @@ class Run:
                 self._error = error
 
     async def _write(self, step: Step) -> None:
-        self._is_proven = False
+        self._is_verified = False
         self.sent.add(step.name)
         try:
             done = await self._component.set(step.name, step.value, force=self._force, asker=self._asker)
         except (VehicleError, UsageError) as error:
-            self._silent = 0
+            self._unanswered = 0
             is_read_only = isinstance(error, Refused) and error.code == ParamErrorCode.READ_ONLY
-            if is_read_only and self._leaves_read_only:
-                reason = "left out: the vehicle says that it can only be read"
-                self._settle(step, ApplyStatus.SKIPPED, step.before, reason, READ_ONLY)
+            if is_read_only and self._skips_read_only:
+                reason = "left out: the vehicle reports that it is read-only"
+                self._record(step, ApplyStatus.SKIPPED, step.before, reason, READ_ONLY)
             else:
-                self._settle(step, ApplyStatus.REFUSED, step.before, str(error))
+                self._record(step, ApplyStatus.REFUSED, step.before, str(error))
             return
         except NoReply as error:
-            self._silent += 1
-            self._settle(step, ApplyStatus.FAILED, None, str(error))
-            if self._silent >= MOST_SILENT:
+            self._unanswered += 1
+            self._record(step, ApplyStatus.FAILED, None, str(error))
+            if self._unanswered >= UNANSWERED_WRITES_MAX:
                 raise
             return
         except LinkError as error:
-            self._settle(step, ApplyStatus.FAILED, None, str(error))
+            self._record(step, ApplyStatus.FAILED, None, str(error))
             raise
         finally:
             self._written_at = anyio.current_time()
-        self._silent = 0
-        self._note_written(step)
+        self._unanswered = 0
+        self._count_write(step)
         self._notes[step.name] = done.note
         if self._is_action(step.name) and self._cautions.resets(step.name):
-            self._new_system = RESET_SYSTEM
+            self._next_system_id = DEFAULT_SYSTEM_ID
         if done.adjusted:
-            self._settle(step, ApplyStatus.ADJUSTED, done.actual, "the vehicle made another value of it")
+            self._record(step, ApplyStatus.ADJUSTED, done.actual, "the vehicle changed the value")
         else:
-            self._tell("writing", self._row_of(step, ApplyStatus.SET, done.actual, done.note))
+            self._report("writing", self._make_row(step, ApplyStatus.SET, done.actual, done.note))
 
     async def _write_system_id(self, step: Step) -> None:
-        """Set the system id, and go on with the vehicle under its new one."""
+        """Set the system id, and continue with the vehicle under its new one."""
         system = int(step.value) if not isinstance(step.value, bytes) else 0
         client = self._component._client
-        if any(self._is_another_with(system, known) for known in client.components.values()):
-            reason = f"another one on this link is system {system}"
-            self._settle(step, ApplyStatus.SKIPPED, step.before, reason, WRONG)
+        if any(self._is_other_vehicle_with(system, known) for known in client.components.values()):
+            reason = f"another vehicle on this link has system id {system}"
+            self._record(step, ApplyStatus.SKIPPED, step.before, reason, WRONG)
             return
         if self._cautions.needs_reboot(step.name):
             await self._write(step)
             if step.name in self.written:
-                self._new_system = system
+                self._next_system_id = system
             return
-        self._is_proven = False
+        self._is_verified = False
         self.sent.add(step.name)
         failure: ParamClientError | None = None
-        keeps_id = False
+        is_id_kept = False
 
-        async def stop_if_it_keeps_its_id() -> None:
-            nonlocal keeps_id
-            await self._set_and_see_it_keep_its_id(step)
-            keeps_id = True
+        async def cancel_if_id_is_kept() -> None:
+            nonlocal is_id_kept
+            await self._set_and_detect_kept_id(step)
+            is_id_kept = True
             sending.cancel_scope.cancel()
 
         async with anyio.create_task_group() as sending:
-            sending.start_soon(stop_if_it_keeps_its_id)
+            sending.start_soon(cancel_if_id_is_kept)
             try:
-                self._component = await client.successor(self._component, system, timeout=FOLLOW_PATIENCE)
-            except ParamClientError as error:  # raised in here, it would come out in a group
+                self._component = await client.successor(
+                    self._component, system, timeout=SYSTEM_CHANGE_TIMEOUT
+                )
+            except ParamClientError as error:  # raised here, the task group would wrap it in a group
                 failure = error
             sending.cancel_scope.cancel()
         self._written_at = anyio.current_time()
-        step = replace(step, needs_reboot=keeps_id)
-        if keeps_id:
-            self._new_system = system
+        step = replace(step, needs_reboot=is_id_kept)
+        if is_id_kept:
+            self._next_system_id = system
         if failure is None:
-            self._note_written(step)
-            self._tell("writing", self._row_of(step, ApplyStatus.SET, step.value))
+            self._count_write(step)
+            self._report("writing", self._make_row(step, ApplyStatus.SET, step.value))
             return
-        self._settle(step, ApplyStatus.FAILED, None, str(failure))
+        self._record(step, ApplyStatus.FAILED, None, str(failure))
         if isinstance(failure, LinkError):
             raise failure
 
-    def _is_another_with(self, system: int, known: Component) -> bool:
-        """Whether another vehicle has this system id: not ours under an earlier one, nor one that is gone."""
+    def _is_other_vehicle_with(self, system: int, known: Component) -> bool:
+        """Return whether `known` is another vehicle with this system id.
+
+        The same vehicle under an earlier id, and a lost vehicle, do not count.
+        """
         uid = self._component.identity.uid
         is_ours = uid is not None and uid not in SHARED_UIDS and known.identity.uid == uid
         return known.system == system and known.state != "lost" and not is_ours
 
-    async def _set_and_see_it_keep_its_id(self, step: Step) -> None:
-        """Set the system id, and return when the vehicle has acknowledged that and still has the old one.
+    async def _set_and_detect_kept_id(self, step: Step) -> None:
+        """Set the system id, and return once the vehicle has acknowledged it and still has the old one.
 
-        ArduPlane and Rover may take the new one before they have answered. This then never returns.
+        ArduPlane and Rover may change the id before they acknowledge; then this call does not return until
+        it is cancelled.
         """
         component = self._component
         with suppress(ParamClientError):
             await component.set(step.name, step.value, asker=self._asker)
             acknowledged_at = anyio.current_time()
-            while component._machine.presence.beat_at < acknowledged_at + ID_CHANGE_TIME:  # noqa: ASYNC110 - nobody tells
-                await anyio.sleep(LOOKING_PACE)
+            while component._machine.presence.beat_at < acknowledged_at + SYSTEM_CHANGE_DELAY:  # noqa: ASYNC110 - no event
+                await anyio.sleep(POLL_INTERVAL)
             return
         await anyio.sleep_forever()
 
-    async def _restart(self) -> None:
-        """Start the vehicle again, and go on with it; under its new system id if it has been given one."""
+    async def _reboot_vehicle(self) -> None:
+        """Reboot the vehicle and continue with it, under its new system id if one is pending."""
         await self._check_armed()
-        self._tell("rebooting")
-        system = self._system_to_come() if self._new_system is None else self._new_system
+        self._report("rebooting")
+        system = self._pending_system_id() if self._next_system_id is None else self._next_system_id
         self._component = await self._component.reboot(system=system)
-        self._new_system = None
+        self._next_system_id = None
         self._reboots += 1
-        # what such a start takes back is set again
-        takes_back = any(self._cautions.resets(name) for name in self._reboot_for)
-        self._kept_over = set() if takes_back else set(self.written)
-        self._notes.clear()  # what they say has happened, or has not
+        # values that a resetting parameter has reverted are written again
+        is_reset = any(self._cautions.resets(name) for name in self._reboot_for)
+        self._written_before_reboot = set() if is_reset else set(self.written)
+        self._notes.clear()  # they warn of effects of this reboot
         self._reboot_for.clear()
 
-    def _settle_lost(self) -> None:
-        """Tell of what the vehicle had taken, and has another value of since it has started again.
+    def _record_lost_values(self) -> None:
+        """Record as adjusted the values that the vehicle had acknowledged and lost with the reboot.
 
-        It is not set again: the next start would do the same to it.
+        They are not written again: the next reboot would change them again.
         """
         for step in self.plan.steps:
-            if step.name in self._kept_over and step.name not in self.rows:
-                reason = "the vehicle acknowledged it, and has another value since it has started again"
-                self._settle(step, ApplyStatus.ADJUSTED, step.before, reason)
+            if step.name in self._written_before_reboot and step.name not in self.rows:
+                reason = "the vehicle acknowledged the value, and has another one after the reboot"
+                self._record(step, ApplyStatus.ADJUSTED, step.before, reason)
 
-    def _check_it_is_the_same(self) -> None:
+    def _check_same_vehicle(self) -> None:
+        """Raise `AnotherVehicle` if the identity is not that of the first inspection."""
         found = self._component.identity
         if self._first is not None and not self._first_identity.is_same_vehicle(found):
             system, component = self._component.system, self._component.component
             raise AnotherVehicle(system, component, str(self._first_identity), str(found))
 
-    # Before anything is sent
+    # Checks and storage before a write
 
     async def _check_armed(self) -> None:
-        """See that no part of the vehicle says that it is armed, and that the one that is set says so."""
+        """Check that every component of the vehicle is disarmed, and that the component to set reports so.
+
+        Raises:
+            VehicleArmed: a component is armed, or the armed state is unknown.
+        """
         if self._allow_armed:
             return
         component = self._component
-        with anyio.move_on_after(HEARTBEAT_PATIENCE):
-            while component.is_armed is None and component.state != "lost":  # noqa: ASYNC110 - nobody tells
-                await anyio.sleep(LOOKING_PACE)
-        parts = [each for each in component._client.components.values() if each.system == component.system]
-        if any(each.is_armed for each in parts):
-            words = f"{self._address} is armed; nothing is set then"
+        with anyio.move_on_after(HEARTBEAT_TIMEOUT):
+            while component.is_armed is None and component.state != "lost":  # noqa: ASYNC110 - no event
+                await anyio.sleep(POLL_INTERVAL)
+        own = [each for each in component._client.components.values() if each.system == component.system]
+        if any(each.is_armed for each in own):
+            message = f"{self._address} is armed; nothing is set then"
         elif component.is_armed is None and component.state != "lost":
-            words = f"{self._address} does not say whether it is armed; nothing is set then"
+            message = (
+                f"{self._address} does not report whether it is armed (no heartbeat within "
+                f"{HEARTBEAT_TIMEOUT:g} s); nothing is set then"
+            )
         else:
             return
-        raise VehicleArmed(words, system=component.system, component=component.component)
+        raise VehicleArmed(message, system=component.system, component=component.component)
 
     def _check_resets(self) -> None:
-        """What takes others back at the next start may only be set where that start follows at once."""
+        """Check that parameters that reset others at the next start are set only with `reboot`.
+
+        Raises:
+            UsageError: one of them is to be set without `reboot`.
+        """
         for step in self.plan.steps:
             if self._is_action(step.name) and self._cautions.resets(step.name) and not self._reboot:
                 raise UsageError(
-                    f"{step.name} gives others their defaults back at the next start of the vehicle; "
-                    "it can only be set with reboot=True"
+                    f"{step.name} resets other parameters to their defaults at the next start of the "
+                    "vehicle; it can only be set with reboot=True"
                 )
 
-    async def _store(self) -> None:
-        """Keep what the vehicle has: in the file, and in the cache if anything is to be written."""
-        client, component, seen = self._component._client, self._component, self.seen
+    async def _store_state(self) -> None:
+        """Store the vehicle's state: in the backup file, and in the cache if the plan has steps."""
+        client, component, inspection = self._component._client, self._component, self.inspection
         if (path := self._backup) is not None:
             from paramclient.files import write_file
 
-            await client._writer.aside(lambda: write_file(path, seen.table))
+            await client._writer.aside(lambda: write_file(path, inspection.table))
         cache = client.cache
         if cache is not None and self.plan.steps:
-            await client._writer.write_all()  # so that history knows what is changed from
+            await client._writer.write_all()  # the history then has the values from before the change
             await client._writer.aside(
                 lambda: cache.store_snapshot(
                     component.identity,
                     component.component,
-                    seen.table,
+                    inspection.table,
                     reason=self._reason,
-                    hash=seen.hash,
-                    complete=seen.complete,
+                    hash=inspection.hash,
+                    complete=inspection.complete,
                 )
             )
 
-    # What is told
+    # Progress and rows
 
     @property
     def _address(self) -> str:
         return f"{self._component.system}/{self._component.component}"
 
-    def _note_written(self, step: Step) -> None:
+    def _count_write(self, step: Step) -> None:
         self.written[step.name] = self.written.get(step.name, 0) + 1
         if step.needs_reboot:
             self._reboot_for[step.name] = None
 
-    def _settle(
+    def _record(
         self, step: Step, status: ApplyStatus, actual: Value | None, reason: str, category: str = ""
     ) -> None:
-        """The last word on a parameter, but for the proof."""
-        row = self._row_of(step, status, actual, reason, category)
+        """Record an outcome that only the verification may still change, and report it."""
+        row = self._make_row(step, status, actual, reason, category)
         self.rows[step.name] = row
-        self._tell("writing", row)
+        self._report("writing", row)
 
-    def _row_of(
+    def _make_row(
         self, step: Step, status: ApplyStatus, actual: Value | None, reason: str = "", category: str = ""
     ) -> ApplyRow:
         wanted = self._wanted[step.name]
@@ -551,14 +577,14 @@ class Run:
         held = None if self._first is None else self._first.table.get(name)
         return None if held is None else held.value
 
-    def _tell(self, phase: str, row: ApplyRow | None = None) -> None:
+    def _report(self, phase: str, row: ApplyRow | None = None) -> None:
         if self._progress is not None:
             done = self.rows.keys() | self.written.keys()
             left = 0 if self._first is None else sum(step.name not in done for step in self.plan.steps)
             self._progress(ApplyProgress(phase, len(done), len(done) + left, row))
 
-    def _row(self, planned: PlanRow) -> ApplyRow:
-        """What became of a parameter in the end."""
+    def _final_row(self, planned: PlanRow) -> ApplyRow:
+        """Return the row of a parameter at the end of the run."""
         name, actual = planned.name, planned.before
 
         def row(status: ApplyStatus, reason: str = "", category: str = "") -> ApplyRow:
@@ -577,10 +603,10 @@ class Run:
             is_set = name in self.sent
             return row(ApplyStatus.SET, self._notes.get(name, "")) if is_set else row(ApplyStatus.UNCHANGED)
         if (settled := self.rows.get(name)) is not None:
-            return replace(settled, actual=actual) if self._is_proven else settled
+            return replace(settled, actual=actual) if self._is_verified else settled
         answered = "acknowledged" if name in self.written else "sent, not acknowledged"
         if name in self.sent and actual is None:
-            reason = f"{answered}, and the vehicle does not tell it any more"
+            reason = f"{answered}, and the vehicle no longer reports it"
             return replace(row(ApplyStatus.UNPROVEN, reason), nearest=())
         if planned.status in (PlanStatus.SKIPPED, PlanStatus.INVALID):
             return row(ApplyStatus.SKIPPED, planned.reason, planned.category)
@@ -588,7 +614,7 @@ class Run:
             return row(ApplyStatus.SKIPPED, "not on this vehicle", MISSING)
         if name not in self.sent:
             return row(ApplyStatus.FAILED, "not reached")
-        if not self._is_proven:
+        if not self._is_verified:
             return row(ApplyStatus.UNPROVEN, f"{answered}, and not read back")
         if self._is_action(name):
             return row(ApplyStatus.SET, "done by the vehicle")

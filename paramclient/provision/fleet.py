@@ -1,4 +1,4 @@
-"""Set up and verify several vehicles, side by side."""
+"""`apply_all` and `verify_all`: set up and verify several vehicles concurrently."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from paramclient.provision.set_up import apply
 __all__ = ["apply_all", "verify_all"]
 
 Wanted: TypeAlias = ParamSet | Mapping[tuple[int, int], ParamSet] | Callable[[Component], ParamSet]
-"""What several vehicles shall have: all the same, or each its own, by address or by a call."""
+"""The wanted parameters of several vehicles: one set for all, or a set for each by address or by a call."""
 
 Result = TypeVar("Result")
 
@@ -42,26 +42,26 @@ async def apply_all(
     progress: Callable[[Component, ApplyProgress], None] | None = None,
     before_writing: Callable[[Component], Awaitable[object]] | None = None,
 ) -> FleetApplied:
-    """`apply` to several vehicles side by side. What becomes of one does not stop the others.
+    """`apply` to several vehicles concurrently. A failure of one vehicle does not stop the others.
 
     Args:
         components: the vehicles.
-        wanted: what they shall have: all the same; or each its own, by (system, component) or by a call.
-            `overlay` puts what is one vehicle's own over what all share.
+        wanted: one set for all vehicles, or a set for each by (system, component) or by a call. `overlay`
+            combines a shared set with one of a single vehicle.
         include, reboot, allow_armed, skip_invalid, force, durable, timeout, asker: as in `apply`.
-        info: gives the metadata for a vehicle.
-        backup: gives the name of the file for the state before of a vehicle.
-        progress, before_writing: as in `apply`, with the vehicle.
+        info: returns the metadata for a vehicle.
+        backup: returns the name of a vehicle's backup file.
+        progress, before_writing: as in `apply`, with the vehicle as first argument.
 
     Raises:
-        UsageError: there is nothing in `wanted` for one of them; then nothing was sent to any.
+        UsageError: `wanted` has no set for one of the vehicles; nothing was sent to any vehicle.
     """
     given = (include,) if isinstance(include, str) else tuple(include)
 
     async def one(component: Component, own: ParamSet) -> ApplyResult:
-        def tell(how_far: ApplyProgress) -> None:
+        def report(state: ApplyProgress) -> None:
             if progress is not None:
-                progress(component, how_far)
+                progress(component, state)
 
         return await apply(
             component,
@@ -76,11 +76,11 @@ async def apply_all(
             backup=None if backup is None else backup(component),
             timeout=timeout,
             asker=asker,
-            progress=tell,
+            progress=report,
             before_writing=None if before_writing is None else partial(before_writing, component),
         )
 
-    return FleetApplied(*await _side_by_side(components, wanted, one))
+    return FleetApplied(*await _run_concurrently(components, wanted, one))
 
 
 async def verify_all(
@@ -91,9 +91,9 @@ async def verify_all(
     info: Callable[[Component], Mapping[str, ParamInfo] | None] | None = None,
     force: bool = False,
 ) -> FleetVerified:
-    """`verify` several vehicles side by side.
+    """`verify` several vehicles concurrently.
 
-    Args and errors as in `apply_all`.
+    Arguments and errors as in `apply_all`.
     """
     given = (include,) if isinstance(include, str) else tuple(include)
 
@@ -101,15 +101,15 @@ async def verify_all(
         described = None if info is None else info(component)
         return await verify(component, own, include=given, info=described, force=force)
 
-    return FleetVerified(*await _side_by_side(components, wanted, one))
+    return FleetVerified(*await _run_concurrently(components, wanted, one))
 
 
-async def _side_by_side(
+async def _run_concurrently(
     components: Iterable[Component],
     wanted: Wanted,
     one: Callable[[Component, ParamSet], Awaitable[Result]],
 ) -> tuple[dict[tuple[int, int], Result], dict[tuple[int, int], ParamClientError]]:
-    """Do it for each; results and errors by address, in the order of the components."""
+    """Call `one` for each component; return results and errors by address, in the order of the components."""
     jobs = {
         (component.system, component.component): (component, _wanted_for(component, wanted))
         for component in components
@@ -141,5 +141,5 @@ def _wanted_for(component: Component, wanted: Wanted) -> ParamSet:
         return wanted[component.system, component.component]
     except KeyError:
         raise UsageError(
-            f"there is nothing that component {component.system}/{component.component} shall have"
+            f"no wanted parameters are given for vehicle {component.system}/{component.component}"
         ) from None

@@ -1,4 +1,4 @@
-"""See what a vehicle has of what is wanted, and what would have to be done; nothing is written."""
+"""`prepare` and `verify`: read what a vehicle has of the wanted parameters, and plan the changes."""
 
 from __future__ import annotations
 
@@ -23,41 +23,42 @@ from paramclient.provision.planning import ParamInfo, Plan, check_component, pla
 from paramclient.provision.runner import Runner, run_here
 
 __all__ = [
-    "LOOKING_PACE",
-    "Seen",
-    "identified",
-    "look",
-    "look_again",
-    "look_for",
+    "POLL_INTERVAL",
+    "Inspection",
+    "wait_for_identity",
+    "inspect",
+    "reread",
+    "read_hidden",
     "plan_for",
     "prepare",
     "verify",
 ]
 
-IDENTITY_PATIENCE: Final = 10.0
-"""Seconds for a vehicle to say who it is. It is asked a few times, and mostly given up sooner."""
-MOST_BESIDE: Final = 36
-"""Names that are requested beside the table, at the most: two windows, 0.4 s of what ArduPilot answers."""
-LOOKING_PACE: Final = 0.05
-"""Seconds between two looks whether a vehicle has said something of itself."""
-FIRST_READS: Final = 0.5
-"""Seconds to allow for reads by name beside those that they take one after the other."""
-READ_PACE: Final = 0.025
-"""Seconds that one of many reads takes on a quick link: ArduPilot answers 49 per second (measured)."""
-READ_SIZE: Final = 6.0
-"""Bytes of a read and its answer, 73, over those of one parameter in ArduPilot's file, 13 (measured)."""
+IDENTITY_TIMEOUT: Final = 10.0
+"""Seconds to wait for the identity of a vehicle. The identification usually ends sooner, after a few
+requests."""
+EARLY_READS_MAX: Final = 36
+"""Names that are requested while the table is downloaded: two windows, which ArduPilot answers in 0.4 s."""
+POLL_INTERVAL: Final = 0.05
+"""Seconds between two checks of a state for which there is no event, such as the identity."""
+READ_OVERHEAD: Final = 0.5
+"""Seconds that a group of reads by name takes in addition to the time per read."""
+READ_INTERVAL: Final = 0.025
+"""Seconds for one of many reads on a fast link: ArduPilot answers 49 per second (measured)."""
+READ_SIZE_RATIO: Final = 6.0
+"""Bytes of a read and its response, 73, over those of one parameter in ArduPilot's file, 13 (measured)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Seen:
-    """A vehicle's table, and what it has besides of what is wanted.
+class Inspection:
+    """The state of a vehicle: its table and the wanted parameters that are not in its list.
 
     Attributes:
-        table: all of it, each value heard in this session or confirmed by the vehicle's hash.
-        complete: whether these are all the parameters in its list.
-        hash: the hash under which the vehicle has confirmed its list, or None.
-        absent: names that it did not know, or would not tell, when it was asked.
-        download_time: seconds that the download of the table has taken; 0 where there was none.
+        table: the parameters, each received in this session or confirmed by the vehicle's hash.
+        complete: whether `table` has all parameters of the vehicle's list.
+        hash: the hash with which the vehicle confirmed its list, or None.
+        absent: requested names that the vehicle does not have or did not answer.
+        download_time: seconds that the download of the table took; 0 if there was none.
     """
 
     table: ParamSet
@@ -66,78 +67,81 @@ class Seen:
     absent: frozenset[str]
     download_time: float
 
-    def reads_are_quicker(self, count: int) -> bool:
-        """Whether so many reads by name take less time than to look at the whole table again.
+    def is_reading_faster(self, count: int) -> bool:
+        """Return whether `count` reads by name are faster than another download of the table.
 
-        Never with a hash, which confirms the table without a download.
+        False with a hash, which confirms the table without a download.
         """
         if self.hash is not None:
             return False
-        pace = max(READ_PACE, READ_SIZE * self.download_time / max(len(self.table), 1))
-        return FIRST_READS + count * pace < self.download_time
+        pace = max(READ_INTERVAL, READ_SIZE_RATIO * self.download_time / max(len(self.table), 1))
+        return READ_OVERHEAD + count * pace < self.download_time
 
 
-async def look(
+async def inspect(
     component: Component,
     wanted: ParamSet,
     absent: frozenset[str] = frozenset(),
     *,
     whole: bool = False,
     run: Runner = run_here,
-) -> Seen:
-    """Bring the table up to date, and ask by name for what is wanted and not in it.
+) -> Inspection:
+    """Update the table, and read by name the wanted parameters that it does not have.
 
-    Vehicles have parameters that are in no list: those that PX4 does not use yet, those of a group that
-    ArduPilot hides. They can be read and set by name. So is asked what was heard earlier on this link and
-    has not been told again: what the hash says nothing about, or an incomplete list has left out. What does
-    not come then either counts as not there. Names that are probably hidden are requested beside the list.
+    Vehicles have parameters that are in no list: those that PX4 does not use yet, and those of a group that
+    ArduPilot hides. They can be read and set by name. Values that were received earlier on this link and not
+    confirmed since are read by name too: those that the hash does not cover, or that an incomplete list has
+    left out. A parameter that is not received then either counts as absent. Names that are probably hidden
+    are requested while the list is downloaded.
 
     Args:
         component: the vehicle.
-        wanted: what it is to have.
-        absent: names that the vehicle is known not to have, unless they are in the list by now.
-        whole: ask again for everything that has not been told again, not only for what is wanted.
-        run: runs what takes long for a large table.
+        wanted: the wanted parameters.
+        absent: names that the vehicle is known not to have, unless they are listed by now.
+        whole: read all unconfirmed parameters, not only the wanted ones.
+        run: runs the computations that take long for a large table.
 
     Raises:
-        NoReply: it did not answer.
+        NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
-    component._machine.sync.expire_hash()  # what was announced before may have moved
+    component._machine.sync.expire_hash()  # the hash may have changed since its announcement
     before = copy_params(component.params)
     with _Search(component, _probably_hidden(component, wanted).difference(absent)) as search:
         fetched = await component.fetch_all()
         await component.refreshed()
         search.leave_out(component.params)
         await search.wait()
-    shown, silent = search.result()
+    shown, absent_names = search.result()
     after = copy_params(component.params)
     not_covered = frozenset(_not_covered(component, fetched))
     autopilot = component.autopilot
 
-    def sort_out() -> tuple[dict[str, Param], bool, set[str], set[str], list[str]]:
+    def select() -> tuple[dict[str, Param], bool, set[str], set[str], list[str]]:
         listed = {name: param for name, param in after.items() if param.index is not None}
         table = {name: param for name, param in listed.items() if param.trust is not Trust.CACHED}
         is_whole = fetched.complete and len(table) == len(listed)
-        hidden = silent
+        hidden = absent_names
         if is_whole and autopilot == "ardupilot":
-            hidden = silent | _in_no_hidden_group(table, wanted).difference(after)
+            hidden = absent_names | _in_no_hidden_group(table, wanted).difference(after)
         missing = frozenset(fetched.missing)
         given_up = {name for name, param in table.items() if param.index in missing}
-        heard = {name for name, param in before.items() if param.trust is Trust.LIVE}
-        unsure = given_up | heard.intersection(table, not_covered)
+        live = {name for name, param in before.items() if param.trust is Trust.LIVE}
+        unconfirmed = given_up | live.intersection(table, not_covered)
         known = absent | hidden | shown.keys()
-        asked = [name for name in wanted if name in unsure or (name not in table and name not in known)]
+        to_read = [
+            name for name in wanted if name in unconfirmed or (name not in table and name not in known)
+        ]
         if whole:
-            asked += unsure.difference(asked)
-        return table, is_whole, hidden, given_up, asked
+            to_read += unconfirmed.difference(to_read)
+        return table, is_whole, hidden, given_up, to_read
 
-    table, is_whole, silent, given_up, asked = await run(sort_out)
-    asked_for, not_told = await _ask(component, asked, given_up)
-    found, unknown = shown | asked_for, silent.difference(table) | not_told
+    table, is_whole, absent_names, given_up, to_read = await run(select)
+    requested, unreported = await _read_names(component, to_read, given_up)
+    found, unknown = shown | requested, absent_names.difference(table) | unreported
     system, number, identity, at = component.system, component.component, component.identity, time.time()
 
-    def take() -> ParamSet:
+    def make_set() -> ParamSet:
         return ParamSet.of(
             (param for name, param in (table | found).items() if name not in unknown),
             component=number,
@@ -147,8 +151,8 @@ async def look(
             source=f"vehicle {system}/{number}",
         )
 
-    return Seen(
-        await run(take),
+    return Inspection(
+        await run(make_set),
         is_whole,
         fetched.hash,
         (absent | unknown).difference(table),
@@ -156,53 +160,53 @@ async def look(
     )
 
 
-async def look_for(component: Component, seen: Seen, names: Iterable[str]) -> Seen:
-    """Ask by name for what may have appeared, and take what has been heard of the others meanwhile.
+async def read_hidden(component: Component, inspection: Inspection, names: Iterable[str]) -> Inspection:
+    """Read by name parameters that may have appeared, and add the values received meanwhile.
 
     Args:
         component: the vehicle.
-        seen: what it had when it was looked at.
+        inspection: its latest inspection.
         names: param_ids.
 
     Raises:
-        NoReply: it did not answer.
+        NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
-    found, unknown = await _ask(component, names, ())
-    params = {**seen.table.params, **_heard(component, seen, found)}
-    table = replace(seen.table, params=params, at=time.time())
-    return replace(seen, table=table, absent=(seen.absent | unknown).difference(found))
+    found, unknown = await _read_names(component, names, ())
+    params = {**inspection.table.params, **_current_values(component, inspection, found)}
+    table = replace(inspection.table, params=params, at=time.time())
+    return replace(inspection, table=table, absent=(inspection.absent | unknown).difference(found))
 
 
-async def look_again(component: Component, seen: Seen, names: Iterable[str]) -> Seen:
-    """Read by name what the vehicle has, and take what has been heard of the others meanwhile.
+async def reread(component: Component, inspection: Inspection, names: Iterable[str]) -> Inspection:
+    """Read parameters again by name, and add the values of other parameters received meanwhile.
 
     Args:
         component: the vehicle.
-        seen: what it had when it was looked at.
-        names: param_ids. One that the vehicle does not tell any more is not in the result.
+        inspection: its latest inspection.
+        names: param_ids. Parameters that the vehicle no longer reports are not in the result.
 
     Raises:
-        NoReply: it did not answer.
+        NoReply: the vehicle did not answer.
         LinkError: the link failed, or the client was closed.
     """
     names = frozenset(names)
-    asked_at = anyio.current_time()
-    found, unknown = await _ask(component, names, names)
+    began = anyio.current_time()
+    found, unknown = await _read_names(component, names, names)
     if names and not found:
-        what = f"the values of {component.system}/{component.component}"
-        raise NoReply(what, attempts=0, waited=anyio.current_time() - asked_at)
-    params = {**seen.table.params, **_heard(component, seen, found)}
-    told = {name: param for name, param in params.items() if name not in unknown}
-    return replace(seen, table=replace(seen.table, params=told, at=time.time()))
+        subject = f"the values of {component.system}/{component.component}"
+        raise NoReply(subject, attempts=0, waited=anyio.current_time() - began)
+    params = {**inspection.table.params, **_current_values(component, inspection, found)}
+    reported = {name: param for name, param in params.items() if name not in unknown}
+    return replace(inspection, table=replace(inspection.table, params=reported, at=time.time()))
 
 
-async def identified(component: Component) -> None:
-    """Wait until the vehicle has said who it is, or will not: what is stored goes under its name."""
-    with anyio.move_on_after(IDENTITY_PATIENCE):
+async def wait_for_identity(component: Component) -> None:
+    """Wait until the vehicle is identified, at most `IDENTITY_TIMEOUT`: the cache key is its identity."""
+    with anyio.move_on_after(IDENTITY_TIMEOUT):
         station = component._client._station
-        while station.identity_of(component._machine) is None:  # noqa: ASYNC110 - nobody tells
-            await anyio.sleep(LOOKING_PACE)
+        while station.identity_of(component._machine) is None:  # noqa: ASYNC110 - no event
+            await anyio.sleep(POLL_INTERVAL)
 
 
 async def prepare(
@@ -214,12 +218,12 @@ async def prepare(
     force: bool = False,
     run: Runner = run_here,
 ) -> Plan:
-    """Work out what `apply` would send to a vehicle, and in which order. Only reads.
+    """Return the plan of what `apply` would send to a vehicle, and in which order. Only reads.
 
     Args:
         component: the vehicle.
         wanted, include, info, force: as in `plan`.
-        run: runs what takes long: a plan of thousands of parameters takes a second.
+        run: runs long computations: a plan of thousands of parameters takes a second.
 
     Raises:
         UsageError: as from `plan`.
@@ -229,11 +233,11 @@ async def prepare(
     check_component(wanted, component.component)
     given = (include,) if isinstance(include, str) else tuple(include)
     autopilot = component.autopilot
-    # what cannot be right is told before the vehicle is asked
+    # errors in `wanted` are raised before the vehicle is read
     await run(lambda: plan({}, wanted, include=given, autopilot=autopilot))
-    await identified(component)
-    seen = await look(component, wanted, run=run)
-    return await run(lambda: plan_for(component, seen.table, wanted, given, info, force=force))
+    await wait_for_identity(component)
+    inspection = await inspect(component, wanted, run=run)
+    return await run(lambda: plan_for(component, inspection.table, wanted, given, info, force=force))
 
 
 async def verify(
@@ -244,12 +248,12 @@ async def verify(
     info: Mapping[str, ParamInfo] | None = None,
     force: bool = False,
 ) -> Plan:
-    """Compare a vehicle with what is wanted. Only reads.
+    """Compare a vehicle with the wanted parameters. Only reads.
 
-    What comes of it is what `prepare` gives: `is_met` is the answer, and the rows that are to be *set* are
-    those that differ.
+    The result is the plan that `prepare` returns: `is_met` is true if nothing differs, and the rows with
+    status `set` are the parameters that differ.
 
-    Args and errors as in `prepare`.
+    Arguments and errors as in `prepare`.
     """
     return await prepare(component, wanted, include=include, info=info, force=force)
 
@@ -263,7 +267,7 @@ def plan_for(
     *,
     force: bool,
 ) -> Plan:
-    """The plan for a vehicle that has this table."""
+    """Return the plan for a vehicle that has this table."""
     return plan(
         table,
         wanted,
@@ -275,27 +279,30 @@ def plan_for(
     )
 
 
-def _heard(component: Component, seen: Seen, found: Mapping[str, Param]) -> dict[str, WrittenParam]:
-    """What has been heard by now of the parameters that were seen before, and what was found."""
-    heard = {name: component.params[name] for name in seen.table if name in component.params}
-    return {name: WrittenParam.of(param) for name, param in (heard | dict(found)).items()}
+def _current_values(
+    component: Component, inspection: Inspection, found: Mapping[str, Param]
+) -> dict[str, WrittenParam]:
+    """Return the present values of the inspected parameters, and the parameters that were found."""
+    known = {name: component.params[name] for name in inspection.table if name in component.params}
+    return {name: WrittenParam.of(param) for name, param in (known | dict(found)).items()}
 
 
 def _not_covered(component: Component, fetched: FetchResult) -> Collection[str]:
-    """The names of whose values a fetch says nothing, but for what is missing in it."""
+    """Return the names whose values a fetch neither received nor confirmed, except missing ones."""
     if fetched.source != "cache" and not fetched.resumed:
         return ()
-    if fetched.hash is None:  # the policy allowed no more, or some of it came before
+    if fetched.hash is None:  # the cache policy did not verify it, or the download was resumed
         return component.params.keys()
     return component._machine.table.unhashed()
 
 
-async def _ask(
+async def _read_names(
     component: Component, names: Iterable[str], given_up: Collection[str]
 ) -> tuple[dict[str, Param], frozenset[str]]:
-    """Read parameters by name: those that are there, and those that the vehicle does not have or tell.
+    """Read parameters by name; return those received and the names that the vehicle does not have or report.
 
-    Of `given_up`, which were asked for already, no answer is one; else it ends the asking.
+    A timeout ends the reads and is raised, except for names in `given_up`, whose earlier request failed: they
+    count as not reported.
     """
     names = tuple(names)
     with _Search(component, [name for name in names if name not in component.params]) as search:
@@ -303,36 +310,36 @@ async def _ask(
     found, unknown = search.result()
     failed: list[NoReply | LinkError] = []
 
-    async def ask(name: str) -> None:
+    async def read_one(name: str) -> None:
         try:
             found[name] = await component.get(name)
-        except (VehicleError, UsageError):  # a name that cannot be is not there either
+        except (VehicleError, UsageError):  # the vehicle cannot have an invalid name either
             unknown.add(name)
         except (NoReply, LinkError) as error:
             if isinstance(error, NoReply) and name in given_up:
                 unknown.add(name)
                 return
             failed.append(error)
-            asking.cancel_scope.cancel()
+            reading.cancel_scope.cancel()
 
-    async with anyio.create_task_group() as asking:
+    async with anyio.create_task_group() as reading:
         for name in names:
             if name not in found and name not in unknown:
-                asking.start_soon(ask, name)
+                reading.start_soon(read_one, name)
     if failed:
         raise failed[0]
     return found, frozenset(unknown)
 
 
 class _Search:
-    """A search for parameters of which nothing has been heard, all at once, for as long as its block lasts.
+    """A context manager that searches for parameters not received before; leaving it ends the search.
 
     Args:
         component: the vehicle.
-        names: what to search for; a name that cannot be one is left out.
+        names: param_ids to search for; invalid names are left out.
 
     Raises:
-        NoReply: the vehicle is lost, and there is something to search for.
+        NoReply: the vehicle is lost, and `names` is not empty.
     """
 
     def __init__(self, component: Component, names: Iterable[str]) -> None:
@@ -351,12 +358,12 @@ class _Search:
             self._component._machine.name_searches.cancel(self._search, anyio.current_time())
 
     def leave_out(self, names: Iterable[str]) -> None:
-        """Search no longer for these names, as the vehicle spells them."""
+        """Stop the search for these names, as the vehicle spells them."""
         if self._search is not None:
             self._search.leave_out(names)
 
     async def wait(self) -> None:
-        """Wait until nothing is left to search for.
+        """Wait until the search has ended for all names.
 
         Raises:
             NoReply: the vehicle is lost.
@@ -366,9 +373,9 @@ class _Search:
             await self._component._wait(search, None, lambda: ("names", search.attempts))
 
     def result(self) -> tuple[dict[str, Param], set[str]]:
-        """What is there, and what is not.
+        """Return the parameters found, and the names that the vehicle does not have.
 
-        What is in neither needs to be asked for one by one: the link loses much, or the names cannot be.
+        Names in neither must be read one by one: the link loses many packets, or the names are invalid.
         """
         found: dict[str, Param] = {}
         unknown: set[str] = set()
@@ -382,11 +389,11 @@ class _Search:
 
 
 def _probably_hidden(component: Component, wanted: ParamSet) -> frozenset[str]:
-    """Wanted members of groups whose switches are wanted on, where nothing is known of them yet.
+    """Return wanted names of groups whose switch is wanted on, if nothing is known of them yet.
 
-    ArduPilot lists a group only while its switch is on. A name of them that is listed after all has been
-    requested in vain, so there are none where they are many, nor where the table comes as a list, which reads
-    slow down.
+    ArduPilot lists a group only while its switch is on. The request for a name that is listed after all is
+    wasted. The result is empty if there are more than `EARLY_READS_MAX`, and if the table is downloaded as a
+    list, which reads slow down.
     """
     if component.autopilot != "ardupilot" or not component._machine.fetches.may_use_file():
         return frozenset()
@@ -395,18 +402,18 @@ def _probably_hidden(component: Component, wanted: ParamSet) -> frozenset[str]:
     groups = tuple(f"{name.rpartition('_')[0]}_" for name in switches)
     names = [name for name in wanted if name.startswith(groups) and name not in switches]
     unheard = frozenset(name for name in names if name not in component.params)
-    return unheard if len(unheard) <= MOST_BESIDE else frozenset()
+    return unheard if len(unheard) <= EARLY_READS_MAX else frozenset()
 
 
 def _in_no_hidden_group(table: Mapping[str, Param], wanted: ParamSet) -> frozenset[str]:
-    """Wanted names that an ArduPilot cannot have: neither its list nor a group that it hides has them.
+    """Return wanted names that an ArduPilot cannot have: neither listed nor in a hidden group.
 
-    The list leaves out what follows the switch of a group, an INT8 that is listed, while that is 0; the
-    names of the group begin alike (`AP_Param::next_group`). All else that can be read by name is in it.
+    While the switch of a group, a listed INT8, is 0, the list leaves out the parameters of that group; their
+    names share a prefix (`AP_Param::next_group`). All other parameters that can be read by name are listed.
 
     Args:
         table: the whole list.
-        wanted: what to look for.
+        wanted: the wanted parameters.
     """
     switches = [name for name, param in table.items() if param.type is ParamType.INT8 and param.value == 0]
     hidden = {start for name in switches for start in _starts(name)}
@@ -414,12 +421,12 @@ def _in_no_hidden_group(table: Mapping[str, Param], wanted: ParamSet) -> frozens
 
 
 def _starts(name: str) -> Iterator[str]:
-    """Return what a name may have in common with those of its group: all up to each underscore."""
+    """Return the prefixes that a name may share with its group: the part up to each underscore."""
     return (name[: at + 1] for at, letter in enumerate(name) if letter == "_")
 
 
 def _is_name(name: str) -> bool:
-    """Whether a parameter can have this name."""
+    """Return whether a parameter can have this name."""
     with suppress(UsageError):
         return check_name(name) != HASH_CHECK
     return False

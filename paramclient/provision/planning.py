@@ -1,4 +1,4 @@
-"""What a set-up would do, worked out before anything is sent: which values, in which order, and why not."""
+"""The plan of a set-up: the values to write, their order, and reasons for parameters that are not written."""
 
 from __future__ import annotations
 
@@ -42,63 +42,79 @@ __all__ = [
 ]
 
 MISSING: Final = "missing"
-"""The category of what the vehicle does not have."""
+"""The category of a parameter that the vehicle does not have."""
 WRONG: Final = "wrong"
 """The category of a value that the parameter's type cannot take, or that cannot be sent."""
-MOST_SUGGESTED: Final = 40
-"""Names for which similar ones are looked up. Who misses more has another vehicle's file, and no typos."""
+SUGGESTIONS_MAX: Final = 40
+"""Missing names up to which similar names are suggested. With more, the file is for another vehicle and has
+no typing errors."""
 
 
 class ParamInfo(Protocol):
-    """What a plan takes from metadata, where there is some."""
+    """The metadata of one parameter that a plan uses."""
 
     @property
-    def minimum(self) -> float | None: ...
+    def minimum(self) -> float | None:
+        """The lowest valid value in the unit of the parameter, or None."""
+        ...
+
     @property
-    def maximum(self) -> float | None: ...
+    def maximum(self) -> float | None:
+        """The highest valid value in the unit of the parameter, or None."""
+        ...
+
     @property
-    def is_read_only(self) -> bool: ...
+    def is_read_only(self) -> bool:
+        """Whether only the vehicle writes the parameter."""
+        ...
+
     @property
-    def reboot_required(self) -> bool: ...
+    def reboot_required(self) -> bool:
+        """Whether a change takes effect after a reboot."""
+        ...
 
 
 class PlanStatus(StrEnum):
-    """What a plan means to do with a wanted parameter."""
+    """The planned action for a wanted parameter."""
 
     SET = "set"
+    """The value differs and is to be written."""
     LATER = "later"
-    """The vehicle does not have it now; a step of the plan may bring it to light, and then it is set."""
+    """The vehicle does not have the parameter now; a step of the plan may reveal it, and then it is set."""
     UNCHANGED = "unchanged"
+    """The vehicle has the value already."""
     SKIPPED = "skipped"
-    """It stays as it is on board, or is not there at all; `PlanRow.reason` says why."""
+    """The parameter is not written, or the vehicle does not have it; `PlanRow.reason` gives the reason."""
     INVALID = "invalid"
-    """The value cannot be right; `PlanRow.reason` says why."""
+    """The value is invalid; `PlanRow.reason` gives the reason."""
 
 
 class RowStanding(StrEnum):
-    """How what a vehicle has compares with a wanted parameter."""
+    """The comparison of a vehicle's parameter with the wanted one."""
 
     SAME = "same"
+    """The vehicle has the wanted value."""
     DIFFERENT = "different"
+    """The vehicle has another value, or the wanted value is invalid."""
     MISSING = "missing"
     """The vehicle does not have the parameter."""
     LEFT_OUT = "left out"
-    """It need not be the same."""
+    """The parameter is left out, and may differ."""
 
 
 @dataclass(frozen=True, slots=True)
 class PlanRow:
-    """What a plan means to do with one wanted parameter.
+    """The planned action for one wanted parameter, with the value that the vehicle has.
 
     Attributes:
-        wanted: the parameter as it is written.
-        status: what is to be done.
-        before: the value that the vehicle has, or None where it does not have the parameter.
-        type: the vehicle's type for it; None where that is not known.
-        category: for what is skipped or invalid, the kind of reason: one of `CATEGORIES`, `MISSING`, or
+        wanted: the parameter as the file has it.
+        status: the planned action.
+        before: the value that the vehicle has, or None if it does not have the parameter.
+        type: the vehicle's type of the parameter; None if unknown.
+        category: for skipped and invalid parameters, the kind of reason: one of `CATEGORIES`, `MISSING`, or
             `WRONG`; else "".
-        reason: the same as a sentence; "" where there is nothing to say.
-        nearest: for what the vehicle does not have, its names that look most alike, the likeliest first.
+        reason: the reason for the status as a sentence; may be "".
+        nearest: for a parameter that the vehicle does not have, the most similar names, most similar first.
     """
 
     wanted: WrittenParam
@@ -111,16 +127,17 @@ class PlanRow:
 
     @property
     def name(self) -> str:
+        """The param_id."""
         return self.wanted.name
 
     @property
     def differs(self) -> bool:
-        """Whether the vehicle holds another value than the wanted one, or none."""
+        """Whether the vehicle has another value than the wanted one, or no such parameter."""
         return self.before is None or not _is_same(self.wanted.value, self.before, self.type)
 
     @property
     def standing(self) -> RowStanding:
-        """How it compares."""
+        """How the vehicle's parameter compares with the wanted one."""
         if self.category == MISSING:
             return RowStanding.MISSING
         if self.status is PlanStatus.SKIPPED:
@@ -129,7 +146,7 @@ class PlanRow:
 
     @property
     def is_met(self) -> bool:
-        """Whether the vehicle has the value already, or need not have it."""
+        """Whether the vehicle has the wanted value, or the parameter is left out."""
         return self.standing in (RowStanding.SAME, RowStanding.LEFT_OUT)
 
     def __str__(self) -> str:
@@ -148,10 +165,11 @@ class Step:
     """One value to write.
 
     Attributes:
-        name, value: what is sent, as it is written.
-        type: the vehicle's type for it, with which it is sent.
-        before: what the vehicle has.
-        needs_reboot: whether it counts only from the next start on.
+        name: param_id.
+        value: the value to send.
+        type: the vehicle's type of the parameter, which PARAM_SET carries.
+        before: the value that the vehicle has.
+        needs_reboot: whether the change takes effect after a reboot.
     """
 
     name: str
@@ -167,15 +185,15 @@ class Step:
 
 @dataclass(frozen=True, slots=True)
 class Stage:
-    """Steps that are done side by side, before those of the next stage.
+    """Steps that are written concurrently, before those of the next stage.
 
     Attributes:
-        purpose: what they have in common, in words.
-        steps: the steps, in the order in which the parameters are written down.
+        purpose: what the steps have in common, in words.
+        steps: the steps, in the order of the file.
         reveals: whether other parameters may appear afterwards.
-        reboot_first: whether the vehicle has to start again before the next stage: what is set before that
-            would be lost, or is not there yet.
-        is_last: whether these may end the conversation. They are done one after another instead.
+        reboot_first: whether the vehicle must reboot before the next stage: values that are set before the
+            reboot would be lost, or their parameters do not exist yet.
+        is_last: whether the steps may end the connection. These are written one by one.
     """
 
     purpose: str
@@ -187,20 +205,19 @@ class Stage:
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """What a set-up means to do; see `plan`.
+    """The planned actions of a set-up; see `plan`.
 
     Attributes:
-        wanted: what is to come of it.
-        rows: by name, one for each wanted parameter, in the order in which they are written.
-        stages: the steps, in the order in which they are to be done. After a stage that reveals others, or
-            after a start of the vehicle, it is looked at afresh and planned anew; the further stages are what
-            is known so far.
-        extra: names that the vehicle has and `wanted` does not; they stay as they are.
-        include: what was asked for although the list leaves it out.
-        identity: whose plan it is, where `current` said so.
-        force: whether values that the autopilot cannot store are sent all the same.
-        unstarted: switches that are on already, and whose group is not there: as they count from the next
-            start of the vehicle on, it may not have started since they were set.
+        wanted: the wanted parameters.
+        rows: by name, one row for each wanted parameter, in the order of the file.
+        stages: the steps in the order of writing. After a stage that reveals parameters, and after a reboot,
+            the vehicle is read again and a new plan is made; the later stages are those known so far.
+        extra: names that the vehicle has and `wanted` does not have; they are not changed.
+        include: categories and globs that are included although the list leaves them out.
+        identity: the vehicle of the plan, if `current` names it.
+        force: whether to send values that the autopilot cannot store.
+        unstarted: switches that are on and whose group is missing: they take effect after a reboot, and the
+            vehicle may not have rebooted since they were set.
     """
 
     wanted: ParamSet
@@ -214,26 +231,26 @@ class Plan:
 
     @property
     def steps(self) -> list[Step]:
-        """Every value to write, in order."""
+        """All values to write, in order."""
         return [step for stage in self.stages for step in stage.steps]
 
     @property
     def reboot_for(self) -> tuple[str, ...]:
-        """The names of steps that count only from the next start of the vehicle on."""
+        """The names of steps that take effect after a reboot."""
         return tuple(step.name for step in self.steps if step.needs_reboot)
 
     @property
     def counts(self) -> Mapping[PlanStatus, int]:
-        """How many rows have each status."""
+        """The number of rows with each status."""
         return Counter(row.status for row in self.rows.values())
 
     def of(self, status: PlanStatus) -> list[PlanRow]:
-        """The rows with this status, in order."""
+        """Return the rows with this status, in order."""
         return [row for row in self.rows.values() if row.status is status]
 
     @property
     def is_met(self) -> bool:
-        """Whether the vehicle has all that is wanted already, but for what is left out on purpose."""
+        """Whether the vehicle has all wanted values, except those left out on purpose."""
         return all(row.is_met for row in self.rows.values())
 
     def __repr__(self) -> str:
@@ -251,30 +268,29 @@ def plan(
     encoding: Encoding | None = None,
     force: bool = False,
 ) -> Plan:
-    """Work out what has to be set on a vehicle so that it has the wanted values. Nothing is sent.
+    """Return what must be set on a vehicle so that it has the wanted values. Sends nothing.
 
-    The order: what chooses the frame; the switches that show groups of others; everything else; switches
-    that are turned off; what may end the conversation, such as the system id.
+    The order: parameters that select the frame; switches that reveal groups of parameters; all other
+    parameters; switches that are turned off; parameters that may end the connection, such as the system id.
 
-    A value is invalid that the parameter's own type cannot take, or that cannot be sent exactly: a fraction
-    for an integer, and, where integers are sent as float32 (ArduPilot), one beyond 24 bits. So is one
-    outside of the range in the metadata, or not finite, unless "out-of-range" is included: many vehicles
-    take such values without a word. Of PX4 and ArduPilot, only `force` lets NaN and infinity through: PX4
-    cannot save them, nor anything else from then on, and may stop.
+    A value is invalid if the parameter's type cannot hold it, or if it cannot be sent exactly: a fraction for
+    an integer, and, where integers are sent as float32 (ArduPilot), an integer beyond 24 bits. Values outside
+    of the range in the metadata, and values that are not finite, are invalid unless "out-of-range" is
+    included: many vehicles accept such values without an error. For PX4 and ArduPilot, only `force` allows
+    NaN and infinity: PX4 cannot save them, nor any other parameter from then on, and may stop.
 
     Args:
-        current: what the vehicle has: a table, such as `component.params`, or a snapshot.
-        wanted: what it shall have.
-        include: what the list leaves out, and is to be set all the same: categories (`CATEGORIES`), and globs
-            of names.
-        info: metadata by name, where there is some.
-        autopilot: "px4" or "ardupilot"; None where `current` says it, or for the lists of both.
-        encoding: how values are sent; None: as the autopilot does.
-        force: let NaN and infinity be set, whatever the autopilot makes of them.
+        current: the vehicle's parameters: a table, such as `component.params`, or a snapshot.
+        wanted: the wanted parameters.
+        include: categories (`CATEGORIES`) and globs of names to set although the list leaves them out.
+        info: metadata by name.
+        autopilot: "px4" or "ardupilot"; None if `current` names it, or to use the lists of both.
+        encoding: the encoding of values; None for that of the autopilot.
+        force: allow NaN and infinity for every autopilot.
 
     Raises:
-        UsageError: `include` names no category and is no glob, or the two are of different components or
-            autopilots.
+        UsageError: an element of `include` is neither a category nor a glob, or `current` and `wanted` are
+            of different components or autopilots.
     """
     identity = None
     if isinstance(current, ParamSet):
@@ -307,10 +323,13 @@ def plan(
 
 
 def overlay(base: ParamSet, over: ParamSet) -> ParamSet:
-    """The parameters of `base`, with those of `over` in their place or behind them.
+    """Return the parameters of `base`, replaced and extended by those of `over`.
 
-    For one file that all vehicles share, and a small one for each. What `over` says of the vehicle counts,
-    else what `base` says.
+    For a file that all vehicles share, and a small file for each vehicle. The identity and address of `over`
+    have precedence over those of `base`.
+
+    Raises:
+        UsageError: the two are of different components.
     """
     check_component(over, base.component)
     return ParamSet(
@@ -324,10 +343,10 @@ def overlay(base: ParamSet, over: ParamSet) -> ParamSet:
 
 
 def check_component(wanted: ParamSet, component: int | None) -> None:
-    """See that parameters are meant for this component.
+    """Check that parameters are meant for this component.
 
     Raises:
-        UsageError: they say that they are another one's.
+        UsageError: they name another component.
     """
     if wanted.component is not None and component is not None and wanted.component != component:
         raise UsageError(
@@ -337,10 +356,10 @@ def check_component(wanted: ParamSet, component: int | None) -> None:
 
 
 def _check_autopilot(wanted: ParamSet, autopilot: str | None) -> None:
-    """See that parameters are not those of another autopilot: many share a name, and mean something else.
+    """Check that parameters are not those of another autopilot: shared names have different meanings.
 
     Raises:
-        UsageError: they say that they are.
+        UsageError: the parameters name another autopilot.
     """
     if wanted.identity is None:
         return
@@ -353,6 +372,8 @@ def _check_autopilot(wanted: ParamSet, autopilot: str | None) -> None:
 
 
 class _Planner:
+    """Makes the rows and stages of one plan; the arguments are those of `plan`, resolved."""
+
     def __init__(
         self,
         current: ParamSet | Mapping[str, Param],
@@ -374,12 +395,12 @@ class _Planner:
         self._info = info
         self._encoding = encoding
         self._force = force
-        # nothing but ArduPilot sends integers as float32
+        # only ArduPilot sends integers as float32
         usual = "ardupilot" if encoding is Encoding.C_CAST else ""
         self._against_non_finite = reason_against_non_finite(autopilot or usual)
 
     def row(self, wanted: WrittenParam) -> PlanRow:
-        """What is to be done with one parameter; what is missing is settled later."""
+        """Return the row of one parameter; `settle_missing` completes rows of missing parameters."""
         name = wanted.name
         held: Param | WrittenParam | None = self._current.get(name)
         before = None if held is None else held.value
@@ -398,40 +419,40 @@ class _Planner:
         info = self._info.get(name)
         if info is not None and info.is_read_only and not self._choice.has(name, READ_ONLY):
             return verdict(PlanStatus.SKIPPED, READ_ONLY, "left out: it can only be read")
-        wrong = self._wrong(name, wanted.value, kind, info)
+        wrong = self._find_fault(name, wanted.value, kind, info)
         if wrong is None and isinstance(wanted.value, bytes) and not isinstance(before, bytes):
-            wrong = WRONG, f"{format_value(wanted.value)} are raw bytes, and the vehicle gives a number"
+            wrong = WRONG, f"{format_value(wanted.value)} are raw bytes, and the vehicle has a number"
         if wrong is None or (wrong[0] == OUT_OF_RANGE and self._choice.has(name, OUT_OF_RANGE)):
             return verdict(PlanStatus.SET)
         return verdict(PlanStatus.INVALID, *wrong)
 
     def stages(self, rows: Mapping[str, PlanRow]) -> tuple[Stage, ...]:
-        """The steps, in order."""
+        """Return the stages, in order."""
         steps = [self._step(row) for row in rows.values() if row.status is PlanStatus.SET]
         is_any_missing = any(row.status is PlanStatus.LATER for row in rows.values())
-        last = _taken(steps, lambda step: self._cautions.is_last(step.name))
-        frame = _taken(steps, lambda step: self._cautions.chooses_frame(step.name))
-        switches = _taken(steps, lambda step: self._cautions.reveals(step.name))
-        turned_off = _taken(switches, lambda step: step.value == 0)
+        last = _pop_matching(steps, lambda step: self._cautions.is_last(step.name))
+        frame = _pop_matching(steps, lambda step: self._cautions.chooses_frame(step.name))
+        switches = _pop_matching(steps, lambda step: self._cautions.reveals(step.name))
+        turned_off = _pop_matching(switches, lambda step: step.value == 0)
         stages = []
         if frame:
             resets = any(self._cautions.resets(step.name) for step in frame)
             waits = is_any_missing and any(step.needs_reboot for step in frame)
-            stages.append(Stage("what chooses the frame", tuple(frame), True, resets or waits))
+            stages.append(Stage("frame parameters", tuple(frame), True, resets or waits))
         if switches:
             waits = is_any_missing and any(step.needs_reboot for step in switches)
-            stages.append(Stage("what shows others", tuple(switches), True, waits))
+            stages.append(Stage("switches that reveal parameters", tuple(switches), True, waits))
         if steps:
-            stages.append(Stage("the others", tuple(steps)))
+            stages.append(Stage("all other parameters", tuple(steps)))
         if turned_off:
-            stages.append(Stage("what is turned off", tuple(turned_off)))
+            stages.append(Stage("switches that are turned off", tuple(turned_off)))
         if last:
             last.sort(key=lambda step: self._cautions.is_system_id(step.name))
-            stages.append(Stage("what may end the conversation", tuple(last), is_last=True))
+            stages.append(Stage("parameters that may end the connection", tuple(last), is_last=True))
         return tuple(stages)
 
     def unstarted(self, rows: Mapping[str, PlanRow]) -> tuple[str, ...]:
-        """Switches that may only wait for a start of the vehicle to show what is missing."""
+        """Return switches whose missing group may appear after a reboot."""
         missing = [name for name, row in rows.items() if row.status is PlanStatus.LATER]
         return tuple(
             name
@@ -444,10 +465,13 @@ class _Planner:
         )
 
     def settle_missing(self, rows: Mapping[str, PlanRow], stages: Sequence[Stage]) -> dict[str, PlanRow]:
-        """What is missing, and nothing in the plan could bring to light, is skipped; similar names."""
-        may_come = any(stage.reveals for stage in stages)
+        """Return the rows with missing parameters as later, if a stage may reveal them, or skipped.
+
+        Adds the similar names that the vehicle has.
+        """
+        may_appear = any(stage.reveals for stage in stages)
         names = [name for name, row in rows.items() if row.status is PlanStatus.LATER]
-        if len(names) > MOST_SUGGESTED:
+        if len(names) > SUGGESTIONS_MAX:
             nearest: Mapping[str, tuple[str, ...]] = {}
         else:
             nearest = {name: nearest_names(name, self._current.keys() - rows.keys()) for name in names}
@@ -455,18 +479,18 @@ class _Planner:
         for name in names:
             settled[name] = PlanRow(
                 rows[name].wanted,
-                PlanStatus.LATER if may_come else PlanStatus.SKIPPED,
+                PlanStatus.LATER if may_appear else PlanStatus.SKIPPED,
                 type=rows[name].type,
                 category=MISSING,
-                reason=rows[name].reason + (", unless a step shows it" if may_come else ""),
+                reason=rows[name].reason + (", unless a step reveals it" if may_appear else ""),
                 nearest=nearest.get(name, ()),
             )
         return settled
 
-    def _wrong(
+    def _find_fault(
         self, name: str, value: Value, kind: ParamType | int | None, info: ParamInfo | None
     ) -> tuple[str, str] | None:
-        """What is wrong with a value: the category, and a sentence."""
+        """Return why a value is invalid, as category and sentence, or None."""
         if self._cautions.is_system_id(name) and (isinstance(value, bytes) or not 1 <= value <= 255):
             return WRONG, "a system id is a number from 1 to 255"
         if kind is not None:
@@ -483,7 +507,7 @@ class _Planner:
                 return None
             if self._against_non_finite:
                 return WRONG, self._against_non_finite
-            return OUT_OF_RANGE, f"{value} is no number to fly with"
+            return OUT_OF_RANGE, f"{value} is not a finite number"
         if info is not None:
             sent = _float32(value) if kind == ParamType.REAL32 else value
             if info.minimum is not None and sent < _float32(info.minimum):
@@ -493,12 +517,12 @@ class _Planner:
         return None
 
     def _step(self, row: PlanRow) -> Step:
-        assert row.before is not None, "only what the vehicle has is set"
+        assert row.before is not None, "only parameters that the vehicle has are set"
         kind = ParamType.REAL32 if row.type is None else row.type
         return Step(row.name, row.wanted.value, kind, row.before, self._needs_reboot(row.name))
 
     def _value_to_be(self, name: str) -> Value | None:
-        """The value that a parameter shall have, or else has."""
+        """Return the wanted value of a parameter, or else its present value."""
         param: Param | WrittenParam | None = self._wanted.get(name) or self._current.get(name)
         return None if param is None else param.value
 
@@ -509,15 +533,15 @@ class _Planner:
         return self._cautions.needs_reboot(name, self._vehicle_type)
 
 
-def _taken(steps: list[Step], fits: Callable[[Step], bool]) -> list[Step]:
-    """Take those that fit out of the steps."""
+def _pop_matching(steps: list[Step], fits: Callable[[Step], bool]) -> list[Step]:
+    """Remove the steps that fit from the list, and return them."""
     taken = [step for step in steps if fits(step)]
     steps[:] = [step for step in steps if not fits(step)]
     return taken
 
 
 def _is_same(wanted: Value, held: Value, kind: ParamType | int | None) -> bool:
-    """Whether a vehicle that holds a value has the wanted one; in its type, where that is known."""
+    """Return whether two values are equal in the vehicle's type; as float32 if the type is unknown."""
     if isinstance(wanted, bytes) or isinstance(held, bytes):
         return wanted == held
     if kind is None:
@@ -531,7 +555,7 @@ def _is_same(wanted: Value, held: Value, kind: ParamType | int | None) -> bool:
 
 
 def _float32(value: float) -> float:
-    """The nearest float32; what is beyond them becomes infinite."""
+    """Return the nearest float32; infinity for values beyond its range."""
     try:
         number: float = struct.unpack("<f", struct.pack("<f", value))[0]
     except OverflowError:

@@ -1,4 +1,4 @@
-"""What came of a set-up: one row for each wanted parameter, and what else is to be said."""
+"""Results of `apply`, `restore` and `verify`: one row for each wanted parameter, totals, progress."""
 
 from __future__ import annotations
 
@@ -17,35 +17,36 @@ __all__ = ["ApplyProgress", "ApplyResult", "ApplyRow", "ApplyStatus", "FleetAppl
 
 
 class ApplyStatus(StrEnum):
-    """What became of a wanted parameter."""
+    """The outcome for one wanted parameter."""
 
     SET = "set"
-    """It was written, and read back at the end."""
+    """The value was written, and read back at the end."""
     UNCHANGED = "unchanged"
     """The vehicle had the value already."""
     ADJUSTED = "adjusted"
-    """It was written, and the vehicle made another value of it, at once or within a second afterwards."""
+    """The value was written, and the vehicle changed it, immediately or within a second."""
     REFUSED = "refused"
+    """The vehicle refused the value."""
     SKIPPED = "skipped"
-    """It was not written: left out, not on this vehicle, or invalid."""
+    """The parameter was not written: left out, not on this vehicle, or invalid."""
     UNPROVEN = "unproven"
-    """It was sent, and could not be read back at the end."""
+    """The value was sent, and could not be read back at the end."""
     FAILED = "failed"
-    """The vehicle does not have the value, or did not answer, or it was not reached."""
+    """The vehicle does not have the value or did not answer, or `apply` ended before the parameter."""
 
 
 @dataclass(frozen=True, slots=True)
 class ApplyRow:
-    """What became of one wanted parameter.
+    """The outcome for one wanted parameter, with its values before and after.
 
     Attributes:
-        wanted: the parameter as it is written.
-        status: what became of it.
-        before: the value that the vehicle had, or None where it did not have the parameter.
-        actual: the value that it was last seen to have, or None.
-        type: the vehicle's type for it; None where that is not known.
-        category: as in `PlanRow`, for what is skipped.
-        reason: a sentence; "" where there is nothing to say.
+        wanted: the parameter as the file has it.
+        status: the outcome.
+        before: the value before `apply`, or None if the vehicle did not have the parameter.
+        actual: the value that the vehicle last reported, or None.
+        type: the vehicle's type of the parameter; None if unknown.
+        category: as in `PlanRow`, for skipped parameters.
+        reason: the reason for the status as a sentence; may be "".
         nearest: as in `PlanRow`.
     """
 
@@ -60,18 +61,19 @@ class ApplyRow:
 
     @property
     def name(self) -> str:
+        """The param_id."""
         return self.wanted.name
 
     @property
     def is_as_wanted(self) -> bool:
-        """Whether there is nothing to be seen to: it has the value, or was left out on purpose."""
+        """Whether the parameter has the wanted value, or was left out on purpose."""
         if self.status is ApplyStatus.SKIPPED:
-            return self.category in _ON_PURPOSE
+            return self.category in _INTENDED_CATEGORIES
         return self.status in (ApplyStatus.SET, ApplyStatus.UNCHANGED)
 
     @property
     def so_far(self) -> ApplyRow:
-        """The same where nobody will read it back any more."""
+        """This row with `SET` replaced by `UNPROVEN`, for a run that ended before the value was read back."""
         if self.status is not ApplyStatus.SET:
             return self
         return replace(self, status=ApplyStatus.UNPROVEN, reason="acknowledged, and not read back")
@@ -86,12 +88,13 @@ class ApplyRow:
 
 @dataclass(frozen=True, slots=True)
 class ApplyProgress:
-    """How far a set-up is.
+    """The progress of `apply`.
 
     Attributes:
-        phase: "reading", "writing", "rebooting".
-        done, total: values that were written in this run so far, and that are to be written as far as known.
-        row: what has just become of one parameter; not its last word before the proof at the end.
+        phase: "reading", "writing" or "rebooting".
+        done: number of values written in this run so far.
+        total: number of values to write, as far as known.
+        row: the latest outcome for one parameter; the read-back at the end may change it.
     """
 
     phase: str
@@ -102,19 +105,19 @@ class ApplyProgress:
 
 @dataclass(frozen=True, slots=True)
 class ApplyResult:
-    """What came of a set-up.
+    """The result of `apply` or `restore` for one vehicle.
 
     Attributes:
-        system, component: the vehicle's address at the end; another one than before where its system id was
-            set.
-        rows: by name, one for each wanted parameter, in the order in which they are written.
-        plan: what was planned first.
-        before: the state that was stored before anything was sent.
-        extra: names that the vehicle had when its whole table was read last, and that are not wanted; they
-            were left alone.
-        reboots: how often the vehicle was started again.
-        reboot_required: names that were written and count only from the next start of the vehicle on.
-        error: what ended it before its time, or None. What is in the rows holds all the same.
+        system: system id of the vehicle at the end; it differs from the first one if the system id was set.
+        component: component id of the vehicle.
+        rows: by name, one row for each wanted parameter, in the order of the file.
+        plan: the first plan.
+        before: the state that was stored before the first write.
+        extra: names that the vehicle had when its whole table was last read, and that are not wanted; they
+            were not changed.
+        reboots: number of reboots.
+        reboot_required: names that were written and take effect after a reboot.
+        error: the error that ended the run early, or None. The rows are valid in both cases.
         elapsed: seconds.
     """
 
@@ -131,21 +134,21 @@ class ApplyResult:
 
     @property
     def complete(self) -> bool:
-        """Whether the vehicle has all that is wanted, proven, but for what is left out on purpose."""
+        """Whether the vehicle has all wanted values, read back, except those left out on purpose."""
         return self.error is None and all(row.is_as_wanted for row in self.rows.values())
 
     @property
     def counts(self) -> Mapping[ApplyStatus, int]:
-        """How many rows have each status."""
+        """The number of rows with each status."""
         return Counter(row.status for row in self.rows.values())
 
     def of(self, status: ApplyStatus) -> list[ApplyRow]:
-        """The rows with this status, in order."""
+        """Return the rows with this status, in order."""
         return [row for row in self.rows.values() if row.status is status]
 
     @property
     def news(self) -> list[ApplyRow]:
-        """The rows with something to see: not what was so already, or is left out and no different."""
+        """The rows to show: all except unchanged parameters and left-out ones that do not differ."""
         return [row for row in self.rows.values() if self._is_news(row)]
 
     def _is_news(self, row: ApplyRow) -> bool:
@@ -163,11 +166,11 @@ class ApplyResult:
 
 @dataclass(frozen=True, slots=True)
 class FleetApplied:
-    """What came of a set-up of several vehicles.
+    """The results of `apply_all`.
 
     Attributes:
-        results: by (system, component) as they were called at the start, what came of each.
-        errors: those to which nothing was written, each with its error.
+        results: by (system, component) at the start, the result for each vehicle.
+        errors: by (system, component), the error of each vehicle to which nothing was written.
     """
 
     results: Mapping[tuple[int, int], ApplyResult]
@@ -175,17 +178,17 @@ class FleetApplied:
 
     @property
     def complete(self) -> bool:
-        """Whether all of them have all that is wanted."""
+        """Whether all vehicles have all wanted values."""
         return not self.errors and all(result.complete for result in self.results.values())
 
 
 @dataclass(frozen=True, slots=True)
 class FleetVerified:
-    """How several vehicles compare with what is wanted.
+    """The results of `verify_all`.
 
     Attributes:
-        results: by (system, component), how each compares.
-        errors: those that could not be compared, each with its error.
+        results: by (system, component), the comparison for each vehicle.
+        errors: by (system, component), the error of each vehicle that could not be compared.
     """
 
     results: Mapping[tuple[int, int], Plan]
@@ -193,8 +196,9 @@ class FleetVerified:
 
     @property
     def is_met(self) -> bool:
-        """Whether all of them have all that is wanted."""
+        """Whether all vehicles have all wanted values."""
         return not self.errors and all(result.is_met for result in self.results.values())
 
 
-_ON_PURPOSE = frozenset(CATEGORIES) - {OUT_OF_RANGE}
+_INTENDED_CATEGORIES = frozenset(CATEGORIES) - {OUT_OF_RANGE}
+"""Categories of parameters that are left out on purpose: a skipped row of one is no failure."""

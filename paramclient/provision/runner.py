@@ -1,4 +1,4 @@
-"""Runners of long computations: in place, or in the worker thread of a service."""
+"""Runners of long computations: in the calling task, or in a worker thread of a service."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ Result = TypeVar("Result")
 
 
 class Runner(Protocol):
-    """Runs a computation and returns its result, such as in a worker thread, to keep the event loop free.
+    """Runs a computation and returns its result, for example in a worker thread to keep the event loop free.
 
-    An exception of the computation is raised by the call. The computation touches nothing that the event
-    loop may change meanwhile.
+    The call raises the exception of the computation. The computation must not use objects that the event
+    loop may change while it runs.
     """
 
     async def __call__(self, work: Callable[[], Result], /) -> Result: ...
 
 
 async def run_here(work: Callable[[], Result], /) -> Result:
-    """Run a computation in place."""
+    """Run a computation in the calling task."""
     return work()

@@ -1,4 +1,4 @@
-"""Set a vehicle up, or bring an earlier state of it back."""
+"""`apply` and `restore`: write wanted values to a vehicle, or an earlier state of that vehicle."""
 
 from __future__ import annotations
 
@@ -12,19 +12,20 @@ from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.model.paramset import ParamSet
 from paramclient.provision.cautions import OUT_OF_RANGE
-from paramclient.provision.execution import Run
-from paramclient.provision.inspection import identified
+from paramclient.provision.execution import ApplyRun
+from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.planning import ParamInfo, Plan
 from paramclient.provision.results import ApplyProgress, ApplyResult
 
-__all__ = ["BEFORE_APPLY", "BEFORE_RESTORE", "apply", "restore", "restored"]
+__all__ = ["BEFORE_APPLY", "BEFORE_RESTORE", "apply", "restore", "restore_categories"]
 
 BEFORE_APPLY: Final = "before apply"
+"""The reason of the snapshot that `apply` stores before its first write."""
 BEFORE_RESTORE: Final = "before restore"
-"""What a snapshot of the state before says it is for."""
+"""The reason of the snapshot that `restore` stores before its first write."""
 
-RESTORED: Final = ("identity", "hardware", "calibration", OUT_OF_RANGE)
-"""What is included when a vehicle gets back a state of its own."""
+OWN_STATE_CATEGORIES: Final = ("identity", "hardware", "calibration", OUT_OF_RANGE)
+"""Categories that `restore` includes if the state is the vehicle's own."""
 
 
 async def apply(
@@ -44,50 +45,51 @@ async def apply(
     progress: Callable[[ApplyProgress], None] | None = None,
     before_writing: Callable[[], Awaitable[object]] | None = None,
 ) -> ApplyResult:
-    """Bring a vehicle to the wanted values, and prove each of them by reading it back at the end.
+    """Write the wanted values to a vehicle, and verify each of them by reading it back at the end.
 
-    It begins with what the vehicle has, whatever happened before: nothing is taken from an earlier run but
-    what the vehicle itself has kept. What it has is stored first, as a snapshot in the cache, and in the
-    file `backup`. Then stage by stage (see `plan`) the values are written, side by side within a stage. Where
-    others may have appeared, and after the vehicle has started again, it is looked at afresh. At the end all
-    is read again: by the vehicle's hash where there is one, else as a file or a list.
+    The call starts from the vehicle's present values; it uses no record of an earlier run. First it stores
+    the vehicle's state: as a snapshot in the cache, and in the file `backup`. Then it writes the values stage
+    by stage (see `plan`), concurrently within a stage. Where further parameters may have appeared, and after
+    a reboot, it reads the vehicle again. At the end it reads all values again: by the vehicle's hash if there
+    is one, else as a file or a list.
 
-    What the vehicle refuses, adjusts or does not answer is in its row; the others are set all the same.
+    A value that the vehicle refuses, adjusts or does not acknowledge is reported in its row; the remaining
+    values are still written.
 
-    Once something was sent, a failure is no exception but the end of the result: `error` says what it was,
-    and the rows what became of each value so far. Cancelled, it leaves the vehicle with what was written. In
-    every case the next call goes on from there.
+    After the first PARAM_SET, a failure is not raised: `error` of the result holds it, and the rows hold the
+    outcome of each value so far. Cancellation leaves the values that were written on the vehicle. The next
+    call continues from there.
 
     Args:
         component: the vehicle.
-        wanted: what it shall have; or a plan, of which what is wanted and included is taken. It is worked out
-            afresh from what the vehicle has now.
-        include: as in `plan`; of a plan, what is included besides.
+        wanted: the wanted parameters; or a plan, from which the wanted parameters and `include` are used. The
+            plan is computed again from the vehicle's present values.
+        include: as in `plan`; added to the `include` of a plan.
         info: as in `plan`.
-        reboot: start the vehicle again where values count only from then on.
-        allow_armed: go on although it is armed.
-        skip_invalid: set the others although some values cannot be right.
+        reboot: reboot the vehicle if values take effect after a reboot.
+        allow_armed: continue if the vehicle is armed.
+        skip_invalid: skip invalid values and write the remaining ones.
         force: as in `plan`.
-        durable: return only when the values and their lines of history are on the disk, past a loss of power;
-            where that fails, `error` of the result is a CacheError.
-        backup: a file for the state before; its form follows from its name, see `paramclient.files`.
-        timeout: seconds, after which the result says how far it came.
-        asker: for whom it is done, as in `Component.set`.
-        progress: called after each value and when a phase begins; it must not raise.
-        before_writing: awaited once, when the vehicle has been read, and before its state is stored and the
-            first value is written; what it raises ends the call.
+        durable: return only when the values and their history are on the disk and survive a power loss; if
+            that fails, `error` of the result is a CacheError.
+        backup: a file for the state before the first write; its name determines the file format, see
+            `paramclient.files`.
+        timeout: seconds, after which the result reports how far the run came.
+        asker: the author of the changes, as in `Component.set`.
+        progress: called after each value and at the start of a phase; it must not raise.
+        before_writing: awaited once, after the vehicle was read, and before its state is stored and the
+            first value is written; its exceptions end the call.
 
     Raises:
-        InvalidParameters: values cannot be right, and `skip_invalid` is not given.
-        UsageError: as from `plan`; the plan is one for another vehicle; or SYS_AUTOCONFIG is included, which
-            takes the others back at the next start, and `reboot` is not given; or `durable`, and the client
-            keeps no cache.
-        VehicleArmed: it is armed, and `allow_armed` is not given.
-        FileError, CacheError: the state before could not be stored.
-        NoReply: the vehicle did not answer before anything was sent.
-        LinkError: the link failed, or the client was closed, before anything was sent.
+        InvalidParameters: some values are invalid, and `skip_invalid` is false.
+        UsageError: as from `plan`; the plan is for another vehicle; SYS_AUTOCONFIG, which resets other
+            parameters at the next start, is included without `reboot`; or `durable` without a cache.
+        VehicleArmed: the vehicle is armed, and `allow_armed` is false.
+        FileError, CacheError: the state before the first write could not be stored.
+        NoReply: the vehicle did not answer before the first write.
+        LinkError: the link failed, or the client was closed, before the first write.
     """
-    run = Run(
+    run = ApplyRun(
         component,
         wanted,
         include=(include,) if isinstance(include, str) else tuple(include),
@@ -103,7 +105,7 @@ async def apply(
         before_writing=before_writing,
         reason=BEFORE_APPLY,
     )
-    return await _done(run, timeout)
+    return await _run(run, timeout)
 
 
 async def restore(
@@ -121,28 +123,28 @@ async def restore(
     progress: Callable[[ApplyProgress], None] | None = None,
     before_writing: Callable[[], Awaitable[object]] | None = None,
 ) -> ApplyResult:
-    """Bring an earlier state of a vehicle back: `apply`, with its own identity and calibration included.
+    """Restore an earlier state of a vehicle: `apply`, with its own identity and calibration included.
 
-    What the vehicle measures at each start, counts, or does not let others set stays as it is: its rows are
-    skipped, with the reason, and the result is complete all the same. Parameters that the vehicle has and the
-    state does not are left alone; `extra` of the result names them.
+    Parameters that the vehicle measures at each start, counts, or does not let clients write are not changed:
+    their rows are skipped with a reason, and the result can be complete without them. Parameters that the
+    vehicle has and the state does not have are not changed; `extra` of the result names them.
 
     Args:
         component: the vehicle.
-        state: what it had, such as a snapshot, or the file of a backup. If it does not say that it is this
-            vehicle's own, identity and calibration are left out.
+        state: the earlier state, such as a snapshot or a backup file. Identity and calibration are left out
+            unless the state names this vehicle as its own.
         include, info, reboot, allow_armed, force, backup, timeout, asker, progress, before_writing: as in
             `apply`.
 
     Raises:
-        UsageError: it is the state of another vehicle.
+        UsageError: the state is that of another vehicle.
         ParamClientError: as from `apply`.
     """
     given = (include,) if isinstance(include, str) else tuple(include)
-    run = Run(
+    run = ApplyRun(
         component,
         state,
-        include=(*await restored(component, state), *given),
+        include=(*await restore_categories(component, state), *given),
         info=info,
         reboot=reboot,
         allow_armed=allow_armed,
@@ -153,28 +155,30 @@ async def restore(
         progress=progress,
         before_writing=before_writing,
         reason=BEFORE_RESTORE,
-        leaves_read_only=True,
+        skips_read_only=True,
     )
-    return await _done(run, timeout)
+    return await _run(run, timeout)
 
 
-async def restored(component: Component, state: ParamSet) -> tuple[str, ...]:
-    """What `restore` includes of this state although the list leaves it out.
+async def restore_categories(component: Component, state: ParamSet) -> tuple[str, ...]:
+    """Return the categories that `restore` includes for this state.
+
+    Waits until the vehicle is identified.
 
     Raises:
-        UsageError: it is the state of another vehicle.
+        UsageError: the state is that of another vehicle.
     """
-    await identified(component)
-    whose, own = state.identity, component.identity
-    is_own = whose is not None and whose.is_same_vehicle(own)
-    if whose is not None and not is_own and None not in (whose.uid, own.uid) and whose.uid != own.uid:
-        raise UsageError(f"the state is that of another vehicle: {whose}; this one is {own}")
-    return RESTORED if is_own else (OUT_OF_RANGE,)
+    await wait_for_identity(component)
+    origin, own = state.identity, component.identity
+    is_own = origin is not None and origin.is_same_vehicle(own)
+    if origin is not None and not is_own and None not in (origin.uid, own.uid) and origin.uid != own.uid:
+        raise UsageError(f"the state is that of another vehicle: {origin}; this vehicle is {own}")
+    return OWN_STATE_CATEGORIES if is_own else (OUT_OF_RANGE,)
 
 
-async def _done(run: Run, timeout: float | None) -> ApplyResult:
+async def _run(run: ApplyRun, timeout: float | None) -> ApplyResult:
     with anyio.move_on_after(timeout):
         await run.prepare()
-        await run.work()
+        await run.write_and_verify()
         return run.result()
-    return run.ended_by_time()
+    return run.timed_out_result()

@@ -1,4 +1,4 @@
-"""Names that look like a mistyped one."""
+"""Parameter names that are similar to a mistyped one."""
 
 from __future__ import annotations
 
@@ -8,27 +8,32 @@ from typing import Final
 
 __all__ = ["nearest_names"]
 
-MOST_NAMES: Final = 3
-LIKENESS: Final = 0.8
-"""Of two names of ten characters that differ in two of them. Unrelated ones share more than half by chance:
-`ATC_RAT_RLL_P` and `ATC_RAT_YAW_P`."""
-SHARED_END: Final = 2
-"""Characters at the start or at the end that two names share, or they are not compared: it takes long."""
+SIMILAR_NAMES_MAX: Final = 3
+"""Names that are suggested for one mistyped name, so that the message stays short."""
+SIMILARITY_MIN: Final = 0.8
+"""Ratio of `difflib.SequenceMatcher` from which two names count as similar: names of ten characters that
+differ in two of them. Unrelated names share more than half by chance: `ATC_RAT_RLL_P` and `ATC_RAT_YAW_P`."""
+AFFIX_LENGTH: Final = 2
+"""Characters at the start or at the end that two names must share before they are compared: a comparison
+is slow."""
 
 
 def nearest_names(name: str, names: Iterable[str]) -> tuple[str, ...]:
-    """The names that look most like this one, the likeliest first; in any case of the letters."""
+    """Return the names most similar to `name`, most similar first, at most `SIMILAR_NAMES_MAX`.
+
+    The case of the letters of `name` does not matter.
+    """
     wanted = name.upper()
     likely = [
         other
         for other in sorted(names)
-        if other[:SHARED_END] == wanted[:SHARED_END] or other[-SHARED_END:] == wanted[-SHARED_END:]
+        if other[:AFFIX_LENGTH] == wanted[:AFFIX_LENGTH] or other[-AFFIX_LENGTH:] == wanted[-AFFIX_LENGTH:]
     ]
     matcher = difflib.SequenceMatcher(autojunk=False)
     matcher.set_seq2(wanted)
     scored = []
     for other in likely:
         matcher.set_seq1(other)
-        if matcher.real_quick_ratio() >= LIKENESS and matcher.quick_ratio() >= LIKENESS:
+        if matcher.real_quick_ratio() >= SIMILARITY_MIN and matcher.quick_ratio() >= SIMILARITY_MIN:
             scored.append((-matcher.ratio(), other))
-    return tuple(other for score, other in sorted(scored)[:MOST_NAMES] if -score >= LIKENESS)
+    return tuple(other for score, other in sorted(scored)[:SIMILAR_NAMES_MAX] if -score >= SIMILARITY_MIN)

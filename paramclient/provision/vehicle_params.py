@@ -1,4 +1,4 @@
-"""Parameters taken down as a set, so that they can be compared, saved or set: of a vehicle, of the cache."""
+"""Parameters of a vehicle or of the cache as a `ParamSet`, to compare, save or write them."""
 
 from __future__ import annotations
 
@@ -24,35 +24,36 @@ if TYPE_CHECKING:
 
 __all__ = [
     "NO_DEFAULTS",
-    "Taken",
-    "before_last_apply",
-    "cached_set",
-    "differing",
-    "incomplete",
+    "FetchedSet",
+    "load_state_before_apply",
+    "load_cached_set",
+    "select_non_defaults",
+    "incomplete_error",
     "left_out_note",
-    "set_of",
-    "taken",
-    "whole_set",
+    "cached_param_set",
+    "collect_set",
+    "fetch_set",
 ]
 
-REFRESH_PATIENCE: Final = 10.0
-"""Seconds for the values that no hash covers."""
-MOST_NAMED: Final = 20
-"""Missing parameters that are named to people."""
+REFRESH_TIMEOUT: Final = 10.0
+"""Seconds to wait for the values that the vehicle's hash does not cover."""
+NAMES_SHOWN_MAX: Final = 20
+"""Parameters that a message names, so that it stays readable; it gives the number of further ones."""
 NO_DEFAULTS: Final = (
-    "the firmware's defaults are not known, so nor is what differs from them: they come with the parameter "
-    "file over MAVFTP, which ArduPilot and PX4 from 1.18 on serve"
+    "the firmware's defaults are not known, so the parameters that differ from them cannot be found: the "
+    "defaults come with the parameter file over MAVFTP, which ArduPilot and PX4 from 1.18 on serve"
 )
+"""The message for a request that needs the firmware's defaults when no parameter has one."""
 
 
 @dataclass(frozen=True, slots=True)
-class Taken:
-    """What of a fetched table was given or confirmed in this session.
+class FetchedSet:
+    """The parameters of a fetched table that were received or confirmed in this session.
 
     Attributes:
-        set: the parameters.
-        params: the same as the table has them.
-        missing: the names (or `index 12`) of those that did not come.
+        set: the parameters as a set.
+        params: the same parameters as `Param` objects of the table.
+        missing: the names (or `index 12`) of parameters that were not received.
     """
 
     set: ParamSet
@@ -60,36 +61,36 @@ class Taken:
     missing: Sequence[str]
 
 
-async def taken(
+async def collect_set(
     component: Component,
     result: FetchResult,
     *,
     source: str,
     timeout: float | None = None,
     run: Runner = run_here,
-) -> Taken:
-    """Take down what a fetch has brought.
+) -> FetchedSet:
+    """Return the parameters of a fetched table as a set.
 
-    The values that no hash covers are waited for. Parameters that the vehicle does not list, and that are
-    only last known, cannot be confirmed, and are left out.
+    Waits for the values that the vehicle's hash does not cover. Parameters that the vehicle does not list
+    and that are only cached cannot be confirmed; they are left out.
 
     Args:
         component: the component.
-        result: what its fetch has brought.
-        source: where it comes from, in words.
-        timeout: seconds for the values that no hash covers, `REFRESH_PATIENCE` at most; what has not come
-            then is missing.
-        run: runs what takes long for a large table.
+        result: the result of its fetch.
+        source: the origin of the set, in words.
+        timeout: seconds to wait for the values that no hash covers, at most `REFRESH_TIMEOUT`; values that
+            were not received by then are missing.
+        run: runs the computations that take long for a large table.
 
     Raises:
         LinkError: the link failed.
     """
-    with suppress(NoReply):  # what was not read afresh is missing below
-        await component.refreshed(timeout=min(REFRESH_PATIENCE, math.inf if timeout is None else timeout))
+    with suppress(NoReply):  # values that were not read again are reported as missing below
+        await component.refreshed(timeout=min(REFRESH_TIMEOUT, math.inf if timeout is None else timeout))
     table = copy_params(component.params)
     system, number, identity, at = component.system, component.component, component.identity, time.time()
 
-    def take() -> Taken:
+    def take() -> FetchedSet:
         params = list(table.values())
         known = [param for param in params if param.trust is not Trust.CACHED]
         stale = {
@@ -99,51 +100,51 @@ async def taken(
         }
         missing = [stale.get(index, f"index {index}") for index in sorted({*result.missing, *stale})]
         found = ParamSet.of(known, component=number, system=system, identity=identity, at=at, source=source)
-        return Taken(found, known, missing)
+        return FetchedSet(found, known, missing)
 
     return await run(take)
 
 
-async def whole_set(
+async def fetch_set(
     component: Component,
     *,
     source: str,
     timeout: float | None = None,
     progress: Callable[[Progress], None] | None = None,
     run: Runner = run_here,
-) -> Taken:
-    """Bring a component's table up to date and take all of it down.
+) -> FetchedSet:
+    """Fetch all parameters of a component and return them as a set.
 
     Args:
-        component, source, run: as in `taken`.
+        component, source, run: as in `collect_set`.
         timeout, progress: as in `Component.fetch_all`.
 
     Raises:
-        VehicleError: some parameters did not come; the text names them.
+        VehicleError: some parameters were not received; the message names them.
         ParamClientError: as from `Component.fetch_all`.
     """
     result = await component.fetch_all(timeout=timeout, progress=progress)
-    found = await taken(component, result, source=source, run=run)
+    found = await collect_set(component, result, source=source, run=run)
     if found.missing:
-        raise incomplete(component, found.missing)
+        raise incomplete_error(component, found.missing)
     return found
 
 
-def incomplete(component: Component, missing: Sequence[str]) -> VehicleError:
-    """What says that some parameters did not come."""
-    shown = ", ".join(islice(missing, MOST_NAMED))
-    more = len(missing) - MOST_NAMED
-    who = f"{component.system}/{component.component} {component.autopilot}"
+def incomplete_error(component: Component, missing: Sequence[str]) -> VehicleError:
+    """Return the error for a component some of whose parameters were not received."""
+    shown = ", ".join(islice(missing, NAMES_SHOWN_MAX))
+    more = len(missing) - NAMES_SHOWN_MAX
+    vehicle = f"{component.system}/{component.component} {component.autopilot}"
     rest = f" and {more} more" if more > 0 else ""
     return VehicleError(
-        f"{who} on {component._client.link.name} is incomplete: {shown}{rest} did not come",
+        f"{vehicle} on {component._client.link.name} is incomplete: {shown}{rest} did not come",
         system=component.system,
         component=component.component,
     )
 
 
-def set_of(table: CachedComponent) -> ParamSet:
-    """What the cache has of a component."""
+def cached_param_set(table: CachedComponent) -> ParamSet:
+    """Return a component's cached parameters as a set."""
     return ParamSet.of(
         table.params.values(),
         component=table.component,
@@ -154,36 +155,36 @@ def set_of(table: CachedComponent) -> ParamSet:
     )
 
 
-def cached_set(
+def load_cached_set(
     cache: ParamCache, key: str, component: int, *, note: Callable[[str], None] | None = None
 ) -> ParamSet:
-    """All that the cache has of a component.
+    """Return the complete cached table of a component as a set.
 
     Args:
         cache: the cache.
         key: `Identity.key` of the vehicle.
         component: component id.
-        note: is told of names that are left out, in a sentence.
+        note: called with a sentence that names the parameters that are left out.
 
     Raises:
-        CacheError: it has no such table, or not all of it.
+        CacheError: the cache has no table of this component, or an incomplete one.
     """
     table = cache.load(key, component)
     if table is None:
         raise NotInCache(f"the cache has no table of component {component} of {key}")
     if not table.complete:
-        who = f"{table.system}/{component} ({key})"
+        vehicle = f"{table.system}/{component} ({key})"
         of = "" if table.count is None else f" of {table.count}"
-        raise NotInCache(f"the cache has {table.size}{of} parameters of {who}, not all; fetch them first")
+        raise NotInCache(f"the cache has {table.size}{of} parameters of {vehicle}, not all; fetch them first")
     if table.left_out and note is not None:
         note(left_out_note(table))
-    return set_of(table)
+    return cached_param_set(table)
 
 
 def left_out_note(table: CachedComponent) -> str:
-    """Return what says that names of a cached table are left out."""
-    shown = ", ".join(map(repr, table.left_out[:MOST_NAMED]))
-    more = len(table.left_out) - MOST_NAMED
+    """Return the sentence about names of a cached table that are left out of a set."""
+    shown = ", ".join(map(repr, table.left_out[:NAMES_SHOWN_MAX]))
+    more = len(table.left_out) - NAMES_SHOWN_MAX
     rest = f" and {more} more" if more > 0 else ""
     return (
         f"{table.system}/{table.component} ({table.key}): left out, as no parameter file can hold the name: "
@@ -191,30 +192,37 @@ def left_out_note(table: CachedComponent) -> str:
     )
 
 
-def before_last_apply(cache: ParamCache, key: str, component: int) -> ParamSet:
-    """The state of a component before anything was last applied to it.
+def load_state_before_apply(cache: ParamCache, key: str, component: int) -> ParamSet:
+    """Return the state that the cache stored of a component before the latest `apply`.
+
+    Args:
+        cache: the cache.
+        key: `Identity.key` of the vehicle.
+        component: component id.
 
     Raises:
-        CacheError: nothing is known of that.
+        CacheError: the cache has no snapshot from before an `apply`.
     """
     try:
-        kept = [each for each in cache.snapshots(key, component) if each.reason == BEFORE_APPLY]
+        snapshots = [each for each in cache.snapshots(key, component) if each.reason == BEFORE_APPLY]
     except UnknownVehicle:
-        kept = []
-    if not kept:
-        raise NotInCache(f"the cache knows of no apply to {key}; name the moment whose state is to come back")
-    return cache.state_at(key, component, kept[-1].id)
+        snapshots = []
+    if not snapshots:
+        raise NotInCache(
+            f"the cache has no snapshot from before an apply to {key}; name the time of the state to restore"
+        )
+    return cache.state_at(key, component, snapshots[-1].id)
 
 
-def differing(whole: ParamSet, params: Iterable[Param]) -> ParamSet:
-    """Of a set, what differs from the firmware's defaults.
+def select_non_defaults(whole: ParamSet, params: Iterable[Param]) -> ParamSet:
+    """Return the parameters of a set that differ from the firmware's defaults.
 
     Args:
         whole: the set.
-        params: the same parameters as their table has them.
+        params: the same parameters as `Param` objects of the table.
 
     Raises:
-        UsageError: the defaults are not known, or nothing differs.
+        UsageError: the defaults are not known, or no parameter differs.
     """
     if not any(param.default is not None for param in whole.values()):
         raise UsageError(NO_DEFAULTS)

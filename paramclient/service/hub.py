@@ -22,7 +22,7 @@ from paramclient.client.client import ParamClient
 from paramclient.client.component import address_in_words
 from paramclient.client.worker_thread import Worker
 from paramclient.documents.component import ProgressDoc
-from paramclient.documents.job import far_text
+from paramclient.documents.job import progress_text
 from paramclient.documents.results import FetchResultDoc
 from paramclient.errors import NoReply, ParamClientError, UsageError
 from paramclient.links import Link, create_link
@@ -369,7 +369,7 @@ class Hub:
                 logger.warning(
                     "%s of %d/%d on %s, which %s had asked for at %s, was cut off %s, as the service ended",
                     *("a restore" if each.kind == "restore" else "an apply", each.system, each.component),
-                    *(each.link, each.asked_by, time_text(each.began), far_text(each)),
+                    *(each.link, each.asked_by, time_text(each.began), progress_text(each)),
                 )
 
     async def _recall(self, followed: Followed) -> None:

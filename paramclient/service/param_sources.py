@@ -18,9 +18,14 @@ from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import is_pattern
 from paramclient.model.values import Trust, check_name
-from paramclient.provision.inspection import identified
+from paramclient.provision.inspection import wait_for_identity
 from paramclient.provision.runner import Runner
-from paramclient.provision.vehicle_params import Taken, before_last_apply, cached_set, whole_set
+from paramclient.provision.vehicle_params import (
+    FetchedSet,
+    fetch_set,
+    load_cached_set,
+    load_state_before_apply,
+)
 from paramclient.service.problems import ServiceError
 from paramclient.service.reading import check_pieces
 from paramclient.service.request import LARGEST_UPLOAD
@@ -219,7 +224,7 @@ async def resolved(hub: Hub, target: Followed, source: Source) -> ParamSet:
     if source.component is not None:
         where = source.component
         other = hub.find(where.system, where.component, where.link)
-        found = await whole_set(other.component, source=f"link {other.line.name}", run=hub.read_aside)
+        found = await fetch_set(other.component, source=f"link {other.line.name}", run=hub.read_aside)
         return found.set
     if source.vehicle is not None:
         kept = source.vehicle
@@ -246,13 +251,13 @@ async def state(hub: Hub, target: Followed, when: float | int | None) -> ParamSe
     cache = the_cache(hub)
     key, component = await key_of(hub, target), target.component.component
     if when is None:
-        return await known_to(hub, lambda: before_last_apply(cache, key, component))
+        return await known_to(hub, lambda: load_state_before_apply(cache, key, component))
     return await past(hub, key, component, when)
 
 
 async def key_of(hub: Hub, target: Followed) -> str:
     """The key under which a component is kept, when all that was heard of it is on the disk."""
-    await identified(target.component)
+    await wait_for_identity(target.component)
     await written(hub)
     return target.component.identity.key
 
@@ -279,7 +284,7 @@ async def past(hub: Hub, key: str, component: int, when: float | int | None) -> 
     cache = the_cache(hub)
     await cached(hub, key, component)
     if when is None:
-        return await known_to(hub, lambda: cached_set(cache, key, component))
+        return await known_to(hub, lambda: load_cached_set(cache, key, component))
     return await known_to(hub, lambda: cache.state_at(key, component, when))
 
 
@@ -324,7 +329,7 @@ async def known_to(hub: Hub, look: Callable[[], Result]) -> Result:
         raise ServiceError(404, "unknown-state", str(error), error=type(error).__name__) from error
 
 
-async def known_set(target: Followed, run: Runner) -> Taken:
+async def known_set(target: Followed, run: Runner) -> FetchedSet:
     """The table of a component as it stands here, if all of it was heard or confirmed in this session.
 
     Args:
@@ -338,7 +343,7 @@ async def known_set(target: Followed, run: Runner) -> Taken:
     table, count = copy_params(component.params), component.count
     system, number, identity, at = component.system, component.component, component.identity, time.time()
 
-    def take() -> Taken:
+    def take() -> FetchedSet:
         params = list(table.values())
         unsure = sum(param.trust is Trust.CACHED for param in params)
         listed = sum(param.index is not None for param in params)
@@ -348,7 +353,7 @@ async def known_set(target: Followed, run: Runner) -> Taken:
             raise ServiceError(409, "incomplete", what)
         source = f"link {target.line.name}"
         found = ParamSet.of(params, component=number, system=system, identity=identity, at=at, source=source)
-        return Taken(found, params, ())
+        return FetchedSet(found, params, ())
 
     return await run(take)
 

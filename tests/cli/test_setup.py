@@ -219,7 +219,7 @@ def test_reboot_is_only_done_when_asked_for(
     vehicle = copter()
     outcome = command("apply", put(vehicle), wanted)
     assert outcome.code == 0
-    assert "1/1 ardupilot: counts only from the next start of the vehicle on: EK2_ENABLE\n" in outcome.err
+    assert "1/1 ardupilot: takes effect after a reboot: EK2_ENABLE\n" in outcome.err
     assert vehicle.values["EK2_GPS_TYPE"] == 3
     vehicle = copter()
     outcome = command("apply", put(vehicle), wanted, "--reboot", "--json")
@@ -248,7 +248,7 @@ def test_somebody_at_a_terminal_is_asked(
         outcome = command("apply", put(vehicle), file())
         assert outcome.code == (0 if sets else 1)
         assert "go on? [y/N]" in outcome.err
-        assert ["1", "RTL_ALT", "1500", "2500", "set", "the others"] in outcome.rows
+        assert ["1", "RTL_ALT", "1500", "2500", "set", "all other parameters"] in outcome.rows
         assert vehicle.requests["PARAM_SET"] == sets
         assert "go on?" not in command("apply", put(copter()), file(), "--json").err
         assert "go on?" not in command("apply", put(vehicle), file(), "--yes").err
@@ -264,8 +264,8 @@ def test_dry_run_prints_what_would_be_sent_in_its_order(
     outcome = command("apply", put(vehicle), wanted, "--dry-run", "--reboot", "--backup", backup)
     assert outcome.code == 0
     assert outcome.rows[1:3] == [
-        ["1", "EK2_ENABLE", "0", "1", "set", "what shows others, counts from the next start on"],
-        ["1", "restart", "the vehicle starts again"],
+        ["1", "EK2_ENABLE", "0", "1", "set", "switches that reveal parameters, takes effect after a reboot"],
+        ["1", "reboot", "the vehicle reboots"],
     ]
     assert [row[:5] for row in outcome.rows[3:5]] == [
         ["2", "RTL_ALT", "1500", "2500", "set"],
@@ -393,7 +393,7 @@ def test_restore_takes_a_moment_or_a_snapshot(
 @pytest.mark.parametrize(
     ("when", "text"),
     [
-        ([], "the cache knows of no apply to uid:"),
+        ([], "the cache has no snapshot from before an apply to uid:"),
         (["2h ago"], "is not known: its table was never complete; there is no snapshot"),
         (["4"], "there is no snapshot 4 of uid:"),
     ],
@@ -607,5 +607,5 @@ def test_metadata_says_what_is_out_of_range_and_what_needs_a_start(
     options = ("--metadata", metadata, "--include", "out-of-range")
     outcome = command("apply", put(vehicle), file(), *options)
     assert outcome.code == 0
-    assert "counts only from the next start of the vehicle on: WPNAV_SPEED" in outcome.err
+    assert "takes effect after a reboot: WPNAV_SPEED" in outcome.err
     assert command("verify", put(vehicle), file(), "--metadata", metadata).code == 0

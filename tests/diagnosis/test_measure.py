@@ -1,4 +1,4 @@
-"""The diagnosis of a vehicle and its link: its measurements and findings, and that it changes nothing."""
+"""The diagnosis of a vehicle and its link: measurements, findings, report; it changes nothing."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ UID = "0002000000003338470e3034"
 
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Runs the command in this process, on a clock that leaps."""
+    """Run the command line in this process, on simulated time."""
     leaping(monkeypatch)
     return in_process(capsys)
 
 
 @pytest.fixture
 def live_command(capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs the command in this process in real time."""
+    """Run the command line in this process in real time."""
     return in_process(capsys)
 
 
@@ -65,7 +65,7 @@ def texts(document: dict[str, Any], severity: str) -> list[str]:
     return [each["text"] for each in document["findings"] if each["severity"] == severity]
 
 
-# what is measured
+# Measurements
 
 
 def test_px4(command: Command, put: Put) -> None:
@@ -112,7 +112,7 @@ def test_ardupilot(command: Command, put: Put) -> None:
     assert any("no parameter hash" in text for text in texts(document, "note"))
 
 
-def test_an_ardupilot_without_mavftp_is_slow_and_says_why(command: Command, put: Put) -> None:
+def test_an_ardupilot_without_mavftp_is_slow_with_advice(command: Command, put: Put) -> None:
     document = command("check", put(ArduPilotVehicle(ftp=False)), "--json").json
     assert document["files"]["is_announced"] is False
     assert document["files"]["size"] is None
@@ -121,7 +121,7 @@ def test_an_ardupilot_without_mavftp_is_slow_and_says_why(command: Command, put:
     assert "BRD_OPTIONS" in finding["advice"]
 
 
-def test_a_component_that_says_little(command: Command, put: Put) -> None:
+def test_a_component_with_few_services(command: Command, put: Put) -> None:
     table = [SimParam(f"CAM_{n}", ParamType.REAL32, float(n)) for n in range(8)]
     document = command("check", put(GenericVehicle(table)), "--json").json
     assert document["hash"]["before"] is None
@@ -145,7 +145,7 @@ def test_a_lossy_link_is_measured(command: Command, put: Put) -> None:
 
 
 def test_a_list_that_takes_too_long_is_cut_short(command: Command, put: Put) -> None:
-    """And what has no time left is said not to be measured."""
+    """Measurements without time left are reported as not measured."""
     slow = ArduPilotVehicle(ftp=False, burst=1, period=0.05)
     done = command("check", put(slow), "--json", "--timeout", "9")
     document = done.json
@@ -157,11 +157,11 @@ def test_a_list_that_takes_too_long_is_cut_short(command: Command, put: Put) -> 
     assert document["elapsed_s"] < 11
 
 
-def test_parameters_that_never_come_are_a_problem(command: Command, put: Put) -> None:
+def test_parameters_that_are_never_received_are_a_problem(command: Command, put: Put) -> None:
     done = command("check", put(PX4Vehicle(uid=1, dead=[100])), "--json")
     assert done.code == ExitCode.INCOMPLETE
     assert done.json["list"]["missing"] == 1
-    assert any(text.startswith("1 index of 903 never came") for text in texts(done.json, "problem"))
+    assert any(text.startswith("1 index of 903 stayed missing") for text in texts(done.json, "problem"))
 
 
 def test_other_stations_and_vehicles_are_named(command: Command, put: Put) -> None:
@@ -180,7 +180,7 @@ def test_other_stations_and_vehicles_are_named(command: Command, put: Put) -> No
 
 
 def test_nothing_is_changed(command: Command, put: Put, tmp_path: Path) -> None:
-    """Of all that is sent, nothing can write a parameter, a file or a setting."""
+    """No message that is sent can write a parameter, a file or a setting."""
     for vehicle in (PX4Vehicle(uid=1, ftp=True, metadata=True), ArduPilotVehicle()):
         log = tmp_path / f"{type(vehicle).__name__}.tlog"
         before = {row.name: row.value for row in vehicle.params.values()}
@@ -210,7 +210,7 @@ def test_nothing_is_changed(command: Command, put: Put, tmp_path: Path) -> None:
 # what is printed
 
 
-def test_people_see_a_table(live_command: Command, put: Put) -> None:
+def test_the_output_is_a_table(live_command: Command, put: Put) -> None:
     done = live_command("check", put(PX4Vehicle(uid=0x1234567890)))
     rows = {row[0]: row[1:] for row in done.rows if row}
     assert done.code == ExitCode.DONE
@@ -237,7 +237,7 @@ def test_a_report_can_be_attached_to_an_issue(command: Command, put: Put, tmp_pa
     assert str(Path.home()) not in text
 
 
-def test_a_report_is_never_written_over(command: Command, tmp_path: Path) -> None:
+def test_an_existing_report_is_not_overwritten(command: Command, tmp_path: Path) -> None:
     path = tmp_path / "check.md"
     path.write_text("mine")
     done = command("check", "sim:px4", "--report", path)
@@ -272,7 +272,7 @@ def test_a_log_cannot_be_measured(command: Command, tmp_path: Path) -> None:
     log = Path(__file__).parents[1] / "data" / "px4_get_set.tlog"
     done = command("check", f"replay:{log}")
     assert done.code == ExitCode.USAGE
-    assert "is a log: nothing can be measured there" in done.err
+    assert "is a log: check needs a link to a vehicle" in done.err
 
 
 def test_no_vehicle(command: Command, put: Put) -> None:
@@ -284,7 +284,7 @@ def test_no_vehicle(command: Command, put: Put) -> None:
 
 
 @pytest.mark.anyio
-async def test_it_needs_a_client_that_counts() -> None:
+async def test_the_diagnosis_needs_a_client_that_counts_traffic() -> None:
     async with ParamClient(SimLink(PX4Vehicle()), cache=False) as client:
         vehicle = await client.component()
         with pytest.raises(UsageError, match="traffic=True"):
@@ -295,7 +295,7 @@ async def test_it_needs_a_client_that_counts() -> None:
 
 
 def report(**changes: Any) -> VehicleReport:
-    """A vehicle with nothing unusual, but for the changes."""
+    """Return the report of a vehicle without findings, with these changes."""
     link = LinkReport(
         name="udpin:0.0.0.0:14550",
         seconds=5.0,
@@ -376,7 +376,7 @@ def test_nothing_unusual() -> None:
         ({"reads": {"answered": 28}}, Severity.PROBLEM, "2 of 30 reads stayed unanswered"),
         ({"list": {"error": "no reply"}}, Severity.PROBLEM, "could not be downloaded: no reply"),
         ({"list": {"is_cut_short": True, "rate": 450.0}}, Severity.SLOW, "All of it takes 2 s"),
-        ({"list": {"missing": 3}}, Severity.PROBLEM, "3 indices of 900 never came"),
+        ({"list": {"missing": 3}}, Severity.PROBLEM, "3 indices of 900 stayed missing"),
         ({"list": {"rate": 8.0}}, Severity.SLOW, "at 8 values per second"),
         ({"list": {"longest_pause": 1.2}}, Severity.SLOW, "paused for 1.2 s"),
         ({"files": {"size": None, "is_serving": False, "error": "x"}}, Severity.SLOW, "does not answer: x"),
@@ -392,14 +392,14 @@ def test_nothing_unusual() -> None:
     ],
     ids=lambda value: str(value)[:40],
 )
-def test_what_is_unusual_is_found(changes: dict[str, Any], severity: Severity, text: str) -> None:
+def test_an_unusual_result_becomes_a_finding(changes: dict[str, Any], severity: Severity, text: str) -> None:
     [finding] = findings_of(report(**changes))
     assert finding.severity is severity
     assert text in finding.text
 
 
 def test_a_lossy_list_may_pause() -> None:
-    """What was lost is requested again: that explains a pause."""
+    """Requests for lost values explain a pause."""
     assert findings_of(report(list={"longest_pause": 1.2, "lost": 30})) == []
 
 
@@ -408,5 +408,5 @@ def test_problems_come_first() -> None:
     assert [each.severity for each in found] == [Severity.PROBLEM, Severity.SLOW, Severity.NOTE]
 
 
-def test_what_was_not_measured_is_not_judged() -> None:
+def test_missing_measurements_have_no_findings() -> None:
     assert findings_of(report(reads=None, list=None, files=None, hash=None)) == []

@@ -1,4 +1,4 @@
-"""What is told as JSON: values to the last bit, members in their order, and what the schema says."""
+"""JSON documents: exact values, order of members, agreement with their schema, lazy loading of pydantic."""
 
 from __future__ import annotations
 
@@ -69,9 +69,9 @@ def param(name: str, value: Value, kind: ParamType | int = ParamType.REAL32, **m
         (b"\x01\x02\x03\x04", 99, "0x04030201"),
     ],
 )
-def test_values_are_told_exactly(value: Value, kind: ParamType | int, shown: object) -> None:
-    told = value_json(value, kind)
-    assert (type(told), repr(told)) == (type(shown), repr(shown))
+def test_values_are_exact(value: Value, kind: ParamType | int, shown: object) -> None:
+    member = value_json(value, kind)
+    assert (type(member), repr(member)) == (type(shown), repr(shown))
     document = ParamDoc.of(param("P", value, kind))
     assert repr(strict(json.dumps(document.as_json(), allow_nan=False))["value"]) == repr(shown)
 
@@ -84,7 +84,7 @@ def test_bits_have_the_width_of_the_type() -> None:
     assert bits_written(WrittenParam("P", 300, ParamType.INT8)) is None
 
 
-def test_what_was_written_for_a_float_is_told_as_one() -> None:
+def test_an_integer_written_for_a_float_becomes_a_float() -> None:
     assert typed(5, ParamType.REAL32) == (5.0, ParamType.REAL32)
     assert isinstance(typed(5, ParamType.REAL32)[0], float)
     assert typed(5, ParamType.INT32) == (5, ParamType.INT32)
@@ -94,7 +94,7 @@ def test_what_was_written_for_a_float_is_told_as_one() -> None:
 # members
 
 
-def test_a_parameter_has_its_members_in_order_and_none_that_says_nothing() -> None:
+def test_a_parameter_has_its_members_in_order_and_no_empty_ones() -> None:
     bare = ParamDoc.of(param("P", 1.5))
     assert list(bare.as_json()) == ["value", "type", "index", "bits"]
     info = ParamInfo("P", units="m", values={1.5: "half"}, minimum=0, maximum=math.inf, reboot_required=True)
@@ -122,14 +122,14 @@ def test_a_parameter_has_its_members_in_order_and_none_that_says_nothing() -> No
     assert InfoDoc.of(ParamInfo("P")).as_json() == {}
 
 
-def test_what_did_not_come_is_told_where_something_did_not() -> None:
+def test_errors_are_a_member_only_if_a_parameter_was_not_received() -> None:
     error = UnknownParameter("no such", system=1, component=1, name="Q")
     assert GotDoc.of([], None, {"Q": error}).as_json() == {"params": {}, "errors": {"Q": "no such"}}
     metadata = Metadata.of([ParamInfo("P{n}", units="s")])
     assert GotDoc.of([param("P7", 1.0)], metadata, {}).as_json()["params"]["P7"]["units"] == "s"
 
 
-def test_history_tells_programs_more() -> None:
+def test_exact_history_has_times_and_bits() -> None:
     entry = HistoryEntry(0.25, 1, "P", param("P", math.nan), None, "us for <b>")
     assert HistoryEntryDoc.of(entry).as_json() == {
         "time": "1970-01-01T00:00:00.250Z",
@@ -150,7 +150,7 @@ def test_history_tells_programs_more() -> None:
 
 
 def documents() -> Iterator[Document]:
-    """One of each kind that is built of plain things."""
+    """Yield one document of each kind that can be built from plain data."""
     info = ParamInfo("A", type=ParamType.REAL32, short_description="\x1b[31m<script>", bits={0: "GPS"})
     left = ParamSet(
         {"A": WrittenParam("A", 1, ParamType.REAL32, 0.5, "of old"), "B": WrittenParam("B", math.nan)},
@@ -195,7 +195,7 @@ def documents() -> Iterator[Document]:
 
 
 @pytest.mark.parametrize("document", [*documents()], ids=lambda document: type(document).__name__)
-def test_a_document_is_what_its_schema_says_and_comes_back(document: Document) -> None:
+def test_a_document_matches_its_schema_and_can_be_parsed_again(document: Document) -> None:
     content = strict(json.dumps(document.as_json(), allow_nan=False))
     schema = type(document).model_json_schema(mode="serialization")
     answer = {"application/json": {"schema": schema}}
@@ -210,7 +210,7 @@ def test_a_document_is_what_its_schema_says_and_comes_back(document: Document) -
         setattr(document, next(iter(type(document).model_fields)), None)
 
 
-def test_every_document_says_what_it_is() -> None:
+def test_every_document_has_a_docstring() -> None:
     for path in (ROOT / "paramclient" / "documents").glob("*.py"):
         module = importlib.import_module(f"paramclient.documents.{path.stem}")
         classes = [
@@ -223,7 +223,7 @@ def test_every_document_says_what_it_is() -> None:
             assert each.name in module.__all__
 
 
-def test_the_command_loads_pydantic_only_where_json_is_made(tmp_path: Path) -> None:
+def test_the_command_line_loads_pydantic_only_for_json(tmp_path: Path) -> None:
     words = ["cache", "list", "--cache", str(tmp_path / "none.sqlite3")]
     program = (
         "import sys; from paramclient.cli import run\n"

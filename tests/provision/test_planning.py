@@ -1,4 +1,4 @@
-"""What a set-up would do: which values, in which order, and what is left alone for which reason."""
+"""Plans of set-ups: values to write, their order, left-out and invalid parameters, similar names."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import Encoding, Param, ParamType, Value, bits_of, from_bits
 from paramclient.provision import CATEGORIES, MISSING, WRONG, Plan, PlanStatus, overlay, plan
 from paramclient.provision.cautions import OUT_OF_RANGE, READ_ONLY, Caution, cautions_for
-from paramclient.provision.planning import MOST_SUGGESTED
+from paramclient.provision.planning import SUGGESTIONS_MAX
 from paramclient.sim.param_table import SimParam, ardupilot_table, ek2_group, px4_table
 
 SECTIONS = ("left_out", "frame", "resets", "reveals", "last", "system_id", "reboot")
@@ -30,7 +30,7 @@ class Info:
 
 
 def held(**values: Value | tuple[ParamType | int, Value]) -> dict[str, Param]:
-    """A vehicle's table: an int is an INT32, a float a REAL32, other types are said."""
+    """Return a vehicle's table: an int is an INT32, a float a REAL32, other types are given."""
     table: dict[str, Param] = {}
     for name, entry in values.items():
         default = ParamType.REAL32 if isinstance(entry, float) else ParamType.INT32
@@ -60,7 +60,7 @@ def only_row(made: Plan) -> tuple[PlanStatus, str, str]:
     return row.status, row.category, row.reason
 
 
-def test_every_wanted_parameter_ends_in_one_of_the_states() -> None:
+def test_every_wanted_parameter_gets_a_status() -> None:
     made = plan(
         held(ROLL_P=4.0, PITCH_P=4.0, STAT_RUNTIME=5, COUNT=(ParamType.INT8, 1), OTHER=1),
         written(ROLL_P=4, PITCH_P=6.5, STAT_RUNTIME=6, COUNT=300, PICTH_P=1),
@@ -83,13 +83,13 @@ def test_every_wanted_parameter_ends_in_one_of_the_states() -> None:
     assert str(made.rows["ROLL_P"]) == "ROLL_P = 4"
 
 
-def test_nothing_to_do_is_met_and_what_is_missing_is_not() -> None:
+def test_a_plan_is_met_without_steps_and_not_met_with_a_missing_parameter() -> None:
     table = held(ROLL_P=4.0, STAT_RUNTIME=5)
     assert plan(table, written(ROLL_P=4, STAT_RUNTIME=6), autopilot="ardupilot").is_met
     assert not plan(table, written(ROLL_P=4, ROLL_I=6), autopilot="ardupilot").is_met
 
 
-def test_who_is_mistyped_is_told_the_nearest_names() -> None:
+def test_a_mistyped_name_gets_the_nearest_names() -> None:
     table = copy_of(ardupilot_table())
     made = plan(table, written(ATC_RAT_RRL_P=0.1, wpnav_speed=500, NO_SUCH_THING=1), autopilot="ardupilot")
     assert made.rows["ATC_RAT_RRL_P"].nearest[0] == "ATC_RAT_RLL_P"
@@ -98,8 +98,8 @@ def test_who_is_mistyped_is_told_the_nearest_names() -> None:
     assert "did you mean ATC_RAT_RLL_P" in str(made.rows["ATC_RAT_RRL_P"])
 
 
-def test_the_file_of_another_vehicle_is_not_taken_for_mistyped() -> None:
-    names = {f"WPNAV_SPEEE{number}": 1 for number in range(MOST_SUGGESTED + 1)}
+def test_many_missing_names_get_no_suggestions() -> None:
+    names = {f"WPNAV_SPEEE{number}": 1 for number in range(SUGGESTIONS_MAX + 1)}
     made = plan(copy_of(ardupilot_table()), written(**names), autopilot="ardupilot")
     assert {row.nearest for row in made.rows.values()} == {()}
 
@@ -149,7 +149,7 @@ def test_the_file_of_another_vehicle_is_not_taken_for_mistyped() -> None:
         ("px4", "SYS_AUTOCONFIG", "action"),
     ],
 )
-def test_what_is_not_a_setting_is_left_out_and_can_be_included(
+def test_parameters_that_are_no_settings_are_left_out_unless_included(
     autopilot: str, name: str, category: str
 ) -> None:
     table, wanted = held(**{name: 1}), written(**{name: 2})
@@ -172,7 +172,7 @@ def test_what_is_not_a_setting_is_left_out_and_can_be_included(
         ("px4", "CAL_BARO0_OFF", "SENS_BAR_AUTOCAL", 0),
     ],
 )
-def test_what_a_vehicle_measures_is_a_calibration_where_it_is_told_not_to(
+def test_a_measured_value_is_a_calibration_if_the_vehicle_does_not_measure_it(
     autopilot: str, name: str, switch: str, value: int
 ) -> None:
     def category(held_value: int, **wanted: Value) -> str:
@@ -194,16 +194,16 @@ def test_what_a_vehicle_measures_is_a_calibration_where_it_is_told_not_to(
         "INS_TCAL1_ENABLE",
     ],
 )
-def test_settings_of_a_sensor_are_no_calibration(name: str) -> None:
+def test_sensor_settings_are_no_calibration(name: str) -> None:
     assert only_row(plan(held(**{name: 1}), written(**{name: 2}), autopilot="ardupilot"))[0] is PlanStatus.SET
 
 
 @pytest.mark.parametrize("name", ["ASPD_SCALE_APPLY", "ASPD_SCALE_NSD", "SYS_CAL_TMAX"])
-def test_how_px4_calibrates_is_a_setting(name: str) -> None:
+def test_px4_calibration_options_are_settings(name: str) -> None:
     assert only_row(plan(held(**{name: 1}), written(**{name: 2}), autopilot="px4"))[0] is PlanStatus.SET
 
 
-def test_what_erases_all_others_comes_first_and_before_a_start() -> None:
+def test_a_parameter_that_resets_all_others_comes_first_and_needs_a_reboot() -> None:
     table, wanted = held(RTL_ALT=1500, FORMAT_VERSION=120), written(RTL_ALT=2000, FORMAT_VERSION=0)
     assert order(plan(table, wanted, autopilot="ardupilot")) == [["RTL_ALT"]]
     made = plan(table, wanted, autopilot="ardupilot", include="action")
@@ -211,7 +211,7 @@ def test_what_erases_all_others_comes_first_and_before_a_start() -> None:
     assert made.stages[0].reboot_first
 
 
-def test_of_an_unknown_autopilot_both_lists_count() -> None:
+def test_an_unknown_autopilot_uses_both_lists() -> None:
     table = held(SYSID_THISMAV=1, MAV_SYS_ID=1, OTHER=1)
     assert order(plan(table, written(SYSID_THISMAV=2, MAV_SYS_ID=2, OTHER=2))) == [["OTHER"]]
     assert order(plan(table, written(SYSID_THISMAV=2, OTHER=2), autopilot="px4")) == [
@@ -219,7 +219,7 @@ def test_of_an_unknown_autopilot_both_lists_count() -> None:
     ]
 
 
-def test_a_snapshot_says_itself_whose_it_is() -> None:
+def test_a_snapshot_names_its_own_vehicle() -> None:
     identity = Identity(1, "sim:", autopilot=3)
     current = ParamSet.of(held(STAT_RUNTIME=1, BIG=1).values(), identity=identity)
     made = plan(current, written(STAT_RUNTIME=2, BIG=16777217))
@@ -229,7 +229,7 @@ def test_a_snapshot_says_itself_whose_it_is() -> None:
 
 
 @pytest.mark.parametrize("include", ["compass", "Calibration", "", ["calibration", "ofs*"]])
-def test_what_can_be_included_is_a_category_or_a_glob(include: str | list[str]) -> None:
+def test_include_takes_categories_and_globs(include: str | list[str]) -> None:
     with pytest.raises(UsageError, match=r"neither a glob of parameter names.*identity, hardware"):
         plan(held(A=1), written(A=2), include=include)
 
@@ -245,7 +245,7 @@ def test_what_can_be_included_is_a_category_or_a_glob(include: str | list[str]) 
         (ParamType.REAL32, math.nan, Encoding.C_CAST, "ArduPilot ignores NaN"),
     ],
 )
-def test_what_the_type_cannot_take_is_found_beforehand(
+def test_a_value_that_the_type_cannot_hold_is_invalid(
     kind: ParamType, value: Value, encoding: Encoding, says: str
 ) -> None:
     table = held(P=(kind, 0))
@@ -256,14 +256,14 @@ def test_what_the_type_cannot_take_is_found_beforehand(
     assert not made.stages
 
 
-def test_integers_beyond_24_bits_are_sent_where_they_are_exact() -> None:
+def test_integers_beyond_24_bits_are_valid_if_they_are_exact() -> None:
     table = held(P=0)
     for value in (16777217, -5000000, 2**31 - 1):
         assert plan(table, written(P=value), autopilot="px4").steps
     assert plan(table, written(P=2**30), autopilot="ardupilot").steps
 
 
-def test_the_range_counts_where_metadata_is_there() -> None:
+def test_a_value_outside_of_the_metadata_range_is_invalid() -> None:
     table = held(P=1.0, Q=7.0)
     info = {"P": Info(minimum=0.1, maximum=2.0), "Q": Info(maximum=2.0)}
     for value, says in ((0.05, "0.05 is below its minimum, 0.1"), (2.5, "2.5 is above its maximum, 2")):
@@ -278,7 +278,7 @@ def test_the_range_counts_where_metadata_is_there() -> None:
     assert only_row(plan(table, written(Q=7), info=info))[0] is PlanStatus.UNCHANGED
 
 
-def test_what_is_no_number_has_to_be_asked_for() -> None:
+def test_a_value_that_is_not_finite_must_be_included() -> None:
     for value in (math.nan, math.inf):
         made = plan(held(P=1.0), written(P=value))
         assert only_row(made)[:2] == (PlanStatus.INVALID, OUT_OF_RANGE)
@@ -287,7 +287,9 @@ def test_what_is_no_number_has_to_be_asked_for() -> None:
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize(("autopilot", "says"), [("px4", "may stop"), ("ardupilot", "does not answer")])
-def test_what_an_autopilot_cannot_store_has_to_be_forced(value: float, autopilot: str, says: str) -> None:
+def test_a_value_that_the_autopilot_cannot_store_must_be_forced(
+    value: float, autopilot: str, says: str
+) -> None:
     table, wanted = held(P=1.0), written(P=value)
     made = plan(table, wanted, autopilot=autopilot, include=OUT_OF_RANGE)
     status, category, reason = only_row(made)
@@ -299,7 +301,7 @@ def test_what_an_autopilot_cannot_store_has_to_be_forced(value: float, autopilot
     assert plan(held(P=math.nan), written(P=math.nan), autopilot="px4").is_met
 
 
-def test_metadata_knows_what_can_only_be_read_and_what_needs_a_reboot() -> None:
+def test_metadata_marks_read_only_and_reboot_parameters() -> None:
     info = {"A": Info(is_read_only=True), "B": Info(reboot_required=True)}
     made = plan(held(A=1, B=1, C=1), written(A=2, B=2, C=2), info=info)
     assert (made.rows["A"].status, made.rows["A"].category) == (PlanStatus.SKIPPED, READ_ONLY)
@@ -307,7 +309,7 @@ def test_metadata_knows_what_can_only_be_read_and_what_needs_a_reboot() -> None:
     assert order(plan(held(A=1), written(A=2), info=info, include=READ_ONLY)) == [["A"]]
 
 
-def test_what_a_firmware_says_of_its_parameters_is_such_metadata() -> None:
+def test_metadata_of_a_firmware_is_accepted_as_info() -> None:
     described = Metadata.of(
         [
             ParamInfo("P", minimum=0, maximum=1, reboot_required=True),
@@ -320,7 +322,7 @@ def test_what_a_firmware_says_of_its_parameters_is_such_metadata() -> None:
     assert made.rows["Q"].status is PlanStatus.SET
 
 
-def test_values_are_compared_in_the_type_that_the_vehicle_gives_them() -> None:
+def test_values_are_compared_in_the_type_of_the_vehicle() -> None:
     table = held(A=0.1, B=(ParamType.UINT8, 3), C=-0.0, D=16777217)
     assert plan(table, written(A=0.1, B=3.0, C=0, D=16777217), autopilot="px4").is_met
     assert [step.name for step in plan(table, written(A=0.1, D=16777216), autopilot="px4").steps] == ["D"]
@@ -332,7 +334,7 @@ def test_a_snapshot_without_types_is_compared_as_numbers() -> None:
     assert [step.type for step in plan(current, written(A=0.2, B=16777216)).steps] == [ParamType.REAL32] * 2
 
 
-def test_a_system_id_is_one_that_can_be() -> None:
+def test_a_system_id_is_valid_from_1_to_255() -> None:
     for value in (0, 256, b"abcd"):
         made = plan(held(MAV_SYS_ID=1), written(MAV_SYS_ID=value), autopilot="px4", include="identity")
         assert only_row(made) == (PlanStatus.INVALID, WRONG, "a system id is a number from 1 to 255")
@@ -347,11 +349,11 @@ def test_raw_bytes_are_compared_with_raw_bytes() -> None:
     assert only_row(made) == (
         PlanStatus.INVALID,
         WRONG,
-        "0x04030201 are raw bytes, and the vehicle gives a number",
+        "0x04030201 are raw bytes, and the vehicle has a number",
     )
 
 
-def test_the_order_is_one_that_works_on_ardupilot() -> None:
+def test_the_order_of_stages_works_on_ardupilot() -> None:
     table = held(
         WPNAV_SPEED=500.0,
         SYSID_ENFORCE=0,
@@ -387,7 +389,7 @@ def test_the_order_is_one_that_works_on_ardupilot() -> None:
     assert set(made.reboot_for) == {"FRAME_CLASS", "EK2_ENABLE", "GPS1_TYPE"}
 
 
-def test_what_a_step_may_show_is_set_later_and_not_given_up() -> None:
+def test_a_parameter_that_a_step_may_reveal_is_set_later() -> None:
     table = held(EK2_ENABLE=0, WPNAV_SPEED=500.0)
     wanted = written(EK2_ALT_M_NSE=3.0, EK2_ENABLE=1, WPNAV_SPEED=600)
     made = plan(table, wanted, autopilot="ardupilot")
@@ -401,7 +403,7 @@ def test_what_a_step_may_show_is_set_later_and_not_given_up() -> None:
     assert hidden.rows["EK2_ALT_M_NSE"].status is PlanStatus.SKIPPED
 
 
-def test_px4_starts_again_between_the_frame_and_all_that_it_resets() -> None:
+def test_px4_reboots_between_the_frame_and_the_parameters_it_resets() -> None:
     table = held(SYS_AUTOSTART=4001, MC_ROLL_P=6.5, SYS_AUTOCONFIG=0, MAV_SYS_ID=1)
     made = plan(
         table, written(MC_ROLL_P=7, MAV_SYS_ID=3, SYS_AUTOSTART=4050), autopilot="px4", include="identity"
@@ -411,8 +413,8 @@ def test_px4_starts_again_between_the_frame_and_all_that_it_resets() -> None:
     assert made.reboot_for == ("SYS_AUTOSTART", "MAV_SYS_ID")
 
 
-def test_a_table_is_its_own_plan() -> None:
-    """What was saved from a vehicle asks nothing of it."""
+def test_a_plan_for_the_saved_table_of_a_vehicle_has_no_steps() -> None:
+    """The table saved from a vehicle needs no write."""
     for table, autopilot in ((px4_table(), "px4"), (ardupilot_table(), "ardupilot")):
         current = copy_of(table)
         wanted = ParamSet.of(current.values())
@@ -425,7 +427,7 @@ def test_a_table_is_its_own_plan() -> None:
         assert everything.counts == {PlanStatus.UNCHANGED: len(current)}
 
 
-def test_a_file_of_another_component_is_none_of_this_one() -> None:
+def test_a_file_of_another_component_is_refused() -> None:
     camera = ParamSet({"A": WrittenParam("A", 1)}, component=100, source="cam.params")
     autopilot = ParamSet.of(held(A=2).values(), component=1)
     with pytest.raises(
@@ -436,7 +438,7 @@ def test_a_file_of_another_component_is_none_of_this_one() -> None:
         overlay(camera, autopilot)
 
 
-def test_a_file_of_another_autopilot_is_none_of_this_one() -> None:
+def test_a_file_of_another_autopilot_is_refused() -> None:
     for own, other, number in (("px4", "ardupilot", 3), ("ardupilot", "px4", 12)):
         wanted = ParamSet(
             {"A": WrittenParam("A", 2)}, identity=Identity(1, "sim:", autopilot=number), source="f"
@@ -448,7 +450,7 @@ def test_a_file_of_another_autopilot_is_none_of_this_one() -> None:
         assert plan(held(A=1), wanted).steps
 
 
-def test_one_set_lies_over_another() -> None:
+def test_overlay_replaces_and_extends_the_base() -> None:
     base = ParamSet({name: WrittenParam(name, 1) for name in "ABC"}, component=1, source="base")
     over = ParamSet({"B": WrittenParam("B", 2), "D": WrittenParam("D", 3)}, system=7, source="over")
     both = overlay(base, over)
@@ -459,7 +461,7 @@ def test_one_set_lies_over_another() -> None:
 
 @pytest.mark.parametrize("autopilot", ["px4", "ardupilot"])
 @pytest.mark.parametrize("section", SECTIONS)
-def test_every_glob_of_the_list_hits_something_or_says_where_it_would(section: str, autopilot: str) -> None:
+def test_every_glob_of_the_list_matches_or_is_listed_in_elsewhere(section: str, autopilot: str) -> None:
     table = px4_table() if autopilot == "px4" else (*ardupilot_table(), *ek2_group())
     names = [row.name for row in table]
     entries: tuple[Caution, ...] = tuple(cautions_for(autopilot).entries[section])

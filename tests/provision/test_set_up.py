@@ -1,4 +1,4 @@
-"""Setting vehicles up: everything arrives, in an order that works, and is proven; or it is said why not."""
+"""`apply`, `verify` and `restore` on simulated vehicles: order, verification, failures, reboots."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ from paramclient.provision import (
     verify,
     verify_all,
 )
-from paramclient.provision.execution import LASTING_TIME, Run
+from paramclient.provision.execution import VERIFY_DELAY, ApplyRun
 from paramclient.sim import Air, ArduPilotVehicle, FaultyLink, GenericVehicle, PX4Vehicle, SimParam
 from paramclient.sim.param_table import Entry
 from tests.shell import FlakyLink, Tap, a_client, residue, swiftly
@@ -54,7 +54,7 @@ from tests.shell import FlakyLink, Tap, a_client, residue, swiftly
 SETTINGS: dict[str, Value | tuple[ParamType, Value]] = {
     f"TUNE_{number:02}": number / 4 if number % 3 else number for number in range(30)
 }
-"""What is set in most of these tests."""
+"""Parameters that most of these tests set."""
 OTHERS: dict[str, Value | tuple[ParamType, Value]] = {
     "STAT_RUNTIME": 5,
     "MAV_SYS_ID": 1,
@@ -74,15 +74,15 @@ GROUP: dict[str, Value | tuple[ParamType, Value]] = {
 }
 
 
-class Hiding(ArduPilotVehicle):
-    """An ArduPilot that does not know the parameters of a group by name while it is hidden."""
+class HidingGroup(ArduPilotVehicle):
+    """An ArduPilot that answers no reads by name for the parameters of a hidden group."""
 
     def _find(self, name: str) -> Entry | None:
         entry = super()._find(name)
         return entry if entry is not None and (not self._listed or self._is_listed(entry)) else None
 
 
-class Clamping(ArduPilotVehicle):
+class ClampingVehicle(ArduPilotVehicle):
     """An ArduPilot that keeps TUNE_01 within 0 to 10."""
 
     def _write(self, entry: Entry, bits: int) -> None:
@@ -92,8 +92,8 @@ class Clamping(ArduPilotVehicle):
         super()._write(entry, bits)
 
 
-class Meddling(PX4Vehicle):
-    """A PX4 of which TUNE_19 takes TUNE_01 back.
+class RevertingVehicle(PX4Vehicle):
+    """A PX4 whose TUNE_19 reverts TUNE_01.
 
     Attributes:
         quarrels: whether TUNE_01 also takes back TUNE_19.
@@ -116,7 +116,7 @@ CLAMPED: dict[str, Value | tuple[ParamType, Value]] = {
     "MPC_XY_CRUISE": 5.0,
     "MPC_VEL_MANUAL": 10.0,
 }
-"""What PX4's position controller sets to limits."""
+"""Parameters that PX4's position controller clamps."""
 
 
 def ardupilot(make: type[ArduPilotVehicle] = ArduPilotVehicle, **options: Any) -> ArduPilotVehicle:
@@ -148,7 +148,7 @@ def written(values: Mapping[str, Value], **options: Any) -> ParamSet:
 
 
 def another(*names: str) -> dict[str, Value]:
-    """Other values than those of SETTINGS."""
+    """Return values that differ from those of SETTINGS."""
     wanted: dict[str, Value] = {}
     for name in names or SETTINGS:
         value = SETTINGS[name]
@@ -162,21 +162,21 @@ def statuses(result: Any) -> dict[str, str]:
 
 
 def sets(tap: Tap) -> list[str]:
-    """The names of what was written, once each, in order."""
+    """Return the names of the written parameters, once each, in order."""
     return list(dict.fromkeys(message.param_id for message in tap.messages(wire.ParamSet)))
 
 
 @EVERY_KIND
 @pytest.mark.parametrize("loss", [0.0, 0.15])
 @swiftly
-async def test_everything_arrives_and_is_proven(make: Callable[[], Any], loss: float) -> None:
+async def test_all_values_are_written_and_verified(make: Callable[[], Any], loss: float) -> None:
     vehicle = make()
     air = Air([vehicle], uplink=FaultyLink(loss=loss, seed=1), downlink=FaultyLink(loss=loss, seed=2))
     wanted = another() | {"STAT_RUNTIME": 6, "CAL_ACC0_XOFF": 1.0, "COMPASS_OFS_X": 1.0, "EK2_GPS_TYPE": 3}
     async with a_client(air) as client:
         component = await client.component()
         result = await apply(component, written(wanted | {"EK2_ENABLE": 1}))
-        await anyio.sleep(3.0)  # the client asks for the hash by itself after writes
+        await anyio.sleep(3.0)  # the client requests the hash after writes
         assert residue(component) == []
     assert result.error is None
     left_out = {name for name, row in result.rows.items() if row.status is ApplyStatus.SKIPPED}
@@ -192,7 +192,7 @@ async def test_everything_arrives_and_is_proven(make: Callable[[], Any], loss: f
 
 @EVERY_KIND
 @swiftly
-async def test_what_would_be_sent_is_told_beforehand_and_nothing_else_is_sent(
+async def test_prepare_lists_exactly_the_values_that_apply_sends(
     make: Callable[[], Any],
 ) -> None:
     tap = Tap(make())
@@ -213,7 +213,7 @@ async def test_what_would_be_sent_is_told_beforehand_and_nothing_else_is_sent(
 
 @EVERY_KIND
 @swiftly
-async def test_the_proof_is_asked_for_after_the_last_write(make: Callable[[], Any]) -> None:
+async def test_the_verification_is_requested_after_the_last_write(make: Callable[[], Any]) -> None:
     tap = Tap(make())
     async with a_client(tap) as client:
         assert (await apply(await client.component(), written(another()))).complete
@@ -228,7 +228,7 @@ async def test_the_proof_is_asked_for_after_the_last_write(make: Callable[[], An
 
 
 @swiftly
-async def test_a_value_that_the_last_list_leaves_out_is_not_proven() -> None:
+async def test_a_value_missing_from_the_last_list_is_unproven() -> None:
     vehicle = ardupilot(ftp=False)
 
     def lose(progress: ApplyProgress) -> None:
@@ -239,16 +239,16 @@ async def test_a_value_that_the_last_list_leaves_out_is_not_proven() -> None:
     async with a_client(vehicle) as client:
         result = await apply(await client.component(), written(another("TUNE_01", "TUNE_02")), progress=lose)
     assert statuses(result) == {"TUNE_01": "unproven", "TUNE_02": "set"}
-    assert "does not tell" in str(result.rows["TUNE_01"])
+    assert "no longer reports it" in str(result.rows["TUNE_01"])
     assert not result.complete
 
 
 @swiftly
-async def test_what_no_hash_covers_is_read_again_for_the_proof() -> None:
+async def test_values_that_no_hash_covers_are_read_again_for_verification() -> None:
     vehicle = px4()
 
     def learn(progress: ApplyProgress) -> None:
-        if progress.phase == "reading":  # in flight, without a word
+        if progress.phase == "reading":  # changed in flight, without a PARAM_VALUE
             vehicle._entry("CAL_ACC0_XOFF").store(bits_of(0.75, ParamType.REAL32))
 
     wanted = written({"TUNE_01": 9.5, "CAL_ACC0_XOFF": 0.5})
@@ -264,7 +264,7 @@ async def test_what_no_hash_covers_is_read_again_for_the_proof() -> None:
 @EVERY_KIND
 @pytest.mark.parametrize("policy", ["hash-only", "cache-only"])
 @swiftly
-async def test_a_policy_that_allows_no_download_does_not_spare_the_proof(
+async def test_the_verification_reads_the_values_with_every_cache_policy(
     make: Callable[[], Any], policy: str, tmp_path: Path
 ) -> None:
     vehicle = make()
@@ -281,12 +281,12 @@ async def test_a_policy_that_allows_no_download_does_not_spare_the_proof(
     asked = {each.param_id for each in messages[last + 1 :] if isinstance(each, wire.ParamRequestRead)}
     by_hash = make is px4 and policy == "hash-only"
     assert asked == ({wire.HASH_CHECK} if by_hash else {"TUNE_01", "TUNE_04"})
-    assert not kept.complete  # what was only believed is not in it
+    assert not kept.complete  # values that were only cached are not in it
 
 
 @EVERY_KIND
 @swiftly
-async def test_where_there_is_nothing_to_do_nothing_is_written_or_read_again(make: Callable[[], Any]) -> None:
+async def test_a_plan_without_steps_writes_and_rereads_nothing(make: Callable[[], Any]) -> None:
     vehicle = make()
     tap = Tap(vehicle)
     wanted = ParamSet.of(vehicle.params.values())
@@ -302,7 +302,7 @@ async def test_where_there_is_nothing_to_do_nothing_is_written_or_read_again(mak
 
 
 def downloads(tap: Tap) -> int:
-    """How often the table was requested, as a file or as a list."""
+    """Return the number of times that the table was requested, as a file or as a list."""
     packets = [Packet.unpack(message.payload) for message in tap.messages(wire.FileTransfer)]
     files = {packet.sequence for packet in packets if packet.opcode == Opcode.OPEN_FILE_RO}
     return len(files) or len(tap.messages(wire.ParamRequestList))
@@ -310,7 +310,7 @@ def downloads(tap: Tap) -> int:
 
 @pytest.mark.parametrize("ftp", [True, False])
 @swiftly
-async def test_two_downloads_are_enough_for_any_file(ftp: bool) -> None:
+async def test_two_downloads_suffice_for_any_file(ftp: bool) -> None:
     switch: dict[str, Value | tuple[ParamType, Value]] = {"GRIP_ENABLE": (ParamType.INT8, 1)}
     grip: dict[str, Value | tuple[ParamType, Value]] = {"GRIP_TYPE": (ParamType.INT8, 0), "GRIP_REGRAB": 1.0}
     groups = {"EK2_ENABLE": GROUP, "GRIP_ENABLE": grip}
@@ -349,7 +349,7 @@ async def test_two_downloads_are_enough_for_any_file(ftp: bool) -> None:
     ids=["few", "too many", "a list, which reads slow down"],
 )
 @swiftly
-async def test_members_of_a_group_that_is_to_be_shown_are_requested_beside_the_file(
+async def test_members_of_a_group_to_reveal_are_requested_during_the_file_download(
     listed: int, ftp: bool, is_beside: bool
 ) -> None:
     hidden: dict[str, Value | tuple[ParamType, Value]] = {f"GRIP_{number}": 1.0 for number in range(30)}
@@ -378,8 +378,8 @@ async def test_members_of_a_group_that_is_to_be_shown_are_requested_beside_the_f
 
 
 @swiftly
-async def test_a_group_that_cannot_be_asked_by_name_is_set_once_it_is_there() -> None:
-    vehicle = ardupilot(Hiding)
+async def test_a_group_that_cannot_be_read_by_name_is_set_once_it_is_revealed() -> None:
+    vehicle = ardupilot(HidingGroup)
     wanted = written({"EK2_GPS_TYPE": 3, "TUNE_01": 9.0, "EK2_ENABLE": 1, "EK2_NO_SUCH": 1})
     tap = Tap(vehicle)
     asked: list[int] = []
@@ -394,9 +394,9 @@ async def test_a_group_that_cannot_be_asked_by_name_is_set_once_it_is_there() ->
         assert plan.rows["EK2_GPS_TYPE"].status is PlanStatus.LATER
         result = await apply(component, wanted, progress=count)
         count(ApplyProgress("over", 0, 0))
-    # what was not there was asked for again when others had been shown, and the whole table was not
+    # missing names were requested again after others had been revealed, and the whole table was not
     assert asked[0] < asked[1] < asked[-1]
-    assert downloads(tap) == 3  # one for the plan, one before the first write, one for the proof
+    assert downloads(tap) == 3  # one for the plan, one before the first write, one for the verification
     assert statuses(result) == {
         "EK2_GPS_TYPE": "set",
         "TUNE_01": "set",
@@ -410,7 +410,7 @@ async def test_a_group_that_cannot_be_asked_by_name_is_set_once_it_is_there() ->
 
 
 @swiftly
-async def test_what_is_not_there_is_named_and_not_written() -> None:
+async def test_a_missing_parameter_is_reported_and_not_written() -> None:
     tap = Tap(ardupilot())
     async with a_client(tap) as client:
         result = await apply(
@@ -426,8 +426,8 @@ async def test_what_is_not_there_is_named_and_not_written() -> None:
 
 
 @swiftly
-async def test_what_one_refuses_or_adjusts_does_not_stop_the_others() -> None:
-    vehicle = ardupilot(Clamping, read_only=["TUNE_02", "TUNE_04"], param_error=True)
+async def test_a_refused_or_adjusted_value_does_not_stop_the_others() -> None:
+    vehicle = ardupilot(ClampingVehicle, read_only=["TUNE_02", "TUNE_04"], param_error=True)
     wanted = written(another() | {"TUNE_01": 99.0})
     async with a_client(vehicle) as client:
         component = await client.component()
@@ -444,7 +444,7 @@ async def test_what_one_refuses_or_adjusts_does_not_stop_the_others() -> None:
     assert result.rows["TUNE_02"].actual == SETTINGS["TUNE_02"]
     assert not result.complete
     assert result.error is None
-    # it has what it made of it already, and does not say why that does not change
+    # the vehicle has the adjusted value already, and gives no reason for not changing it
     assert {name for name, status in statuses(again).items() if status == "refused"} == {
         *("TUNE_01", "TUNE_02", "TUNE_04")
     }
@@ -453,7 +453,7 @@ async def test_what_one_refuses_or_adjusts_does_not_stop_the_others() -> None:
 
 @pytest.mark.parametrize("bring", [apply, restore])
 @swiftly
-async def test_every_value_that_is_written_tells_who_asked(bring: Callable[..., Any]) -> None:
+async def test_every_written_value_records_its_author(bring: Callable[..., Any]) -> None:
     async with a_client(px4()) as client:
         component = await client.component()
         await component.fetch_all()
@@ -478,7 +478,7 @@ async def test_every_value_that_is_written_tells_who_asked(bring: Callable[..., 
 
 
 @swiftly
-async def test_values_that_cannot_be_are_told_before_anything_is_sent() -> None:
+async def test_invalid_values_are_raised_before_anything_is_sent() -> None:
     tap = Tap(ardupilot())
     wanted = written({"TUNE_01": 7.0, "SMALL": 300, "TUNE_03": 2**24 + 1})
     async with a_client(tap) as client:
@@ -494,7 +494,7 @@ async def test_values_that_cannot_be_are_told_before_anything_is_sent() -> None:
 
 
 @swiftly
-async def test_a_wrong_choice_is_told_before_the_vehicle_is_asked() -> None:
+async def test_a_wrong_include_is_raised_before_the_vehicle_is_read() -> None:
     tap = Tap(ardupilot())
     async with a_client(tap) as client:
         component = await client.component()
@@ -508,7 +508,7 @@ async def test_a_wrong_choice_is_told_before_the_vehicle_is_asked() -> None:
 
 
 @swiftly
-async def test_what_is_left_out_can_be_included() -> None:
+async def test_left_out_parameters_can_be_included() -> None:
     vehicle = ardupilot()
     async with a_client(vehicle) as client:
         component = await client.component()
@@ -521,10 +521,10 @@ async def test_what_is_left_out_can_be_included() -> None:
 
 
 @swiftly
-async def test_another_that_takes_a_value_back_has_it_set_again() -> None:
+async def test_a_value_changed_by_a_later_write_is_written_again() -> None:
     for quarrels in (False, True):
-        vehicle = px4(Meddling)
-        assert isinstance(vehicle, Meddling)
+        vehicle = px4(RevertingVehicle)
+        assert isinstance(vehicle, RevertingVehicle)
         vehicle.quarrels = quarrels
         tap = Tap(vehicle)
         async with a_client(tap) as client:
@@ -537,7 +537,7 @@ async def test_another_that_takes_a_value_back_has_it_set_again() -> None:
 
 
 @swiftly
-async def test_what_the_vehicle_has_is_stored_before_anything_is_sent(tmp_path: Path) -> None:
+async def test_the_state_is_stored_before_anything_is_sent(tmp_path: Path) -> None:
     cache = ParamCache(tmp_path / "cache.sqlite3")
     vehicle = ardupilot()
     tap = Tap(vehicle)
@@ -552,7 +552,7 @@ async def test_what_the_vehicle_has_is_stored_before_anything_is_sent(tmp_path: 
         async with ParamClient(tap, cache=cache) as client:
             component = await client.component()
             first = await apply(component, written(another("TUNE_01")))
-            await apply(component, written(another("TUNE_01")))  # nothing to do, nothing to undo
+            await apply(component, written(another("TUNE_01")))  # no steps, no snapshot
             key = component.identity.key
     assert seen == [("before apply", 0)]
     (summary,) = cache.snapshots(key, 1)
@@ -564,7 +564,7 @@ async def test_what_the_vehicle_has_is_stored_before_anything_is_sent(tmp_path: 
 
 
 @swiftly
-async def test_where_the_state_cannot_be_stored_nothing_is_sent(tmp_path: Path) -> None:
+async def test_nothing_is_sent_if_the_state_cannot_be_stored(tmp_path: Path) -> None:
     tap = Tap(ardupilot())
     broken = mock.Mock(side_effect=CacheError("disk full"))
     with mock.patch.object(ParamCache, "store_snapshot", broken):
@@ -576,9 +576,7 @@ async def test_where_the_state_cannot_be_stored_nothing_is_sent(tmp_path: Path) 
 
 @pytest.mark.parametrize("bring", [apply, restore])
 @swiftly
-async def test_before_anything_is_stored_or_written_the_caller_may_stop_it(
-    bring: Callable[..., Any], tmp_path: Path
-) -> None:
+async def test_before_writing_may_end_the_call(bring: Callable[..., Any], tmp_path: Path) -> None:
     cache = ParamCache(tmp_path / "cache.sqlite3")
     tap = Tap(ardupilot())
     seen: list[int] = []
@@ -600,7 +598,7 @@ async def test_before_anything_is_stored_or_written_the_caller_may_stop_it(
 
 
 @swiftly
-async def test_of_several_vehicles_each_may_be_stopped() -> None:
+async def test_before_writing_may_end_the_call_for_one_of_several_vehicles() -> None:
     one, two = ardupilot(system=1), ardupilot(system=2)
 
     async def stop(component: Component) -> None:
@@ -616,7 +614,7 @@ async def test_of_several_vehicles_each_may_be_stopped() -> None:
 
 
 @swiftly
-async def test_progress_is_told() -> None:
+async def test_progress_is_reported() -> None:
     told: list[ApplyProgress] = []
     async with a_client(ardupilot()) as client:
         await apply(await client.component(), written(another()), progress=told.append)
@@ -629,7 +627,7 @@ async def test_progress_is_told() -> None:
 
 
 @swiftly
-async def test_a_vehicle_that_falls_silent_ends_it_and_the_next_one_goes_on() -> None:
+async def test_a_silent_vehicle_ends_the_run_and_the_next_run_continues() -> None:
     vehicle = ardupilot()
     tap = Tap(vehicle)
     async with a_client(tap) as client:
@@ -659,7 +657,7 @@ async def test_a_vehicle_that_falls_silent_ends_it_and_the_next_one_goes_on() ->
 
 
 @swiftly
-async def test_a_link_that_fails_ends_it_with_what_is_known() -> None:
+async def test_a_failed_link_ends_the_run_with_the_rows_so_far() -> None:
     vehicle = ardupilot()
     link = FlakyLink(vehicle)
     async with a_client(link) as client:
@@ -681,7 +679,7 @@ async def test_a_link_that_fails_ends_it_with_what_is_known() -> None:
 
 
 @swiftly
-async def test_the_time_that_is_given_ends_it() -> None:
+async def test_the_timeout_ends_the_run() -> None:
     vehicle = ardupilot()
     async with a_client(Air.symmetric([vehicle], rate=1000.0)) as client:
         component = await client.component()
@@ -698,7 +696,7 @@ async def test_the_time_that_is_given_ends_it() -> None:
 
 
 @swiftly
-async def test_a_vehicle_gets_an_earlier_state_of_its_own_back() -> None:
+async def test_restore_writes_an_earlier_state_of_the_vehicle() -> None:
     vehicle = ardupilot()
     original = vehicle.values
     async with a_client(vehicle) as client:
@@ -714,13 +712,13 @@ async def test_a_vehicle_gets_an_earlier_state_of_its_own_back() -> None:
     assert undone.rows["STAT_RUNTIME"].category == "counter"
     vehicle.set_param("STAT_RUNTIME", 5)
     assert vehicle.values == original
-    # it was asked for by name before it was shown, so it is part of the state
+    # it was read by name before it was revealed, so it is part of the state
     assert vehicle.param("EK2_ALT_M_NSE").value == 3.0
     assert undone.extra == ()
 
 
 @swiftly
-async def test_a_state_brings_back_nothing_that_the_vehicle_measures_or_keeps_to_itself() -> None:
+async def test_restore_skips_measured_and_read_only_parameters() -> None:
     own: dict[str, Value | tuple[ParamType, Value]]
     own = {"BARO1_GND_PRESS": 94500.0, "BARO1_DEVID": 65540, "INS_GYROFFS_X": 0.25, "LOCKED": 1.0}
     vehicle = ArduPilotVehicle(
@@ -748,13 +746,13 @@ async def test_a_state_brings_back_nothing_that_the_vehicle_measures_or_keeps_to
             "INS_GYROFFS_X": ("measured", 0.5),
             "LOCKED": ("read-only", 2.0),
         }
-        assert "it can only be read" in str(result.rows["LOCKED"])
-        # who asks for just this is told that it was refused
+        assert "the vehicle reports that it is read-only" in str(result.rows["LOCKED"])
+        # `apply` of this parameter alone reports the refusal
         assert statuses(await apply(component, written({"LOCKED": 1.0}))) == {"LOCKED": "refused"}
 
 
 @swiftly
-async def test_more_than_the_state_has_is_left_alone_and_said() -> None:
+async def test_restore_reports_parameters_that_the_state_does_not_have() -> None:
     vehicle = ardupilot()
     state = {name: param for name, param in vehicle.params.items() if name != "TUNE_05"}
     vehicle.set_param("TUNE_05", 5.0)
@@ -766,7 +764,7 @@ async def test_more_than_the_state_has_is_left_alone_and_said() -> None:
         result = await restore(component, kept)
         assert result.extra == ("TUNE_05",)
         assert statuses(result)["TUNE_04"] == "set"
-        # of a state that does not say whose it is, only the settings
+        # a state without an identity restores only the settings
         vehicle.set_param("COMPASS_OFS_X", 4.0)
         unsaid = await restore(component, ParamSet.of(state.values()))
         assert unsaid.rows["COMPASS_OFS_X"].category == "calibration"
@@ -774,7 +772,7 @@ async def test_more_than_the_state_has_is_left_alone_and_said() -> None:
 
 
 @swiftly
-async def test_the_state_or_the_plan_of_another_vehicle_is_none_of_this_one() -> None:
+async def test_the_state_or_plan_of_another_vehicle_is_refused() -> None:
     async with a_client(ardupilot(uid2=b"another")) as client:
         component = await client.component()
         plan = await prepare(component, written(another()))
@@ -782,9 +780,7 @@ async def test_the_state_or_the_plan_of_another_vehicle_is_none_of_this_one() ->
     async with a_client(ardupilot()) as client:
         component = await client.component()
         await component.fetch_all()
-        with pytest.raises(
-            UsageError, match="the plan is one for another vehicle: the ardupilot 616e6f74686572"
-        ):
+        with pytest.raises(UsageError, match="the plan is for another vehicle: the ardupilot 616e6f74686572"):
             await apply(component, plan)
         with pytest.raises(
             UsageError, match="the state is that of another vehicle: the ardupilot 616e6f74686572"
@@ -793,7 +789,7 @@ async def test_the_state_or_the_plan_of_another_vehicle_is_none_of_this_one() ->
 
 
 @swiftly
-async def test_several_vehicles_are_set_up_side_by_side() -> None:
+async def test_several_vehicles_are_set_up_concurrently() -> None:
     vehicles = [ardupilot(), px4(system=2), ardupilot(system=3, read_only=["TUNE_01"])]
     base = written(another())
     async with a_client(Air(vehicles)) as client:
@@ -804,7 +800,7 @@ async def test_several_vehicles_are_set_up_side_by_side() -> None:
             (2, 1): overlay(base, written({"TUNE_02": 42.0})),
             (3, 1): overlay(base, written({"SMALL": 1000})),
         }
-        with pytest.raises(UsageError, match="nothing that component 3/1 shall have"):
+        with pytest.raises(UsageError, match="no wanted parameters are given for vehicle 3/1"):
             await apply_all(components, {address: over[address] for address in [(1, 1), (2, 1)]})
         told: list[tuple[int, str]] = []
         applied = await apply_all(
@@ -824,7 +820,7 @@ async def test_several_vehicles_are_set_up_side_by_side() -> None:
 
 @EVERY_KIND
 @swiftly
-async def test_an_armed_vehicle_is_left_alone_unless_told_otherwise(make: Callable[..., Any]) -> None:
+async def test_an_armed_vehicle_is_refused_unless_allowed(make: Callable[..., Any]) -> None:
     vehicle = make(armed=True)
     tap = Tap(vehicle)
     async with a_client(tap) as client:
@@ -834,7 +830,7 @@ async def test_an_armed_vehicle_is_left_alone_unless_told_otherwise(make: Callab
         assert tap.messages(wire.ParamSet) == []
         assert (await prepare(component, written(another()))).steps
         assert (await apply(component, written(another("TUNE_01")), allow_armed=True)).complete
-        # it refuses to start again then, and that is the end of it
+        # an armed vehicle refuses to reboot, which ends the run
         result = await apply(component, written({"FRAME_CLASS": 2}), allow_armed=True, reboot=True)
         if make is ardupilot:
             assert isinstance(result.error, CommandRefused)
@@ -842,7 +838,7 @@ async def test_an_armed_vehicle_is_left_alone_unless_told_otherwise(make: Callab
 
 
 @swiftly
-async def test_so_is_another_part_of_an_armed_vehicle() -> None:
+async def test_another_component_of_an_armed_vehicle_is_refused() -> None:
     for system in (1, 2):
         camera = GenericVehicle({"TUNE_01": 0.25}, system=1, component=100)
         air = Air.symmetric([camera, ardupilot(armed=True, system=system)])
@@ -856,20 +852,20 @@ async def test_so_is_another_part_of_an_armed_vehicle() -> None:
 
 
 @swiftly
-async def test_who_does_not_say_whether_it_is_armed_may_be() -> None:
+async def test_a_vehicle_with_unknown_armed_state_is_refused() -> None:
     vehicle = ardupilot()
     async with a_client(vehicle) as client:
         component = await client.component()
         with (
             mock.patch.object(Component, "is_armed", None),
-            pytest.raises(VehicleArmed, match="1/1 does not say whether it is armed"),
+            pytest.raises(VehicleArmed, match="1/1 does not report whether it is armed"),
         ):
             await apply(component, written(another()))
         assert vehicle.requests["PARAM_SET"] == 0
 
 
 @swiftly
-async def test_a_vehicle_that_is_armed_meanwhile_ends_it() -> None:
+async def test_a_vehicle_armed_during_the_run_ends_it() -> None:
     vehicle = ardupilot()
 
     def arm(progress: ApplyProgress) -> None:
@@ -887,8 +883,8 @@ async def test_a_vehicle_that_is_armed_meanwhile_ends_it() -> None:
 
 
 @swiftly
-async def test_a_reboot_follows_where_values_count_only_then() -> None:
-    vehicle = ardupilot(reboot_groups=["EK2_ENABLE"], make=Hiding)
+async def test_a_reboot_follows_values_that_take_effect_after_it() -> None:
+    vehicle = ardupilot(reboot_groups=["EK2_ENABLE"], make=HidingGroup)
     tap = Tap(vehicle)
     wanted = written(another("TUNE_01") | {"EK2_ALT_M_NSE": 1.5, "EK2_ENABLE": 1, "FRAME_CLASS": 2})
     async with a_client(tap) as client:
@@ -908,7 +904,7 @@ async def test_a_reboot_follows_where_values_count_only_then() -> None:
 
 
 @swiftly
-async def test_a_change_too_small_for_px4_is_told_and_its_value_after_the_start() -> None:
+async def test_a_change_too_small_for_px4_is_reported_with_the_value_after_the_reboot() -> None:
     vehicle = px4(table=SETTINGS | {"SYS_HITL": 0}, not_in_use=(), late_use={})
     near = from_bits(bits_of(0.25, ParamType.REAL32) + 1, ParamType.REAL32)
     async with a_client(vehicle) as client:
@@ -929,13 +925,13 @@ async def test_a_change_too_small_for_px4_is_told_and_its_value_after_the_start(
     assert result.reboots == 1
     row = result.rows["TUNE_01"]
     assert (row.status, row.actual) == (ApplyStatus.ADJUSTED, 0.25)
-    assert row.reason == "the vehicle acknowledged it, and has another value since it has started again"
-    assert vehicle.requests["PARAM_SET"] == 3  # what the next start takes back is not set again
+    assert row.reason == "the vehicle acknowledged the value, and has another one after the reboot"
+    assert vehicle.requests["PARAM_SET"] == 3  # a value that a reboot reverts is not written again
 
 
 @swiftly
-async def test_a_group_that_comes_with_a_start_is_set_after_it() -> None:
-    vehicle = ardupilot(reboot_groups=["EK2_ENABLE"], make=Hiding)
+async def test_a_group_revealed_by_a_reboot_is_set_after_it() -> None:
+    vehicle = ardupilot(reboot_groups=["EK2_ENABLE"], make=HidingGroup)
     tap = Tap(vehicle)
     async with a_client(tap) as client:
         result = await apply(
@@ -949,8 +945,8 @@ async def test_a_group_that_comes_with_a_start_is_set_after_it() -> None:
 
 
 @swiftly
-async def test_names_that_no_start_brings_cost_one_start_at_most() -> None:
-    async with a_client(ardupilot(make=Hiding)) as client:
+async def test_names_that_no_reboot_reveals_cost_at_most_one_reboot() -> None:
+    async with a_client(ardupilot(make=HidingGroup)) as client:
         component = await client.component()
         wanted = written({"EK2_NO_SUCH": 1.5, "EK2_ENABLE": 1})
         assert (await apply(component, wanted, reboot=True)).reboots == 1
@@ -959,20 +955,20 @@ async def test_names_that_no_start_brings_cost_one_start_at_most() -> None:
 
 
 @swiftly
-async def test_px4_starts_again_before_what_the_frame_would_reset() -> None:
+async def test_px4_reboots_before_parameters_that_the_frame_resets() -> None:
     vehicle = px4(uid=77)
     vehicle.set_param("TUNE_05", 9.0)
     tap = Tap(vehicle)
     wanted = written(another("TUNE_01") | {"SYS_AUTOSTART": 4050, "SYS_AUTOCONFIG": 1, "TUNE_05": 9.0})
     async with a_client(tap) as client:
         component = await client.component()
-        with pytest.raises(UsageError, match="SYS_AUTOCONFIG gives others their defaults back"):
+        with pytest.raises(UsageError, match="SYS_AUTOCONFIG resets other parameters to their defaults"):
             await apply(component, wanted, include="SYS_AUTOCONFIG")
         assert tap.messages(wire.ParamSet) == []
         result = await apply(component, wanted, include="SYS_AUTOCONFIG", reboot=True)
     assert result.complete
     assert result.reboots == 1
-    # what was right before had been reset with the others, and was set again
+    # values that were right before the reset were reset too, and written again
     assert [message.param_id for message in tap.messages(wire.ParamSet)] == [
         *("SYS_AUTOSTART", "SYS_AUTOCONFIG", "TUNE_01", "TUNE_05")
     ]
@@ -1012,7 +1008,7 @@ async def test_a_changed_system_id_is_followed(make: Callable[..., Any]) -> None
         assert client.components[7, 1].state == "synced"
         await anyio.sleep(5.0)  # what is measured at a start is read again
         assert residue(component) == []
-        # and back again, although it was just heard under that id
+        # and back to the old id, under which it was heard just before
         undone = await restore(client.components[7, 1], result.before, reboot=True)
     assert undone.complete
     assert (undone.system, vehicle.system) == (1, 1)
@@ -1031,8 +1027,8 @@ async def test_plane_and_rover_take_their_system_id_without_a_reboot() -> None:
 
 
 @swiftly
-async def test_copter_keeps_its_system_id_until_it_starts_again() -> None:
-    """Which is known beforehand, and seen: another firmware may take it at once."""
+async def test_copter_keeps_its_system_id_until_it_reboots() -> None:
+    """The list says so, and the heartbeats show it: another firmware may change the id immediately."""
     vehicle = ardupilot()
     async with a_client(vehicle) as client:
         component = await client.component()
@@ -1045,7 +1041,7 @@ async def test_copter_keeps_its_system_id_until_it_starts_again() -> None:
 
 
 @swiftly
-async def test_a_copter_that_takes_its_system_id_at_once_is_followed() -> None:
+async def test_a_copter_that_changes_its_system_id_immediately_is_followed() -> None:
     vehicle = ardupilot(kind="plane")
     vehicle._heartbeat = dataclasses.replace(vehicle._heartbeat, type=2)
     async with a_client(vehicle) as client:
@@ -1057,14 +1053,14 @@ async def test_a_copter_that_takes_its_system_id_at_once_is_followed() -> None:
 
 
 @swiftly
-async def test_a_system_id_that_another_one_has_is_not_taken() -> None:
+async def test_a_system_id_of_another_vehicle_is_not_set() -> None:
     vehicles = [ardupilot(), ardupilot(system=7)]
     async with a_client(Air(vehicles)) as client:
         component = await client.component(1, 1)
         await client.component(7, 1)
         result = await apply(component, written({"SYSID_THISMAV": 7}), include="identity")
     assert statuses(result) == {"SYSID_THISMAV": "skipped"}
-    assert result.rows["SYSID_THISMAV"].reason == "another one on this link is system 7"
+    assert result.rows["SYSID_THISMAV"].reason == "another vehicle on this link has system id 7"
     assert not result.complete
     assert [vehicle.system for vehicle in vehicles] == [1, 7]
 
@@ -1075,7 +1071,7 @@ async def test_without_a_reboot_a_px4_keeps_its_system_id_for_now() -> None:
     async with a_client(vehicle) as client:
         result = await apply(await client.component(), written({"MAV_SYS_ID": 7}), include="identity")
         assert (result.system, vehicle.system) == (1, 1)
-        # that it has the id only from its next start on can be seen
+        # the pending system id can be detected
         component = await client.component()
         started = await apply(component, written({"MAV_SYS_ID": 7}), include="identity", reboot=True)
     assert statuses(result) == {"MAV_SYS_ID": "set"}
@@ -1085,7 +1081,7 @@ async def test_without_a_reboot_a_px4_keeps_its_system_id_for_now() -> None:
 
 
 @swiftly
-async def test_the_backup_is_a_file_that_brings_everything_back(tmp_path: Path) -> None:
+async def test_the_backup_file_restores_every_parameter(tmp_path: Path) -> None:
     vehicle = ardupilot()
     original = vehicle.values
     path = tmp_path / "before.json"
@@ -1102,7 +1098,7 @@ async def test_the_backup_is_a_file_that_brings_everything_back(tmp_path: Path) 
 
 
 @swiftly
-async def test_what_may_end_the_conversation_is_done_one_by_one() -> None:
+async def test_parameters_that_may_end_the_connection_are_written_one_by_one() -> None:
     tap = Tap(ardupilot())
     async with a_client(tap) as client:
         wanted = written({"SYSID_THISMAV": 7, "SYSID_ENFORCE": 1})
@@ -1113,7 +1109,7 @@ async def test_what_may_end_the_conversation_is_done_one_by_one() -> None:
 
 
 @swiftly
-async def test_a_link_that_fails_while_the_system_id_changes_ends_it() -> None:
+async def test_a_link_that_fails_during_the_system_id_change_ends_the_run() -> None:
     broken = mock.AsyncMock(side_effect=LinkError("gone", link="x"))
     async with a_client(ardupilot()) as client:
         component = await client.component()
@@ -1125,7 +1121,7 @@ async def test_a_link_that_fails_while_the_system_id_changes_ends_it() -> None:
 
 
 @swiftly
-async def test_what_the_cache_believes_is_not_taken_for_what_the_vehicle_has(tmp_path: Path) -> None:
+async def test_cached_values_are_not_taken_for_values_of_the_vehicle(tmp_path: Path) -> None:
     wanted = written({"EK2_ALT_M_NSE": 3.0, "TUNE_01": 0.25})
     for vehicle in (ardupilot(), px4(uid=77)):
         with ParamCache(tmp_path / f"{type(vehicle).__name__}.sqlite3") as cache:
@@ -1140,13 +1136,13 @@ async def test_what_the_cache_believes_is_not_taken_for_what_the_vehicle_has(tmp
 
 
 @swiftly
-async def test_the_state_before_is_all_of_it_what_no_hash_covers_too(tmp_path: Path) -> None:
+async def test_the_stored_state_includes_values_that_no_hash_covers(tmp_path: Path) -> None:
     vehicle = px4(uid=77)
     path = tmp_path / "cache.sqlite3"
     async with ParamClient(vehicle, cache=path) as client:
         assert (await apply(await client.component(), written({"TUNE_01": 0.25}))).complete
     vehicle.set_param("CAL_ACC0_XOFF", 0.75)
-    vehicle.reboot()  # so that it does not tell by itself
+    vehicle.reboot()  # so that it does not send the value unrequested
     async with ParamClient(vehicle, cache=path) as client:
         result = await apply(await client.component(), written({"TUNE_01": 0.25}))
     assert vehicle.requests["PARAM_REQUEST_LIST"] == 1
@@ -1154,22 +1150,22 @@ async def test_the_state_before_is_all_of_it_what_no_hash_covers_too(tmp_path: P
 
 
 @swiftly
-async def test_a_vehicle_that_answers_nothing_any_more_is_not_asked_for_every_value() -> None:
+async def test_the_run_ends_after_three_unanswered_writes() -> None:
     tap = Tap(ardupilot())
 
-    def go_deaf(progress: ApplyProgress) -> None:
+    def stop_answering(progress: ApplyProgress) -> None:
         tap.is_deaf = progress.phase == "writing"
 
     async with a_client(tap) as client:
         component = await client.component()
-        result = await apply(component, written(another()), progress=go_deaf)
+        result = await apply(component, written(another()), progress=stop_answering)
         assert component.state != "lost"
     assert isinstance(result.error, NoReply)
     assert [row.reason for row in result.rows.values()].count("not reached") >= 5
 
 
 @swiftly
-async def test_another_vehicle_in_its_place_ends_it() -> None:
+async def test_another_vehicle_at_the_same_address_ends_the_run() -> None:
     vehicle = ardupilot()
     tap = Tap(vehicle)
     async with a_client(tap) as client:
@@ -1186,18 +1182,18 @@ async def test_a_failure_before_anything_is_sent_is_raised() -> None:
     vehicle = ardupilot()
     tap = Tap(vehicle)
 
-    async def arm(run: Run) -> None:
+    async def arm(run: ApplyRun) -> None:
         vehicle.armed = True
         await anyio.sleep(2)
 
     async with a_client(tap) as client:
-        with mock.patch.object(Run, "_store", arm), pytest.raises(VehicleArmed):
+        with mock.patch.object(ApplyRun, "_store_state", arm), pytest.raises(VehicleArmed):
             await apply(await client.component(), written(another()))
     assert tap.messages(wire.ParamSet) == []
 
 
-class Ending(Tap):
-    """An endpoint that has something happen when the station has sent so many frames."""
+class EndpointWithEvent(Tap):
+    """An endpoint that calls `happen` after the station has sent a number of frames."""
 
     def __init__(self, endpoint: Any, frames: int, happen: Callable[[], object]) -> None:
         super().__init__(endpoint)
@@ -1211,12 +1207,12 @@ class Ending(Tap):
             self._happen()
 
 
-class Story:
-    """A vehicle, what it shall have, and how it is set up; the same each time it is made.
+class Scenario:
+    """A vehicle, its wanted parameters and the options of `apply`; identical each time it is made.
 
     Attributes:
         vehicle: the vehicle, with the same hardware id each time.
-        wanted: what it shall have.
+        wanted: the wanted parameters.
         options: those of `apply`.
     """
 
@@ -1229,7 +1225,7 @@ class Story:
         elif kind == "px4":
             self.vehicle = px4(uid=77)
         elif kind == "ardupilot that starts":
-            self.vehicle = ardupilot(Hiding, reboot_groups=["EK2_ENABLE"])
+            self.vehicle = ardupilot(HidingGroup, reboot_groups=["EK2_ENABLE"])
             wanted |= {"FRAME_CLASS": 2, "SYSID_THISMAV": 7}
         else:
             self.vehicle = px4(uid=77)
@@ -1239,12 +1235,14 @@ class Story:
         self.wanted = written(wanted)
 
     def truth(self) -> dict[str, Value]:
-        """What it holds, hidden or not."""
+        """Return all values of the vehicle, hidden ones included."""
         return {entry.name: entry.value for entry in self.vehicle._entries}
 
 
-async def session_that_ends(story: Story, cache: ParamCache, *, frames: int, how: str, **faults: Any) -> None:
-    """Set a vehicle up until the station has sent so many frames; then the session ends in some way."""
+async def run_interrupted(
+    story: Scenario, cache: ParamCache, *, frames: int, how: str, **faults: Any
+) -> None:
+    """Run `apply` until the station has sent `frames` frames; then end the session in the way of `how`."""
     scope = anyio.CancelScope()
 
     def end() -> None:
@@ -1252,10 +1250,10 @@ async def session_that_ends(story: Story, cache: ParamCache, *, frames: int, how
             tap.is_deaf = tap.is_mute = True
         else:
             scope.cancel()
-        if how == "kill":  # what is not on disk by now never will be
+        if how == "kill":  # nothing more is written to the disk
             client._writer._cache = None
 
-    tap = Ending(Air.symmetric([story.vehicle], **faults), frames, end)
+    tap = EndpointWithEvent(Air.symmetric([story.vehicle], **faults), frames, end)
     with scope:
         async with ParamClient(tap, cache=cache) as client:
             with contextlib.suppress(NoReply):
@@ -1271,18 +1269,18 @@ async def session_that_ends(story: Story, cache: ParamCache, *, frames: int, how
     loss=st.sampled_from([0.0, 0.0, 0.1]),
     seed=st.integers(0, 1000),
 )
-def test_wherever_it_ends_the_next_one_brings_exactly_what_is_wanted(
+def test_the_next_run_completes_after_an_interruption_anywhere(
     kind: str, frames: int, how: str, loss: float, seed: int, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
     path = tmp_path_factory.mktemp("cache") / "cache.sqlite3"
 
     @swiftly
     async def told() -> None:
-        story = Story(kind)
+        story = Scenario(kind)
         before = story.truth()
         wanted = {name: param.value for name, param in story.wanted.items()}
         with ParamCache(path) as cache:
-            await session_that_ends(story, cache, frames=frames, how=how, loss=loss, seed=seed)
+            await run_interrupted(story, cache, frames=frames, how=how, loss=loss, seed=seed)
             air = Air.symmetric([story.vehicle], loss=loss, seed=seed + 1)
             async with ParamClient(air, cache=cache) as client:
                 result = await apply(await client.component(), story.wanted, **story.options)
@@ -1292,12 +1290,12 @@ def test_wherever_it_ends_the_next_one_brings_exactly_what_is_wanted(
             (key,) = [known.key for known in cache.vehicles() if known.identity.uid is not None]
             history = cache.history(key)
             first = cache.state_at(key, 1, cache.snapshots(key)[0].id)
-            # the state before anything was sent is there, and every step from it to what is now
+            # the cache has the state before the first write, and every change from it to the present state
             assert {name: param.value for name, param in first.items()} == {
                 name: value for name, value in before.items() if name in first
             }
             assert first.keys() >= before.keys() - GROUP.keys()
-            for name in before.keys() - GROUP.keys():  # those come and go, with what shows them
+            for name in before.keys() - GROUP.keys():  # these appear and disappear with their switch
                 lines = [line for line in history if line.name == name]
                 steps = [(line.old.value, line.new and line.new.value) for line in lines]
                 assert all(earlier[1] == later[0] for earlier, later in itertools.pairwise(steps)), steps
@@ -1310,7 +1308,7 @@ def test_wherever_it_ends_the_next_one_brings_exactly_what_is_wanted(
 
 @EVERY_KIND
 @swiftly
-async def test_a_file_of_another_autopilot_is_refused_before_the_vehicle_is_asked(
+async def test_a_file_of_another_autopilot_is_refused_before_the_vehicle_is_read(
     make: Callable[[], Any],
 ) -> None:
     tap = Tap(make())
@@ -1325,12 +1323,12 @@ async def test_a_file_of_another_autopilot_is_refused_before_the_vehicle_is_aske
     }
 
 
-# what the vehicle changes after it has acknowledged it
+# Values that the vehicle changes after its acknowledgement
 
 
 @pytest.mark.parametrize("delay", [0.02, 0.8, 1.1])
 @swiftly
-async def test_what_modules_clamp_within_a_second_is_adjusted(delay: float) -> None:
+async def test_a_value_clamped_within_a_second_is_adjusted(delay: float) -> None:
     vehicle = PX4Vehicle(table=SETTINGS | CLAMPED, clamp_delay=delay)
     wanted = {"MPC_TILTMAX_LND": 80.0, "TUNE_01": 9.5, "MPC_XY_CRUISE": 6.0}
     async with a_client(vehicle) as client:
@@ -1340,11 +1338,11 @@ async def test_what_modules_clamp_within_a_second_is_adjusted(delay: float) -> N
     assert (row.before, row.actual) == (12.0, 45.0)
     assert "changed it afterwards" in row.reason
     assert not result.complete
-    assert vehicle.requests["PARAM_SET"] == 4  # once more, as another one that was set may have changed it
+    assert vehicle.requests["PARAM_SET"] == 4  # once more: a later write may have changed it
 
 
 @swiftly
-async def test_a_clamp_back_to_the_old_value_is_no_failure_but_an_adjustment() -> None:
+async def test_a_clamp_to_the_old_value_is_adjusted_and_not_failed() -> None:
     vehicle = PX4Vehicle(table=SETTINGS | CLAMPED | {"MPC_TILTMAX_LND": 45.0}, clamp_delay=0.5)
     async with a_client(vehicle) as client:
         result = await apply(await client.component(), written({"MPC_TILTMAX_LND": 80.0}))
@@ -1353,7 +1351,7 @@ async def test_a_clamp_back_to_the_old_value_is_no_failure_but_an_adjustment() -
 
 
 @swiftly
-async def test_what_is_clamped_by_another_wanted_value_arrives_with_the_second_try() -> None:
+async def test_a_value_clamped_by_another_wanted_value_is_set_with_the_second_attempt() -> None:
     vehicle = PX4Vehicle(table=SETTINGS | CLAMPED, clamp_delay=0.0)
     async with a_client(vehicle) as client:
         wanted = {"MPC_XY_CRUISE": 18.0, "MPC_XY_VEL_MAX": 19.0}
@@ -1361,7 +1359,7 @@ async def test_what_is_clamped_by_another_wanted_value_arrives_with_the_second_t
 
 
 @swiftly
-async def test_what_was_as_wanted_and_is_changed_by_another_one_is_seen() -> None:
+async def test_an_unchanged_value_that_another_write_changes_is_detected() -> None:
     vehicle = PX4Vehicle(table=SETTINGS | CLAMPED, clamp_delay=1.0)
     async with a_client(vehicle) as client:
         wanted = {"MPC_XY_VEL_MAX": 8.0, "MPC_VEL_MANUAL": 10.0}
@@ -1370,7 +1368,7 @@ async def test_what_was_as_wanted_and_is_changed_by_another_one_is_seen() -> Non
 
 
 @swiftly
-async def test_the_proof_begins_long_enough_after_the_last_write() -> None:
+async def test_the_verification_begins_after_the_verify_delay() -> None:
     tap = Tap(px4())
     async with a_client(tap) as client:
         assert (await apply(await client.component(), written(another()))).complete
@@ -1380,20 +1378,20 @@ async def test_the_proof_begins_long_enough_after_the_last_write() -> None:
         for at, _, message in tap.heard
         if isinstance(message, wire.ParamRequestRead) and message.param_id == wire.HASH_CHECK
     ]
-    assert hashes[-1] - sets[-1] >= LASTING_TIME
+    assert hashes[-1] - sets[-1] >= VERIFY_DELAY
 
 
 @swiftly
-async def test_where_nothing_is_to_be_written_nothing_is_waited_for() -> None:
+async def test_a_run_without_writes_has_no_verify_delay() -> None:
     async with a_client(px4()) as client:
         result = await apply(await client.component(), written({"TUNE_01": 0.25}))
     assert result.complete
-    assert result.elapsed < LASTING_TIME
+    assert result.elapsed < VERIFY_DELAY
 
 
 @pytest.mark.parametrize("value", [float("nan"), float("-inf")])
 @swiftly
-async def test_what_px4_cannot_save_is_only_set_when_forced(value: float) -> None:
+async def test_a_value_that_px4_cannot_save_is_set_only_if_forced(value: float) -> None:
     vehicle = px4()
     async with a_client(vehicle) as client:
         component = await client.component()
@@ -1424,7 +1422,7 @@ def ardupilot_on_a_serial_port(**options: Any) -> ArduPilotVehicle:
 
 
 def tuned(vehicle: ArduPilotVehicle, count: int) -> ParamSet:
-    """Other values of so many floats that the vehicle has, one above."""
+    """Return changed values, one higher, of `count` floats of the vehicle."""
     values = {
         name: param.value
         for name, param in vehicle.params.items()
@@ -1433,15 +1431,15 @@ def tuned(vehicle: ArduPilotVehicle, count: int) -> ParamSet:
     return written({name: values[name] + 1.0 for name in [*values][:count]})
 
 
-def reads_behind_the_last_set(tap: Tap) -> list[str]:
-    """The names that were asked for by name after the last write."""
+def reads_after_the_last_set(tap: Tap) -> list[str]:
+    """Return the names that were read by name after the last write."""
     messages = [message for _, _, message in tap.heard]
     last = max(place for place, message in enumerate(messages) if isinstance(message, wire.ParamSet))
     return [each.param_id for each in messages[last + 1 :] if isinstance(each, wire.ParamRequestRead)]
 
 
 @swiftly
-async def test_twenty_values_over_a_radio_take_one_download_and_are_proven_by_name() -> None:
+async def test_twenty_values_over_a_radio_take_one_download_and_are_verified_by_name() -> None:
     tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
     wanted = tuned(vehicle, 21)
     first, *changed = wanted
@@ -1455,7 +1453,7 @@ async def test_twenty_values_over_a_radio_take_one_download_and_are_proven_by_na
     assert statuses(result) == {**dict.fromkeys(changed, "set"), first: "unchanged"}
     assert result.elapsed <= 6.5
     assert downloads(tap) == 1
-    assert sorted(reads_behind_the_last_set(tap)) == sorted(wanted)
+    assert sorted(reads_after_the_last_set(tap)) == sorted(wanted)
 
 
 @swiftly
@@ -1471,13 +1469,13 @@ async def test_switches_of_groups_take_one_download_over_a_radio_too() -> None:
 
 
 @swiftly
-async def test_a_value_that_changes_behind_its_acknowledgement_is_seen_over_a_radio() -> None:
+async def test_a_value_that_changes_after_its_acknowledgement_is_detected_over_a_radio() -> None:
     tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
     wanted = tuned(vehicle, 4)
     one, other, dead, *_ = wanted
 
     def change(progress: ApplyProgress) -> None:
-        if progress.row is not None and progress.row.name == one:  # on board, without a word
+        if progress.row is not None and progress.row.name == one:  # changed on board, without a PARAM_VALUE
             vehicle._entry(one).store(bits_of(77.0, ParamType.REAL32))
             vehicle._dead.add(dead)
 
@@ -1486,27 +1484,27 @@ async def test_a_value_that_changes_behind_its_acknowledgement_is_seen_over_a_ra
     assert (statuses(result)[one], statuses(result)[other]) == ("adjusted", "set")
     assert result.rows[one].actual == 77.0
     assert statuses(result)[dead] == "unproven"
-    assert "does not tell" in str(result.rows[dead])
+    assert "no longer reports it" in str(result.rows[dead])
     assert not result.complete
     assert downloads(tap) == 1
 
 
 @swiftly
-async def test_a_vehicle_that_falls_silent_before_the_proof_over_a_radio_ends_it() -> None:
+async def test_a_vehicle_that_falls_silent_before_verification_over_a_radio_ends_the_run() -> None:
     tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
     wanted = tuned(vehicle, 3)
 
-    def go_deaf(progress: ApplyProgress) -> None:
+    def stop_answering(progress: ApplyProgress) -> None:
         tap.is_deaf = progress.phase == "reading" and vehicle.requests["PARAM_SET"] > 0
 
     async with a_client(tap) as client:
-        result = await apply(await client.component(), wanted, progress=go_deaf)
+        result = await apply(await client.component(), wanted, progress=stop_answering)
     assert isinstance(result.error, NoReply)
     assert set(statuses(result).values()) == {"unproven"}
 
 
 @swiftly
-async def test_a_large_file_is_proven_by_a_download_over_a_radio_too() -> None:
+async def test_a_large_file_is_verified_by_a_download_over_a_radio_too() -> None:
     tap = on_a_radio(vehicle := ardupilot_on_a_serial_port())
     wanted = ParamSet.of(vehicle.params.values())
     wanted = ParamSet({**wanted.params, **tuned(vehicle, 5).params})
@@ -1514,14 +1512,14 @@ async def test_a_large_file_is_proven_by_a_download_over_a_radio_too() -> None:
         result = await apply(await client.component(), wanted)
     assert result.complete
     assert downloads(tap) == 2
-    assert reads_behind_the_last_set(tap) == []
+    assert reads_after_the_last_set(tap) == []
 
 
 @swiftly
-async def test_a_hash_proves_all_of_it_over_a_radio_too() -> None:
+async def test_a_hash_verifies_all_values_over_a_radio_too() -> None:
     tap = on_a_radio(PX4Vehicle(burst=3, period=0.025))
     async with a_client(tap) as client:
         result = await apply(await client.component(), written({"MC_ROLL_P": 6.25, "MC_PITCH_P": 6.25}))
     assert result.complete
-    assert set(reads_behind_the_last_set(tap)) == {wire.HASH_CHECK}
+    assert set(reads_after_the_last_set(tap)) == {wire.HASH_CHECK}
     assert downloads(tap) == 1

@@ -321,7 +321,7 @@ const PHASES = { reading: "Reading", writing: "Writing", rebooting: "Starting ag
 /** The lines of a plan in the order in which they would be sent, then those that would be left out. */
 function linesOf(plan, table, other, refresh) {
   const staged = plan.stages.flatMap(({ purpose, steps }) =>
-    steps.map(({ name }) => [name, purpose === "the others" ? "" : purpose]),
+    steps.map(({ name }) => [name, purpose === "all other parameters" ? "" : purpose]),
   );
   const purposes = new Map(staged);
   const names = [...purposes.keys(), ...Object.keys(plan.params).filter((name) => !purposes.has(name))];

@@ -14,7 +14,7 @@ from paramclient.files import FileForm, dumps
 from paramclient.files.param_file import ENDINGS
 from paramclient.model.identity import autopilot_name
 from paramclient.model.paramset import ParamSet
-from paramclient.provision.vehicle_params import differing, whole_set
+from paramclient.provision.vehicle_params import fetch_set, select_non_defaults
 from paramclient.service.answering import document_answer
 from paramclient.service.hub import Hub
 from paramclient.service.param_sources import (
@@ -78,8 +78,10 @@ async def file(
         if source == "known":
             found = await known_set(target, hub.aside)
         else:
-            found = await whole_set(target.component, source=f"link {target.line.name}", run=hub.aside)
-        chosen = await hub.aside(lambda: differing(found.set, found.params)) if changed else found.set
+            found = await fetch_set(target.component, source=f"link {target.line.name}", run=hub.aside)
+        chosen = (
+            await hub.aside(lambda: select_non_defaults(found.set, found.params)) if changed else found.set
+        )
         return await attachment(hub, chosen, form)
 
     return await answered(request, work, target)

@@ -19,8 +19,8 @@ from paramclient.metadata import Metadata, MetadataStore
 from paramclient.model.comparison import compare, defaults_of
 from paramclient.model.paramset import ParamSet
 from paramclient.provision import ApplyProgress, ApplyResult, ApplyRow, Plan, apply, overlay, prepare, restore
-from paramclient.provision.set_up import restored
-from paramclient.provision.vehicle_params import NO_DEFAULTS, Taken, whole_set
+from paramclient.provision.set_up import restore_categories
+from paramclient.provision.vehicle_params import NO_DEFAULTS, FetchedSet, fetch_set
 from paramclient.service.answering import document_answer
 from paramclient.service.followed_component import Followed
 from paramclient.service.hub import Hub
@@ -246,8 +246,8 @@ async def _present(hub: Hub, target: Followed, body: Compared) -> ParamSet:
         return (await known_set(target, hub.read_aside)).set
     source = f"link {target.line.name}"
 
-    async def work() -> Taken:
-        return await whole_set(target.component, source=source, run=hub.read_aside)
+    async def work() -> FetchedSet:
+        return await fetch_set(target.component, source=source, run=hub.read_aside)
 
     return (await _within(target, body.timeout_s, work)).set
 
@@ -286,7 +286,7 @@ async def _plan_back(hub: Hub, target: Followed, body: Restored) -> Plan:
     earlier = await state(hub, target, body.when)
 
     async def work() -> Plan:
-        include = (*await restored(target.component, earlier), *body.include)
+        include = (*await restore_categories(target.component, earlier), *body.include)
         info = target.metadata
         return await prepare(
             target.component, earlier, include=include, info=info, force=body.force, run=hub.read_aside
