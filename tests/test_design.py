@@ -201,11 +201,14 @@ def test_the_simulators_load_only_when_a_link_asks_for_them() -> None:
                 assert not (each.runs_at_import and room_of(target) == "sim"), f"{module}:{each.line}"
 
 
-def test_only_the_command_and_the_ports_of_windows_know_asyncio() -> None:
-    """The library runs on trio too: see `tests/client/test_backends.py`."""
+def test_only_the_command_uvicorns_protocols_and_the_ports_of_windows_know_asyncio() -> None:
+    """The library runs on trio too: see `tests/client/test_backends.py`. uvicorn runs on asyncio alone."""
     loops = {"asyncio", "trio"}
     uses = {module for module in MODULES for each in imports_of(module) if each.top in loops}
-    assert {module for module in uses if not is_command(module)} == {"paramclient.links.transport"}
+    assert {module for module in uses if not is_command(module)} == {
+        "paramclient.links.transport",
+        "paramclient.service.connections",
+    }
 
 
 def test_only_the_remote_client_knows_httpx() -> None:

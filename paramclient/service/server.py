@@ -15,7 +15,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 
 from paramclient.errors import LinkError, UsageError
 from paramclient.service.app import Settings, create_app
-from paramclient.service.connections import Connection
+from paramclient.service.connections import Connection, WebSocketConnection
 from paramclient.service.gate import Gate
 from paramclient.service.hub import Hub
 from paramclient.service.log_limit import LogLimit
@@ -190,7 +190,7 @@ def _config(app: ASGIApp, listening: Listening) -> uvicorn.Config:
         app,
         lifespan="off",
         http=Connection,
-        ws="websockets-sansio",
+        ws=WebSocketConnection,
         ws_max_size=LARGEST_FRAME,
         ws_per_message_deflate=False,
         log_config=None,

@@ -10,9 +10,10 @@ import logging
 import re
 import socket
 import ssl
+import struct
 import time
 from collections import deque
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -551,6 +552,87 @@ async def test_a_listener_who_never_reads_is_left(monkeypatch: pytest.MonkeyPatc
             await until(lambda: service.hub.feed.listeners == 1)
             await overwhelm(service)
             await until(lambda: service.hub.feed.listeners == 0)
+
+
+@pytest.mark.parametrize("is_secure", [False, True])
+async def test_what_one_connection_sends_is_parsed_in_slices(
+    is_secure: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slices: list[int] = []
+
+    def watched(original: Callable[[Any, bytes], None]) -> Callable[[Any, bytes], None]:
+        def data_received(self: Any, data: bytes) -> None:
+            slices.append(len(data))
+            original(self, data)
+
+        return data_received
+
+    for kind in (connections.Connection, connections.WebSocketConnection):
+        monkeypatch.setattr(kind, "data_received", watched(kind.data_received))
+    options = {"ssl": trusting(), "server_hostname": "127.0.0.1"} if is_secure else {}
+    async with served(listening=over_tls() if is_secure else None) as service:
+        async with service.connection(**options) as (reader, writer):
+            writer.write(service.head("GET", "/api/v1/ws", *UPGRADE))
+            await reader.readuntil(b'"resumed":false}')
+            pings = [b"\x89\x82\0\0\0\0" + struct.pack("!H", number) for number in range(20_000)]
+            writer.write(b"".join(pings))
+            pongs = [b"\x8a\x02" + struct.pack("!H", number) for number in range(20_000)]
+            assert await reader.readexactly(4 * 20_000) == b"".join(pongs)
+        async with service.connection(**options) as (reader, writer):
+            body = b'{"system": 1, "timeout_s": 0.01' + b" " * 60_000 + b"}"
+            more = ("Connection: close", "Content-Type: application/json", f"Content-Length: {len(body)}")
+            writer.write(service.head("POST", "/api/v1/find", *more) + body)
+            assert Answer.of(await taken(reader)).problem == "no-reply"
+    assert max(slices) <= connections.BYTES_AT_ONCE
+    assert sum(slices) > 160_000 + 60_000
+
+
+async def test_of_a_websocket_that_is_not_read_nothing_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "STALL_PATIENCE", 0.5)
+    made: list[Any] = []
+    original = connections.WebSocketConnection.connection_made
+
+    def connection_made(self: Any, transport: Any) -> None:
+        made.append(transport)
+        original(self, transport)
+
+    monkeypatch.setattr(connections.WebSocketConnection, "connection_made", connection_made)
+    ping = b"\x89\xfd\0\0\0\0" + b"p" * 125
+    async with served() as service:
+        with a_narrow_socket(service.port) as narrow:
+            narrow.send(service.head("GET", "/api/v1/ws", *UPGRADE))
+            await until(lambda: service.hub.feed.listeners == 1)
+            data, sent, largest = (ping * 8 + b"\x81\x80\0\0\0\0") * 600, 0, 0
+            with contextlib.suppress(ConnectionError):
+                while sent < 2 * KERNEL and service.hub.feed.listeners:
+                    with contextlib.suppress(BlockingIOError):
+                        sent += narrow.send(data[sent % len(data) :])
+                    largest = max(largest, made[0].get_write_buffer_size())
+                    await asyncio.sleep(0)
+            assert sent < 2 * KERNEL
+            assert largest < 150_000
+            await until(lambda: service.hub.feed.listeners == 0)
+
+
+@pytest.mark.parametrize(
+    ("frames", "code"),
+    [
+        (b"\x81\x84\0\0\0\0\xff\xfe\xff\xff", 1007),
+        (b"\x81\x81\0\0\0\0\xff" * 2 + b"\x88\x82\0\0\0\0\x03\xe8", None),
+        (b"\x01\x80\0\0\0\0" + b"\0\x80\0\0\0\0" * 1_000, 1009),
+    ],
+)
+async def test_a_websocket_message_that_is_none_closes_it_without_a_traceback(
+    frames: bytes, code: int | None, caplog: pytest.LogCaptureFixture
+) -> None:
+    async with served() as service, service.connection() as (reader, writer):
+        writer.write(service.head("GET", "/api/v1/ws", *UPGRADE))
+        await reader.readuntil(b'"resumed":false}')
+        writer.write(frames)
+        told = await taken(reader)
+        assert code is None or told[2:4] == struct.pack("!H", code)
+        assert (await service.ask()).status == 200
+    assert [record for record in caplog.records if record.levelno >= logging.WARNING] == []
 
 
 @pytest.mark.parametrize("is_secure", [False, True])
