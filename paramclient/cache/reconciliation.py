@@ -210,9 +210,14 @@ def _divided(
     newer: list[StoredParam] = []
     older: list[StoredParam] = []
     agrees = True
+    overtaken: dict[str, float] = {}  # what is older than an overtaken observation is overtaken too
     for item in update.params:
         name, is_listed = item.param.name, item.param.index is not None
-        if seen.is_news(name, item.heard_at, is_listed=is_listed):
+        if not seen.is_news(name, item.heard_at, is_listed=is_listed):
+            overtaken[name] = max(item.heard_at, overtaken.get(name, -math.inf))
+    for item in update.params:
+        name = item.param.name
+        if item.heard_at > overtaken.get(name, -math.inf):
             newer.append(item)
             continue
         row = seen.rows.get(name)

@@ -374,6 +374,25 @@ def interleaved(caches: Callable[[], tuple[ParamCache, ParamCache]], examples: i
     )
 
 
+def test_what_went_before_anything_was_written_does_not_come_back(tmp_path: Path) -> None:
+    """The first value of a parameter had no index, and a later one had: the list without it overtakes both."""
+    path = tmp_path / "cache"
+    caches = staticmethod(lambda: (ParamCache(path), ParamCache(path)))
+    programs = type("Machine", (Programs,), {"caches": caches})()
+    programs.begin()
+    programs.goes(name="B")
+    programs.is_set(number=1, name="C", value=2, at=1)
+    programs.lists(number=1)
+    programs.goes(name="C")
+    programs.is_set(number=0, name="B", value=2, at=2)
+    programs.lists(number=0)
+    for number, side in enumerate(programs.sides):
+        programs.read_all(side)
+        programs.flush(number)
+    assert programs.opened[0].component(system=1).params.keys() == {"A", "B"}
+    programs.teardown()
+
+
 def test_whatever_two_programs_write_to_a_file_was_so(tmp_path: Path) -> None:
     path = tmp_path / "cache"
     interleaved(lambda: (ParamCache(path), ParamCache(path)), examples=100)
