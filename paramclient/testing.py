@@ -98,7 +98,7 @@ def _make(kind: Callable[..., V], pace: float | None, seed: int, options: dict[s
     faults: Faults = {name: options.pop(name) for name in Faults.__annotations__ if name in options}  # type: ignore[assignment]  # exactly the keys of Faults
     if pace is not None:
         if not (math.isfinite(pace) and pace > 0.0):
-            raise UsageError(f"pace is a number of values per second above 0, not {pace}")
+            raise UsageError(f"pace must be a number of values per second above 0, not {pace}")
         if options.keys() & {"burst", "period"}:
             raise UsageError("pace replaces burst and period: give either pace or these two")
         burst = max(1, int(pace * LIST_PERIOD_MAX))

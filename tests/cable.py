@@ -1,4 +1,4 @@
-"""A serial cable for tests: a pseudo-terminal behind a symbolic link, to be plugged in and pulled out."""
+"""A serial cable for tests: a pseudo-terminal behind a symbolic link that can be plugged in and unplugged."""
 
 from __future__ import annotations
 
@@ -15,12 +15,13 @@ from paramclient.sim import Endpoint
 
 __all__ = ["Cable"]
 
-PATIENCE = 120.0
-"""Seconds after which a test gives up; nothing waits that long when all is well."""
+TIMEOUT = 120.0
+"""Seconds after which a test fails; a passing test never waits that long."""
 
 
 class Cable:
-    """The far end of a serial port. `device` is a path that stays the same, as those of /dev/serial/by-id do.
+    """The remote end of a serial port. `device` is a path that stays the same, like those of
+    /dev/serial/by-id.
 
     Attributes:
         device: the path of the port.
@@ -42,7 +43,7 @@ class Cable:
 
     @property
     def link(self) -> str:
-        """The name of the link over it."""
+        """The link name of the port."""
         return f"serial:{self.device}:115200"
 
     def plug_in(self) -> None:
@@ -61,33 +62,33 @@ class Cable:
         assert self.offer(data) == len(data)
 
     def offer(self, data: bytes) -> int:
-        """Send as much as there is room for; how much that was."""
+        """Write as much as the buffer accepts; return the number of bytes."""
         try:
             return os.write(self._file, data)
         except BlockingIOError:
             return 0
 
     def recv(self, size: int) -> bytes:
-        """Wait for bytes, as a socket does."""
-        readable, _, _ = select.select([self._file], [], [], PATIENCE)
+        """Wait for bytes, like a socket."""
+        readable, _, _ = select.select([self._file], [], [], TIMEOUT)
         assert readable, "nothing has come"
         return os.read(self._file, size)
 
     def drain(self) -> None:
-        """Take, and forget, what has come."""
-        with suppress(OSError):  # nothing more, or nobody has the port open
+        """Read and discard all received bytes."""
+        with suppress(OSError):  # no more bytes, or no program has the port open
             while os.read(self._file, 65536):
                 pass
 
     async def carry(self, vehicle: Endpoint, *, rate: float, portion: int = 64) -> None:
-        """Let a vehicle speak at the port, at so many bytes a second each way, until the cable is pulled out.
+        """Connect a vehicle to the port, with this many bytes per second each way, until unplugged.
 
-        Bytes come in portions that have nothing to do with frames, as from a USB driver.
+        Bytes are transferred in portions independent of frames, as by a USB driver.
         """
         outgoing = bytearray()
         while self._file >= 0:
             now = anyio.current_time()
-            with suppress(OSError):  # nothing has come, or nobody has the port open
+            with suppress(OSError):  # no bytes, or no program has the port open
                 vehicle.receive(os.read(self._file, portion), now)
             vehicle.tick(now)
             outgoing += b"".join(vehicle.data_to_send())

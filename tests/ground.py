@@ -1,4 +1,4 @@
-"""A ground station that asks simulated vehicles by hand, and what it says to them."""
+"""A ground station with simulated time, and its messages, for tests of simulated vehicles."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from paramclient.model.values import Encoding, ParamType, Value, encode
 from paramclient.protocol import wire
 from paramclient.sim import Endpoint
 
-__all__ = ["LIST", "SIGNS_OF_LIFE", "SMALL", "Station", "cast", "indices", "names", "read", "write"]
+__all__ = ["LIST", "PERIODIC_MESSAGES", "SMALL", "Station", "cast", "indices", "names", "read", "write"]
 
 SMALL: dict[str, Value | tuple[ParamType | int, Value]] = {
     "A_FLOAT": 1.5,
@@ -19,8 +19,8 @@ SMALL: dict[str, Value | tuple[ParamType | int, Value]] = {
     "D_SHORT": (ParamType.INT16, -3),
 }
 LIST = wire.ParamRequestList(1, 1)
-SIGNS_OF_LIFE = (wire.Heartbeat, wire.SystemTime)
-"""What a generic vehicle sends each second from the first call on."""
+PERIODIC_MESSAGES = (wire.Heartbeat, wire.SystemTime)
+"""Messages that a generic vehicle sends each second from the first call on."""
 
 M = TypeVar("M")
 
@@ -37,12 +37,12 @@ def write(
 
 
 def cast(name: str, value: float, kind: int = ParamType.REAL32) -> wire.ParamSet:
-    """A set as for ArduPilot, whatever the value."""
+    """Return a PARAM_SET in ArduPilot's encoding, for every value."""
     return wire.ParamSet(1, 1, name, struct.pack("<f", value), kind)
 
 
 class Station:
-    """A ground station in a time of its own: `log` holds what came from the endpoint, and when."""
+    """A ground station with simulated time; `log` has the received messages and their times."""
 
     def __init__(self, endpoint: Endpoint, *, start: float = 0.0) -> None:
         self.endpoint = endpoint
@@ -61,7 +61,7 @@ class Station:
         self._collect()
 
     def wait(self, seconds: float) -> Station:
-        """Let time pass, from deadline to deadline."""
+        """Advance the time, from deadline to deadline."""
         until = self.now + seconds
         while (due := self.endpoint.next_deadline()) is not None and due <= until:
             self.now = max(due, self.now)
@@ -73,7 +73,7 @@ class Station:
         return self
 
     def heard(self, kind: type[M]) -> list[M]:
-        """The messages of a kind since this was last asked, and forget the rest."""
+        """Return the messages of a kind since the last call, and clear the log."""
         found: list[M] = [message for _, _, message in self.log if isinstance(message, kind)]
         self.log.clear()
         return found
@@ -82,11 +82,11 @@ class Station:
         return self.heard(wire.ParamValue)
 
     def times(self) -> list[float]:
-        """When the PARAM_VALUEs came."""
+        """Return the times of the received PARAM_VALUEs."""
         return [time for time, _, message in self.log if isinstance(message, wire.ParamValue)]
 
     def ask(self, *messages: wire.Message, seconds: float = 0.2) -> list[wire.ParamValue]:
-        """What PARAM_VALUEs come within some time after these."""
+        """Send messages; return the PARAM_VALUEs received within this time."""
         self.log.clear()
         return self.send(*messages).wait(seconds).values()
 

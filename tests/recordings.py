@@ -1,25 +1,26 @@
-"""Reads the telemetry logs in tests/data: both directions of real sessions, frame by frame.
+"""Reader and comparison of the telemetry logs in tests/data: both directions of real sessions, frame by
+frame.
 
-`replay` gives a simulated vehicle the ground station's frames of a log at the recorded times. `differences`
-says where the vehicle's messages differ from the recorded ones, by these rules:
+`replay` sends a simulated vehicle the ground station's frames of a log at the recorded times. `differences`
+returns the differences between the vehicle's messages and the recorded ones, by these rules:
 
 Series: Each message belongs to one series: the values of a list; the other PARAM_VALUEs of each name (index
-65535) or index; the answers of MAVFTP; the texts of the banner; each further message type. A value belongs to
-the list if its index is one more than that of the list's last value, or 0 after another request for the list.
+65535) or index; the responses of MAVFTP; the texts of the banner; each further message type. A value belongs
+to the list if its index is one more than that of the list's last value, or 0 after another list request.
 
 Order: A series has the same messages in the same order. Two messages of different series that were recorded
-more than 50 ms apart come in the same order, within what the phase allows.
+more than 50 ms apart are in the same order, within the tolerance of the phase.
 
 Time: The time from a request to each message is that of the log, within 20 ms or 20 %, whichever is larger.
-The request of a list's value is the PARAM_REQUEST_LIST from which its pass began; of another PARAM_VALUE, the
-latest read or set of that parameter; of an answer of MAVFTP, the latest request of that kind with a lower
-number, so the request for the burst for each of its blocks; of the banner, the latest request for the list
+The request of a list's value is the PARAM_REQUEST_LIST that started its pass; of another PARAM_VALUE, the
+latest read or set of that parameter; of a response of MAVFTP, the latest request of that kind with a lower
+number, which for each block of a burst is the burst's request; of the banner, the latest request for the list
 or for a file; of other messages, the latest command. Heartbeats have no request: their spacing is that of the
 log within 20 %.
 
-Phase: A log does not tell at which point of the vehicle's loop a request arrived. So each replay states the
-phase of the vehicle's loop, and a value of a list may come with the burst before or after (10 values of
-ArduPilot, 20 of PX4), a block of a file up to two blocks earlier or later. A pass of a list that another
+Phase: A log does not contain the phase of the vehicle's loop at which a request arrived. Each replay
+therefore states the phase of the loop, and a value of a list may be in the burst before or after (10 values
+of ArduPilot, 20 of PX4), a block of a file up to two blocks earlier or later. A pass of a list that another
 request ends may have as many values more or less.
 """
 
@@ -43,7 +44,7 @@ from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.sim import Vehicle
 
 Messages: TypeAlias = list[tuple[float, wire.Message]]
-"""Messages, each with the seconds since the log's first frame."""
+"""Messages, each with the time since the log's first frame in seconds."""
 
 DATA = Path(__file__).parent / "data"
 NAMES = tuple(sorted(path.stem for path in DATA.glob("*.tlog")))
@@ -55,9 +56,9 @@ class Record(NamedTuple):
 
     Attributes:
         time: seconds since the first frame of the log.
-        data: the frame as it stood on the wire.
-        system: who sent it.
-        frame: the same, checked; None for a message that the dialect does not know.
+        data: the frame as on the wire.
+        system: the sender's system id.
+        frame: the frame with a valid checksum; None for a message that the dialect does not define.
     """
 
     time: float
@@ -72,7 +73,7 @@ class Record(NamedTuple):
 
 @cache
 def read(name: str) -> tuple[Record, ...]:
-    """All frames of `tests/data/{name}.tlog`: eight bytes of time (big-endian µs) before each frame."""
+    """Return all frames of `tests/data/{name}.tlog`: 8 bytes of time (big-endian µs) before each frame."""
     content = (DATA / f"{name}.tlog").read_bytes()
     framer = wire.Framer(stream=False)
     records: list[Record] = []
@@ -96,12 +97,12 @@ def read(name: str) -> tuple[Record, ...]:
 
 
 def from_ground(name: str) -> list[Record]:
-    """What the ground station sent."""
+    """Return the frames of the ground station."""
     return [record for record in read(name) if record.system == GROUND_STATION]
 
 
 def from_vehicle(name: str) -> Messages:
-    """What the vehicle sent, as far as `wire` decodes it: the time, and the message."""
+    """Return the vehicle's messages that `wire` decodes, with their times."""
     return [
         (record.time, message)
         for record in read(name)
@@ -110,7 +111,7 @@ def from_vehicle(name: str) -> Messages:
 
 
 def param_values(messages: Iterable[tuple[float, wire.Message]]) -> list[wire.ParamValue]:
-    """The PARAM_VALUEs among them, in order."""
+    """Return the PARAM_VALUEs among the messages, in order."""
     return [message for _, message in messages if isinstance(message, wire.ParamValue)]
 
 
@@ -121,13 +122,12 @@ def replay(
     phase: float = 0.0,
     on_board: Iterable[tuple[float, str, Value]] = (),
 ) -> Messages:
-    """Let the vehicle hear the ground station of a log at the recorded times; what it sent meanwhile, as far
-    as `wire` decodes it.
+    """Send the vehicle the ground station's frames of a log; return its messages that `wire` decodes.
 
     Args:
         phase: seconds into the log at which the vehicle's heartbeats, and with them the slots of ArduPilot,
-            are due. It has been on for a second then.
-        on_board: what happened inside the vehicle: when, which parameter, and the value that it took.
+            are due. The vehicle has then been on for a second.
+        on_board: changes on board: time, parameter, and new value.
     """
     inputs: list[tuple[float, bytes | tuple[str, Value]]] = [
         *((record.time, record.data) for record in from_ground(name)),
@@ -161,10 +161,11 @@ def replay(
 def differences(
     name: str, recorded: Messages, sent: Messages, *, burst: int, unasked: Collection[str] = ()
 ) -> list[str]:
-    """Where what was sent in a replay differs from the log, by the rules above; none where it is right.
+    """Return the differences between a replay and the log by the rules above; an empty list if there are
+    none.
 
     Args:
-        burst: values of a list that the vehicle sends in one go.
+        burst: values of a list that the vehicle sends in one burst.
         unasked: parameters whose values outside lists are left out.
     """
     expected, actual = _series(name, recorded, unasked), _series(name, sent, unasked)
@@ -200,12 +201,12 @@ def differences(
 
 
 def last_list(name: str) -> list[wire.ParamValue]:
-    """The values of the last list of a log, in order."""
+    """Return the values of the last list of a log, in order."""
     return param_values(_passes(_series(name, from_vehicle(name), ())["list"])[-1])
 
 
 class _Pair(NamedTuple):
-    """The earliest and latest time that the phase allows for a message, and when it was sent."""
+    """The earliest and latest time that the phase allows for a message, and its time in the replay."""
 
     first: float
     last: float
@@ -213,7 +214,7 @@ class _Pair(NamedTuple):
 
 
 def _series(name: str, messages: Messages, unasked: Collection[str]) -> defaultdict[str, Messages]:
-    """The messages by series; an index 0 begins a pass if a list was requested since the pass before."""
+    """Return the messages by series; index 0 starts a pass if a list was requested since the last pass."""
     lists = [time for time, request in _requests(name) if isinstance(request, wire.ParamRequestList)]
     series: defaultdict[str, Messages] = defaultdict(list)
     last, passes = None, 0
@@ -249,7 +250,7 @@ def _requests(name: str) -> list[tuple[float, wire.Message]]:
 
 
 def _request_of(answer: tuple[float, wire.Message], requests: Messages) -> float:
-    """When it was sent that a message of the vehicle answers; without a request, when the message came."""
+    """Return the time of the request that a message answers; without a request, the message's own time."""
     came, message = answer
     times = [time for time, request in requests if time <= came and _answers(message, request)]
     return max(times, default=came)
@@ -290,10 +291,10 @@ def _beats(recorded: Messages, sent: Messages) -> list[str]:
 
 
 def _order(pairs: list[_Pair]) -> list[str]:
-    """Where messages come in another order, though they were recorded far from each other."""
+    """Return messages in another order, though they were recorded far from each other."""
     found = []
     near: list[tuple[float, float]] = []
-    ahead = -math.inf  # when the last of those was sent that were recorded long before
+    ahead = -math.inf  # the replay time of the last message that was recorded long before
     for pair in sorted(pairs):
         while near and near[0][0] < pair.first - 0.05:
             ahead = max(ahead, heappop(near)[1])

@@ -182,11 +182,11 @@ def test_equal_seeds_lose_the_same_packets(make: Callable[..., SimVehicle[Vehicl
 @pytest.mark.parametrize(
     ("arguments", "problem"),
     [
-        ({"loss": 2.0}, "loss is a share"),
-        ({"pace": 0.0}, "pace is a number of values per second"),
-        ({"pace": float("nan")}, "pace is a number of values per second"),
+        ({"loss": 2.0}, "loss must be a share"),
+        ({"pace": 0.0}, "pace must be a number of values per second"),
+        ({"pace": float("nan")}, "pace must be a number of values per second"),
         ({"pace": 40.0, "burst": 3}, "pace replaces burst and period"),
-        ({"system": 0}, "system is a number from 1 to 255"),
+        ({"system": 0}, "system must be a number from 1 to 255"),
     ],
 )
 def test_invalid_arguments_are_rejected(arguments: dict[str, Any], problem: str) -> None:

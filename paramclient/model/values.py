@@ -214,7 +214,7 @@ def check_name(name: str) -> str:
     if not name:
         raise UsageError("a parameter name has at least one character")
     if not (name.isascii() and name.isprintable()):
-        raise UsageError(f"parameter name {name!r}: only printable ASCII characters can stand in a param_id")
+        raise UsageError(f"parameter name {name!r}: only printable ASCII characters are allowed")
     if len(name) > NAME_LENGTH:
         raise UsageError(f"parameter name {name!r} has {len(name)} bytes; a param_id holds {NAME_LENGTH}")
     return name
@@ -249,7 +249,7 @@ def check_value(value: SupportsIndex | SupportsFloat | bytes) -> Value:
         if isinstance(value, SupportsFloat):
             return float(value)
     except (ArithmeticError, TypeError, ValueError) as error:
-        raise UsageError(f"a parameter value is one number of ordinary size: {error}") from error
+        raise UsageError(f"a parameter value must be a number in the range of a float: {error}") from error
     raise UsageError(f"a parameter value is a number, not {type(value).__name__}")
 
 

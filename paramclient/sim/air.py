@@ -100,16 +100,16 @@ class FaultyLink:
         shares = {"loss": loss, "duplicate": duplicate, "reorder": reorder, "bit_errors": bit_errors}
         for name, share in shares.items():
             if not 0.0 <= share <= 1.0:
-                raise UsageError(f"{name} is a share between 0 and 1, not {share}")
+                raise UsageError(f"{name} must be a share between 0 and 1, not {share}")
         if not (math.isfinite(loss_burst) and loss_burst >= 1.0):
-            raise UsageError(f"loss_burst is a number of datagrams from 1 up, not {loss_burst}")
+            raise UsageError(f"loss_burst must be a number of datagrams from 1 up, not {loss_burst}")
         for name, seconds in {"delay": delay, "jitter": jitter}.items():
             if not (math.isfinite(seconds) and seconds >= 0.0):
-                raise UsageError(f"{name} is a number of seconds from 0 up, not {seconds}")
+                raise UsageError(f"{name} must be a number of seconds from 0 up, not {seconds}")
         if rate is not None and not (math.isfinite(rate) and rate > 0.0):
-            raise UsageError(f"rate is a number of bytes per second above 0, not {rate}")
+            raise UsageError(f"rate must be a number of bytes per second above 0, not {rate}")
         if queue is not None and (rate is None or queue < 0):
-            raise UsageError("queue is a number of bytes from 0 up, and needs a rate")
+            raise UsageError("queue must be a number of bytes from 0 up, and needs a rate")
         self._loss = loss
         self._loss_burst = loss_burst
         self._is_fading = False

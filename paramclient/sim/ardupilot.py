@@ -111,7 +111,7 @@ class ArduPilotVehicle(Vehicle):
         **options: Unpack[VehicleOptions],
     ) -> None:
         if kind not in _KINDS:
-            raise UsageError(f"kind is one of {', '.join(_KINDS)}, not {kind!r}")
+            raise UsageError(f"kind must be one of {', '.join(_KINDS)}, not {kind!r}")
         self._is_copter = kind == "copter"
         vehicle_type, state, self._start_state = _KINDS[kind]
         if groups is None:
@@ -128,9 +128,9 @@ class ArduPilotVehicle(Vehicle):
         if uid2 is None:
             uid2 = (int.from_bytes(_UID2, "little") + system - 1).to_bytes(18, "little")
         if len(uid2) > 18:
-            raise UsageError(f"uid2 has up to 18 bytes, not {len(uid2)}")
+            raise UsageError(f"uid2 must have at most 18 bytes, not {len(uid2)}")
         if not 0.0 <= live_period < math.inf:
-            raise UsageError(f"live_period is a number of seconds from 0 up, not {live_period}")
+            raise UsageError(f"live_period must be a number of seconds from 0 up, not {live_period}")
         if ftp:
             self._ftp = FileServer(self._packed_params, self._apply_packed, ftp_rate)
         self._in_groups = (
@@ -141,7 +141,7 @@ class ArduPilotVehicle(Vehicle):
         self._switches = members.keys()
         self._late_switches = frozenset(reboot_groups)
         if others := self._late_switches - self._switches:
-            raise UsageError(f"no switches of groups: {', '.join(sorted(others))}")
+            raise UsageError(f"reboot_groups that are not switches in groups: {', '.join(sorted(others))}")
         self._was_on = {row.name: row.bits != 0 for row in rows if row.name in self._late_switches}
         self._read_only = frozenset(read_only)
         self._live = frozenset(live)

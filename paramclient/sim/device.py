@@ -57,15 +57,15 @@ class Device(ABC):
     ) -> None:
         for what, number in (("system", system), ("component", component)):
             if not 1 <= number <= 255:
-                raise UsageError(f"{what} is a number from 1 to 255, not {number}")
+                raise UsageError(f"{what} must be a number from 1 to 255, not {number}")
         if mavlink_version not in (1, 2):
-            raise UsageError(f"mavlink_version is 1 or 2, not {mavlink_version}")
+            raise UsageError(f"mavlink_version must be 1 or 2, not {mavlink_version}")
         if not boot_time >= 0.0:
-            raise UsageError(f"boot_time is a number of seconds from 0 up, not {boot_time}")
+            raise UsageError(f"boot_time must be a number of seconds from 0 up, not {boot_time}")
         if not 0.0 <= telemetry <= 10_000.0:
-            raise UsageError(f"telemetry is a number of messages per second from 0 to 10000, not {telemetry}")
+            raise UsageError(f"telemetry must be 0 to 10000 messages per second, not {telemetry}")
         if not reboot_down >= 0.0:
-            raise UsageError(f"reboot_down is a number of seconds from 0 up, not {reboot_down}")
+            raise UsageError(f"reboot_down must be a number of seconds from 0 up, not {reboot_down}")
         self.armed = armed
         self.system = system
         self.component = component

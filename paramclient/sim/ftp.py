@@ -17,6 +17,7 @@ from paramclient.protocol.ftp.param_pck import PackedParam
 __all__ = ["PARAM_FILE", "Address", "FileServer"]
 
 PARAM_FILE: Final = "@PARAM/param.pck"
+"""Path of the packed parameter file in MAVFTP."""
 IDLE_LIMIT: Final = 3.0
 """Seconds without a response after which ArduPilot reassigns the session; each response restarts the time."""
 PX4_IDLE_LIMIT: Final = 11.0
@@ -112,7 +113,7 @@ class FileServer:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.rate) and self.rate > 0.0):
-            raise UsageError(f"the rate of MAVFTP is a number of bytes per second above 0, not {self.rate}")
+            raise UsageError(f"the rate of MAVFTP must be above 0 bytes per second, not {self.rate}")
 
     @property
     def open_files(self) -> list[str]:

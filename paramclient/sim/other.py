@@ -44,9 +44,9 @@ class OtherStation:
     ) -> None:
         for what, number in (("system", system), ("component", component)):
             if not 1 <= number <= 255:
-                raise UsageError(f"{what} is a number from 1 to 255, not {number}")
+                raise UsageError(f"{what} must be a number from 1 to 255, not {number}")
         if not list_every > 0.0:
-            raise UsageError(f"list_every is a number of seconds above 0, not {list_every}")
+            raise UsageError(f"list_every must be a number of seconds above 0, not {list_every}")
         self.system = system
         self.component = component
         self._target = (target_system, target_component)
@@ -54,7 +54,7 @@ class OtherStation:
         self._encoding = encoding
         self._sets = sorted(sets, key=lambda each: each[0])
         if not all(0.0 <= when < math.inf for when, _ in self._sets):
-            raise UsageError("a parameter is set at a number of seconds from 0 up")
+            raise UsageError("the times in sets must be numbers of seconds from 0 up")
         self._started_at: float | None = None
         self._next_heartbeat = math.inf
         self._next_list = math.inf

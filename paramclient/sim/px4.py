@@ -161,9 +161,9 @@ class PX4Vehicle(BytewiseVehicle):
         if unknown := unknown.difference(row.name for row in rows):
             raise UsageError(f"not in the table: {', '.join(sorted(unknown))}")
         if not autosave >= 0.0:
-            raise UsageError(f"autosave is a number of seconds from 0 up, not {autosave}")
+            raise UsageError(f"autosave must be a number of seconds from 0 up, not {autosave}")
         if clamp_delay is not None and not clamp_delay >= 0.0:
-            raise UsageError(f"clamp_delay is a number of seconds from 0 up, not {clamp_delay}")
+            raise UsageError(f"clamp_delay must be a number of seconds from 0 up, not {clamp_delay}")
         self._clamp_delay = clamp_delay
         self._ftp = FileServer(
             self._packed_params if ftp else lambda: None, self._apply_packed, ftp_rate, is_px4=True

@@ -123,18 +123,18 @@ class Vehicle(Device):
         if param_error and mavlink_version == 1:
             raise UsageError("PARAM_ERROR does not exist in MAVLink 1")
         if burst < 1 or not (math.isfinite(period) and period > 0.0):
-            raise UsageError("burst is a number from 1 up, and period a number of seconds above 0")
+            raise UsageError("burst must be a number from 1 up, and period a number of seconds above 0")
         if list_stops_at is not None and list_stops_at < 0:
-            raise UsageError(f"list_stops_at is a number of values from 0 up, not {list_stops_at}")
+            raise UsageError(f"list_stops_at must be a number of values from 0 up, not {list_stops_at}")
         if not list_stops >= 0:
-            raise UsageError(f"list_stops is a number of lists from 0 up, not {list_stops}")
+            raise UsageError(f"list_stops must be a number of lists from 0 up, not {list_stops}")
         self._entries = [Entry(row, order, encoding) for order, row in enumerate(rows)]
         self._by_name = {self._key(entry.name): entry for entry in reversed(self._entries)}
         self._listed: list[Entry] = []
         self._dead: set[int | str] = set()
         for each in dead:
             if isinstance(each, int) and not 0 <= each < _TABLE_SIZE_MAX:
-                raise UsageError(f"an index is a number from 0 to {_TABLE_SIZE_MAX - 1}, not {each}")
+                raise UsageError(f"an index must be a number from 0 to {_TABLE_SIZE_MAX - 1}, not {each}")
             self._dead.add(self._entry(each).name if isinstance(each, str) else each)
         self._list_stops_at = math.inf if list_stops_at is None else list_stops_at
         self._list_stops = list_stops
@@ -203,7 +203,7 @@ class Vehicle(Device):
             UsageError: the count is below 1.
         """
         if count < 1:
-            raise UsageError(f"count is a number of values from 1 up, not {count}")
+            raise UsageError(f"count must be a number of values from 1 up, not {count}")
         self._when_listed.setdefault(count, []).append(do)
 
     @property

@@ -43,7 +43,7 @@ from paramclient.protocol.ftp.packets import Opcode, Packet
 from paramclient.protocol.vehicle_selection import LOOK_TIME
 from paramclient.provision import apply, prepare, restore, verify
 from paramclient.sim import Air, ArduPilotVehicle, Endpoint, Vehicle
-from tests.cable import PATIENCE, Cable
+from tests.cable import TIMEOUT, Cable
 from tests.shell import FlakyLink, Tap, a_client, bits, generic, residue, small_px4
 
 pytestmark = pytest.mark.anyio
@@ -67,7 +67,7 @@ def nothing_remains() -> Iterator[None]:
 @asynccontextmanager
 async def beside() -> AsyncIterator[anyio.abc.TaskGroup]:
     """Tasks beside the test, which end with it."""
-    with anyio.fail_after(PATIENCE):
+    with anyio.fail_after(TIMEOUT):
         async with anyio.create_task_group() as tasks:
             yield tasks
             tasks.cancel_scope.cancel()
@@ -202,7 +202,7 @@ async def test_a_link_that_cannot_be_opened(link: str) -> None:
 async def test_a_table_comes_by_list_and_then_from_the_cache(tmp_path: Path) -> None:
     sources = []
     told: list[Progress] = []
-    with anyio.fail_after(PATIENCE):
+    with anyio.fail_after(TIMEOUT):
         for _ in range(2):
             vehicle = small_px4(**QUICK)
             async with ParamClient(vehicle, cache=tmp_path / "cache") as client:
@@ -380,7 +380,7 @@ async def test_calls_that_wait_end_with_the_client() -> None:
 
 async def test_what_the_body_raises_comes_out_as_it_is_and_what_was_learnt_is_kept(tmp_path: Path) -> None:
     vehicle = small_px4(**QUICK)
-    with pytest.raises(ZeroDivisionError), anyio.fail_after(PATIENCE):  # noqa: PT012 - the body is what counts
+    with pytest.raises(ZeroDivisionError), anyio.fail_after(TIMEOUT):  # noqa: PT012 - the body is what counts
         async with ParamClient(vehicle, cache=tmp_path / "cache") as client:
             await (await client.component()).fetch_all()
             _ = 1 / 0
@@ -390,7 +390,7 @@ async def test_what_the_body_raises_comes_out_as_it_is_and_what_was_learnt_is_ke
 
 async def test_a_client_that_is_cancelled_writes_what_it_has_learnt(tmp_path: Path) -> None:
     vehicle = small_px4(**QUICK)
-    with anyio.fail_after(PATIENCE), anyio.CancelScope() as scope:
+    with anyio.fail_after(TIMEOUT), anyio.CancelScope() as scope:
         async with ParamClient(vehicle, cache=tmp_path / "cache") as client:
             await (await client.component()).fetch_all()
             scope.cancel()

@@ -18,7 +18,7 @@ from paramclient.client import link_task
 from paramclient.errors import LinkError
 from paramclient.links import Link, Peer, create_link, serve_endpoint, udp
 from paramclient.protocol import wire
-from tests.cable import PATIENCE
+from tests.cable import TIMEOUT
 from tests.shell import a_client, bits, generic
 
 HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
@@ -69,12 +69,12 @@ def names(monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
 def listening(host: str = "127.0.0.1", port: int = 0) -> socket.socket:
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     sock.bind((host, port))
-    sock.settimeout(PATIENCE)
+    sock.settimeout(TIMEOUT)
     return sock
 
 
 async def failure(link: Link) -> LinkError:
-    with anyio.fail_after(PATIENCE), pytest.raises(LinkError) as caught:  # noqa: PT012 - received data comes first
+    with anyio.fail_after(TIMEOUT), pytest.raises(LinkError) as caught:  # noqa: PT012 - received data comes first
         while True:
             await link.receive()
     return caught.value
@@ -170,7 +170,7 @@ async def test_an_address_that_is_lost_and_restored(net: Net, monkeypatch: pytes
 
     monkeypatch.setattr(udp.UdpIn, "_open", open_if_there)
     vehicle = generic(burst=50, period=0.001)
-    with anyio.fail_after(PATIENCE):
+    with anyio.fail_after(TIMEOUT):
         async with a_client("udpin:127.0.0.1:0") as client, anyio.create_task_group() as tasks:
             far: Any = create_link(f"udpout:127.0.0.1:{client.link.address[1]}")  # type: ignore[attr-defined]
             far.is_the_vehicles = True
@@ -289,7 +289,7 @@ async def test_a_slow_resolver_does_not_delay_received_data(
         link: Any = create_link(f"udpout:drone:{far.getsockname()[1]}")
         await link.open()
         names["drone"] = slow
-        with anyio.fail_after(PATIENCE):
+        with anyio.fail_after(TIMEOUT):
             assert [data for _, data in await link.receive()] == [HEARTBEAT]
         await link.close()
 
@@ -306,7 +306,7 @@ async def test_tcp_resolves_a_name_at_each_opening(names: dict[str, Any]) -> Non
             names["drone"] = "127.0.0.2"
             await failure(link)
             await link.open()
-            after.settimeout(PATIENCE)
+            after.settimeout(TIMEOUT)
             after.accept()[0].close()
             await link.close()
 
@@ -361,9 +361,9 @@ def without_a_file(monkeypatch: pytest.MonkeyPatch) -> None:
 async def test_tcpin_receives_from_all_connections_without_a_selector_file() -> None:
     link: Any = create_link("tcpin:127.0.0.1:0")
     await link.open()
-    clients = [socket.create_connection(link.address, timeout=PATIENCE) for _ in range(3)]
+    clients = [socket.create_connection(link.address, timeout=TIMEOUT) for _ in range(3)]
     got: dict[Peer, bytes] = {}
-    with anyio.fail_after(PATIENCE):
+    with anyio.fail_after(TIMEOUT):
         for number, client in enumerate(clients):
             client.send(bytes([number]))
             got.update(await link.receive())
@@ -395,7 +395,7 @@ async def test_tcpin_receives_from_all_connections_without_a_selector_file() -> 
 @pytest.mark.asyncio
 async def test_a_session_over_a_listener_without_a_selector_file() -> None:
     vehicle = generic(stream=True, burst=50, period=0.001)
-    with anyio.fail_after(PATIENCE):
+    with anyio.fail_after(TIMEOUT):
         async with a_client("tcpin:127.0.0.1:0") as client, anyio.create_task_group() as tasks:
             port = client.link.address[1]  # type: ignore[attr-defined]
             tasks.start_soon(serve_endpoint, vehicle, create_link(f"tcp:127.0.0.1:{port}"))
@@ -425,7 +425,7 @@ for name in ("add_reader", "add_writer", "remove_reader", "remove_writer"):
 def test_a_session_on_a_loop_without_socket_readiness(ours: str, theirs: str) -> None:
     async def session() -> None:
         vehicle = generic(stream="tcp" in ours, burst=50, period=0.001)
-        with anyio.fail_after(PATIENCE):
+        with anyio.fail_after(TIMEOUT):
             async with anyio.create_task_group() as tasks:
                 client = a_client(f"{ours}:127.0.0.1:0") if ours.endswith("in") else None
                 if client is None:

@@ -43,7 +43,8 @@ from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle
 from tests.cable import Cable
 
 HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
-PATIENCE = 20.0  # seconds after which a test fails; a passing test never waits that long
+TIMEOUT = 20.0
+"""Seconds after which a test fails; a passing test never waits that long."""
 RMEM_MAX = int(Path("/proc/sys/net/core/rmem_max").read_text())
 
 
@@ -60,7 +61,7 @@ def open_files() -> int:
 async def collect(link: Link, count: int) -> list[tuple[Peer, bytes]]:
     """Receive until this many chunks have arrived."""
     found: list[tuple[Peer, bytes]] = []
-    with anyio.fail_after(PATIENCE):
+    with anyio.fail_after(TIMEOUT):
         while len(found) < count:
             found += await link.receive()
     return found
@@ -83,7 +84,7 @@ def udp_socket(to: tuple[str, int] | None = None, *, host: str = "127.0.0.1") ->
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_DGRAM) as sock:
         sock.bind((host, 0))
-        sock.settimeout(PATIENCE)
+        sock.settimeout(TIMEOUT)
         if to is not None:
             sock.connect(to)
         yield sock
@@ -97,7 +98,7 @@ def free_udp_port() -> int:
 @contextmanager
 def tcp_listener(backlog: int = 8) -> Iterator[socket.socket]:
     with socket.create_server(("127.0.0.1", 0), backlog=backlog) as listener:
-        listener.settimeout(PATIENCE)
+        listener.settimeout(TIMEOUT)
         yield listener
 
 
@@ -172,7 +173,7 @@ async def connected(kind: str) -> AsyncIterator[tuple[Any, Any]]:
         else:
             link = create_link("tcpin:127.0.0.1:0")
             await link.open()
-            far = stack.enter_context(socket.create_connection(link.address, timeout=PATIENCE))
+            far = stack.enter_context(socket.create_connection(link.address, timeout=TIMEOUT))
         try:
             far.send(HEARTBEAT)
             await collect(link, 1)
@@ -447,7 +448,7 @@ async def test_closing_wakes_the_receiver(kind: str) -> None:
         for _ in range(10):  # the simulated vehicle keeps tasks running
             await anyio.lowlevel.checkpoint()
         await link.close()
-        with anyio.fail_after(PATIENCE):
+        with anyio.fail_after(TIMEOUT):
             while not failures:
                 await anyio.lowlevel.checkpoint()
         assert failures[0].link == link.name
@@ -502,7 +503,7 @@ async def test_a_cancelled_receive_loses_nothing(kind: str) -> None:
                     for _ in range(after):
                         await anyio.lowlevel.checkpoint()
                     tasks.cancel_scope.cancel()
-        with anyio.fail_after(PATIENCE):
+        with anyio.fail_after(TIMEOUT):
             while len(b"".join(got)) < len(b"".join(sent)):
                 await receive()
     assert b"".join(got) == b"".join(sent)
@@ -820,7 +821,7 @@ async def test_udpout_may_start_before_its_vehicle() -> None:
         await link.send(frame(1), None)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
             vehicle.bind(("127.0.0.1", port))
-            vehicle.settimeout(PATIENCE)
+            vehicle.settimeout(TIMEOUT)
             await link.send(frame(2), None)  # must not be lost with the error of the first
             assert vehicle.recv(1000) == frame(2)
             vehicle.sendto(frame(3), link.address)
@@ -831,7 +832,7 @@ async def test_udpout_may_start_before_its_vehicle() -> None:
 async def test_udpout_to_a_broadcast_address_receives_from_everyone() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as vehicle:
         vehicle.bind(("0.0.0.0", 0))
-        vehicle.settimeout(PATIENCE)
+        vehicle.settimeout(TIMEOUT)
         async with opened(f"udpout:127.255.255.255:{vehicle.getsockname()[1]}") as link:
             await link.send(frame(1), None)
             assert vehicle.recv(1000) == frame(1)
@@ -863,7 +864,7 @@ async def test_a_burst_waits_for_a_late_reader(kind: str) -> None:
             # If the system grants a smaller buffer, the datagrams that fit must still be received.
             whole = link.receive_buffer >= udp.RECEIVE_BUFFER
             expected = count if whole else min(count, link.receive_buffer // 1280)
-            with anyio.fail_after(PATIENCE):
+            with anyio.fail_after(TIMEOUT):
                 while len(got) < expected:
                     await anyio.lowlevel.checkpoint()
             tasks.cancel_scope.cancel()
@@ -1154,8 +1155,8 @@ async def test_tcpin_continues_when_a_client_disconnects(leave: Callable[[socket
     async with opened("tcpin:127.0.0.1:0") as link:
         await link.send(HEARTBEAT, None)
         with (
-            socket.create_connection(link.address, timeout=PATIENCE) as one,
-            socket.create_connection(link.address, timeout=PATIENCE) as two,
+            socket.create_connection(link.address, timeout=TIMEOUT) as one,
+            socket.create_connection(link.address, timeout=TIMEOUT) as two,
         ):
             one.send(frame(1))
             two.send(frame(2))
@@ -1167,7 +1168,7 @@ async def test_tcpin_continues_when_a_client_disconnects(leave: Callable[[socket
             assert two.recv(1000) == frame(4)
             two.send(frame(5))
             assert await collect(link, 1) == [(peer_of[frame(2)], frame(5))]
-            with socket.create_connection(link.address, timeout=PATIENCE) as three:
+            with socket.create_connection(link.address, timeout=TIMEOUT) as three:
                 three.send(frame(6))
                 [(peer, data)] = await collect(link, 1)
                 assert data == frame(6)
@@ -1177,7 +1178,7 @@ async def test_tcpin_continues_when_a_client_disconnects(leave: Callable[[socket
 @pytest.mark.asyncio
 async def test_tcpin_closes_a_client_that_does_not_read(monkeypatch: pytest.MonkeyPatch) -> None:
     async with connected("tcpin") as (link, far):
-        with socket.create_connection(link.address, timeout=PATIENCE) as stuck:
+        with socket.create_connection(link.address, timeout=TIMEOUT) as stuck:
             stuck.send(frame(1))
             [(peer, _)] = await collect(link, 1)
             with monkeypatch.context() as patch:
@@ -1192,7 +1193,7 @@ async def test_tcpin_closes_a_client_that_does_not_read(monkeypatch: pytest.Monk
 async def test_tcpin_limits_its_connections(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tcp, "CONNECTIONS_MAX", 1)
     async with connected("tcpin") as (link, far):
-        with socket.create_connection(link.address, timeout=PATIENCE) as second:
+        with socket.create_connection(link.address, timeout=TIMEOUT) as second:
             far.send(frame(1))
             assert [data for _, data in await collect(link, 1)] == [frame(1)]
             far.send(frame(2))
@@ -1200,7 +1201,7 @@ async def test_tcpin_limits_its_connections(monkeypatch: pytest.MonkeyPatch) -> 
             assert second.recv(1000) == b""
         far.close()
         assert [data for _, data in await collect(link, 1)] == [b""]
-        with socket.create_connection(link.address, timeout=PATIENCE) as third:
+        with socket.create_connection(link.address, timeout=TIMEOUT) as third:
             third.send(frame(3))
             assert [data for _, data in await collect(link, 1)] == [frame(3)]
 
@@ -1208,7 +1209,7 @@ async def test_tcpin_limits_its_connections(monkeypatch: pytest.MonkeyPatch) -> 
 @pytest.mark.asyncio
 async def test_tcpin_without_descriptors_is_a_link_error() -> None:
     async with connected("tcpin") as (link, _):
-        with socket.create_connection(link.address, timeout=PATIENCE):
+        with socket.create_connection(link.address, timeout=TIMEOUT):
             lowest_free = os.dup(0)
             os.close(lowest_free)
             soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
@@ -1235,7 +1236,7 @@ def request_by_index(index: int, system: int = 1) -> bytes:
 async def answer(link: Link, request: bytes) -> tuple[wire.Frame, wire.ParamValue]:
     """Send a request, and wait for the first PARAM_VALUE."""
     framer = wire.Framer(stream=link.is_stream)
-    with anyio.fail_after(PATIENCE):
+    with anyio.fail_after(TIMEOUT):
         await link.send(request, None)
         while True:
             for _, data in await link.receive():
@@ -1261,7 +1262,7 @@ async def test_a_simulated_vehicle_sends_its_complete_list() -> None:
     async with opened("sim:px4") as link:
         request = wire.ParamRequestList(1, 1)
         await link.send(wire.encode(request, system=255, component=190, sequence=0), None)
-        with anyio.fail_after(PATIENCE):
+        with anyio.fail_after(TIMEOUT):
             while len(names) < 904:
                 for _, data in await link.receive():
                     names.update(wire.text_of(found.payload[8:24]) for found in framer.receive(data))
@@ -1344,7 +1345,7 @@ async def test_an_overdue_vehicle_still_receives() -> None:
         served: Any = await tasks.start(serve_endpoint, endpoint, create_link("udpin:127.0.0.1:0"))
         with udp_socket(served.address) as far:
             far.send(frame(1))
-            with anyio.fail_after(PATIENCE):
+            with anyio.fail_after(TIMEOUT):
                 while endpoint.inbox != [frame(1)]:
                     await anyio.lowlevel.checkpoint()
         tasks.cancel_scope.cancel()

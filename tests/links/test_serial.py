@@ -30,7 +30,7 @@ from paramclient.errors import LinkError, UsageError
 from paramclient.links import Link, Peer, create_link, serial
 from paramclient.links.transport import UNREAD_BYTES_MAX, Transport
 from paramclient.protocol import wire
-from tests.cable import PATIENCE, Cable
+from tests.cable import TIMEOUT, Cable
 from tests.shell import a_client, bits, generic, small_px4, until
 
 HEARTBEAT = wire.encode(wire.Heartbeat(6, 8), system=255, component=190, sequence=0)
@@ -59,7 +59,7 @@ async def opened(cable: Cable) -> AsyncIterator[Any]:
     link = create_link(cable.link)
     await link.open()
     try:
-        with anyio.fail_after(PATIENCE):
+        with anyio.fail_after(TIMEOUT):
             yield link
     finally:
         await link.close()
@@ -86,7 +86,11 @@ async def refusal(link: Link) -> LinkError:
 @pytest.mark.asyncio
 async def test_a_whole_session(cable: Cable, port: str) -> None:
     vehicle = small_px4(stream=True)
-    async with asyncio.timeout(PATIENCE), a_client(cable.link) as client, anyio.create_task_group() as tasks:
+    async with (
+        asyncio.timeout(TIMEOUT),
+        a_client(cable.link) as client,
+        anyio.create_task_group() as tasks,
+    ):
         tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
         component = await client.component()
         result = await component.fetch_all()
@@ -103,7 +107,7 @@ async def test_the_cache_knows_the_vehicle_by_its_port(cable: Cable, tmp_path: P
     for spelling in (f"serial:{cable.device}:115200", f"serial://{cable.device},115200"):
         vehicle = small_px4(stream=True)
         async with (
-            asyncio.timeout(PATIENCE),
+            asyncio.timeout(TIMEOUT),
             ParamClient(spelling, cache=tmp_path / "cache") as client,
             anyio.create_task_group() as tasks,
         ):
@@ -118,7 +122,11 @@ async def test_unplugged_in_the_middle_of_a_download(
     cable: Cable, port: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     vehicle = generic(burst=1, period=0.03, stream=True)
-    async with asyncio.timeout(PATIENCE), a_client(cable.link) as client, anyio.create_task_group() as tasks:
+    async with (
+        asyncio.timeout(TIMEOUT),
+        a_client(cable.link) as client,
+        anyio.create_task_group() as tasks,
+    ):
         tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
         component = await client.component()
         changes = component.changes()
@@ -146,7 +154,11 @@ async def test_unplugged_permanently(cable: Cable, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(link_task, "FIRST_BACKOFF", 0.05)
     monkeypatch.setattr(link_task, "LONGEST_BACKOFF", 0.1)
     vehicle = generic(stream=True)
-    async with asyncio.timeout(PATIENCE), a_client(cable.link) as client, anyio.create_task_group() as tasks:
+    async with (
+        asyncio.timeout(TIMEOUT),
+        a_client(cable.link) as client,
+        anyio.create_task_group() as tasks,
+    ):
         tasks.start_soon(partial(cable.carry, vehicle, rate=RATE))
         component = await client.component()
         cable.pull_out()
@@ -255,7 +267,7 @@ async def test_a_transport_pauses_at_its_limit(cable: Cable) -> None:
     port = await Transport.opened(str(cable.device), 115200)
     try:
         sent = 0
-        with anyio.fail_after(PATIENCE):
+        with anyio.fail_after(TIMEOUT):
             while port._unread < UNREAD_BYTES_MAX:
                 sent += cable.offer(bytes(500))
                 await anyio.sleep(0.0001)
@@ -407,7 +419,7 @@ class Stuck:
         is_it = id(port) == self._port  # the garbage collector closes ports of earlier tests
         if is_it and name == self._slow:
             self.is_in_it.set()
-            assert self.may_go_on.wait(PATIENCE)
+            assert self.may_go_on.wait(TIMEOUT)
         self._real[name](port)
         if is_it and name == "close":
             self.is_closed.set()
@@ -424,7 +436,7 @@ async def test_opening_a_stalled_driver_times_out(cable: Cable, monkeypatch: pyt
     assert stuck.is_in_it.is_set()
     assert not stuck.is_closed.is_set()
     stuck.may_go_on.set()
-    assert await anyio.to_thread.run_sync(stuck.is_closed.wait, PATIENCE)
+    assert await anyio.to_thread.run_sync(stuck.is_closed.wait, TIMEOUT)
     monkeypatch.undo()
     await until(lambda: "paramclient serial" not in {thread.name for thread in threading.enumerate()})
     async with opened(cable):

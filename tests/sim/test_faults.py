@@ -22,7 +22,7 @@ from paramclient.sim import (
     SimParam,
     Vehicle,
 )
-from tests.ground import LIST, SIGNS_OF_LIFE, SMALL, Station, cast, indices, names, read, write
+from tests.ground import LIST, PERIODIC_MESSAGES, SMALL, Station, cast, indices, names, read, write
 from tests.simulation import Simulation
 
 NO_INDEX = wire.NO_INDEX
@@ -164,7 +164,7 @@ class TestWhenListed:
         vehicle.when_listed(3, lambda: seen.append(len(vehicle.data_to_send())))
         vehicle.receive(wire.encode(LIST, system=255, component=190, sequence=0), 0.0)
         vehicle.tick(1.0)
-        assert seen == [3 + len(SIGNS_OF_LIFE) * 2]
+        assert seen == [3 + len(PERIODIC_MESSAGES) * 2]
         vehicle.receive(wire.encode(LIST, system=255, component=190, sequence=0), 1.0)
         vehicle.tick(2.0)
         assert len(seen) == 1

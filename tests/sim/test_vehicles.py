@@ -28,7 +28,7 @@ from paramclient.sim import (
     ardupilot_table,
     px4_table,
 )
-from tests.ground import LIST, SIGNS_OF_LIFE, SMALL, Station, cast, indices, names, read, write
+from tests.ground import LIST, PERIODIC_MESSAGES, SMALL, Station, cast, indices, names, read, write
 
 NO_INDEX = wire.NO_INDEX
 
@@ -210,7 +210,7 @@ class TestEveryVehicle:
         vehicle = kind()
         vehicle.receive(wire.encode(LIST, system=255, component=190, sequence=0), 0.0)
         vehicle.reboot(0.5)
-        assert len(vehicle.data_to_send()) <= len(SIGNS_OF_LIFE)
+        assert len(vehicle.data_to_send()) <= len(PERIODIC_MESSAGES)
 
     def test_switched_off_permanently(self, kind: Callable[[], Vehicle]) -> None:
         vehicle = kind()
@@ -241,7 +241,7 @@ class TestEveryVehicle:
         vehicle = _SHARED.setdefault(kind, kind())
         for piece in data:
             vehicle.receive(piece, 0.0)
-        assert len(vehicle.data_to_send()) <= len(SIGNS_OF_LIFE)
+        assert len(vehicle.data_to_send()) <= len(PERIODIC_MESSAGES)
 
 
 _SHARED: dict[Callable[[], Vehicle], Vehicle] = {}
@@ -310,7 +310,7 @@ class TestOptions:
         vehicle = GenericVehicle(SMALL, telemetry=50.0)
         vehicle.tick(0.0)
         vehicle.tick(1e5)
-        assert len(vehicle.data_to_send()) == pytest.approx(51 + 2 * len(SIGNS_OF_LIFE), abs=1)
+        assert len(vehicle.data_to_send()) == pytest.approx(51 + 2 * len(PERIODIC_MESSAGES), abs=1)
         assert vehicle.next_deadline() == pytest.approx(1e5 + 0.02, abs=0.02)
 
     def test_a_stream_joins_pieces(self) -> None:
