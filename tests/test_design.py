@@ -344,7 +344,7 @@ def test_importing_the_package_loads_nothing_that_only_some_need() -> None:
     ]
     unwanted += ["paramclient.sim", "paramclient.testing", "paramclient.cli", "paramclient.provision"]
     unwanted += ["paramclient.documents", "paramclient.service", "fastapi", "starlette", "uvicorn", "httpx"]
-    unwanted += ["prometheus_client", "httpx_sse"]
+    unwanted += ["filelock", "prometheus_client", "httpx_sse"]
     unwanted += ["paramclient.remote"]
     program = f"import sys, paramclient; print([name for name in {unwanted!r} if name in sys.modules])"
     run = subprocess.run(

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import logging
 import os
-import sys
 from functools import partial
 from pathlib import Path
 from typing import Final
@@ -17,16 +16,12 @@ from typing import Final
 import anyio
 import platformdirs
 
+from paramclient.cache.lock import try_to_lock
 from paramclient.client.signing import Signing, timestamp_now
 from paramclient.client.worker_thread import Worker
 from paramclient.errors import UsageError
 from paramclient.protocol.wire import Signer, SigningPolicy, Verifier
 from paramclient.protocol.wire.signing import MOST_AHEAD, UNITS
-
-if sys.platform == "win32":
-    import msvcrt
-else:
-    import fcntl
 
 __all__ = ["TimestampFile", "TimestampKeeper"]
 
@@ -188,14 +183,10 @@ def _locked(path: Path) -> int | None:
     """A file's descriptor with the lock on it, or None where somebody else has that."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
     try:
-        if sys.platform == "win32":
-            msvcrt.locking(descriptor, msvcrt.LK_NBLCK, 1)
-        else:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except (BlockingIOError, PermissionError):  # the one on POSIX, the other on Windows
-        os.close(descriptor)
-        return None
+        if try_to_lock(descriptor):
+            return descriptor
     except OSError:
         os.close(descriptor)
         raise
-    return descriptor
+    os.close(descriptor)
+    return None
