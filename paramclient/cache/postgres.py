@@ -7,12 +7,11 @@ advisory locks, so that what is read before a change is what the change is made 
 from __future__ import annotations
 
 import json
-import socket
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar, Final, TypeVar
 from uuid import uuid4
@@ -38,8 +37,9 @@ SILENCE: Final = 5_000
 LOCK_TIMEOUT: Final = "5s"
 """How long another station's transaction may hold a vehicle; they take milliseconds."""
 ANSWER_TIMEOUT: Final = 20.0
-"""Seconds after which a statement without an answer means that the database stands still: its machine swaps,
-or its disk hangs. The longest of ours take a second or two, and wait five for a lock."""
+"""Seconds for a statement. The database ends one that takes longer; where it does not answer even then, as
+its machine swaps or its disk hangs, the connection is closed. The longest of ours take a second or two, and
+wait five for a lock."""
 IDLE_TIMEOUT: Final = "15s"
 """When the database ends a transaction of a station that stands still, and would hold its vehicles."""
 MOST_CONNECTIONS: Final = 4
@@ -83,9 +83,8 @@ class PostgresDatabase:
             kind = _connection_kind()
             listener: psycopg.Connection[tuple[Any, ...]] = kind.connect(**self._options(), autocommit=True)
             try:
-                with _watched(listener):
-                    _migrate(listener, self.address.place)
-                    listener.execute(f"LISTEN {CHANNEL}")
+                _migrate(listener, self.address.place)
+                listener.execute(f"LISTEN {CHANNEL}")
                 pool = pools.ConnectionPool(
                     connection_class=kind,
                     kwargs=self._options(),
@@ -208,7 +207,7 @@ class PostgresDatabase:
             pool = self._pool
         if pool is None:
             raise Away("the connection is closed")
-        with pool.connection() as connection, _watched(connection), connection.transaction():
+        with pool.connection() as connection, connection.transaction():
             yield connection
 
     @contextmanager
@@ -238,6 +237,7 @@ class PostgresDatabase:
         settings = {
             "search_path": SCHEMA,
             "lock_timeout": LOCK_TIMEOUT,
+            "statement_timeout": round(1000 * ANSWER_TIMEOUT),
             "idle_in_transaction_session_timeout": IDLE_TIMEOUT,
         }
         chosen = " ".join(f"-c {name}={value}" for name, value in settings.items())
@@ -470,46 +470,30 @@ def _libraries() -> tuple[Any, Any]:
 
 @cache
 def _connection_kind() -> Any:
-    """A connection that knows since when it waits for an answer."""
+    """A connection that closes when a statement is not answered in `ANSWER_TIMEOUT`.
+
+    No setting of the database or of TCP covers a server that hangs: it cancels no statement, while its
+    operating system goes on to acknowledge what it is sent.
+    """
 
     class Connection(_libraries()[0].Connection):  # type: ignore[misc]  # loaded here, where it is wanted
-        asked_at: float | None = None
+        def wait(self, work: Any, *arguments: Any, **options: Any) -> Any:
+            return super().wait(self._limited(work), *arguments, **options)
 
-        def wait(self, *arguments: Any, **options: Any) -> Any:
-            self.asked_at = time.monotonic()
+        def _limited(self, work: Generator[Any, Any, T]) -> Generator[Any, Any, T]:
+            """Do the work, which psycopg resumes when the socket is ready, and ten times a second."""
+            deadline = time.monotonic() + ANSWER_TIMEOUT
             try:
-                return super().wait(*arguments, **options)
-            finally:
-                self.asked_at = None
+                wanted = next(work)
+                while time.monotonic() < deadline:
+                    wanted = work.send((yield wanted))
+            except StopIteration as end:
+                result: T = end.value
+                return result
+            self.close()
+            raise _libraries()[0].OperationalError(f"no answer in {ANSWER_TIMEOUT:g} s")
 
     return Connection
-
-
-@contextmanager
-def _watched(connection: Any) -> Iterator[None]:
-    """Break a connection on which a statement is not answered: whoever waits for that gets an error then."""
-    is_over = threading.Event()
-    line = socket.fromfd(connection.fileno(), socket.AF_INET, socket.SOCK_STREAM)  # of whatever kind it is
-
-    def watch() -> None:
-        left = ANSWER_TIMEOUT
-        while not is_over.wait(left):
-            asked_at = connection.asked_at
-            waited = 0.0 if asked_at is None else time.monotonic() - asked_at
-            left = ANSWER_TIMEOUT - waited
-            if left <= 0:
-                with suppress(OSError):
-                    line.shutdown(socket.SHUT_RDWR)
-                return
-
-    thread = threading.Thread(target=watch, name="paramclient cache watch", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        is_over.set()
-        thread.join()
-        line.close()
 
 
 def _end(pool: ConnectionPool[Any] | None) -> None:

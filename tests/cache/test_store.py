@@ -26,12 +26,13 @@ from hypothesis import strategies as st
 
 from paramclient import ParamClient, Trust
 from paramclient.cache import CacheChange, CopyResult, ParamCache, StoredParam, TableState, TableUpdate
+from paramclient.cache.database_url import Address
 from paramclient.cache.operations import Save
 from paramclient.cache.outbox import LocalCopy
-from paramclient.cache.postgres import Away, PostgresDatabase
+from paramclient.cache.postgres import Away, PostgresDatabase, PostgresSession
 from paramclient.cache.rows import Row
 from paramclient.cache.shared import SharedStore, _Link
-from paramclient.cache.transaction import Line
+from paramclient.cache.transaction import Line, Session
 from paramclient.cache.transfer import take_whole
 from paramclient.errors import CacheError, UsageError
 from tests.cache import test_cache, test_fleet, test_snapshots
@@ -547,6 +548,41 @@ def test_a_database_that_stands_still_is_given_up(
         running.go_on()
     until(lambda: a.away is None)
     assert told(b) == [(5, 1, 5), (6, 5, 6)]
+
+
+def test_a_statement_that_takes_too_long_is_ended_by_the_database(
+    server_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with database_on(server_url) as url:
+        database = PostgresDatabase(Address.parse(url))
+        database.open().close()
+        with monkeypatch.context() as impatient:  # the database, not the station
+            impatient.setattr("paramclient.cache.postgres.ANSWER_TIMEOUT", 0.5)
+            database.open().close()
+        try:
+            with pytest.raises(Away, match="statement timeout"):
+                database.read(lambda session: sleeping(session))
+            assert database.revisions() == {}
+        finally:
+            database.close()
+
+
+def sleeping(session: Session) -> None:
+    """Have the database work for longer than any statement may."""
+    assert isinstance(session, PostgresSession)
+    session.connection.execute("SELECT pg_sleep(60)")
+
+
+def test_a_transaction_takes_no_thread(server_url: str) -> None:
+    with database_on(server_url) as url:
+        database = PostgresDatabase(Address.parse(url))
+        database.open().close()
+        try:
+            database.revisions()  # the threads of the connections are there from now on
+            before = set(threading.enumerate())
+            assert database.read(lambda _: set(threading.enumerate())) == before
+        finally:
+            database.close()
 
 
 def test_another_database_under_the_same_name_is_not_taken_for_the_one_before(
