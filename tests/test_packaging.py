@@ -137,7 +137,7 @@ def test_what_an_installation_brings(metadata: Message) -> None:
     always = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra ==" not in each}
     command = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra == 'cli'" in each}
     serial = {re.split(r"[^\w-]", each)[0] for each in requirements if "extra == 'serial'" in each}
-    assert always == {"anyio", "fastcrc", "platformdirs", "pydantic", "pymavlink"}
+    assert always == {"anyio", "fastcrc", "filelock", "platformdirs", "pydantic", "pymavlink"}
     assert command == {"cyclopts", "rich", "pyyaml"}
     assert serial == {"serialx"}
     assert metadata["Requires-Python"] == ">=3.11"

@@ -173,7 +173,12 @@ class AccessMiddleware:
     # Where it comes from
 
     def _check_host(self, request: Request) -> None:
-        """The service is called by a name of its own: another one may be led here by its owner's DNS."""
+        """The service is called by a name of its own: another one may be led here by its owner's DNS.
+
+        Starlette's TrustedHostMiddleware is not equal, as it matches names only, not ranges of addresses
+        or names with a final dot, and refuses with 400 in plain text, also on a WebSocket whose server
+        cannot send a response.
+        """
         name = request.host_name
         if name in _LOOPBACK_NAMES or name in self._settings.hosts or name == self._settings.listen.lower():
             return
