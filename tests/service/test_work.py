@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
+import math
 import threading
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import anyio
@@ -15,15 +18,18 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
+from paramclient.client.fetch_all import BEGUN_AT_ONCE, FetchTogether
 from paramclient.documents.component import ComponentsDoc
 from paramclient.documents.diff import DiffDoc
 from paramclient.documents.job import JobsDoc
 from paramclient.errors import FileError, UsageError
 from paramclient.files import loads
 from paramclient.model import comparison as compare_room
+from paramclient.model import params as params_model
 from paramclient.model import patterns
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import NameChoice
+from paramclient.model.values import Param
 from paramclient.provision import inspection
 from paramclient.service import (
     AccessSettings,
@@ -36,9 +42,12 @@ from paramclient.service import (
     quota,
 )
 from paramclient.service.answering import written_out
+from paramclient.service.event_feed import MOST_AT_ONCE
+from paramclient.service.link import LOOKED_AT_ONCE
 from paramclient.service.param_sources import LARGEST_UPLOAD, MOST_NAMES, MOST_PATTERNS, MOST_VALUES
 from paramclient.service.quota import LONG_REQUESTS_OF_ONE
 from paramclient.service.reading import MOST_PIECES
+from paramclient.service.route_context import answered
 from paramclient.service.routes import params as params_room
 from paramclient.service.routes import setup as setup_room
 from paramclient.sim import GenericVehicle
@@ -458,3 +467,120 @@ async def test_a_list_of_jobs_has_their_results() -> None:
         assert (first["kind"], last["kind"]) == ("fetch", "apply")
         assert last["result"] == answer.json()
         assert (await browser.get(f"/api/v1/jobs/{last['id']}")).json() == last
+
+
+class Turns:
+    """Counts what happens in one turn of the event loop."""
+
+    def __init__(self) -> None:
+        self.most = 0
+        self._count = 0
+        self._next()
+
+    def note(self) -> None:
+        """It has happened."""
+        self._count += 1
+        self.most = max(self.most, self._count)
+
+    def _next(self) -> None:
+        self._count = 0
+        asyncio.get_running_loop().call_soon(self._next)
+
+
+@swiftly
+async def test_a_table_is_read_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = {f"ABC_P{number:04}": float(number) for number in range(3 * params_room.AT_ONCE)}
+    async with service(GenericVehicle(table=table)) as (_, browser):
+        await fetched(browser)
+        turns = Turns()
+
+        def param_of(*given: Any) -> Param:
+            turns.note()
+            return made(*given)
+
+        made = params_model.param_of
+        monkeypatch.setattr(params_model, "param_of", param_of)
+        for query, count in (
+            ("", len(table)),
+            ("?names=ABC_P000*", 10),
+            ("?names=ABC_P0001&changed=true", 0),
+        ):
+            answer = await browser.get(f"{C}/params{query}")
+            assert list(answer.json()["params"]) == list(table)[:count]
+        assert params_room.AT_ONCE / 2 < turns.most <= params_room.AT_ONCE
+
+
+@swiftly
+async def test_events_are_written_out_few_at_a_time() -> None:
+    async with service() as (hub, browser):
+        turns = Turns()
+
+        def write() -> str:
+            turns.note()
+            return '"a":1'
+
+        for _ in range(1_000):
+            hub.feed.publish("note", write)
+        async with browser.stream("GET", f"/api/v1/events?after={hub.feed.run}-0") as stream:
+            async for line in stream.aiter_lines():
+                if line.endswith("-1000"):
+                    break
+        assert turns.most == MOST_AT_ONCE
+
+
+@swiftly
+async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
+    class Station:
+        def begin_fetches(self, machines: list[Any], now: float, *, refresh: bool) -> list[Any]:
+            turns.note()
+            return [SimpleNamespace(done=False) for _ in machines]
+
+    def component(system: int) -> Any:
+        machine = SimpleNamespace(
+            who=SimpleNamespace(has_parameters=True),
+            presence=SimpleNamespace(is_lost=False),
+            peers=SimpleNamespace(contest=None),
+            fetch=None,
+            system=system,
+            vehicle=(system, None),
+            address=(system, 1),
+        )
+        return SimpleNamespace(_machine=machine, _cache_is_due=lambda now: True)
+
+    components = {(system, 1): component(system) for system in range(1, 251)}
+    station: Any = Station()
+    together = FetchTogether(station, components, system=None, refresh=False)
+    turns = Turns()
+    checks = 0
+
+    def check() -> None:
+        nonlocal checks
+        checks += 1
+        if len(together._fetches) == 250:
+            raise EOFError
+
+    together._end = lambda now: together._fetches.clear()  # type: ignore[method-assign]
+    closed: Any = None
+    bounds = {"until": 9e9, "hear_until": 0.0, "listen_until": 0.0}
+    with pytest.raises(EOFError):
+        await together.run(check, lambda: None, closed, **bounds, progress=None)
+    assert turns.most == BEGUN_AT_ONCE
+    assert checks == 1 + math.ceil(250 / BEGUN_AT_ONCE)
+
+
+@swiftly
+async def test_many_components_are_looked_at_few_at_a_time() -> None:
+    turns = Turns()
+    looked: Any = SimpleNamespace(look=turns.note)
+
+    async def receive() -> dict[str, str]:
+        await anyio.sleep(9)
+        return {"type": "http.disconnect"}
+
+    request: Any = SimpleNamespace(receive=receive)
+
+    async def work() -> int:
+        return 7
+
+    assert await answered(request, work, *[looked] * 1_000) == 7
+    assert turns.most == LOOKED_AT_ONCE
