@@ -26,7 +26,12 @@ Content: TypeAlias = ParamFile | ParamSet | Iterable[ParamSet]
 
 
 def loads(
-    data: bytes, *, source: str = "", form: FileForm | str | None = None, includes: Includes | None = None
+    data: bytes,
+    *,
+    source: str = "",
+    form: FileForm | str | None = None,
+    includes: Includes | None = None,
+    params_max: int | None = None,
 ) -> ParamFile:
     """Read a parameter file from its bytes.
 
@@ -39,8 +44,10 @@ def loads(
         source: its name, for errors and `ParamSet.source`.
         form: the form that it has; None to find out.
         includes: follows the `@include` lines of a list; None refuses them, as bytes lie in no folder.
+        params_max: parameters that it may hold; None for any number. A file with more is not read to its end.
 
     Raises:
+        TooManyParams: it holds more than `params_max`.
         FileError: it has none of the forms, is damaged, or holds no parameter. Up to 20 bad lines are named.
         UsageError: no such form.
     """
@@ -55,15 +62,15 @@ def loads(
     form = form or _form_of(text, source)
     match form:
         case FileForm.QGC:
-            return line_formats.read_qgc(text, source)
+            return line_formats.read_qgc(text, source, params_max)
         case FileForm.PX4_SCRIPT:
-            return script.read_script(text, source)
+            return script.read_script(text, source, params_max)
         case FileForm.JSON:
-            return document.read_json(text, source)
+            return document.read_json(text, source, params_max)
         case FileForm.YAML:
-            return document.read_yaml(text, source)
+            return document.read_yaml(text, source, params_max)
         case _:
-            return line_formats.read_pairs(text, form, source, includes)
+            return line_formats.read_pairs(text, form, source, includes, params_max)
 
 
 def dumps(content: Content, *, form: FileForm | str | None = None, target: str = "") -> bytes:
@@ -121,11 +128,13 @@ def _form_of(text: str, source: str) -> FileForm:
     Raises:
         FileError: nothing in it says anything.
     """
+    if text.lstrip().startswith("{"):  # it may be one line of megabytes, in which no comment is sought
+        return FileForm.JSON
     first = next((line for line in lines_of(text) if line.text), None)
     if first is None:
         raise FileError("the file holds no parameter", source=source)
     if first.text.startswith("{"):
-        return FileForm.JSON
+        return FileForm.JSON  # behind comments
     if line_formats.is_qgc_row(first.text):
         return FileForm.QGC
     if any(script.is_script_line(line.text) for line in lines_of(text)):

@@ -23,13 +23,14 @@ from paramclient.documents.component import ComponentsDoc
 from paramclient.documents.diff import DiffDoc
 from paramclient.documents.job import JobsDoc
 from paramclient.errors import FileError, UsageError
-from paramclient.files import loads
+from paramclient.files import document_schema, dumps, formats, line_formats, loads, script
+from paramclient.files.param_file import TooManyParams
 from paramclient.model import comparison as compare_room
 from paramclient.model import params as params_model
 from paramclient.model import patterns
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import NameChoice
-from paramclient.model.values import Param
+from paramclient.model.values import Param, ParamType
 from paramclient.provision import inspection
 from paramclient.service import (
     AccessSettings,
@@ -44,9 +45,16 @@ from paramclient.service import (
 from paramclient.service.answering import written_out
 from paramclient.service.event_feed import MOST_AT_ONCE
 from paramclient.service.link import LOOKED_AT_ONCE
-from paramclient.service.param_sources import LARGEST_UPLOAD, MOST_NAMES, MOST_PATTERNS, MOST_VALUES
+from paramclient.service.param_sources import (
+    LARGEST_UPLOAD,
+    MOST_NAMES,
+    MOST_PATTERNS,
+    MOST_VALUES,
+    read_upload,
+)
+from paramclient.service.problems import ServiceError
 from paramclient.service.quota import LONG_REQUESTS_OF_ONE
-from paramclient.service.reading import MOST_PIECES
+from paramclient.service.reading import LONGEST_LINE, LONGEST_NUMBER, MOST_PIECES
 from paramclient.service.route_context import answered
 from paramclient.service.routes import params as params_room
 from paramclient.service.routes import setup as setup_room
@@ -584,3 +592,95 @@ async def test_many_components_are_looked_at_few_at_a_time() -> None:
 
     assert await answered(request, work, *[looked] * 1_000) == 7
     assert turns.most == LOOKED_AT_ONCE
+
+
+ESCAPES = b'a: "' + b"\\x41" * 20_000 + b'"\n'
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "most"),
+    [
+        ("a.parm", b"P1 " + b"1" * 100_000, LONGEST_LINE),
+        ("a.yaml", ESCAPES, LONGEST_LINE),
+        ("a.yaml", b"paramclient: 1\rsets: {" + b"a: b, " * 5_000 + b"}", LONGEST_LINE),
+        ("a.params", b"1\t1\tA\t1\t9\r" * 60_001, MOST_PIECES),
+    ],
+)
+@swiftly
+async def test_a_file_with_long_lines_is_not_parsed(name: str, data: bytes, most: int) -> None:
+    async with service() as (_, browser):
+        answer = await browser.post(f"/api/v1/files?name={name}", content=data, headers=A_FILE)
+        assert problem(answer, 413, "too-large")["most"] == most
+
+
+@swiftly
+async def test_a_file_without_lines_may_be_long() -> None:
+    wanted = ParamSet({name: WrittenParam(name, value) for name, value in LARGE.items()})
+    document = json.dumps(json.loads(dumps(wanted, form="json"))).encode()
+    coarse = {name: WrittenParam(name, value, ParamType.REAL32) for name, value in LARGE.items()}
+    packed = dumps(ParamSet(coarse), form="pck")
+    assert b"\n" not in document
+    assert min(len(document), len(packed)) > LONGEST_LINE
+    async with service() as (_, browser):
+        for name, data in (("a.json", document), ("", b"\xef\xbb\xbf \n" + document), ("a.pck", packed)):
+            answer = await browser.post(f"/api/v1/files?name={name}", content=data, headers=A_FILE)
+            assert answer.status_code == 200, answer.text
+            assert len(answer.json()["params"]) == len(LARGE)
+
+
+def test_in_a_document_of_one_line_no_comment_is_sought(monkeypatch: pytest.MonkeyPatch) -> None:
+    sought: list[str] = []
+
+    def lines_of(text: str, *_: Any) -> Iterator[Any]:
+        sought.append(text)
+        return iter(())
+
+    monkeypatch.setattr(formats, "lines_of", lines_of)
+    with pytest.raises(FileError):
+        loads(b'{"a":"' + b"x" * 100_000 + b'"}')
+    assert not sought
+
+
+@pytest.mark.parametrize("number", ["9" * 4_300, "9" * (LONGEST_NUMBER + 1), "0." + "3" * 200])
+@swiftly
+async def test_a_body_with_endless_numbers_is_not_parsed(
+    number: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with service() as (_, browser):
+        with threads_of(monkeypatch, (json, "loads")) as seen:
+            answer = await browser.post("/api/v1/find", content=f'{{"system":{number}}}', headers=A_JSON)
+        assert seen == {"loads": set()}
+        assert problem(answer, 413, "too-large")["most"] == LONGEST_NUMBER
+        answer = await browser.post("/api/v1/find", content=f'{{"system":{"9" * 128}}}', headers=A_JSON)
+        assert answer.status_code == 422
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"".join(b"1\t1\tP%05d\t1.5\t9\n" % number for number in range(20_000)),
+        b"".join(b"P%05d,1.5\n" % number for number in range(20_000)),
+        b"#!/bin/sh\n" + b"param set P 1\n" * 20_000,
+        b'{"paramclient":1,"sets":[{"params":{'
+        + b",".join(b'"P%05d":{"value":1}' % number for number in range(20_000))
+        + b"}}]}",
+    ],
+)
+def test_a_file_with_too_many_parameters_is_not_read_to_its_end(
+    data: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = 0
+
+    class Counted(WrittenParam):
+        def __new__(cls, *_: Any, **__: Any) -> Any:
+            nonlocal made
+            made += 1
+            return super().__new__(cls)
+
+    for room in (line_formats, script, document_schema):
+        monkeypatch.setattr(room, "WrittenParam", Counted)
+    with pytest.raises(TooManyParams, match="more than 1,000 parameters"):
+        loads(data, params_max=1_000)
+    assert made <= 1_001
+    with pytest.raises(ServiceError, match="10,000"):
+        read_upload(data, "", None)
