@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Final
 
 import anyio
+import anyio.lowlevel
 
 from paramclient.client.component import PROGRESS_INTERVAL, TIME_IS_OVER, Component
 from paramclient.errors import CacheError, ContestedAddress, NoReply
@@ -24,6 +25,9 @@ SILENT_PATIENCE: Final = 1.0
 PATIENCE_PER_ANSWER: Final = 4.0
 """The same by the longest time in which another one has answered: where one process is all vehicles, or this
 one serves many links, an answer may come seconds later than it would from one alone."""
+
+BEGUN_AT_ONCE: Final = 32
+"""Fetches that are begun before the event loop comes round: 2 ms."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,8 +101,11 @@ class FetchTogether:
             while True:
                 check()
                 now = anyio.current_time()
-                if self.join(now):
+                while self.join(now):
                     wake()
+                    await anyio.lowlevel.checkpoint()
+                    check()
+                    now = anyio.current_time()
                 is_worth_it = self.is_worth_waiting(now, listen_until=listen_until, hear_until=hear_until)
                 if now >= until or not is_worth_it:
                     return self.outcome(now, waited=now - began)
@@ -114,7 +121,7 @@ class FetchTogether:
     def join(self, now: float) -> bool:
         """Begin the fetches of components that have none yet, as soon as their cached table is there.
 
-        Gives whether any has begun.
+        At most `BEGUN_AT_ONCE`, and those of one vehicle together. Gives whether any has begun.
         """
         self._is_cache_awaited = False
         ready: dict[tuple[int, Peer], list[ComponentMachine]] = {}
@@ -130,7 +137,11 @@ class FetchTogether:
                 ready.setdefault(machine.vehicle, []).append(machine)
             else:
                 self._is_cache_awaited = True
+        count = 0
         for machines in ready.values():
+            if count >= BEGUN_AT_ONCE:
+                break
+            count += len(machines)
             begun = self._station.begin_fetches(machines, now, refresh=self._refresh)
             for machine, fetch in zip(machines, begun, strict=True):
                 address = machine.address

@@ -46,7 +46,7 @@ def is_document(first: str) -> bool:
     return _first_key(first) is not None or first == "---"
 
 
-def read_json(text: str, source: str) -> ParamFile:
+def read_json(text: str, source: str, params_max: int | None = None) -> ParamFile:
     """Read a document in JSON.
 
     Raises:
@@ -72,10 +72,10 @@ def read_json(text: str, source: str) -> ParamFile:
     except ValueError as error:
         line = _line_of(text, error.args[1], last=True) if len(error.args) > 1 else None
         raise FileError(str(error.args[0]), source=source, line=line) from None
-    return _file(content, FileForm.JSON, source, text)
+    return _file(content, FileForm.JSON, source, text, params_max)
 
 
-def read_yaml(text: str, source: str) -> ParamFile:
+def read_yaml(text: str, source: str, params_max: int | None = None) -> ParamFile:
     """Read a document in YAML.
 
     Words and numbers have the same meaning as in JSON: NO is text and not false, 010 is not 8, 1:30 is not
@@ -92,7 +92,7 @@ def read_yaml(text: str, source: str) -> ParamFile:
         content = load(text)
     except InvalidYaml as error:
         raise FileError(f"expected YAML: {error}", source=source, line=error.line, expected="YAML") from None
-    return _file(content, FileForm.YAML, source, text)
+    return _file(content, FileForm.YAML, source, text, params_max)
 
 
 def write_json(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
@@ -143,11 +143,11 @@ def write_yaml(sets: Sequence[ParamSet], around: ParamFile) -> Iterator[str]:
             yield f"      {_key(param.name)}: {_flow(_fields(param))}"
 
 
-def _file(content: object, form: FileForm, source: str, text: str) -> ParamFile:
+def _file(content: object, form: FileForm, source: str, text: str, params_max: int | None) -> ParamFile:
     from paramclient.files.document_schema import InvalidDocument, parse  # imported here: loads pydantic
 
     try:
-        sets, header = parse(content, source)
+        sets, header = parse(content, source, params_max)
     except InvalidDocument as error:
         problems = [_problem(place, what, text) for place, what in error.problems]
         more = [": ".join(filter(None, (_prefix(source, line), what))) for line, what in problems[1:]]

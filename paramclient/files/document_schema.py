@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from paramclient.errors import UsageError
+from paramclient.files.param_file import TooManyParams
 from paramclient.files.text import PROBLEMS_MAX, as_type
 from paramclient.model.identity import Identity
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -30,22 +31,25 @@ _date = re.compile(r"[0-9]{4}-[0-9]{2}-").match
 _bits = re.compile(r"[0-9a-fA-F]{8}(?:[0-9a-fA-F]{8})?").fullmatch
 
 
-def parse(content: object, source: str) -> tuple[tuple[ParamSet, ...], tuple[str, ...]]:
+def parse(
+    content: object, source: str, params_max: int | None = None
+) -> tuple[tuple[ParamSet, ...], tuple[str, ...]]:
     """Return the sets and the header of a document that was parsed from JSON or YAML.
 
     Validates sets and parameters one by one: for a whole document, pydantic would keep an error for each bad
     parameter, each error many times larger than the parameter, and would block all other threads.
 
     Raises:
+        TooManyParams: the document has more parameters than `params_max`.
         InvalidDocument: the content is not a valid document.
     """
     faults = _Faults()
     document = faults.checked(_Document, content, ())
     raw_sets = content.get("sets") if isinstance(content, dict) else None
-    found = [
-        _Written.of(each, ("sets", number), faults)
-        for number, each in enumerate(raw_sets if isinstance(raw_sets, list) else ())
-    ]
+    sets_there = raw_sets if isinstance(raw_sets, list) else []
+    named = [each.get("params") for each in sets_there if isinstance(each, dict)]
+    TooManyParams.check(sum(len(each) for each in named if isinstance(each, dict)), params_max, source)
+    found = [_Written.of(each, ("sets", number), faults) for number, each in enumerate(sets_there)]
     faults.raise_if_any()
     assert document is not None, "otherwise raise_if_any has raised"
     sets = [each.params(source, faults) for each in found]

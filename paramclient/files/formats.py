@@ -26,7 +26,12 @@ Content: TypeAlias = ParamFile | ParamSet | Iterable[ParamSet]
 
 
 def loads(
-    data: bytes, *, source: str = "", form: FileForm | str | None = None, includes: Includes | None = None
+    data: bytes,
+    *,
+    source: str = "",
+    form: FileForm | str | None = None,
+    includes: Includes | None = None,
+    params_max: int | None = None,
 ) -> ParamFile:
     """Parse a parameter file.
 
@@ -39,8 +44,10 @@ def loads(
         source: the file's name, for errors and `ParamSet.source`.
         form: the format; None to detect it.
         includes: reads the files of `@include` lines; None rejects such lines, as bytes have no folder.
+        params_max: maximum number of parameters; None for any. A longer file is not read to its end.
 
     Raises:
+        TooManyParams: the file has more parameters than `params_max`.
         FileError: unknown format, damaged, or without parameters. The error names up to 20 bad lines.
         UsageError: unknown format name.
     """
@@ -55,15 +62,15 @@ def loads(
     form = form or _form_of(text, source)
     match form:
         case FileForm.QGC:
-            return line_formats.read_qgc(text, source)
+            return line_formats.read_qgc(text, source, params_max)
         case FileForm.PX4_SCRIPT:
-            return script.read_script(text, source)
+            return script.read_script(text, source, params_max)
         case FileForm.JSON:
-            return document.read_json(text, source)
+            return document.read_json(text, source, params_max)
         case FileForm.YAML:
-            return document.read_yaml(text, source)
+            return document.read_yaml(text, source, params_max)
         case _:
-            return line_formats.read_pairs(text, form, source, includes)
+            return line_formats.read_pairs(text, form, source, includes, params_max)
 
 
 def dumps(content: Content, *, form: FileForm | str | None = None, target: str = "") -> bytes:
@@ -122,11 +129,13 @@ def _form_of(text: str, source: str) -> FileForm:
     Raises:
         FileError: the text has no line with content.
     """
+    if text.lstrip().startswith("{"):  # it may be one line of megabytes, in which no comment is sought
+        return FileForm.JSON
     first = next((line for line in lines_of(text) if line.text), None)
     if first is None:
         raise FileError("the file contains no parameters", source=source)
     if first.text.startswith("{"):
-        return FileForm.JSON
+        return FileForm.JSON  # behind comments
     if line_formats.is_qgc_row(first.text):
         return FileForm.QGC
     if any(script.is_script_line(line.text) for line in lines_of(text)):

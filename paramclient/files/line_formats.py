@@ -18,7 +18,7 @@ from typing import Final
 
 from paramclient.errors import FileError, UsageError
 from paramclient.files.includes import Includes
-from paramclient.files.param_file import AUTOPILOT, FileForm, ParamFile
+from paramclient.files.param_file import AUTOPILOT, FileForm, ParamFile, TooManyParams
 from paramclient.files.text import (
     Builder,
     Line,
@@ -63,12 +63,14 @@ class _Lines:
         notes: a note for each `@delete` line.
         deletes: number of `@delete` lines.
         comparisons: number of parameters that were compared with these lines.
+        params_max: maximum number of parameters; None for any.
     """
 
     params: list[tuple[WrittenParam, str]] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     deletes: int = 0
     comparisons: int = 0
+    params_max: int | None = None
 
     def delete(self, pattern: str, place: str) -> None:
         """Remove the parameters so far whose names match a glob."""
@@ -84,7 +86,13 @@ class _Lines:
         self.notes.append(f"@delete {pattern} in {place} removes {listed}.")
 
 
-def read_pairs(text: str, form: FileForm, source: str, includes: Includes | None = None) -> ParamFile:
+def read_pairs(
+    text: str,
+    form: FileForm,
+    source: str,
+    includes: Includes | None = None,
+    params_max: int | None = None,
+) -> ParamFile:
     """Read a file with a name and a value on each line.
 
     Name and value are separated by spaces, tabs, a comma or `=`. After the value, only a comment may follow,
@@ -97,14 +105,15 @@ def read_pairs(text: str, form: FileForm, source: str, includes: Includes | None
         form: which of the two formats the file has.
         source: the file's name, for errors.
         includes: reads the files of `@include` lines; None for bytes without a file on disk.
+        params_max: as for `Builder`.
 
     Raises:
         FileError: a line is something else, also in an included file.
     """
     problems = Problems(source)
-    lines = _Lines()
+    lines = _Lines(params_max=params_max)
     header, footer = _read_lines(text, form, lines, problems, includes, is_included=False)
-    builder = Builder(problems)
+    builder = Builder(problems, params_max)
     for param, place in lines.params:
         builder.add(param, place=place)
     sets = builder.result()
@@ -128,7 +137,8 @@ def _read_lines(
             if includes is None:
                 raise UsageError("only a file on disk can include another file")
             found = includes.follow(path)
-            inner, problems_inside = _Lines(), Problems(found.source)
+            inner = _Lines(params_max=lines.params_max)
+            problems_inside = Problems(found.source)
             _read_lines(found.text, form, inner, problems_inside, found.includes, is_included=True)
             problems_inside.raise_if_any()
             lines.params += inner.params
@@ -165,6 +175,7 @@ def _read_lines(
         assert value is not None
         number = None if is_included else line.number
         lines.params.append((WrittenParam(words[0], value, comment=comment, line=number), place))
+        TooManyParams.check(len(lines.params), lines.params_max, problems.source)
 
     return _read_commented_lines(text, take)
 
@@ -196,13 +207,13 @@ def is_pair(text: str) -> bool:
     return len(words) >= 2 and _name(words[0]) is not None and parse_number(words[1]) is not None
 
 
-def read_qgc(text: str, source: str) -> ParamFile:
+def read_qgc(text: str, source: str, params_max: int | None = None) -> ParamFile:
     """Read a file of QGroundControl. Columns may be separated by spaces too, as other programs write them.
 
     Raises:
         FileError: a line does not have five columns, or its value does not fit its type.
     """
-    builder = Builder(Problems(source))
+    builder = Builder(Problems(source), params_max)
 
     def take(line: Line, comment: str) -> None:
         columns = _blanks.split(line.text)

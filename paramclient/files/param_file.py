@@ -11,7 +11,16 @@ from typing import Final
 from paramclient.errors import FileError, UsageError
 from paramclient.model.paramset import ParamSet
 
-__all__ = ["AUTOPILOT", "ENDINGS", "FileForm", "ParamFile", "address", "as_form", "form_of_name"]
+__all__ = [
+    "AUTOPILOT",
+    "ENDINGS",
+    "FileForm",
+    "ParamFile",
+    "TooManyParams",
+    "address",
+    "as_form",
+    "form_of_name",
+]
 
 AUTOPILOT: Final = 1
 """MAV_COMP_ID_AUTOPILOT1: the component of a file that names no component."""
@@ -96,6 +105,16 @@ class ParamFile:
     def __repr__(self) -> str:
         held = ", ".join(f"{address(each)}: {len(each)}" for each in self.sets)
         return f"<ParamFile {self.source or 'unnamed'} {self.form} {held}>"
+
+
+class TooManyParams(FileError):
+    """A file holds more parameters than its reader takes. The rest of the file was not read."""
+
+    @classmethod
+    def check(cls, count: int, params_max: int | None, source: str) -> None:
+        """Raise it if there are more than `params_max`; None is no limit."""
+        if params_max is not None and count > params_max:
+            raise cls(f"the file holds more than {params_max:,} parameters", source=source)
 
 
 def address(params: ParamSet) -> str:

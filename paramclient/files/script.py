@@ -12,7 +12,7 @@ import re
 from typing import Final
 
 from paramclient.errors import UsageError
-from paramclient.files.param_file import FileForm, ParamFile
+from paramclient.files.param_file import FileForm, ParamFile, TooManyParams
 from paramclient.files.text import Builder, Line, Problems, excerpt, lines_of, parse_number
 from paramclient.model.paramset import WrittenParam
 from paramclient.model.values import check_name
@@ -39,7 +39,7 @@ def is_script_line(text: str) -> bool:
     return _changes(text) is not None
 
 
-def read_script(text: str, source: str) -> ParamFile:
+def read_script(text: str, source: str, params_max: int | None = None) -> ParamFile:
     """Read the parameters that a script sets in every case. The default of `set-default` is read as a value.
 
     If a name is set twice, the last value is used, but a value of `set` takes precedence over `set-default`:
@@ -48,7 +48,7 @@ def read_script(text: str, source: str) -> ParamFile:
     Raises:
         FileError: a line sets, loads or resets parameters in a way that depends on more than the file.
     """
-    builder = Builder(Problems(source))
+    builder = Builder(Problems(source), params_max)
     header: list[str] = []
     waiting: list[str] = []
     skipped: list[int] = []
@@ -81,6 +81,8 @@ def read_script(text: str, source: str) -> ParamFile:
             builder.add(param)
             if not is_default:
                 assigned.add(param.name)
+        except TooManyParams:
+            raise
         except UsageError as error:
             builder.problems.add(line.number, str(error), excerpt(line.text))
     sets = builder.result()

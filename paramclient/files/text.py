@@ -12,6 +12,7 @@ from datetime import UTC, datetime
 from typing import Final, NamedTuple
 
 from paramclient.errors import FileError, UsageError
+from paramclient.files.param_file import TooManyParams
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.values import ParamType, Value, bits_of, format_value, from_bits, type_name
 
@@ -110,12 +111,15 @@ class Builder:
 
     Args:
         problems: the bad lines of the file.
+        params_max: maximum number of parameters, repeated ones counted each time; None for any.
     """
 
     problems: Problems
+    params_max: int | None = None
     sets: dict[tuple[int | None, int | None], dict[str, WrittenParam]] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
     repeated: int = 0
+    count: int = 0
     _places: dict[tuple[int | None, int | None, str], str] = field(default_factory=dict)
 
     def add(
@@ -132,7 +136,12 @@ class Builder:
             param: the parameter.
             system, component: the ids of the set.
             place: its position in the file, in words; "" for its line.
+
+        Raises:
+            TooManyParams: the file has more parameters than `params_max`.
         """
+        self.count += 1
+        TooManyParams.check(self.count, self.params_max, self.problems.source)
         params = self.sets.setdefault((system, component), {})
         before = params.get(param.name)
         params[param.name] = param

@@ -18,6 +18,7 @@ from itertools import islice
 from typing import Any, Final, NamedTuple
 
 import anyio
+import anyio.lowlevel
 
 __all__ = ["COMPACT", "Batch", "Feed", "Listener", "Place", "Wanted"]
 
@@ -31,8 +32,9 @@ GATHERING_SHARE: Final = 0.0005
 """Seconds for which events are gathered before listeners are woken again, at most, and for each that there
 is: a download brings hundreds a second, and to wake two hundred for each of them would take more than the
 download itself. One alone hardly waits."""
-MOST_AT_ONCE: Final = 1_024
-"""Events that one listener is given at a time: what it has not taken by then can still be lost."""
+MOST_AT_ONCE: Final = 64
+"""Events that one listener is given at a time. To write out as many takes 9 ms; the event loop comes round
+before the next ones. What a listener has not been given can still be lost."""
 MOST_SHARED: Final = 32
 """Batches that are kept written out, for listeners that stand at the same place and want the same."""
 
@@ -275,6 +277,7 @@ class Listener:
             if feed.is_over:
                 raise EOFError
             return None
+        await anyio.lowlevel.checkpoint()  # a listener that comes back may have thousands of events to take
         batch, stream = feed._after(self.place.seq, self._wanted)
         self.place = batch.place
         return batch, stream

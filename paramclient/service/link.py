@@ -8,6 +8,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Final
 
 import anyio
+import anyio.lowlevel
 
 from paramclient.client.client import ParamClient
 from paramclient.client.events import (
@@ -29,7 +30,7 @@ from paramclient.service.followed_component import Followed
 if TYPE_CHECKING:
     from paramclient.service.event_feed import Feed
 
-__all__ = ["Line"]
+__all__ = ["LOOKED_AT_ONCE", "Line"]
 
 FIRST_BACKOFF: Final = 0.25
 LONGEST_BACKOFF: Final = 5.0
@@ -38,6 +39,8 @@ LOOK_INTERVAL: Final = 0.2
 """Seconds between two looks at what nobody tells of: states, progress."""
 LOOKS_AT_VALUES: Final = 5
 """Of so many looks one goes through all values too."""
+LOOKED_AT_ONCE: Final = 64
+"""Components that are looked at before the event loop comes round: 3 ms where each has something to tell."""
 
 logger = logging.getLogger(__name__)
 
@@ -190,11 +193,13 @@ class Line:
                 await self._over.wait()
             looks += 1
             self._look_at_link()
-            for followed in list(self.followed.values()):
+            for number, followed in enumerate(list(self.followed.values()), 1):
                 if looks % LOOKS_AT_VALUES:
                     followed.look_at_state()
                 else:
                     followed.look()
+                if not number % LOOKED_AT_ONCE:
+                    await anyio.lowlevel.checkpoint()
         if self._ending is not None:
             raise self._ending
         self._become("ended")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import binascii
 import time
+from codecs import BOM_UTF8
 from collections.abc import Callable
 from datetime import datetime
 from typing import TYPE_CHECKING, Annotated, Final, Literal, TypeVar
@@ -14,6 +15,8 @@ from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 from paramclient.documents.document import Body, InParts
 from paramclient.errors import NotInCache, UnknownVehicle, UsageError
 from paramclient.files import FileForm, ParamFile, loads
+from paramclient.files.param_file import TooManyParams
+from paramclient.files.param_pck import is_packed
 from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import is_pattern
@@ -27,7 +30,7 @@ from paramclient.provision.vehicle_params import (
     load_state_before_apply,
 )
 from paramclient.service.problems import ServiceError
-from paramclient.service.reading import check_pieces
+from paramclient.service.reading import check_lines, check_pieces
 from paramclient.service.request import LARGEST_UPLOAD
 from paramclient.service.route_context import Bits, ValueGiven, value_meant, value_of
 
@@ -202,11 +205,22 @@ def read_upload(data: bytes, name: str, form: FileForm | None) -> ParamFile:
     """
     check_size(len(data), LARGEST_UPLOAD)
     check_pieces(data)
-    file = loads(data, source=name, form=form)
-    if sum(map(len, file.sets)) > MOST_VALUES:
+    if not _has_no_lines(data, form):
+        check_lines(data)
+    try:
+        file = loads(data, source=name, form=form, params_max=MOST_VALUES)
+        TooManyParams.check(sum(map(len, file.sets)), MOST_VALUES, name)
+    except TooManyParams:
         what = f"A file may hold {MOST_VALUES:,} parameters here, not more."
-        raise ServiceError(413, "too-large", what, most=MOST_VALUES)
+        raise ServiceError(413, "too-large", what, most=MOST_VALUES) from None
     return file
+
+
+def _has_no_lines(data: bytes, form: FileForm | None) -> bool:
+    """Whether a file is JSON or packed, and so is never looked at line by line."""
+    if form is not None:
+        return form in (FileForm.JSON, FileForm.PCK)
+    return is_packed(data) or data.removeprefix(BOM_UTF8).lstrip().startswith(b"{")
 
 
 async def resolved(hub: Hub, target: Followed, source: Source) -> ParamSet:

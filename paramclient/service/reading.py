@@ -22,13 +22,17 @@ from paramclient.service.problems import MOST_FAULTS, ServiceError
 if TYPE_CHECKING:
     from paramclient.service.hub import Hub
 
-__all__ = ["MOST_PIECES", "SHORT_BODY", "BodyRoute", "check_pieces", "long_request"]
+__all__ = ["MOST_PIECES", "SHORT_BODY", "BodyRoute", "check_lines", "check_pieces", "long_request"]
 
 SHORT_BODY: Final = 4096
 """Bytes of a body that is parsed at once: that takes less time than to hand it to a thread."""
 MOST_PIECES: Final = 60_000
 """Commas, opening brackets and line ends of a body or a file: no more values, members and lines can be in it.
 A file of eight thousand parameters in JSON, the longest of the forms, has 56,000."""
+LONGEST_NUMBER: Final = 128
+"""Digits in a row in a JSON body. To read 4,300 takes 0.6 ms, in which no other thread runs."""
+LONGEST_LINE: Final = 16_384
+"""Bytes of a line of a file that is no JSON: each is searched for comments as a whole."""
 
 
 class BodyRoute(APIRoute):
@@ -79,9 +83,32 @@ def check_pieces(data: bytes) -> None:
     Raises:
         ServiceError: 413, there are.
     """
-    if sum(map(data.count, (b",", b"{", b"[", b"\n"))) > MOST_PIECES:
+    line_ends = max(data.count(b"\n"), data.count(b"\r"))
+    if line_ends + sum(map(data.count, (b",", b"{", b"["))) > MOST_PIECES:
         what = f"A body or a file may have {MOST_PIECES:,} commas, opening brackets and line ends, not more."
         raise ServiceError(413, "too-large", what, most=MOST_PIECES)
+
+
+def check_lines(data: bytes) -> None:
+    """See that a file has no line that takes long by itself.
+
+    Raises:
+        ServiceError: 413, it has.
+    """
+    if _has_run(data, _IN_LINES, LONGEST_LINE):
+        what = f"A line of a file has at most {LONGEST_LINE:,} bytes, unless the file is JSON."
+        raise ServiceError(413, "too-large", what, most=LONGEST_LINE)
+
+
+def _check_numbers(data: bytes) -> None:
+    if _has_run(data, _DIGITS, LONGEST_NUMBER):
+        what = f"A body has at most {LONGEST_NUMBER} digits in a row."
+        raise ServiceError(413, "too-large", what, most=LONGEST_NUMBER)
+
+
+def _has_run(data: bytes, kinds: bytes, most: int) -> bool:
+    """Whether more than so many bytes of a kind follow each other; in a time that grows with the length."""
+    return b"x" * (most + 1) in data.translate(kinds)
 
 
 class _Read(Request):
@@ -107,6 +134,7 @@ def _object(model: type[Body], data: bytes) -> Body:
         ServiceError: it is too large, or cannot be parsed.
     """
     check_pieces(data)
+    _check_numbers(data)
     try:
         content = json.loads(data)
     except json.JSONDecodeError as error:
@@ -120,3 +148,7 @@ def _object(model: type[Body], data: bytes) -> Body:
         found = error.errors(include_url=False, include_context=False, include_input=False)[:MOST_FAULTS]
         faults = [{**fault, "loc": ("body", *fault["loc"])} for fault in found]
     raise RequestValidationError(faults)
+
+
+_DIGITS: Final = bytes(ord("x") if chr(each).isdecimal() and each < 128 else 0 for each in range(256))
+_IN_LINES: Final = bytes(0 if each in b"\r\n" else ord("x") for each in range(256))

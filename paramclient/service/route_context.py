@@ -7,6 +7,7 @@ from collections.abc import Awaitable, Callable
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import anyio
+import anyio.lowlevel
 from fastapi import Depends, Path, Query, Request
 from pydantic import Field, StrictFloat, StrictInt
 
@@ -17,6 +18,7 @@ from paramclient.model.values import Param, ParamType, Value, from_bits, type_na
 from paramclient.service import access
 from paramclient.service.followed_component import Followed
 from paramclient.service.hub import Hub
+from paramclient.service.link import LOOKED_AT_ONCE
 from paramclient.service.problems import ServiceError
 
 if TYPE_CHECKING:
@@ -111,8 +113,10 @@ async def answered(request: Request, work: Callable[[], Awaitable[Result]], *abo
         except Exception as error:  # out of the group it would come wrapped
             outcome = error
         tasks.cancel_scope.cancel()
-    for followed in about:
+    for number, followed in enumerate(about, 1):
         followed.look()
+        if not number % LOOKED_AT_ONCE:
+            await anyio.lowlevel.checkpoint()
     if isinstance(outcome, Exception):
         raise outcome
     return outcome

@@ -375,7 +375,7 @@ def interleaved(caches: Callable[[], tuple[ParamCache, ParamCache]], examples: i
 
 
 def test_what_went_before_anything_was_written_does_not_come_back(tmp_path: Path) -> None:
-    """The first value of a parameter had no index, and a later one had: the list without it overtakes both."""
+    """Its first value had no index, and a later one had: the list without it overtakes both."""
     path = tmp_path / "cache"
     caches = staticmethod(lambda: (ParamCache(path), ParamCache(path)))
     programs = type("Machine", (Programs,), {"caches": caches})()

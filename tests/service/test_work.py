@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
 import base64
 import json
+import math
 import threading
 import tracemalloc
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from types import SimpleNamespace
 from typing import Any
 
 import anyio
@@ -15,15 +18,19 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
+from paramclient.client.fetch_all import BEGUN_AT_ONCE, FetchTogether
 from paramclient.documents.component import ComponentsDoc
 from paramclient.documents.diff import DiffDoc
 from paramclient.documents.job import JobsDoc
 from paramclient.errors import FileError, UsageError
-from paramclient.files import loads
+from paramclient.files import document_schema, dumps, formats, line_formats, loads, script
+from paramclient.files.param_file import TooManyParams
 from paramclient.model import comparison as compare_room
+from paramclient.model import params as params_model
 from paramclient.model import patterns
 from paramclient.model.paramset import ParamSet, WrittenParam
 from paramclient.model.patterns import NameChoice
+from paramclient.model.values import Param, ParamType
 from paramclient.provision import inspection
 from paramclient.service import (
     AccessSettings,
@@ -36,9 +43,19 @@ from paramclient.service import (
     quota,
 )
 from paramclient.service.answering import written_out
-from paramclient.service.param_sources import LARGEST_UPLOAD, MOST_NAMES, MOST_PATTERNS, MOST_VALUES
+from paramclient.service.event_feed import MOST_AT_ONCE
+from paramclient.service.link import LOOKED_AT_ONCE
+from paramclient.service.param_sources import (
+    LARGEST_UPLOAD,
+    MOST_NAMES,
+    MOST_PATTERNS,
+    MOST_VALUES,
+    read_upload,
+)
+from paramclient.service.problems import ServiceError
 from paramclient.service.quota import LONG_REQUESTS_OF_ONE
-from paramclient.service.reading import MOST_PIECES
+from paramclient.service.reading import LONGEST_LINE, LONGEST_NUMBER, MOST_PIECES
+from paramclient.service.route_context import answered
 from paramclient.service.routes import params as params_room
 from paramclient.service.routes import setup as setup_room
 from paramclient.sim import GenericVehicle
@@ -458,3 +475,212 @@ async def test_a_list_of_jobs_has_their_results() -> None:
         assert (first["kind"], last["kind"]) == ("fetch", "apply")
         assert last["result"] == answer.json()
         assert (await browser.get(f"/api/v1/jobs/{last['id']}")).json() == last
+
+
+class Turns:
+    """Counts what happens in one turn of the event loop."""
+
+    def __init__(self) -> None:
+        self.most = 0
+        self._count = 0
+        self._next()
+
+    def note(self) -> None:
+        """It has happened."""
+        self._count += 1
+        self.most = max(self.most, self._count)
+
+    def _next(self) -> None:
+        self._count = 0
+        asyncio.get_running_loop().call_soon(self._next)
+
+
+@swiftly
+async def test_a_table_is_read_a_part_at_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = {f"ABC_P{number:04}": float(number) for number in range(3 * params_room.AT_ONCE)}
+    async with service(GenericVehicle(table=table)) as (_, browser):
+        await fetched(browser)
+        turns = Turns()
+
+        def param_of(*given: Any) -> Param:
+            turns.note()
+            return made(*given)
+
+        made = params_model.param_of
+        monkeypatch.setattr(params_model, "param_of", param_of)
+        for query, count in (
+            ("", len(table)),
+            ("?names=ABC_P000*", 10),
+            ("?names=ABC_P0001&changed=true", 0),
+        ):
+            answer = await browser.get(f"{C}/params{query}")
+            assert list(answer.json()["params"]) == list(table)[:count]
+        assert params_room.AT_ONCE / 2 < turns.most <= params_room.AT_ONCE
+
+
+@swiftly
+async def test_events_are_written_out_few_at_a_time() -> None:
+    async with service() as (hub, browser):
+        turns = Turns()
+
+        def write() -> str:
+            turns.note()
+            return '"a":1'
+
+        for _ in range(1_000):
+            hub.feed.publish("note", write)
+        async with browser.stream("GET", f"/api/v1/events?after={hub.feed.run}-0") as stream:
+            async for line in stream.aiter_lines():
+                if line.endswith("-1000"):
+                    break
+        assert turns.most == MOST_AT_ONCE
+
+
+@swiftly
+async def test_fetches_of_many_are_begun_few_at_a_time() -> None:
+    class Station:
+        def begin_fetches(self, machines: list[Any], now: float, *, refresh: bool) -> list[Any]:
+            turns.note()
+            return [SimpleNamespace(done=False) for _ in machines]
+
+    def component(system: int) -> Any:
+        machine = SimpleNamespace(
+            who=SimpleNamespace(has_parameters=True),
+            presence=SimpleNamespace(is_lost=False),
+            peers=SimpleNamespace(contest=None),
+            fetch=None,
+            system=system,
+            vehicle=(system, None),
+            address=(system, 1),
+        )
+        return SimpleNamespace(_machine=machine, _cache_is_due=lambda now: True)
+
+    components = {(system, 1): component(system) for system in range(1, 251)}
+    station: Any = Station()
+    together = FetchTogether(station, components, system=None, refresh=False)
+    turns = Turns()
+    checks = 0
+
+    def check() -> None:
+        nonlocal checks
+        checks += 1
+        if len(together._fetches) == 250:
+            raise EOFError
+
+    together._end = lambda now: together._fetches.clear()  # type: ignore[method-assign]
+    closed: Any = None
+    bounds = {"until": 9e9, "hear_until": 0.0, "listen_until": 0.0}
+    with pytest.raises(EOFError):
+        await together.run(check, lambda: None, closed, **bounds, progress=None)
+    assert turns.most == BEGUN_AT_ONCE
+    assert checks == 1 + math.ceil(250 / BEGUN_AT_ONCE)
+
+
+@swiftly
+async def test_many_components_are_looked_at_few_at_a_time() -> None:
+    turns = Turns()
+    looked: Any = SimpleNamespace(look=turns.note)
+
+    async def receive() -> dict[str, str]:
+        await anyio.sleep(9)
+        return {"type": "http.disconnect"}
+
+    request: Any = SimpleNamespace(receive=receive)
+
+    async def work() -> int:
+        return 7
+
+    assert await answered(request, work, *[looked] * 1_000) == 7
+    assert turns.most == LOOKED_AT_ONCE
+
+
+ESCAPES = b'a: "' + b"\\x41" * 20_000 + b'"\n'
+
+
+@pytest.mark.parametrize(
+    ("name", "data", "most"),
+    [
+        ("a.parm", b"P1 " + b"1" * 100_000, LONGEST_LINE),
+        ("a.yaml", ESCAPES, LONGEST_LINE),
+        ("a.yaml", b"paramclient: 1\rsets: {" + b"a: b, " * 5_000 + b"}", LONGEST_LINE),
+        ("a.params", b"1\t1\tA\t1\t9\r" * 60_001, MOST_PIECES),
+    ],
+)
+@swiftly
+async def test_a_file_with_long_lines_is_not_parsed(name: str, data: bytes, most: int) -> None:
+    async with service() as (_, browser):
+        answer = await browser.post(f"/api/v1/files?name={name}", content=data, headers=A_FILE)
+        assert problem(answer, 413, "too-large")["most"] == most
+
+
+@swiftly
+async def test_a_file_without_lines_may_be_long() -> None:
+    wanted = ParamSet({name: WrittenParam(name, value) for name, value in LARGE.items()})
+    document = json.dumps(json.loads(dumps(wanted, form="json"))).encode()
+    coarse = {name: WrittenParam(name, value, ParamType.REAL32) for name, value in LARGE.items()}
+    packed = dumps(ParamSet(coarse), form="pck")
+    assert b"\n" not in document
+    assert min(len(document), len(packed)) > LONGEST_LINE
+    async with service() as (_, browser):
+        for name, data in (("a.json", document), ("", b"\xef\xbb\xbf \n" + document), ("a.pck", packed)):
+            answer = await browser.post(f"/api/v1/files?name={name}", content=data, headers=A_FILE)
+            assert answer.status_code == 200, answer.text
+            assert len(answer.json()["params"]) == len(LARGE)
+
+
+def test_in_a_document_of_one_line_no_comment_is_sought(monkeypatch: pytest.MonkeyPatch) -> None:
+    sought: list[str] = []
+
+    def lines_of(text: str, *_: Any) -> Iterator[Any]:
+        sought.append(text)
+        return iter(())
+
+    monkeypatch.setattr(formats, "lines_of", lines_of)
+    with pytest.raises(FileError):
+        loads(b'{"a":"' + b"x" * 100_000 + b'"}')
+    assert not sought
+
+
+@pytest.mark.parametrize("number", ["9" * 4_300, "9" * (LONGEST_NUMBER + 1), "0." + "3" * 200])
+@swiftly
+async def test_a_body_with_endless_numbers_is_not_parsed(
+    number: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with service() as (_, browser):
+        with threads_of(monkeypatch, (json, "loads")) as seen:
+            answer = await browser.post("/api/v1/find", content=f'{{"system":{number}}}', headers=A_JSON)
+        assert seen == {"loads": set()}
+        assert problem(answer, 413, "too-large")["most"] == LONGEST_NUMBER
+        answer = await browser.post("/api/v1/find", content=f'{{"system":{"9" * 128}}}', headers=A_JSON)
+        assert answer.status_code == 422
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        b"".join(b"1\t1\tP%05d\t1.5\t9\n" % number for number in range(20_000)),
+        b"".join(b"P%05d,1.5\n" % number for number in range(20_000)),
+        b"#!/bin/sh\n" + b"param set P 1\n" * 20_000,
+        b'{"paramclient":1,"sets":[{"params":{'
+        + b",".join(b'"P%05d":{"value":1}' % number for number in range(20_000))
+        + b"}}]}",
+    ],
+)
+def test_a_file_with_too_many_parameters_is_not_read_to_its_end(
+    data: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = 0
+
+    class Counted(WrittenParam):
+        def __new__(cls, *_: Any, **__: Any) -> Any:
+            nonlocal made
+            made += 1
+            return super().__new__(cls)
+
+    for room in (line_formats, script, document_schema):
+        monkeypatch.setattr(room, "WrittenParam", Counted)
+    with pytest.raises(TooManyParams, match="more than 1,000 parameters"):
+        loads(data, params_max=1_000)
+    assert made <= 1_001
+    with pytest.raises(ServiceError, match="10,000"):
+        read_upload(data, "", None)
