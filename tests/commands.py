@@ -1,4 +1,4 @@
-"""The command as tests run it: in this process, and with simulated vehicles behind every link."""
+"""Helpers that run the command line in the test process, with simulated vehicles behind every link."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def strict(text: str) -> Any:
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a command ended, and what it printed."""
+    """The exit code and the output of a command."""
 
     code: int
     out: str
@@ -55,13 +55,13 @@ class Outcome:
 
 
 Command: TypeAlias = Callable[..., Outcome]
-"""Takes the words of a command, of any type."""
+"""Takes the arguments of a command, of any type."""
 Put: TypeAlias = Callable[[Endpoint | SimLink | PeersLink], str]
-"""Takes a simulated vehicle, or a link; gives the URL behind which it is."""
+"""Takes a simulated vehicle or a link; returns its URL."""
 
 
 def in_process(capsys: pytest.CaptureFixture[str], *cache: str) -> Command:
-    """Runs the command in this process, with these words behind its own unless it is to have no cache."""
+    """Return a function that runs a command in this process, with the arguments `cache` unless --no-cache."""
 
     def call(*arguments: object) -> Outcome:
         words = [*map(str, arguments)]
@@ -73,7 +73,7 @@ def in_process(capsys: pytest.CaptureFixture[str], *cache: str) -> Command:
 
 
 def behind(monkeypatch: pytest.MonkeyPatch, url: str) -> Put:
-    """Puts what it is given behind every URL; gives this one."""
+    """Return a function that connects every URL to a vehicle or a link, and returns `url`."""
 
     def place(far_end: Endpoint | SimLink | PeersLink) -> str:
         def client(url: str, **options: Any) -> ParamClient:
@@ -87,7 +87,7 @@ def behind(monkeypatch: pytest.MonkeyPatch, url: str) -> Put:
 
 
 def leaping(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs commands on a loop whose clock leaps: what they wait for takes no time."""
+    """Run commands on an event loop with simulated time, on which waits take no time."""
     in_worker, in_thread = Worker.run, anyio.to_thread.run_sync
 
     def waits(call: Callable[..., Any]) -> Callable[..., Any]:

@@ -1,10 +1,12 @@
-"""The command: arguments to the client, and what it brings to a table or JSON.
+"""The command line: parses arguments, calls the client, and prints tables or JSON.
 
-`app` reads the arguments and runs a command; the commands stand in `vehicle` (fetch, get, set, watch),
-`offline` (show, cache), `logs` (import), `setup` (apply, verify, restore), `diff`, `save`, `history`,
-`fleet`, `link`, `ports` and `simulate` (sim). `sources` finds the parameters that a word of the user means,
-`targets` the vehicles that are to be set up, `when` reads moments; `results`, `written`, `metadata`,
-`options`, `session`, `output` and `outcome` serve them all.
+- `app`: all subcommands, the main function, signals and errors.
+- Subcommands: `parameters` (fetch, get, set, watch), `offline` (show, cache), `logs` (import), `setup`
+  (apply, verify, restore), `save`, `diff`, `history`, `fleet`, `link`, `check`, `ports`, `signing`, `serve`,
+  `token` and `simulate` (sim).
+- `sources`, `targets`: the parameters and the vehicles that an argument names. `moments`: times.
+- `connection`, `options`: an open link with its vehicle; options that several subcommands share.
+- `output`, `param_rows`, `results`, `metadata`, `exit_codes`: tables, JSON, metadata and exit codes.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Arguments to a command, and how it ends: exit code, one line for an error, signals."""
+"""The main function of the command line: subcommands, arguments, errors, exit codes, signals."""
 
 from __future__ import annotations
 
@@ -24,22 +24,22 @@ __all__ = ["run"]
 
 
 def run(arguments: Sequence[str]) -> int:
-    """Run the command with these arguments; give its exit code.
+    """Run the command line with these arguments; return its exit code.
 
     Raises:
-        KeyboardInterrupt: Ctrl-C outside of an awaiting command, or a second time inside of one.
-        BrokenPipeError: nobody reads what is printed.
+        KeyboardInterrupt: Ctrl-C while nothing is awaited, or a second Ctrl-C.
+        BrokenPipeError: the reader of stdout has closed it.
     """
     if _shows_help(arguments):
         _load(_app)
-    with _warnings_shown() as lines:
+    with _warnings_shown() as printer:
         try:
             command, bound, _ = _app.parse_args(arguments, exit_on_error=False, print_error=False)
             if _is_verbose(bound.arguments):
-                lines.show_steps()
+                printer.show_steps()
             call = partial(command, *bound.args, **bound.kwargs)
             work = call if inspect.iscoroutinefunction(command) else call()
-            # a command that has asked the user something gives what is to be awaited after that
+            # a subcommand that has asked the user something returns the function to await after that
             code = anyio.run(_until_signal, work) if callable(work) else work
         except CycloptsError as error:
             report(str(error))
@@ -49,31 +49,32 @@ def run(arguments: Sequence[str]) -> int:
             return code_of(error)
         except BrokenPipeError:
             raise
-        except OSError as error:  # of stdout: the library has turned all others into its own
+        except OSError as error:  # of stdout: the library translates all others into its own errors
             report(f"cannot write the output: {error.strerror}")
             return ExitCode.INCOMPLETE
     return code or ExitCode.DONE
 
 
 def _shows_help(arguments: Sequence[str]) -> bool:
-    """Whether a page of help is printed, also as nothing more specific is asked for."""
+    """Return whether help is printed: with --help, and without a subcommand."""
     is_group = len(arguments) == 1 and arguments[0] in ("cache", "fleet", "signing")
     return not arguments or is_group or any(word in _app.help_flags for word in arguments)
 
 
 def _load(app: App) -> None:
-    """Import all commands, so that a page of help can say what each of them does."""
+    """Import all subcommands, so that the help can describe each of them."""
     for name in app:
         _load(app[name])
 
 
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+"""Signals that end a command in an orderly way."""
 
 
 async def _until_signal(work: Callable[[], Awaitable[int | None]]) -> int | None:
-    """Do the work, or on a signal end it in good order and give 128 and its number.
+    """Await `work` and return its exit code; on a signal, cancel it and return 128 plus the signal number.
 
-    Whoever cannot wait for the good order sends a second signal, which ends the process at once.
+    A second signal ends the process immediately.
     """
     loop = asyncio.get_running_loop()
     before = {number: signal.getsignal(number) for number in _SIGNALS}
@@ -88,7 +89,7 @@ async def _until_signal(work: Callable[[], Awaitable[int | None]]) -> int | None
             loop.call_soon_threadsafe(scope.cancel)
 
         for number in _SIGNALS:
-            signal.signal(number, end)  # not by the loop, which on Windows knows no signals
+            signal.signal(number, end)  # not by the event loop, which has no signal handlers on Windows
         try:
             return await work()
         finally:
@@ -97,28 +98,29 @@ async def _until_signal(work: Callable[[], Awaitable[int | None]]) -> int | None
     return 128 + received[0]
 
 
-class _Lines(logging.Handler):
-    """Shows what the library warns of, and what it does, where that is wanted."""
+class _LogPrinter(logging.Handler):
+    """Prints warnings of the library on stderr, and with --verbose each step."""
 
     def show_steps(self) -> None:
-        """From now on show what is done too."""
+        """Print each step from now on."""
         self.setLevel(logging.DEBUG)
         _logger.setLevel(logging.DEBUG)
 
     def emit(self, record: logging.LogRecord) -> None:
+        """Print a log record."""
         if record.levelno >= logging.WARNING:
             report(f"{record.levelname.lower()}: {record.getMessage()}")
         else:
-            room = record.name.removeprefix("paramclient.")
-            say(printable(f"{record.relativeCreated / 1000:8.3f} {room}: {record.getMessage()}"))
+            name = record.name.removeprefix("paramclient.")
+            say(printable(f"{record.relativeCreated / 1000:8.3f} {name}: {record.getMessage()}"))
 
 
 _logger: Final = logging.getLogger("paramclient")
 
 
 @contextmanager
-def _warnings_shown() -> Iterator[_Lines]:
-    handler = _Lines(logging.WARNING)
+def _warnings_shown() -> Iterator[_LogPrinter]:
+    handler = _LogPrinter(logging.WARNING)
     level = _logger.level
     _logger.addHandler(handler)
     try:
@@ -140,10 +142,11 @@ def _examples(*lines: str) -> str:
 _EXIT_CODES: Final = """
 
 Exit codes: 0 done; 1 refused, incomplete, different; 2 usage; 3 no vehicle or no answer; 4 link; 5 cache."""
+"""The last lines of the help."""
 
 _app: Final = App(
     name="paramclient",
-    help="Fetch, get and set the parameters of MAVLink vehicles, and look at them again with no link.",
+    help="Fetch, get and set the parameters of MAVLink vehicles, and show them later without a link.",
     help_epilogue=_examples(
         "fetch sim:px4",
         "get udpin:0.0.0.0:14550 MC_ROLL_P",
@@ -158,7 +161,7 @@ _app: Final = App(
 )
 _cache: Final = App(
     name="cache",
-    help="Look into the cache, or copy it, with no link.",
+    help="Show, remove or copy tables in the cache. Needs no link.",
     help_epilogue=_examples(
         "cache list",
         "cache history 1 MC_ROLL_P",
@@ -170,7 +173,7 @@ _cache: Final = App(
 
 _signing: Final = App(
     name="signing",
-    help="Give a vehicle its key for signed messages, and take it away.",
+    help="Set and remove the signing key of a vehicle.",
     help_epilogue=_examples(
         "signing setup udpin:0.0.0.0:14550 --signing-key vehicle.key",
         "signing disable udpin:0.0.0.0:14550 --signing-key vehicle.key",
@@ -178,11 +181,11 @@ _signing: Final = App(
 )
 _fleet: Final = App(
     name="fleet",
-    help="Compare the vehicles in the cache, with no link.",
+    help="Compare the vehicles in the cache. Needs no link.",
     help_epilogue=_examples("fleet diff BAT1_N_CELLS 'COM_ARM_*'", "fleet diff quad.params"),
 )
 
-# By name: a command loads its own modules only, which halves the time until it opens its link.
+# By name: a subcommand loads only its own modules, which halves the time until it opens its link.
 
 _app.command(
     "paramclient.cli.parameters:fetch",

@@ -1,4 +1,4 @@
-"""The command that measures a vehicle and its link: check."""
+"""The subcommand check: measures a vehicle and its link, and prints or saves the report."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Final
 
 from cyclopts import Parameter
 
-from paramclient.cli.connection import HEARING_PATIENCE, Deadline, listen
+from paramclient.cli.connection import VEHICLE_TIMEOUT, Deadline, listen
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import Id, Seconds, SigningOptions
 from paramclient.cli.output import (
@@ -34,10 +34,10 @@ if TYPE_CHECKING:
 
 __all__ = ["check"]
 
-CHECK_TIME: Final = 60.0
-"""Seconds for everything, unless the user says otherwise: a list at 57600 baud takes 35."""
-MOST_ENTRIES: Final = 8
-"""Files and directories that are named to people."""
+CHECK_TIMEOUT: Final = 60.0
+"""Seconds for the whole measurement without --timeout: a list at 57600 baud takes 35."""
+ENTRIES_SHOWN_MAX: Final = 8
+"""Files and directories that a row names, so that it stays one line; it gives the number of further ones."""
 _UNSIGNED: Final = SigningOptions()
 _COLOURS: Final = {Severity.PROBLEM: "red", Severity.SLOW: "yellow", Severity.NOTE: ""}
 
@@ -55,29 +55,29 @@ async def check(
     verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False,
     options: SigningOptions = _UNSIGNED,
 ) -> int:
-    """Measure what a vehicle is, what it serves and how quickly, and say what is slow or unusual.
+    """Measure a vehicle and its link: identity, services and their speed. Report slow or unusual results.
 
-    Nothing is changed: parameters and files are read, never written. Takes about 5 s on a quick link and 45 s
-    at 57600 baud, as the whole table is downloaded once by list and once as a file.
+    Changes nothing: parameters and files are only read. Takes about 5 s on a fast link and 45 s at 57600
+    baud, because the whole table is downloaded once as a list and once as a file.
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
-        system: The system to measure, 1 to 255. Without it, the first one that is heard.
-        component: The component to measure, 1 to 255. Without it, the autopilot.
-        timeout: Seconds for everything together. Without it, 60.
-        json: Print JSON, for programs.
-        report: Also write the result to this file, which must not exist yet, to be attached to an issue.
-        tlog: Write everything on the link, both ways, to this telemetry log, which must not exist yet.
-        verbose: Tell on stderr what is done, step by step.
+        system: The system to measure, 1 to 255. Default: the first one heard.
+        component: The component to measure, 1 to 255. Default: the autopilot.
+        timeout: Timeout for the whole measurement in seconds. Default: 60.
+        json: Print JSON.
+        report: Also write the result to this new file, to attach it to an issue.
+        tlog: Record all frames of the link, received and sent, in this new telemetry log.
+        verbose: Log each step on stderr.
     """
     if report is not None:
         _check_is_new(report)
-    deadline = Deadline(CHECK_TIME if timeout is None else timeout)
+    deadline = Deadline(CHECK_TIMEOUT if timeout is None else timeout)
     async with listen(url, options.signing, tlog=tlog) as client:
         if client.listens_only:
             raise UsageError(f"{client.link.name} is a log: check needs a link to a vehicle")
-        patience = HEARING_PATIENCE if timeout is None else deadline.left()
-        vehicle = await client.component(system, component, timeout=patience)
+        heartbeat_timeout = VEHICLE_TIMEOUT if timeout is None else deadline.left()
+        vehicle = await client.component(system, component, timeout=heartbeat_timeout)
         left = deadline.left()
         assert left is not None
         measured = await check_vehicle(
@@ -115,7 +115,7 @@ def _show_progress(measurement: str) -> None:
     say(f"measuring: {measurement}")
 
 
-# for people
+# Tables
 
 
 def _sentence(finding: Finding) -> str:
@@ -216,14 +216,14 @@ def _service_rows(report: VehicleReport) -> Iterator[tuple[str, str]]:
 
 
 def _entries(names: tuple[str, ...]) -> str:
-    """The root directory in a few words."""
+    """Return the names in the root directory, abbreviated."""
     if not names:
         return ""
-    more = len(names) - MOST_ENTRIES
-    return f": {', '.join(names[:MOST_ENTRIES])}{f' and {more} more' if more > 0 else ''}"
+    more = len(names) - ENTRIES_SHOWN_MAX
+    return f": {', '.join(names[:ENTRIES_SHOWN_MAX])}{f' and {more} more' if more > 0 else ''}"
 
 
-# for programs and issues
+# JSON and Markdown
 
 
 def _document(report: VehicleReport, findings: Iterable[Finding]) -> CheckDoc:
@@ -239,7 +239,7 @@ def _document(report: VehicleReport, findings: Iterable[Finding]) -> CheckDoc:
 
 
 def _write(path: Path, report: VehicleReport, findings: list[Finding], document: CheckDoc) -> None:
-    """Write the result as Markdown: for people first, then all of it for programs.
+    """Write the result as Markdown: the tables, then all figures as JSON.
 
     Raises:
         UsageError: the file cannot be written.
@@ -277,5 +277,5 @@ def _platform(versions: VersionsDoc) -> str:
 
 
 def _cell(text: str) -> str:
-    """Text that keeps to its cell: what the vehicle says of itself may have anything in it."""
+    """Return text escaped for a Markdown cell: text of the vehicle may contain any character."""
     return printable(text).replace("|", "\\|").replace("`", "'").replace("<", "&lt;")

@@ -1,4 +1,4 @@
-"""A link, a vehicle on it, and the time that there is for both."""
+"""An open link with its vehicle, and the deadline of a command."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from paramclient.protocol.params.fetch_result import Policy
 
 __all__ = ["Deadline", "Session", "connect", "listen"]
 
-HEARING_PATIENCE: Final = 10.0
-"""Seconds for a vehicle to be heard, where the user sets no limit."""
-CHECKING_PATIENCE: Final = 2.5
-"""Seconds for a vehicle to be seen to be still the only one: it is known, unless it was lost or its link was
-away, and then it takes as long as before."""
+VEHICLE_TIMEOUT: Final = 10.0
+"""Seconds to wait for the first heartbeat of a vehicle, without --timeout."""
+RECHECK_TIMEOUT: Final = 2.5
+"""Seconds to check that the vehicle is still the only one: no wait is needed unless the vehicle or the link
+was lost in between."""
 
 
 class Deadline:
-    """The moment at which everything is to be over.
+    """The deadline of a command.
 
     Args:
-        seconds: from now; None for never.
+        seconds: from now; None for no deadline.
     """
 
     def __init__(self, seconds: float | None) -> None:
         self._at = None if seconds is None else anyio.current_time() + seconds
 
     def left(self, at_most: float | None = None) -> float | None:
-        """Seconds that are left, 0 when it is over; None without a limit, or `at_most` where given."""
+        """Return the seconds left, at most `at_most`; 0 after the deadline; `at_most` without a deadline."""
         if self._at is None:
             return at_most
         left = max(self._at - anyio.current_time(), 0.0)
@@ -49,7 +49,7 @@ class Deadline:
 
 @dataclass(frozen=True, slots=True)
 class Session:
-    """An open client and the component that the command is about."""
+    """An open client, and the component that the command works on."""
 
     client: ParamClient
     component: Component
@@ -58,37 +58,40 @@ class Session:
 
     @property
     def now(self) -> float:
-        """The time of day; of a log, when the last frame that was read from it was written."""
+        """The present unix time in seconds; for a log, the time of the last frame read from it."""
         link = self.client.link
         at = link.at if isinstance(link, ReplayLink) else None
         return time.time() if at is None else at
 
     @property
-    def who(self) -> str:
+    def label(self) -> str:
         """The component in words: `1/1 px4`."""
         component = self.component
         return f"{component.system}/{component.component} {component.autopilot}"
 
     async def check_only(self) -> None:
-        """Check that the component is still the only one that the options can mean.
+        """Check that the component is still the only one that matches the options.
 
-        For commands that write, directly before they do: vehicles may come and go while others are read.
+        For subcommands that write, directly before the first write: other vehicles may have appeared.
 
         Raises:
-            AmbiguousVehicle: another vehicle is there, beside it or in its place.
-            NoReply: no vehicle is there any more.
+            AmbiguousVehicle: another vehicle is on the link, or has replaced the component.
+            NoReply: no vehicle is heard.
             LinkError: the link failed.
         """
         options, component = self.options, self.component
-        patience = self.deadline.left(CHECKING_PATIENCE)
         found = await self.client.only_component(
-            options.system, options.component, peer=options.peer, timeout=patience
+            options.system,
+            options.component,
+            peer=options.peer,
+            timeout=self.deadline.left(RECHECK_TIMEOUT),
         )
         if found is not component:
             heard = f"{found.system}/{found.component} {found.autopilot}"
             raise AmbiguousVehicle(
-                f"{self.who} was chosen and is not heard any more, {heard} is. Nothing was written.",
-                vehicles=(self.who, heard),
+                f"{self.label} was chosen and is no longer heard; {heard} is heard instead. "
+                "Nothing was written.",
+                vehicles=(self.label, heard),
                 choose_by=_difference(found, component),
             )
 
@@ -104,13 +107,12 @@ async def connect(
 ) -> AsyncIterator[Session]:
     """Open a link and wait for the component that the options name.
 
-    A log is read as fast as it goes, unless its name says otherwise or somebody looks on live.
-
     Args:
         url: the link.
-        options: which component, and how to reach it.
-        policy, is_live: see `ParamClient` and above.
-        only: whether several vehicles are an error, unless the options name one: for commands that write.
+        options: the component, and the options of the link.
+        policy: as in `ParamClient`.
+        is_live: read a log in real time; otherwise it is read at full speed, unless its name gives a speed.
+        only: whether several vehicles are an error, unless the options name one: for subcommands that write.
 
     Raises:
         UsageError: no such link, or options that exclude each other.
@@ -119,10 +121,10 @@ async def connect(
         LinkError: the link cannot be opened, or failed.
     """
     if options.peer is not None and not options.split_peers:
-        raise UsageError("--peer goes with --split-peers")
+        raise UsageError("--peer needs --split-peers")
     deadline = Deadline(options.timeout)
     async with ParamClient(
-        url if is_live else _at_once(url),
+        url if is_live else _at_full_speed(url),
         cache=None if options.place is True else options.place,
         encoding=options.encoding,
         policy=policy,
@@ -132,34 +134,37 @@ async def connect(
         signing=options.signing,
         split_peers=options.split_peers,
     ) as client:
-        patience = HEARING_PATIENCE if options.timeout is None else deadline.left()
+        timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
         find = client.only_component if only else client.component
-        component = await find(options.system, options.component, peer=options.peer, timeout=patience)
+        component = await find(options.system, options.component, peer=options.peer, timeout=timeout)
         yield Session(client, component, deadline, options)
 
 
 def listen(
     url: str, signing: Signing | None = None, *, listen_only: bool = False, tlog: Path | None = None
 ) -> ParamClient:
-    """A client that counts everything it hears, and neither reads nor writes a cache.
+    """Return a client that counts all traffic, and neither reads nor writes a cache.
 
     Raises:
-        UsageError: no such link, or a service in its place.
+        UsageError: no such link, or the URL of a service.
     """
     if names_service(url):
-        raise UsageError("a service does not give the traffic of its links; ask where such a link is")
+        raise UsageError(
+            f"{url} is a service, which does not report the traffic of its links; run the command with the "
+            "link itself"
+        )
     return ParamClient(url, cache=False, traffic=True, signing=signing, listen_only=listen_only, tlog=tlog)
 
 
 def _difference(found: Component, chosen: Component) -> str:
-    """Return which argument tells two components apart."""
+    """Return the name of the argument that distinguishes two components."""
     if found.system != chosen.system:
         return "system"
     return "component" if found.component != chosen.component else "peer"
 
 
-def _at_once(url: str) -> str:
-    """The same link; a log whose name says nothing of the speed as fast as it goes."""
+def _at_full_speed(url: str) -> str:
+    """Return the link name; for a log without a speed, with the option for full speed."""
     if not url.lower().startswith(f"{LinkKind.REPLAY}:"):
         return url
     spec = parse_link(url)

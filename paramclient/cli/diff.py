@@ -1,4 +1,4 @@
-"""The command that compares: diff."""
+"""The subcommand diff: compares the parameters of files, vehicles in the cache, and links."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from paramclient.provision.vehicle_params import NO_DEFAULTS
 __all__ = ["diff"]
 
 DEFAULTS: Final = "defaults"
-"""The base that is no source of its own; a file of this name is `./defaults`."""
+"""The value of --base for the firmware's defaults; a file of this name is `./defaults`."""
 
 _OPTIONS: Final = LinkOptions()
 
@@ -43,26 +43,26 @@ async def diff(
 ) -> ExitCode:
     """Compare the parameters of two files, links or vehicles in the cache.
 
-    Exit code 0 says that both have the same names with the same values, 1 that they have not.
+    Exit code 0: both have the same names with the same values. Exit code 1: they differ.
 
     Args:
         left: A parameter file; a vehicle in the cache, by its system id, its hardware id in full, uid: and at
             least 6 digits of it, its key, or as cache:VEHICLE; or a link.
-        right: The same.
-        base: A third one, or "defaults" for the firmware's, to see which of the two has moved away from it.
-        only: A name or a pattern such as "MC_*"; all others are left out. It may be given again.
-        partial: A holds only some of the parameters: leave out what only B has.
-        everything: Print also what is the same.
-        metadata: A file that describes parameters. Without it, what is kept of the vehicles' firmware.
+        right: A file, a vehicle in the cache, or a link, like LEFT.
+        base: A third source, or "defaults" for the firmware's defaults, to see which side differs from it.
+        only: Compare only this name or pattern, such as "MC_*". May be given several times.
+        partial: Leave out parameters that only the right side has.
+        everything: Also print parameters that do not differ.
+        metadata: A file that describes parameters. Default: the stored metadata of the vehicles' firmware.
     """
     chosen = from_file(metadata, offline=True)
     third_source = [] if base is None or base == DEFAULTS else [base]
-    ours, theirs, *third = await resolve_all([left, right, *third_source], options)
-    before = _defaults(ours, theirs) if base == DEFAULTS else next(iter(third), None)
+    first, second, *third = await resolve_all([left, right, *third_source], options)
+    before = _defaults(first, second) if base == DEFAULTS else next(iter(third), None)
     if partial:
-        theirs = replace(theirs, params={name: theirs[name] for name in theirs if name in ours})
-    outcome = compare(ours, theirs, base=before, names=only or None)
-    sides = _Sides(ours, theirs, before, options, chosen)
+        second = replace(second, params={name: second[name] for name in second if name in first})
+    outcome = compare(first, second, base=before, names=only or None)
+    sides = _Sides(first, second, before, options, chosen)
     shown = [entry for entry in outcome.entries if everything or entry.is_news]
     if options.json:
         from paramclient.documents.diff import DiffDoc  # only here: loads pydantic
@@ -84,7 +84,7 @@ def _defaults(left: ParamSet, right: ParamSet) -> ParamSet:
 
 
 class _Sides:
-    """What is known of the parameters of each side: firmwares of two ages may call a value differently."""
+    """The metadata of each side: two versions of a firmware may name a value differently."""
 
     def __init__(
         self,
@@ -100,10 +100,11 @@ class _Sides:
         self.is_known = any(each is not None for each in found)
 
     def units(self, name: str) -> str:
+        """Return the units of a parameter, or ""."""
         return units_of(self.left, name) or units_of(self.right, name)
 
 
-# for people
+# Tables
 
 
 def _print(outcome: Comparison, shown: list[Difference], sides: _Sides) -> None:
@@ -117,10 +118,10 @@ def _print(outcome: Comparison, shown: list[Difference], sides: _Sides) -> None:
 
 
 def _cells(entry: Difference, sides: _Sides, *, has_base: bool) -> list[object]:
-    """A row: with a base the values that have moved stand out, else those that differ."""
+    """Return a row; with a base, values that differ from it are coloured, else values that differ."""
     left, right = _shown(entry.left, sides.left), _shown(entry.right, sides.right)
     if left == right and not entry.is_same:
-        left, right = _told_apart(entry.left), _told_apart(entry.right)
+        left, right = _with_bits(entry.left), _with_bits(entry.right)
     style = "bold red" if entry.moved is Moved.CONFLICT else _STYLES[entry.standing]
     together = (Moved.BOTH, Moved.CONFLICT, None)
     base = _shown(entry.base, sides.base)
@@ -136,15 +137,15 @@ def _cells(entry: Difference, sides: _Sides, *, has_base: bool) -> list[object]:
 
 
 def _shown(param: WrittenParam | None, metadata: Metadata | None) -> str | None:
-    """A value, and what it means where that is known: `5 (Loiter)`."""
+    """Return a value with its meaning, if known: `5 (Loiter)`."""
     if param is None:
         return None
     meaning = meaning_of(metadata, param.name, param.value)
     return f"{value_text(param)} ({meaning})" if meaning else value_text(param)
 
 
-def _told_apart(param: WrittenParam | None) -> str | None:
-    """A value with its bits, for two that read alike and are not: NaNs, above all."""
+def _with_bits(param: WrittenParam | None) -> str | None:
+    """Return a value with its bits, for two values with the same text that differ, such as NaNs."""
     if param is None:
         return None
     bits = bits_written(param)
@@ -152,7 +153,7 @@ def _told_apart(param: WrittenParam | None) -> str | None:
 
 
 def _word(entry: Difference) -> str:
-    """What an entry is, in words."""
+    """Return the comparison of an entry in words."""
     more = []
     if entry.types_differ:
         more.append(" and ".join(_type(each) for each in (entry.left, entry.right)))
@@ -166,7 +167,7 @@ def _type(param: WrittenParam | None) -> str:
 
 
 def _summary(outcome: Comparison) -> list[str]:
-    """Who was compared, and how many there are of each kind."""
+    """Return the lines that name the compared sets, and the numbers of entries of each kind."""
     sides = [("left", outcome.left), ("right", outcome.right)]
     if outcome.base is not None:
         sides.append(("base", outcome.base))
@@ -192,3 +193,4 @@ _STYLES: Final = {
     Standing.ONLY_LEFT: "red",
     Standing.ONLY_RIGHT: "green",
 }
+"""Styles of rich for each kind of entry."""

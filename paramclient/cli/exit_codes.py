@@ -1,4 +1,4 @@
-"""How a command ends: exit codes, and the words for what became of a set."""
+"""Exit codes of the command line, and the status words of writes, by error."""
 
 from __future__ import annotations
 
@@ -29,35 +29,38 @@ __all__ = ["ExitCode", "code_of", "status_of", "text_of"]
 
 
 class ExitCode(IntEnum):
-    """Of several that apply, the highest counts."""
+    """The exit codes. If several apply, the highest one is used."""
 
     DONE = 0
+    """The command succeeded."""
     INCOMPLETE = 1
-    """The vehicle refused something, or did not give everything."""
+    """The vehicle refused something, or some parameters are missing."""
     DIFFERENT = 1
-    """What was compared is not the same."""
+    """The compared parameters differ."""
     USAGE = 2
-    """Something was asked for that cannot be right."""
+    """The arguments are invalid."""
     NO_ANSWER = 3
     """No vehicle was heard, or it did not answer."""
     LINK = 4
+    """The link failed."""
     CACHE = 5
+    """The cache failed, or does not have the requested data."""
 
 
 def code_of(error: ParamClientError) -> ExitCode:
-    """The exit code for an error."""
+    """Return the exit code for an error."""
     return next(code for kind, code in _CODES.items() if isinstance(error, kind))
 
 
 def text_of(error: ParamClientError) -> str:
-    """The text of an error for users of the command, who choose by options in the place of arguments."""
+    """Return the message of an error for the command line, with options in place of Python arguments."""
     if isinstance(error, AmbiguousVehicle) and error.choose_by in ("system", "component", "peer"):
         return f"{error.summary} Choose one with --{error.choose_by}."
     return str(error)
 
 
 def status_of(error: ParamClientError) -> str:
-    """What became of a set that ended with this error, in a word."""
+    """Return the status of a write that failed with this error, in a word."""
     return next(status for kind, status in _STATUSES.items() if isinstance(error, kind))
 
 
@@ -69,6 +72,7 @@ _CODES: Final = {
     LinkError: ExitCode.LINK,
     CacheError: ExitCode.CACHE,
 }
+"""Exit codes by class of error; the first class that matches applies."""
 _STATUSES: Final = {
     Refused: "refused",
     FileTransferError: "refused",
@@ -84,3 +88,4 @@ _STATUSES: Final = {
     CacheError: "cache",
     LinkError: "link",
 }
+"""Status words of a failed write by class of error; the first class that matches applies."""

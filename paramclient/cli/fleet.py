@@ -1,4 +1,4 @@
-"""The command fleet diff: which of the vehicles that were ever seen differ, and since when."""
+"""The subcommand fleet diff: compares all vehicles in the cache."""
 
 from __future__ import annotations
 
@@ -25,13 +25,14 @@ def fleet_diff(
     component: Id = None,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Compare all vehicles in the cache: in some parameters with each other, or with a parameter file.
+    """Compare all vehicles in the cache: some parameters with each other, or with a parameter file.
 
-    With each other, those stand out that have another value than most. Exit code 1 says that some do.
+    Without a file, vehicles that differ from the most common value are printed. Exit code 1: some vehicles
+    differ.
 
     Args:
         wanted: Names of parameters, or patterns such as 'MC_*'; or one parameter file.
-        component: This component instead of the autopilot.
+        component: Compare this component instead of the autopilot.
     """
     if not wanted:
         raise UsageError("name the parameters to compare, or a parameter file")
@@ -48,14 +49,14 @@ def fleet_diff(
 
 
 def _chosen(wanted: tuple[str, ...], component: int | None) -> ParamSet | tuple[str, ...]:
-    """What to compare: what a file wants of a component, or names."""
+    """Return the parameters to compare: those of a file for a component, or names."""
     files = [word for word in wanted if "/" in word or "." in word or Path(word).is_file()]
     if not files:
         return tuple(map(check_name, wanted))
     if len(wanted) > 1:
         raise UsageError(f"{files[0]} is a file: name one file, or parameters, not both")
 
-    from paramclient.files import read_file  # only here: it takes its time
+    from paramclient.files import read_file  # only here: takes long to load
 
     file = read_file(files[0])
     for note in file.notes:
@@ -73,7 +74,7 @@ def _print(found: FleetDiff) -> None:
 
 
 def _rows(each: NameSpread, vehicles: int) -> Iterator[tuple[object, ...]]:
-    """A line for what should be, then one for each vehicle that stands out."""
+    """Yield a row for the wanted or most common value, then a row for each vehicle that differs."""
     name: str | None = each.name
     agreeing = [value for value in each.values if value.agrees]
     if each.wanted is not None:
@@ -87,12 +88,12 @@ def _rows(each: NameSpread, vehicles: int) -> Iterator[tuple[object, ...]]:
     for value in each.values:
         for number, holder in enumerate(() if value.agrees else value.holders):
             count_text = None if number else f"{len(value.holders)} of {vehicles}"
-            yield name, _value(value.param), count_text, _since(holder), _who(holder.vehicle)
+            yield name, _value(value.param), count_text, _since(holder), _vehicle_text(holder.vehicle)
             name = None
-    for what, holders in (("lacks it", each.lacking), ("not known", each.unknown)):
+    for label, holders in (("lacks it", each.lacking), ("not known", each.unknown)):
         for number, holder in enumerate(holders):
             count_text = None if number else f"{len(holders)} of {vehicles}"
-            yield name, what, count_text, _since(holder), _who(holder.vehicle)
+            yield name, label, count_text, _since(holder), _vehicle_text(holder.vehicle)
             name = None
 
 
@@ -102,7 +103,7 @@ def _since(holder: Holder) -> str | None:
     return f"{'' if holder.changed else 'before '}{time_text(holder.since)}"
 
 
-def _who(vehicle: FleetVehicle) -> str:
+def _vehicle_text(vehicle: FleetVehicle) -> str:
     return f"{vehicle.system} ({vehicle.key})"
 
 
@@ -114,5 +115,5 @@ def _value(param: Param) -> str:
     return format_value(param.value, param.type)
 
 
-def _number(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
+def _number(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"

@@ -1,4 +1,4 @@
-"""The command history: how the values of a vehicle have changed, and what was set down of them."""
+"""The subcommand history: changes of a vehicle's values, and snapshots of its tables."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ def history(
     snapshots: bool = False,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Print how the values of a vehicle have changed: when, from, to, and by whom. The newest comes last.
+    """Print the changes of a vehicle's values: time, old and new value, author. The newest change is last.
 
-    A set-up that was cut off, as the service ended while it ran, has a line of its own. With --snapshots,
-    print what was set down of its tables instead, each with its number.
+    A set-up that was interrupted by the end of the service has a line of its own. With --snapshots, print the
+    snapshots of the vehicle's tables instead, each with its number.
 
     Args:
         vehicle: Its system id, its hardware id in full, uid: and at least 6 digits of it, or its key.
-        name: This parameter only.
-        component: This component only.
-        since: From this time on only: 2h ago, yesterday, '2026-11-20 14:00'.
-        limit: The newest so many only.
-        snapshots: The snapshots instead of the changes.
+        name: Print only this parameter.
+        component: Print only this component.
+        since: Print only changes from this time on: 2h ago, yesterday, '2026-11-20 14:00'.
+        limit: Print at most this number of changes, the newest ones.
+        snapshots: Print the snapshots instead of the changes.
     """
     begin = None if since is None else parse_time(since, time.time())
     if snapshots and name is not None:
-        raise UsageError("--snapshots lists whole tables: it takes no parameter's name")
+        raise UsageError("--snapshots lists whole tables and takes no parameter name")
     if name is not None:
         check_name(name)
     with ParamCache(options.cache) as cache:
@@ -104,8 +104,8 @@ def _entry_cells(entry: HistoryEntry) -> tuple[object, ...]:
 
 
 def _cut_off_cells(note: CutOff) -> tuple[object, ...]:
-    far = f"{note.done} of {note.total} values" if note.total else "nothing written"
-    return time_text(note.at), note.component, f"({note.kind} cut off)", None, far, note.asked_by
+    progress = f"{note.done} of {note.total} values" if note.total else "nothing written"
+    return time_text(note.at), note.component, f"({note.kind} cut off)", None, progress, note.asked_by
 
 
 def _reason(each: SnapshotSummary) -> str:

@@ -1,4 +1,4 @@
-"""The command that looks at the link itself: link."""
+"""The subcommand link: components, message rates and packet loss on a link."""
 
 from __future__ import annotations
 
@@ -24,18 +24,20 @@ from paramclient.protocol.wire import MAV_AUTOPILOT_INVALID, MAV_TYPE_GCS, enum_
 
 __all__ = ["link"]
 
-LISTENING_TIME: Final = 5.0
-"""Seconds to listen where no terminal shows it live and the user sets no limit."""
+LINK_LISTENING_TIME: Final = 5.0
+"""Seconds to listen without --seconds, if the output is not a terminal."""
 REFRESH_INTERVAL: Final = 0.25
-"""Seconds between two looks."""
-MOST_MESSAGES: Final = 5
-"""Kinds of messages that are named to people, for each component."""
-FIRST_MEASURE: Final = 2.0
+"""Seconds between two updates of the table."""
+MESSAGES_SHOWN_MAX: Final = 5
+"""Kinds of messages that a line names for each component, so that it stays short."""
+MEASURE_DELAY: Final = 2.0
+"""Seconds until the first read that measures the round trip: by then all components are heard."""
 MEASURE_INTERVAL: Final = 4.0
-"""Seconds until the round trip is measured by reading a value, and between two such reads: request and answer
-together take less of the link than our heartbeats."""
+"""Seconds between two reads that measure the round trip: request and response together take less of the link
+than the heartbeats of this client."""
 _UNSIGNED: Final = SigningOptions()
 NO_AUTOPILOT: Final = ("unknown", autopilot_name(MAV_AUTOPILOT_INVALID))
+"""Autopilot names of components that have no parameters to read."""
 
 
 async def link(
@@ -49,23 +51,23 @@ async def link(
     verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False,
     options: SigningOptions = _UNSIGNED,
 ) -> int:
-    """Print who is heard on a link, how much comes, and what is lost on the way.
+    """Print the components on a link, their message rates and the packet loss.
 
-    On a terminal the table is live until Ctrl-C. Elsewhere, and with --json, it is printed once, after
-    --seconds or 5. Loss is counted by the gaps in the frames' sequence numbers.
+    On a terminal the table is live until Ctrl-C. Otherwise, and with --json, it is printed once, after
+    --seconds (default 5). Packet loss is counted by the gaps in the frames' sequence numbers.
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
-        seconds: How long to listen.
-        json: Print JSON, for programs.
-        listen_only: Send nothing, so that no round trip is measured.
-        tlog: Write everything on the link, both ways, to this telemetry log, which must not exist yet.
-        verbose: Tell on stderr what is done, step by step.
+        seconds: Time to listen in seconds.
+        json: Print JSON.
+        listen_only: Send nothing. The round trip is not measured then.
+        tlog: Record all frames of the link, received and sent, in this new telemetry log.
+        verbose: Log each step on stderr.
     """
     is_live = sys.stdout.isatty() and not json
-    limit = seconds if is_live or seconds is not None else LISTENING_TIME
+    limit = seconds if is_live or seconds is not None else LINK_LISTENING_TIME
     async with listen(url, options.signing, listen_only=listen_only, tlog=tlog) as client:
-        report = await _while_measuring(client, _show if is_live else _listen, limit)
+        report = await _run_with_measurements(client, _show if is_live else _listen, limit)
     if not report.frames:
         noise = f" (but {report.bytes_received:,} other bytes)" if report.bytes_received else ""
         raise NoReply(f"anything on {client.link.name}{noise}", attempts=0, waited=report.seconds)
@@ -81,17 +83,18 @@ async def link(
     return ExitCode.DONE
 
 
-async def _while_measuring(
+async def _run_with_measurements(
     client: ParamClient,
-    look: Callable[[ParamClient, float | None], Awaitable[TrafficReport]],
+    listener: Callable[[ParamClient, float | None], Awaitable[TrafficReport]],
     seconds: float | None,
 ) -> TrafficReport:
+    """Run `listener` for at most `seconds` while the round trips are measured; return its report."""
     outcome: TrafficReport | Exception
     async with anyio.create_task_group() as tasks:
-        tasks.start_soon(_measure, client)
+        tasks.start_soon(_measure_round_trips, client)
         try:
-            outcome = await look(client, seconds)
-        except Exception as error:  # out of the group it would come wrapped
+            outcome = await listener(client, seconds)
+        except Exception as error:  # raised here, the task group would wrap it in a group
             outcome = error
         tasks.cancel_scope.cancel()
     if isinstance(outcome, Exception):
@@ -102,14 +105,14 @@ async def _while_measuring(
 async def _listen(client: ParamClient, seconds: float | None) -> TrafficReport:
     deadline = Deadline(seconds)
     while left := deadline.left(REFRESH_INTERVAL):
-        client.traffic_report()  # a link that fails ends it
+        client.traffic_report()  # raises if the link has failed
         await anyio.sleep(left)
     return client.traffic_report()
 
 
 async def _show(client: ParamClient, seconds: float | None) -> TrafficReport:
     with live_view() as draw:
-        deadline = Deadline(seconds)  # from now on: what draws is loaded
+        deadline = Deadline(seconds)  # starts after rich is loaded
         while True:
             report = client.traffic_report()
             if report.frames:
@@ -122,9 +125,9 @@ async def _show(client: ParamClient, seconds: float | None) -> TrafficReport:
             await anyio.sleep(left)
 
 
-async def _measure(client: ParamClient) -> None:
-    """Keep the round trips up to date: each autopilot is asked for a value now and then."""
-    await anyio.sleep(FIRST_MEASURE)
+async def _measure_round_trips(client: ParamClient) -> None:
+    """Read a value of each autopilot every `MEASURE_INTERVAL`, until cancelled."""
+    await anyio.sleep(MEASURE_DELAY)
     async with anyio.create_task_group() as tasks:
         while True:
             for component in client.components.values():
@@ -138,9 +141,10 @@ async def _read_a_value(component: Component) -> None:
         await component.get(0, timeout=MEASURE_INTERVAL)
 
 
-# for people
+# Tables
 
 _COLUMNS: Final = ("from", "what", "v", "frames/s", "bytes/s", "loss", "round trip", "heartbeat")
+"""Columns of the table of components."""
 
 
 def _rows(client: ParamClient, report: TrafficReport) -> Iterator[tuple[object, ...]]:
@@ -163,7 +167,7 @@ def _lines(client: ParamClient, report: TrafficReport) -> Iterator[str]:
     for each in report.components:
         state = "" if each.heartbeat is None else f" {_state(each.heartbeat.system_status)}"
         current = [message for message in each.messages if message.rate]
-        shown = [f"{message.name} {message.rate:.1f}/s" for message in current[:MOST_MESSAGES]]
+        shown = [f"{message.name} {message.rate:.1f}/s" for message in current[:MESSAGES_SHOWN_MAX]]
         more = len(current) - len(shown)
         kinds = f"{', '.join(shown)}{f' and {more} more' if more else ''}" if shown else "silent"
         yield f"{each.system}/{each.component}{state}: {kinds}"

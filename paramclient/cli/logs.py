@@ -1,4 +1,4 @@
-"""What commands make of telemetry logs: import, and a cache that holds no more than one log."""
+"""The subcommand import, and a temporary cache with the content of one telemetry log."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _DEFAULTS: Final = CacheOptions()
 
 
 async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS) -> ExitCode:
-    """Bring what telemetry logs hold into the cache: vehicles, tables and changes, with the logs' times.
+    """Import telemetry logs into the cache: vehicles, tables and changes, with the times of the logs.
 
-    What the cache has of a later time stays as it is, so neither order nor repetition matter. All files are
-    tried even if one cannot be read.
+    Later values in the cache are kept, so neither order nor repetition matters. All files are tried even if
+    one cannot be read.
 
     Args:
         file: A telemetry log (.tlog).
-        files: More of them.
+        files: Further logs.
     """
     found: list[tuple[Path, ImportedTable]] = []
     code = ExitCode.DONE
@@ -50,7 +50,7 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
                 for note in table.notes:
                     report(f"{each.name}, {table.system}/{table.component}: {note}")
             if not tables:
-                report(f"{each} holds no parameters")
+                report(f"{each} has no parameters")
     if options.json:
         from paramclient.documents.command import ImportDoc, ImportedDoc  # only here: loads pydantic
 
@@ -63,11 +63,11 @@ async def import_(file: Path, /, *files: Path, options: CacheOptions = _DEFAULTS
 
 @contextmanager
 def cache_of_log(url: str) -> Iterator[ParamCache]:
-    """A cache that holds what a log does, for the time of the block.
+    """Yield a temporary cache with the content of a telemetry log.
 
     Raises:
-        UsageError: the link's name is none of a log.
-        LinkError: the file cannot be read, or is no telemetry log.
+        UsageError: the link name is invalid.
+        LinkError: the file cannot be read, or is not a telemetry log.
     """
     spec = parse_link(url)
     assert spec.kind is LinkKind.REPLAY

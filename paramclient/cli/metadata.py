@@ -1,4 +1,4 @@
-"""What the commands make of descriptions of parameters, where there are any: names of values, units, help."""
+"""Metadata in the command line: where it comes from, names of values, units, descriptions."""
 
 from __future__ import annotations
 
@@ -40,92 +40,94 @@ __all__ = [
 ]
 
 MetadataChoice: TypeAlias = Annotated[str | None, Parameter(name="--metadata")]
-"""A file that describes parameters, or `vehicle`."""
+"""A metadata file, or `vehicle`."""
 
 VEHICLE: Final = "vehicle"
-"""Asks for what the vehicle itself says, instead of a file."""
-IDENTITY_PATIENCE: Final = 0.5
-"""Seconds that a vehicle has to say which firmware it runs, where something is kept of any firmware."""
-IDENTITY_PAUSE: Final = 0.01
-WORTH_SAYING: Final = 5_000
-"""Bytes of a file that are announced to people: the first, general one is smaller."""
+"""The value of --metadata that downloads the metadata from the vehicle."""
+FIRMWARE_TIMEOUT: Final = 0.5
+"""Seconds to wait for the firmware version of the vehicle, if metadata of any firmware is stored."""
+FIRMWARE_POLL_INTERVAL: Final = 0.01
+"""Seconds between two checks whether the firmware version is known."""
+ANNOUNCED_SIZE_MIN: Final = 5_000
+"""Bytes from which the download of a metadata file is announced: the first, general file is smaller."""
 
 
 def from_file(choice: str | None, *, offline: bool = False) -> Metadata | None:
-    """The descriptions of the file that was chosen; None where none was.
+    """Return the metadata of the file that --metadata names; None if it names none.
 
     Raises:
-        UsageError: it is none, or the vehicle is to be asked where none is spoken to.
+        UsageError: the file has no metadata, or --metadata is `vehicle` in a subcommand without a link.
     """
     if choice == VEHICLE and offline:
-        raise UsageError("--metadata vehicle needs a link; here it takes a file")
+        raise UsageError("--metadata vehicle needs a link; here --metadata takes a file")
     return None if choice in (None, VEHICLE) else read_metadata(choice)
 
 
 async def known_of_session(session: Session, choice: str | None, *, must: bool = False) -> Metadata | None:
-    """What is known of the parameters of the vehicle that is spoken to.
+    """Return the metadata of the vehicle, or None.
 
-    The vehicle itself is asked where that was chosen, or where it must be certain, as for what is written.
-    Else what is kept of its firmware is taken, and nothing is asked.
+    Downloads it from the vehicle if --metadata is `vehicle`, or with `must`, as for values that are written.
+    Otherwise uses the stored metadata of its firmware, without any request.
 
     Raises:
-        UsageError: it must be, and the vehicle does not describe its parameters.
+        UsageError: the vehicle provides no metadata although it is required.
         VehicleError, NoReply, LinkError: as `metadata_of`.
     """
     component = session.component
     if choice == VEHICLE or must:
-        found = await metadata_of(component, timeout=session.deadline.left(), progress=_Reading(session.who))
+        progress = _DownloadNotice(session.label)
+        found = await metadata_of(component, timeout=session.deadline.left(), progress=progress)
         if found is None:
             raise UsageError(
-                f"{session.who} does not describe its parameters; --metadata takes a file that does"
+                f"{session.label} does not describe its parameters; --metadata takes a file that does"
             )
         return found
     cache = session.client.cache
     store = None if cache is None else MetadataStore.beside(cache.path)
     if store is None or not store.has_notes:
         return None
-    with anyio.move_on_after(session.deadline.left(IDENTITY_PATIENCE)):
-        while not component.identity.git_hash:  # noqa: ASYNC110 - nobody tells
-            await anyio.sleep(IDENTITY_PAUSE)
+    with anyio.move_on_after(session.deadline.left(FIRMWARE_TIMEOUT)):
+        while not component.identity.git_hash:  # noqa: ASYNC110 - no event
+            await anyio.sleep(FIRMWARE_POLL_INTERVAL)
     return await anyio.to_thread.run_sync(store.known, component.identity, component.component)
 
 
-class _Reading:
-    """Says on a terminal that it may take a while."""
+class _DownloadNotice:
+    """Announces the download of a large metadata file, once and only on a terminal."""
 
-    def __init__(self, who: str) -> None:
-        self._who = who
-        self._has_said = not sys.stderr.isatty()
+    def __init__(self, vehicle: str) -> None:
+        self._vehicle = vehicle
+        self._is_done = not sys.stderr.isatty()
 
     def __call__(self, received: int, size: int | None) -> None:
-        if not self._has_said and size is not None and size >= WORTH_SAYING:
-            self._has_said = True
-            say(printable(f"reading what {self._who} says of its parameters: {size:,} bytes"))
+        if not self._is_done and size is not None and size >= ANNOUNCED_SIZE_MIN:
+            self._is_done = True
+            say(printable(f"downloading the parameter metadata of {self._vehicle}: {size:,} bytes"))
 
 
 def known_of_table(cache: Path, table: CachedComponent) -> Metadata | None:
-    """What is kept for the firmware that a cached table is of."""
+    """Return the stored metadata of the firmware of a cached table, or None."""
     return MetadataStore.beside(cache).known(table.identity, table.component)
 
 
 def known_of_sets(sets: Sequence[ParamSet], options: LinkOptions) -> list[Metadata | None]:
-    """For each set what is kept for its vehicle's firmware; where it names none, what another one has."""
+    """Return the stored metadata of the firmware of each set; a set without a firmware gets another set's."""
     if options.place is False:
         return [None] * len(sets)
     store = MetadataStore.beside(ParamCache(options.cache).path)
     return store.known_of_sets(sets)
 
 
-# what is to be set
+# Values to write
 
 
 def parse_pairs(words: Sequence[str]) -> list[tuple[str, int | float | str]]:
-    """The parameters and values that `set` is given, as `NAME VALUE` or `NAME=VALUE`.
+    """Parse the arguments of `set`: parameters and values, as `NAME VALUE` or `NAME=VALUE`.
 
-    A value behind an equals sign may be a name, and is then still a text.
+    A value after an equals sign may be the name of a value; it is returned as text.
 
     Raises:
-        UsageError: a name without a value, or what cannot be a name or value.
+        UsageError: a name has no value, or a name or value is invalid.
     """
     pairs: list[tuple[str, int | float | str]] = []
     left = iter(words)
@@ -137,7 +139,7 @@ def parse_pairs(words: Sequence[str]) -> list[tuple[str, int | float | str]]:
                 break
             pairs.append((check_name(name), _number(name, value)))
         elif not text.strip():
-            raise UsageError(f"{name}: there is no value behind the equals sign")
+            raise UsageError(f"{name}: there is no value after the equals sign")
         else:
             number = _number_or_none(name, text)
             pairs.append((check_name(name), text if number is None else number))
@@ -150,24 +152,24 @@ def parse_pairs(words: Sequence[str]) -> list[tuple[str, int | float | str]]:
 def resolved(
     pairs: Iterable[tuple[str, int | float | str]], metadata: Metadata | None
 ) -> list[tuple[str, int | float]]:
-    """The same with a number for every name of a value.
+    """Return the pairs with every name of a value replaced by its number.
 
     Raises:
-        UsageError: a name that is none, or of a parameter that is not described.
+        UsageError: an unknown name of a value, or a parameter without metadata.
     """
     numbers: list[tuple[str, int | float]] = []
     for name, value in pairs:
         if isinstance(value, str):
             info = info_of(metadata, name)
             if info is None:
-                raise UsageError(f"{name}: {value!r} is no number, and {name} is not described")
+                raise UsageError(f"{name}: {value!r} is not a number, and no metadata describes {name}")
             value = info.parse(value)
         numbers.append((name, value))
     return numbers
 
 
 def problems(pairs: Iterable[tuple[str, int | float]], metadata: Metadata | None) -> Iterator[str]:
-    """What speaks against values, in sentences: the vehicle has the last word."""
+    """Yield warnings about values, such as one outside of the range; the vehicle may accept them."""
     for name, value in pairs:
         info = info_of(metadata, name)
         if info is not None and (problem := info.problem(value)) is not None:
@@ -175,40 +177,41 @@ def problems(pairs: Iterable[tuple[str, int | float]], metadata: Metadata | None
 
 
 def info_of(metadata: Metadata | None, name: str) -> ParamInfo | None:
-    """What is known of a parameter."""
+    """Return the metadata of a parameter, or None."""
     return None if metadata is None else metadata.find(name)
 
 
-# what is printed
+# Output
 
 DESCRIBED_COLUMNS: Final = ("meaning", "units")
+"""Columns of a table for which metadata is needed."""
 
 
 def described_cells(metadata: Metadata, param: Param) -> tuple[str, str]:
-    """What stands in these columns."""
+    """Return the cells of `DESCRIBED_COLUMNS` for a parameter."""
     return meaning_of(metadata, param.name, param.value), units_of(metadata, param.name)
 
 
 def meaning_of(metadata: Metadata | None, name: str, value: Value) -> str:
-    """What a value means in a word, or "" where it is only a number."""
+    """Return the meaning of a value in a word, or ""."""
     info = info_of(metadata, name)
     return ("" if info is None else info.text(value)) or ""
 
 
 def units_of(metadata: Metadata | None, name: str) -> str:
-    """The units of a parameter, or "" where there are none or they are not known."""
+    """Return the units of a parameter, or ""."""
     info = info_of(metadata, name)
     return "" if info is None else info.units
 
 
 def needs_reboot(name: str, metadata: Metadata | None) -> bool:
-    """Whether a new value counts only when the vehicle has started again, as far as that is known."""
+    """Return whether a change is known to take effect after a reboot."""
     info = info_of(metadata, name)
     return info is not None and info.reboot_required
 
 
 def print_descriptions(names: Iterable[str], metadata: Metadata) -> None:
-    """Print all that is known of these parameters, for people."""
+    """Print the whole metadata of parameters as text."""
     for name in names:
         info = info_of(metadata, name)
         print_line("")
@@ -218,11 +221,11 @@ def print_descriptions(names: Iterable[str], metadata: Metadata) -> None:
         print_line(f"{name}: {info.short_description}" if info.short_description else name)
         for line in info.long_description.splitlines():
             print_line(f"  {line}" if line.strip() else "")
-        for what, said in _said(info):
-            print_line(f"  {what}: {said}")
+        for label, text in _fields(info):
+            print_line(f"  {label}: {text}")
 
 
-def _said(info: ParamInfo) -> Iterator[tuple[str, str]]:
+def _fields(info: ParamInfo) -> Iterator[tuple[str, str]]:
     units = f" {info.units}" if info.units else ""
     low, high = (None if bound is None else format_value(bound) for bound in (info.minimum, info.maximum))
     if low is not None and high is not None:
@@ -243,18 +246,18 @@ def _said(info: ParamInfo) -> Iterator[tuple[str, str]]:
     if info.is_read_only:
         yield "read-only", "the vehicle sets it"
     if info.reboot_required:
-        yield "reboot", "a new value counts when the vehicle has started again"
+        yield "reboot", "a change takes effect after a reboot"
 
 
 def _number(name: str, text: str) -> int | float:
     number = _number_or_none(name, text)
     if number is None:
-        raise UsageError(f"{name}: {text!r} is no number; 12, 0x1F, -1.5, 1e-3, nan and inf are")
+        raise UsageError(f"{name}: {text!r} is not a number, such as 12, 0x1F, -1.5, 1e-3, nan or inf")
     return number
 
 
 def _number_or_none(name: str, text: str) -> int | float | None:
-    """Read a value exactly: an integer as an int, everything else as a float; None for no number."""
+    """Parse a value exactly: an integer as an int, other numbers as a float; None if it is not a number."""
     try:
         return None if text != text.strip() else number_of(text)
     except UsageError as error:

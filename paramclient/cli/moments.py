@@ -1,4 +1,4 @@
-"""Moments as people write them: `2h ago`, `yesterday 14:00`, ISO times, the number of a snapshot."""
+"""Parsing of times: `2h ago`, `yesterday 14:00`, ISO times, the number of a snapshot."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ WHEN: Final = (
     "a time is written as 2026-11-20T14:00Z, '2026-11-20 14:00' (of this computer's time zone), 14:00, "
     "'yesterday 14:00', yesterday, or '2h 30min ago'"
 )
+"""The accepted formats of a time, for messages."""
 
 _UNITS: Final = {
     **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), 1.0),
@@ -22,6 +23,7 @@ _UNITS: Final = {
     **dict.fromkeys(("d", "day", "days"), 86400.0),
     **dict.fromkeys(("w", "week", "weeks"), 604800.0),
 }
+"""Seconds of each unit of time."""
 _LENGTH: Final = rf"([0-9]{{1,9}}(?:\.[0-9]{{1,9}})?) ?({'|'.join(_UNITS)})(?![a-z])"
 _AGO: Final = re.compile(rf"{_LENGTH}(?: ?{_LENGTH})*(?: ago)?", re.ASCII)
 _MOMENT: Final = re.compile(
@@ -34,15 +36,15 @@ _SNAPSHOT: Final = re.compile(r"[0-9]{1,18}", re.ASCII)
 
 
 def parse_when(text: str, now: float, zone: tzinfo | None = None) -> float | int:
-    """A moment in the past, as `ParamCache.state_at` takes it: a time, or the id of a snapshot.
+    """Parse an argument of `ParamCache.state_at`: a time in the past, or the id of a snapshot.
 
     Args:
-        text: a number without anything else is the id of a snapshot; the rest see `parse_time`.
-        now: unix seconds.
-        zone: of times that name none; None for that of this computer.
+        text: a number alone is the id of a snapshot; for all other texts see `parse_time`.
+        now: the present time in unix seconds.
+        zone: the time zone of times that name none; None for that of this computer.
 
     Raises:
-        UsageError: it is neither, or it is in the future.
+        UsageError: the text is neither, or the time is in the future.
     """
     if _SNAPSHOT.fullmatch(text.strip()):
         return int(text)
@@ -50,18 +52,18 @@ def parse_when(text: str, now: float, zone: tzinfo | None = None) -> float | int
 
 
 def parse_time(text: str, now: float, zone: tzinfo | None = None) -> float:
-    """A time in the past, in unix seconds.
+    """Parse a time in the past; return it in unix seconds.
 
-    A day without a time is its beginning, a time without a day is today's. `yesterday` is the day before by
-    the calendar, `1d ago` 24 hours. The times that this command prints can be read.
+    A day without a time is its midnight, a time without a day is today's. `yesterday` is the calendar day
+    before, `1d ago` is 24 hours ago. The times that paramclient prints are accepted.
 
     Args:
         text: see `WHEN`.
-        now: unix seconds.
-        zone: of times that name none; None for that of this computer.
+        now: the present time in unix seconds.
+        zone: the time zone of times that name none; None for that of this computer.
 
     Raises:
-        UsageError: it is none, or it is in the future.
+        UsageError: the text is not a time, or the time is in the future.
     """
     words = " ".join(text.lower().split())
     try:
@@ -69,7 +71,7 @@ def parse_time(text: str, now: float, zone: tzinfo | None = None) -> float:
     except (ValueError, OverflowError, OSError):  # the 30th of February; the year 0
         at = None
     if at is None or at < 0:
-        raise UsageError(f"{text!r} is no time: {WHEN}")
+        raise UsageError(f"{text!r} is not a time: {WHEN}")
     if at > now:
         raise UsageError(f"{text!r} is in the future")
     return at

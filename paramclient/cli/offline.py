@@ -1,4 +1,4 @@
-"""The commands that need no link: show, cache list, cache path, cache remove, cache copy."""
+"""The subcommands show, cache list, cache path, cache remove and cache copy, which need no link."""
 
 from __future__ import annotations
 
@@ -57,18 +57,17 @@ def show(
     metadata: MetadataChoice = None,
     options: CacheOptions = _DEFAULTS,
 ) -> ExitCode:
-    """Print what was last known of a vehicle, or what a parameter file or a log holds, with no link.
+    """Print the cached parameters of a vehicle, or those of a parameter file or a telemetry log.
 
-    With --changed, exit code 1 says that the firmware's defaults are not known.
+    With --changed, exit code 1: the firmware's defaults are not known.
 
     Args:
-        vehicle: A parameter file; else a vehicle in the cache: its system id, its hardware id in full, uid:
-            and at least 6 digits of it, or its key, also with cache: before it; or replay:FILE, a telemetry
-            log.
-        component: This component only.
-        changed: Only what differs from the firmware's defaults.
-        names: These parameters of a vehicle only, with what is known of them.
-        metadata: A file that describes parameters. Without it, what is kept of the vehicle's firmware.
+        vehicle: A parameter file; a vehicle in the cache: its system id, its hardware id in full, uid: and at
+            least 6 digits of it, or its key, also with the prefix cache:; or replay:FILE, a telemetry log.
+        component: Print only this component.
+        changed: Print only parameters that differ from the firmware's defaults.
+        names: Print only these parameters of a vehicle, with their metadata.
+        metadata: A file that describes parameters. Default: the stored metadata of the vehicle's firmware.
     """
     if vehicle is not None and is_file(vehicle):
         if names or metadata is not None:
@@ -90,7 +89,7 @@ def show(
         print_document(CachedTablesDoc(components=[view.document() for view in views]))
     elif is_list:
         _print_summaries(summaries)
-        say("paramclient show VEHICLE shows one of them: by its system id or its key")
+        say("paramclient show VEHICLE prints the table of one vehicle, by its system id or its key")
     elif not summaries:
         say(f"the cache {printable(cache.place)} is empty")
     for view in [] if options.json else views:
@@ -102,14 +101,14 @@ def show(
 
 
 def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
-    """List the tables in the cache, those of the vehicle seen last first."""
+    """List the tables in the cache, most recently heard vehicles first."""
     with _open(options) as cache:
         summaries = cache.components()
     if options.json:
         from paramclient.documents.cached import CachedListDoc, CachedSummaryDoc  # only here: loads pydantic
 
-        told = [CachedSummaryDoc.of(each) for each in summaries]
-        print_document(CachedListDoc(path=cache.place, components=told))
+        components = [CachedSummaryDoc.of(each) for each in summaries]
+        print_document(CachedListDoc(path=cache.place, components=components))
     elif summaries:
         _print_summaries(summaries)
     else:
@@ -118,7 +117,7 @@ def cache_list(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
 
 
 def cache_path(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
-    """Print where the cache is kept."""
+    """Print the path or the URL of the cache."""
     with _open(options) as cache:
         path = cache.place
     if options.json:
@@ -131,11 +130,11 @@ def cache_path(*, options: CacheOptions = _DEFAULTS) -> ExitCode:
 
 
 def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions = _DEFAULTS) -> ExitCode:
-    """Forget a vehicle: its tables and their history.
+    """Remove a vehicle from the cache: its tables and their history.
 
     Args:
         vehicle: Its system id, its hardware id in full, uid: and at least 6 digits of it, or its key.
-        component: This component's table only.
+        component: Remove only the table of this component.
     """
     with _open(options) as cache:
         key = tables_in(cache, vehicle, component)[0].key
@@ -150,25 +149,25 @@ def cache_remove(vehicle: str, /, *, component: Id = None, options: CacheOptions
 
 
 def cache_copy(source: str, target: str, /, *, json: bool = False) -> ExitCode:
-    """Bring every table of a cache into another one, with history and snapshots, and see that it is there.
+    """Copy every table of a cache to another one, with history and snapshots, and verify the copy.
 
-    What the other one has stays: of each value the later counts, and nothing is there twice. Ended at any
-    moment, it goes on when it is called again.
+    The target keeps what it has: the later of two values is kept, and nothing is duplicated. After an
+    interruption, run the same command again to continue.
 
     Args:
-        source: The cache: a file, or the postgresql:// URL of one that stations share.
-        target: The other one.
-        json: Print JSON, for programs.
+        source: The cache to copy: a file, or the postgresql:// URL of a shared cache.
+        target: The cache to copy to.
+        json: Print JSON.
     """
     if not is_address(source) and not Path(source).is_file():
         raise NotInCache(f"there is no cache {source}")
 
-    def told(key: str, number: int, count: int) -> None:
+    def show_progress(key: str, number: int, count: int) -> None:
         if sys.stderr.isatty():
             say(f"{number} of {count}: {printable(key)}")
 
     with ParamCache(source) as old, ParamCache(target) as new:
-        done = old.copy_to(new, progress=told)
+        done = old.copy_to(new, progress=show_progress)
         place = new.place
     if json:
         from paramclient.documents.cached import CopiedDoc  # only here: loads pydantic
@@ -184,7 +183,7 @@ def cache_copy(source: str, target: str, /, *, json: bool = False) -> ExitCode:
 
 
 def tables_of(options: CacheOptions, vehicle: str, component: int | None) -> list[CachedComponent]:
-    """The cached tables of a vehicle, or that of one of its components.
+    """Return the cached tables of a vehicle, or that of one of its components.
 
     Raises:
         UnknownVehicle, AmbiguousVehicle: as `tables_in`.
@@ -213,13 +212,13 @@ def _has_defaults(table: CachedComponent) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class _View:
-    """What is to be shown of a table.
+    """A cached table, and the part of it to show.
 
     Attributes:
         table: the table.
-        names: the parameters that were named, or none for all.
-        metadata: what is known of them, or None.
-        changed: only what differs from the defaults.
+        names: the named parameters; empty for all.
+        metadata: the metadata of the parameters, or None.
+        changed: whether to show only parameters that differ from the defaults.
     """
 
     table: CachedComponent
@@ -246,7 +245,7 @@ class _View:
         return [params[name] for name in self.names if name in params] if self.names else params.values()
 
     def document(self) -> CachedTableDoc:
-        """The same for programs."""
+        """Return the JSON document."""
         from paramclient.documents.cached import CachedTableDoc  # only here: loads pydantic
 
         return CachedTableDoc.of(self.table, self.params, self.metadata, whole=bool(self.names))
@@ -290,10 +289,12 @@ def _print_table(view: _View) -> None:
         return
     synced = "never complete" if table.synced_at is None else f"synced {time_text(table.synced_at)}"
     crc = "" if table.hash is None else f"; hash {hash_text(table.hash)}"
-    who = f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"
-    number = f"{len(params)} of {table.size} parameters differ from their default" if changed else table.size
-    what = f"{number}: {who}" if changed else f"{number} parameters of {who}"
-    say(printable(f"{what}, {synced}{crc}"))
+    vehicle = f"{table.system}/{table.component} {autopilot_name(table.autopilot)} ({table.key})"
+    if changed:
+        text = f"{len(params)} of {table.size} parameters differ from their default: {vehicle}"
+    else:
+        text = f"{table.size} parameters of {vehicle}"
+    say(printable(f"{text}, {synced}{crc}"))
 
 
 def _value(param: Param) -> str:

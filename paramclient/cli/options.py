@@ -1,4 +1,4 @@
-"""What several commands can be told. The texts below the fields are their help."""
+"""Options that several subcommands share. The texts below the fields are their help."""
 
 from __future__ import annotations
 
@@ -25,37 +25,37 @@ Id: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255)
 
 def _check_seconds(_: object, seconds: float | None) -> None:
     if seconds is not None and not 0 < seconds < math.inf:
-        raise ValueError("It is a number of seconds above 0.")
+        raise ValueError("It must be a number of seconds above 0.")
 
 
 Seconds: TypeAlias = Annotated[float | None, Parameter(validator=_check_seconds)]
-"""A time limit."""
+"""A timeout in seconds."""
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
 class CacheOptions:
-    """Of commands that work with no link."""
+    """Options of subcommands that need no link."""
 
     json: bool = False
-    """Print JSON, for programs."""
+    """Print JSON."""
 
     cache: str | None = None
-    """The cache file, or the postgresql:// URL of one that stations share, instead of the user's own."""
+    """The cache file, or the postgresql:// URL of a shared cache. Default: the user's own cache."""
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True)
 class KeyOptions:
-    """Which signing key, of commands that open a link."""
+    """The signing key, of subcommands that open a link."""
 
     signing_key: Path | None = None
-    """A file with the key for signed messages. Without it, the one that the environment names, if any."""
+    """A file with the key for signed messages. Default: the key that the environment names, if any."""
 
     signing_passphrase: bool = False
-    """Ask for the passphrase of which the key is made, instead."""
+    """Ask for a passphrase, and derive the key from it."""
 
-    _typed: ClassVar[SigningKey | None] = None  # of the class, as the fields of one are options
+    _typed: ClassVar[SigningKey | None] = None  # a class variable, because each field would be an option
 
     def __post_init__(self) -> None:
         if self.signing_passphrase:
@@ -65,10 +65,10 @@ class KeyOptions:
 
     @property
     def key(self) -> SigningKey | None:
-        """The key, if there is one.
+        """The signing key, or None.
 
         Raises:
-            UsageError: it cannot be read.
+            UsageError: the key cannot be read.
         """
         if self._typed is not None:
             return self._typed
@@ -78,14 +78,14 @@ class KeyOptions:
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
 class SigningOptions(KeyOptions):
-    """Of commands that sign what they send and check what comes."""
+    """Options of subcommands that sign sent frames and check received ones."""
 
     signing_policy: SigningPolicy = SigningPolicy.UNSIGNED_RADIOS
-    """What is taken of what comes, where there is a key."""
+    """With a key: which received frames are accepted."""
 
     @property
     def signing(self) -> Signing | None:
-        """As `ParamClient` takes it.
+        """The signing argument of `ParamClient`.
 
         Raises:
             UsageError: the key cannot be read.
@@ -97,53 +97,53 @@ class SigningOptions(KeyOptions):
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
 class LinkOptions(SigningOptions):
-    """Of commands that speak to a vehicle."""
+    """Options of subcommands that communicate with a vehicle."""
 
     json: bool = False
-    """Print JSON, for programs."""
+    """Print JSON."""
 
     system: Id = None
-    """The system to speak to, 1 to 255. Without it, the first one heard; the only one, for what writes."""
+    """System id of the vehicle, 1 to 255. Default: the first one heard; for writes, the only one heard."""
 
     component: Id = None
-    """The component to speak to, 1 to 255. Without it, the autopilot."""
+    """Component id, 1 to 255. Default: the autopilot."""
 
     peer: str | None = None
-    """The peer to speak to, HOST or HOST:PORT, where several have equal ids; goes with --split-peers."""
+    """The peer of the vehicle, HOST or HOST:PORT, if several have equal ids. Needs --split-peers."""
 
     split_peers: bool = False
-    """Take components with equal ids for different ones where they come from different peers."""
+    """Treat components with equal ids as different ones if their messages come from different peers."""
 
     timeout: Seconds = None
-    """Seconds for everything together. Without it, 10 to hear the vehicle, then as many as it takes."""
+    """Timeout for the whole command in seconds. Default: 10 for the first heartbeat, then no limit."""
 
     encoding: Encoding | None = None
-    """How the component lays values into messages, where what it says of itself is wrong."""
+    """Encoding of values in messages, if the component reports a wrong one."""
 
     cache: str | None = None
-    """The cache file, or the postgresql:// URL of one that stations share, instead of the user's own."""
+    """The cache file, or the postgresql:// URL of a shared cache. Default: the user's own cache."""
 
     no_cache: bool = False
     """Neither read nor write a cache."""
 
     listen_only: bool = False
-    """Send nothing, and take what others on the link ask for."""
+    """Send nothing; receive the parameters that other stations on the link request."""
 
     forward: str | None = None
-    """The link to one other program, such as udpout:127.0.0.1:14551, that is to share the vehicle's."""
+    """Share the vehicle's link with one other program over this link, such as udpout:127.0.0.1:14551."""
 
     verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False
-    """Tell on stderr what is done, step by step."""
+    """Log each step on stderr."""
 
     tlog: Path | None = None
-    """Write everything on the link, both ways, to this telemetry log, which must not exist yet."""
+    """Record all frames of the link, received and sent, in this new telemetry log."""
 
     @property
     def place(self) -> str | bool:
-        """Where tables are kept, as `ParamClient` takes it.
+        """The cache argument of `ParamClient`.
 
         Raises:
-            UsageError: a cache was named and none was wanted.
+            UsageError: --cache and --no-cache are both given.
         """
         if self.no_cache and self.cache is not None:
             raise UsageError("--cache and --no-cache exclude each other")
@@ -151,15 +151,15 @@ class LinkOptions(SigningOptions):
 
 
 def _typed_passphrase() -> SigningKey:
-    """The key of a passphrase that the user types, unseen.
+    """Ask for a passphrase without echo; return its key.
 
-    Not to be asked within the event loop, where Ctrl-C would not end it.
+    Must be called outside of the event loop, in which Ctrl-C would not interrupt it.
 
     Raises:
-        UsageError: there is no terminal to ask at, or nothing was typed.
+        UsageError: stdin is not a terminal, or no passphrase was entered.
     """
     if not sys.stdin.isatty():
-        raise UsageError("there is no terminal to ask for the passphrase at")
+        raise UsageError("--signing-passphrase needs a terminal to enter the passphrase")
     try:
         return SigningKey.from_passphrase(getpass.getpass("Signing passphrase: "))
     except EOFError:

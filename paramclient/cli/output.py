@@ -1,7 +1,7 @@
-"""What is printed: JSON for programs, tables and lines for people.
+"""Output of the command line: JSON, tables, lines, progress bars and errors.
 
-Results go to stdout; progress, summaries, warnings and errors to stderr. Text from the wire reaches neither
-as it came: in JSON everything outside ASCII is escaped, and people see `printable` text only.
+Results go to stdout; progress, summaries, warnings and errors to stderr. Text from the wire is never printed
+unchanged: JSON escapes all characters outside ASCII, and all other output is `printable` text.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ __all__ = [
     "say",
 ]
 
-UNLIMITED: Final = 10_000
-"""Columns of an output that is no terminal: nothing is wrapped or cut there."""
+WIDTH_UNLIMITED: Final = 10_000
+"""Width in columns of an output that is not a terminal, so that nothing is wrapped or cut."""
 
 
 @dataclass(frozen=True, slots=True)
 class Coloured:
-    """A cell of a table that is to stand out, in words of rich: `bold red`. It does so on terminals only."""
+    """A cell of a table with a style of rich, such as `bold red`, which only terminals show."""
 
     text: str
     style: str
@@ -52,7 +52,7 @@ class Coloured:
 
 
 def printable(text: str) -> str:
-    """Text that is safe on any terminal: whatever is not printable ASCII becomes `\\x1b`, `\\u202e`, …"""
+    """Return text that is safe on any terminal: characters that are not printable ASCII become `\\x1b`, …"""
     if text.isascii() and text.isprintable():
         return text
     return "".join(
@@ -62,50 +62,50 @@ def printable(text: str) -> str:
 
 
 def milliseconds(seconds: float) -> str:
-    """A short time for people: `103 ms`, and `0.4 ms` where whole ones say nothing."""
+    """Return a time in seconds as milliseconds: `103 ms`, or `0.4 ms` below 10 ms."""
     text = f"{seconds * 1000:.0f}" if seconds >= 0.01 else f"{seconds * 1000:.1f}"
     return f"{text} ms"
 
 
 def default_text(param: Param) -> str | None:
-    """The firmware's default as people see it, or None where it is not known."""
+    """Return the firmware's default as text, or None if it is not known."""
     return None if param.default is None else format_value(param.default, param.type)
 
 
 def by_index(params: Iterable[Param]) -> list[Param]:
-    """In the vehicle's own order; those without an index last, by name."""
+    """Return parameters in the vehicle's order; those without an index last, by name."""
     return sorted(params, key=lambda param: (param.index is None, param.index or 0, param.name))
 
 
-# for programs
+# JSON
 
 
 def print_document(document: Document) -> None:
-    """Print a document of `paramclient.documents` on one line, at once."""
+    """Print a document of `paramclient.documents` on one line, and flush."""
     print(json.dumps(document.as_json(), allow_nan=False), flush=True)
 
 
-# for people
+# Tables and lines
 
 
 def print_line(text: str) -> None:
-    """Print one line of the result, at once."""
+    """Print one line of the result, and flush."""
     print(printable(text), flush=True)
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, right: str = "") -> None:
-    """Print a table: as wide as the terminal allows, and as wide as it needs where there is none.
+    """Print a table, at most as wide as the terminal; without a terminal, as wide as needed.
 
     Args:
-        columns: their headings.
-        rows: their cells; None is an empty one.
-        right: the headings of the columns that are aligned to the right.
+        columns: the headings.
+        rows: the cells of each row; None is an empty cell.
+        right: the headings of the right-aligned columns, separated by spaces.
     """
     from rich.console import Console  # only here: not needed to get started
 
     table = _table(columns, rows, right.split())
-    console = Console(width=None if sys.stdout.isatty() else UNLIMITED)
-    # rich would end the process by itself when the output is closed
+    console = Console(width=None if sys.stdout.isatty() else WIDTH_UNLIMITED)
+    # rich would end the process when the output is closed
     with console.capture() as captured:
         console.print(table)
     lines = [line.rstrip() for line in captured.get().splitlines()]
@@ -114,8 +114,9 @@ def print_table(columns: Sequence[str], rows: Iterable[Sequence[object]], *, rig
 
 @contextmanager
 def live_view() -> Iterator[Callable[[Sequence[str], Iterable[Sequence[object]], Iterable[str]], None]]:
-    """What draws a table with lines below it, each time in the place of the one before, for the time of the
-    block. The last one stays. All columns but the first two are aligned to the right.
+    """Yield a function that draws a table with lines below it, in the place of the one before.
+
+    The last one stays after the block. All columns except the first two are right-aligned.
     """
     from rich.console import Console, Group  # only here: not needed to get started
     from rich.live import Live
@@ -131,18 +132,18 @@ def live_view() -> Iterator[Callable[[Sequence[str], Iterable[Sequence[object]],
 
 
 def report(text: str) -> None:
-    """Tell on stderr what went wrong. Further lines, as the forms of a link name, stay lines."""
+    """Print an error or a warning on stderr. Line breaks, as in the list of link names, are kept."""
     say("\n".join(printable(line) for line in f"paramclient: {text}".splitlines()))
 
 
 def say(text: str) -> None:
-    """Print to stderr what accompanies a result."""
+    """Print a line on stderr that accompanies a result."""
     print(text, file=sys.stderr, flush=True)
 
 
 @contextmanager
 def progress_bar(title: str) -> Iterator[Callable[[Progress], None] | None]:
-    """What draws the progress of a fetch, for the time of the block; None where stderr is no terminal."""
+    """Yield a function that draws the progress of a fetch; None if stderr is not a terminal."""
     if not sys.stderr.isatty():
         yield None
         return

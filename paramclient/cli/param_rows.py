@@ -1,4 +1,4 @@
-"""How parameters without a vehicle are shown: those of a file, and whatever is compared."""
+"""Tables and texts for parameters of files and of compared sets."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["described", "show_file", "value_text"]
 
 
 def show_file(file: ParamFile, component: int | None, *, changed: bool, json: bool) -> ExitCode:
-    """Print what a parameter file holds; see `paramclient show`."""
+    """Print the parameters of a file; see `paramclient show`."""
     sets = file.sets if component is None else [file.choose(component)]
     if changed:
         shown = [_changed(each) for each in sets if any(param.default is not None for param in each.values())]
@@ -40,26 +40,27 @@ def show_file(file: ParamFile, component: int | None, *, changed: bool, json: bo
 
 
 def described(params: ParamSet) -> str:
-    """A set in words: `903 parameters of 1/1 px4 from link sim:px4, 2026-11-20T18:00:00.000Z`."""
-    who = [
+    """Return a set in words: `903 parameters of 1/1 px4 from link sim:px4, 2026-11-20T18:00:00.000Z`."""
+    origin = [
         "" if params.component is None and params.system is None else f"of {address(params)}",
         "" if params.identity is None else autopilot_name(params.identity.autopilot),
         f"from {params.source}" if params.source else "",
     ]
     at = "" if params.at is None else f", {time_text(params.at)}"
-    return " ".join(filter(None, [_counted(len(params)), *who])) + at
+    return " ".join(filter(None, [_counted(len(params)), *origin])) + at
 
 
 def value_text(param: WrittenParam) -> str:
-    """A parameter's value for people."""
+    """Return a parameter's value as text."""
     return _text(param.value, param)
 
 
 _COLUMNS: Final = ("name", "value", "default", "type", "comment")
+"""Columns of the table of a set."""
 
 
 def _print_set(params: ParamSet, *, changed: bool) -> None:
-    """A table of a set; columns that would be empty are left out."""
+    """Print the table of a set, without empty columns."""
     rows = [
         (
             param.name,
@@ -84,7 +85,7 @@ def _print_set(params: ParamSet, *, changed: bool) -> None:
 
 
 def _changed(params: ParamSet) -> ParamSet:
-    """Those whose value differs from the firmware's default."""
+    """Return the parameters whose value differs from the firmware's default."""
     differing = {
         name: param
         for name, param in params.items()

@@ -1,4 +1,4 @@
-"""The commands that speak to a vehicle: fetch, get, set, watch."""
+"""The subcommands fetch, get, set and watch."""
 
 from __future__ import annotations
 
@@ -66,10 +66,10 @@ if TYPE_CHECKING:
 
 __all__ = ["fetch", "get", "set_", "watch"]
 
-REFRESH_PATIENCE: Final = 10.0
-"""Seconds for the values that no hash covers, where the user sets no limit."""
-MOST_INDICES: Final = 20
-"""Missing indices that are named to people."""
+REFRESH_TIMEOUT: Final = 10.0
+"""Seconds to wait for the values that the vehicle's hash does not cover, without --timeout."""
+INDICES_SHOWN_MAX: Final = 20
+"""Missing indices that a message names, so that it stays readable; it gives the number of further ones."""
 
 _DEFAULTS: Final = LinkOptions()
 _News: TypeAlias = Lost | Found | Rebooted | Resynced | Contested | Uncontested
@@ -86,25 +86,25 @@ async def fetch(
     policy: Policy = Policy.AUTO,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
-    """Bring every parameter: from the cache where the vehicle's hash confirms it, else by download.
+    """Fetch all parameters. Uses the cache if the vehicle's hash matches, otherwise downloads.
 
-    Exit code 1 says that some are missing, or with --changed that the firmware's defaults are not known.
+    Exit code 1: some parameters are missing, or with --changed, the firmware's defaults are not known.
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, tcp:HOST:PORT or sim:px4.
-        refresh: Download even what the cache has.
-        changed: Print only what differs from the firmware's defaults.
-        accept: With "sampled", a cached table of a vehicle without a hash is believed when a sample of it
-            agrees, and it is said what that is worth.
-        sample: How many parameters are read for that, 30 without it.
-        policy: What the vehicle may be asked: whatever is needed, only for its hash, or nothing.
+        refresh: Download all parameters even if the cache is up to date.
+        changed: Print only parameters that differ from the firmware's defaults.
+        accept: With "sampled", a cached table of a vehicle without a hash is accepted if a sample of it
+            agrees; the probability that the sample shows a change is printed.
+        sample: Number of parameters in the sample. Default: 30.
+        policy: Requests that may be sent to the vehicle: all that are needed, only for its hash, or none.
     """
     if sample is not None and accept != "sampled":
-        raise UsageError("--sample goes with --accept sampled")
+        raise UsageError("--sample needs --accept sampled")
     async with connect(url, options, policy=policy) as session:
         result = await _fetch_all(session, refresh=refresh, accept=accept, sample=sample or SAMPLE_SIZE)
         with suppress(NoReply):
-            await session.component.refreshed(timeout=session.deadline.left(REFRESH_PATIENCE))
+            await session.component.refreshed(timeout=session.deadline.left(REFRESH_TIMEOUT))
         fetched = _Fetched.of(session, result, policy)
     has_defaults = any(param.default is not None for param in fetched.params)
     if changed:
@@ -124,12 +124,16 @@ async def fetch(
             print_table([*_COLUMNS, "trust", "default"], rows, right="value index default")
         say(printable(fetched.summary))
     if changed and not has_defaults:
-        from paramclient.provision.vehicle_params import NO_DEFAULTS  # only here: brings set-up along
+        from paramclient.provision.vehicle_params import NO_DEFAULTS  # only here: loads provision
 
         report(NO_DEFAULTS)
         return ExitCode.INCOMPLETE
     if fetched.missing:
-        report(f"incomplete: {_named(fetched.missing)} did not come")
+        number = "was" if len(fetched.missing) == 1 else "were"
+        report(
+            f"incomplete: {_index_text(fetched.missing)} of {session.label} {number} not received; run the "
+            "command again to request what is missing"
+        )
         return ExitCode.INCOMPLETE
     return ExitCode.DONE
 
@@ -142,13 +146,13 @@ async def get(
     metadata: MetadataChoice = None,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
-    """Ask the vehicle for single parameters.
+    """Read single parameters from the vehicle.
 
     Args:
         url: The link.
         name: The parameter.
-        names: More of them.
-        metadata: A file that describes parameters; or vehicle, to ask the vehicle for what it says of them.
+        names: Further parameters.
+        metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
     """
     described = from_file(metadata)
     wanted = [check_name(each) for each in dict.fromkeys((name, *names))]
@@ -178,21 +182,21 @@ async def set_(
     metadata: MetadataChoice = None,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
-    """Write parameters, in the order given, and prove by its value that the vehicle has taken each.
+    """Write parameters in the order given, and verify each by the value that the vehicle reports.
 
-    A value is a decimal number, a hexadecimal one (0x1F), nan or inf. Written as NAME=VALUE it may also be
-    the name of a value, or names of bits with | between them, where the parameter is described: the vehicle
-    is asked for that, unless --metadata names a file. All are tried even if one is refused. Where several
-    vehicles are heard, --system has to choose one.
+    A value is a decimal or hexadecimal number (0x1F), nan or inf. As NAME=VALUE, it may also be the name of a
+    value, or names of bits separated by |, if metadata describes the parameter: it is downloaded from the
+    vehicle unless --metadata names a file. All parameters are tried even if one is refused. If several
+    vehicles are heard, --system must choose one.
 
     Args:
         url: The link.
-        pairs: A parameter and its value, as often as wanted; NAME=VALUE is one too.
-        settle: Seconds after the last of them until all are read once more. 1.2 shows what PX4's modules
-            clamp.
+        pairs: A parameter and its value, or NAME=VALUE. May be given several times.
+        settle: Seconds after the last write until all values are read again. 1.2 shows values that PX4's
+            modules clamp.
         force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
-        durable: Go on only when the value and its line of history are on the disk, past a loss of power.
-        metadata: A file that describes parameters; or vehicle, to ask the vehicle for what it says of them.
+        durable: Continue only when the value and its history are on the disk and survive a power loss.
+        metadata: A file that describes parameters; or vehicle, to download the vehicle's own metadata.
     """
     wanted = parse_pairs(pairs)
     described = from_file(metadata)
@@ -215,7 +219,7 @@ async def set_(
             outcomes = [await _read_again(session, outcome) for outcome in outcomes]
         client = session.client
         summary = (
-            f"{sum(not outcome.reason for outcome in outcomes)} of {len(outcomes)} set on {session.who} in "
+            f"{sum(not outcome.reason for outcome in outcomes)} of {len(outcomes)} set on {session.label} in "
             f"{anyio.current_time() - began:.2f} s, "
             f"{client.bytes_received:,} bytes received, {client.bytes_sent:,} sent"
         )
@@ -232,7 +236,7 @@ async def set_(
         say(summary)
     late = {each.name: None for each in outcomes if not each.reason and needs_reboot(each.name, described)}
     if late:
-        say(printable(f"to count when the vehicle has started again: {', '.join(late)}"))
+        say(printable(f"takes effect after a reboot: {', '.join(late)}"))
     for outcome in outcomes:
         if outcome.note:
             say(printable(f"{outcome.name}: {outcome.note}"))
@@ -244,16 +248,16 @@ async def set_(
 async def watch(
     url: str, /, *names: str, policy: Policy = Policy.AUTO, options: LinkOptions = _DEFAULTS
 ) -> int:
-    """Print every change of a value as it happens, whoever caused it, until Ctrl-C.
+    """Print changes of values by any source, as they happen, until Ctrl-C or --timeout.
 
-    What is known is brought up to date first; what has changed since the cache was written is printed too,
-    and so is when the vehicle is lost, found, has started again, or its table agrees with the one here again.
-    With --timeout it ends by itself.
+    Updates the table first, and also prints values that have changed since the cache was written. Also prints
+    when the vehicle is lost, found or rebooted, and when its table matches again.
 
     Args:
         url: The link.
-        names: The parameters to watch; without any, all of them.
-        policy: What the vehicle may be asked beside NAMES: whatever is needed, only for its hash, or nothing.
+        names: The parameters to watch. Default: all.
+        policy: Requests that may be sent besides those for NAMES: all that are needed, only for the hash, or
+            none.
     """
     wanted = [check_name(each) for each in dict.fromkeys(names)]
     async with connect(url, options, policy=policy, is_live=True) as session:
@@ -264,11 +268,11 @@ async def watch(
             if errors:
                 return _report_all(errors.values())
         elif not listens:
-            with suppress(CacheError):  # there may be nothing in it: then all that is heard is new
+            with suppress(CacheError):  # with an empty cache, all received parameters are new
                 await _fetch_all(session)
         known = None if listens else set(session.component.params)
-        what = ", ".join(wanted) if wanted else f"{len(session.component.params)} parameters"
-        say(printable(f"watching {what} of {session.who}"))
+        watched = ", ".join(wanted) if wanted else f"{len(session.component.params)} parameters"
+        say(printable(f"watching {watched} of {session.label}"))
         with anyio.move_on_after(session.deadline.left()):
             await _print_news(
                 session, changes, events, known, frozenset(wanted), as_lines_of_json=options.json
@@ -281,11 +285,10 @@ async def watch(
 
 @dataclass(frozen=True, slots=True)
 class _Fetched:
-    """What the vehicle has given or confirmed in this session.
+    """The parameters that were received or confirmed in this session.
 
-    A value that only the cache knows is left out, and its index is missing like one that did not come; but
-    where the policy keeps it from being asked for, or a sample speaks for it, it is among the others, and
-    named in `cached`.
+    A value that is only cached is left out, and its index counts as missing. If the policy prevents its
+    request, or a sample confirms the table, it is included and named in `cached`.
     """
 
     session: Session
@@ -328,13 +331,13 @@ class _Fetched:
         lost = "" if result.source == "cache" else f"{result.lost} lost, {result.repeated} repeated, "
         trip = "" if result.round_trip is None else f"round trip {milliseconds(result.round_trip)}, "
         return (
-            f"{self.received}{of} parameters of {self.session.who} from {result.source} in "
+            f"{self.received}{of} parameters of {self.session.label} from {result.source} in "
             f"{result.elapsed:.2f} s, {lost}{trip}{self.bytes_received:,} bytes received, "
             f"{self.bytes_sent:,} sent{crc}"
         )
 
     def document(self) -> FetchedDoc:
-        """The same for programs."""
+        """Return the JSON document."""
         from paramclient.documents.command import FetchedDoc  # only here: loads pydantic
 
         return FetchedDoc.of(
@@ -351,7 +354,7 @@ class _Fetched:
 async def _fetch_all(
     session: Session, *, refresh: bool = False, accept: str = "verified", sample: int = SAMPLE_SIZE
 ) -> FetchResult:
-    with progress_bar(f"fetching {session.who}") as progress:
+    with progress_bar(f"fetching {session.label}") as progress:
         return await session.component.fetch_all(
             refresh=refresh,
             accept=accept,
@@ -362,25 +365,27 @@ async def _fetch_all(
 
 
 def _confidence(sample: Sample) -> str:
-    """What a sample that agreed is worth, in words."""
-    chances = " and ".join(f"{sample.confidence(each):.0%} for {each}" for each in _SUPPOSED)
+    """Return the probabilities that the sample would have shown a change, in words."""
+    chances = " and ".join(f"{sample.confidence(each):.0%} for {each}" for each in _ASSUMED_CHANGES)
     return (
-        f"{sample.size} of {sample.count} parameters were read and agreed. If others had changed, the chance "
-        f"to see it so is {chances} of them."
+        f"{sample.size} of {sample.count} parameters were read and agreed. If other parameters had changed, "
+        f"the probability that the sample shows it is {chances} of them."
     )
 
 
-def _named(indices: Sequence[int]) -> str:
-    shown = ", ".join(map(str, indices[:MOST_INDICES]))
-    more = len(indices) - MOST_INDICES
+def _index_text(indices: Sequence[int]) -> str:
+    shown = ", ".join(map(str, indices[:INDICES_SHOWN_MAX]))
+    more = len(indices) - INDICES_SHOWN_MAX
     return f"ind{'ex' if len(indices) == 1 else 'ices'} {shown}{f' and {more} more' if more > 0 else ''}"
 
 
-_SUPPOSED: Final = (1, 10, 100)  # parameters that may have changed
+_ASSUMED_CHANGES: Final = (1, 10, 100)
+"""Numbers of changed parameters for which the probability is given that a sample detects the change."""
 
 # get
 
 _COLUMNS: Final = ("name", "value", "type", "index")
+"""Columns of the table of parameters."""
 
 
 def _cells(param: Param) -> tuple[object, ...]:
@@ -388,7 +393,7 @@ def _cells(param: Param) -> tuple[object, ...]:
 
 
 async def _get_all(session: Session, names: Sequence[str]) -> tuple[list[Param], dict[str, ParamClientError]]:
-    """Read several side by side; what came and what did not, both in the order of the names."""
+    """Read several parameters concurrently; return parameters and errors in the order of the names."""
     found: dict[str, Param] = {}
     errors: dict[str, ParamClientError] = {}
 
@@ -408,7 +413,7 @@ async def _get_all(session: Session, names: Sequence[str]) -> tuple[list[Param],
 
 
 def _report_all(errors: Iterable[ParamClientError]) -> int:
-    """Tell every error; the exit code for all of them."""
+    """Print every error; return the exit code for all of them."""
     worst = ExitCode.DONE
     for error in errors:
         report(str(error))
@@ -421,9 +426,18 @@ def _report_all(errors: Iterable[ParamClientError]) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Written:
-    """What became of one set; `reason` is empty where it was done, and `param` is what was acknowledged.
+    """The outcome of one write.
 
-    `note` says what else is to be known of it.
+    Attributes:
+        name: param_id.
+        type: the vehicle's type of the parameter.
+        requested: the value that was requested.
+        actual: the value that the vehicle has, or None if unknown.
+        status: the outcome in a word.
+        reason: the cause of a failure; "" for a success.
+        code: the exit code.
+        param: the acknowledged parameter, or None.
+        note: a remark on the outcome, or "".
     """
 
     name: str
@@ -437,7 +451,7 @@ class _Written:
     note: str = ""
 
     def document(self, metadata: Metadata | None) -> SetDoneDoc:
-        """The same for programs."""
+        """Return the JSON document."""
         from paramclient.documents.command import SetDoneDoc  # only here: loads pydantic
 
         return SetDoneDoc.of(
@@ -483,13 +497,13 @@ async def _write(session: Session, name: str, value: int | float, *, force: bool
 
 
 async def _read_again(session: Session, written: _Written) -> _Written:
-    """What has become of a value since it was acknowledged."""
+    """Read a written value again; return the outcome with the present value."""
     if written.param is None:
         return written
     try:
         param = await session.component.get(written.name, timeout=session.deadline.left())
     except ParamClientError as error:
-        reason = f"acknowledged, and not read once more: {error}"
+        reason = f"acknowledged, but the second read failed: {error}"
         return replace(written, actual=None, status=status_of(error), reason=reason, code=code_of(error))
     if param.same_value(written.param):
         return written
@@ -508,9 +522,16 @@ async def _print_news(
     *,
     as_lines_of_json: bool,
 ) -> None:
-    """Print changes, and what becomes of the component, until cancelled.
+    """Print changes and events of the component until cancelled.
 
-    A parameter that has just been heard for the first time is no change; None: whichever it is.
+    Args:
+        session: the session.
+        changes: the changes of the component.
+        events: the events of the client.
+        known: names of the table at the start. The first value of any other parameter is not a change. None:
+            the first value of every parameter is not a change.
+        wanted: the names to watch; empty for all.
+        as_lines_of_json: print JSON instead of text.
     """
     async with aclosing(_merged(changes, events)) as news:
         async for each in news:
@@ -533,7 +554,7 @@ async def _print_news(
 
 
 async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | Event]:
-    """What comes from either of them, as it comes."""
+    """Yield changes and events in the order of their arrival."""
     waiting: dict[asyncio.Future[Change | Event], Changes | Events] = {}
 
     def wait(feed: Changes | Events) -> None:
@@ -546,17 +567,17 @@ async def _merged(changes: Changes, events: Events) -> AsyncGenerator[Change | E
             done, _ = await asyncio.wait(waiting, return_when=asyncio.FIRST_COMPLETED)
             for each in [each for each in waiting if each in done]:
                 feed = waiting.pop(each)
-                if not isinstance(each.exception(), StopAsyncIteration):  # else a log is over
+                if not isinstance(each.exception(), StopAsyncIteration):  # else a log has ended
                     wait(feed)
                     yield each.result()
     finally:
         for each in waiting:
             if not each.cancel():
-                each.exception()  # both end with the link; one of them is told
+                each.exception()  # both end with the link; one error is reported
 
 
 def _line(news: Change | _News, at: float) -> Document:
-    """What has happened, for programs."""
+    """Return the JSON document of a change or an event."""
     from paramclient.documents.command import ChangeLineDoc, EventLineDoc  # only here: loads pydantic
 
     return ChangeLineDoc.of(news, at) if isinstance(news, Change) else EventLineDoc.of(news, at)
@@ -573,16 +594,16 @@ def _change_text(change: Change) -> str:
 def _event_text(event: _News) -> str:
     match event:
         case Lost():
-            what = f"lost: not heard for {event.silence:.1f} s"
+            text = f"lost: not heard for {event.silence:.1f} s"
         case Found():
-            what = f"found after {event.silence:.1f} s"
+            text = f"found after {event.silence:.1f} s"
         case Rebooted():
-            what = "has started again"
+            text = "rebooted"
         case Contested():
-            what = f"contested: {'; '.join(event.contest.claimants)}"
+            text = f"contested: {'; '.join(event.contest.claimants)}"
         case Uncontested():
-            what = "contested no more"
+            text = "no longer contested"
         case Resynced():
-            number = len(event.changed)
-            what = f"resynced: {number or 'nothing'} had moved"
-    return f"{event.component.system}/{event.component.component} {what}"
+            count = len(event.changed)
+            text = f"resynced: {count or 'no'} {'value' if count == 1 else 'values'} had changed"
+    return f"{event.component.system}/{event.component.component} {text}"

@@ -1,4 +1,4 @@
-"""The command ports: which serial ports there are, and which of them are autopilots."""
+"""The subcommand ports: lists serial ports, and marks autopilots."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def ports(*, json: bool = False) -> ExitCode:
     Needs the extra `serial`: pip install 'paramclient[serial]'.
 
     Args:
-        json: Print JSON, for programs.
+        json: Print JSON.
     """
     found = list_ports()
     if json:
@@ -26,7 +26,7 @@ def ports(*, json: bool = False) -> ExitCode:
         columns = ["device", "autopilot", "product", "manufacturer", "usb id", "link"]
         print_table(columns, map(_port_cells, found))
     else:
-        say("there are no serial ports")
+        say("this computer has no serial ports")
     return ExitCode.DONE
 
 

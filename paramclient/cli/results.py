@@ -1,4 +1,4 @@
-"""How set-ups are shown: what is to be done, what became of it, and how a vehicle compares."""
+"""Tables and exit codes of set-ups: plans, results of apply and restore, comparisons."""
 
 from __future__ import annotations
 
@@ -38,32 +38,34 @@ __all__ = [
     "verified_doc",
 ]
 
-MOST_NAMED: Final = 10
-"""Parameters that are named in one line."""
+RESULT_NAMES_MAX: Final = 10
+"""Parameters that a line names, so that it stays short; it gives the number of further ones."""
 
 
 @dataclass(frozen=True, slots=True)
 class Vehicle:
-    """A vehicle as it is called in what is printed.
+    """A vehicle as the output names it.
 
     Attributes:
-        system, component: its address when the command began.
-        who: in words, `1/1 px4`.
+        system: its system id at the start of the command.
+        component: its component id.
+        label: its address and autopilot, `1/1 px4`.
     """
 
     system: int
     component: int
-    who: str
+    label: str
 
 
 Cells: TypeAlias = list[object]
+"""The cells of a row."""
 
 
-# what was done
+# Results
 
 
 def show_applied(results: Mapping[Vehicle, ApplyResult], *, full: bool) -> None:
-    """Print one table of what became of each value, and a line for each vehicle on stderr."""
+    """Print one table of the outcome for each value, and a line for each vehicle on stderr."""
     _print(
         ["name", "before", "wanted", "now", "status", "reason"],
         {
@@ -72,45 +74,45 @@ def show_applied(results: Mapping[Vehicle, ApplyResult], *, full: bool) -> None:
         },
     )
     for vehicle, result in results.items():
-        say(printable(f"{vehicle.who}: {_counted(result.counts, ApplyStatus)} in {result.elapsed:.1f} s"))
+        say(printable(f"{vehicle.label}: {_counted(result.counts, ApplyStatus)} in {result.elapsed:.1f} s"))
         if (result.system, result.component) != (vehicle.system, vehicle.component):
             say(f"{vehicle.system}/{vehicle.component} is {result.system}/{result.component} now")
         if result.reboot_required:
             names = _listed(result.reboot_required)
-            say(printable(f"{vehicle.who}: takes effect after a reboot: {names}"))
+            say(printable(f"{vehicle.label}: takes effect after a reboot: {names}"))
         if result.error is not None:
-            report(f"{vehicle.who}: {result.error}; run it again to go on from here")
+            report(f"{vehicle.label}: {result.error}; run it again to continue")
 
 
 def show_interrupted(rows: Mapping[Vehicle, Sequence[ApplyRow]]) -> None:
-    """Print what became of each value before somebody ended it."""
+    """Print the outcome for each value before Ctrl-C ended the command."""
     _print(
         ["name", "before", "wanted", "now", "status", "reason"],
         {vehicle: map(_applied_cells, each) for vehicle, each in rows.items()},
     )
-    taken = sum(row.status is ApplyStatus.UNPROVEN for each in rows.values() for row in each)
+    unproven = sum(row.status is ApplyStatus.UNPROVEN for each in rows.values() for row in each)
     say(
-        f"interrupted: {_number(taken, 'value')} acknowledged, not proven, and others may be on their way; "
-        "run it again to go on from what the vehicle has"
+        f"interrupted: {_number(unproven, 'value')} acknowledged, not proven, and others may be in flight; "
+        "run it again to continue"
     )
 
 
 def applied_code(result: ApplyResult) -> ExitCode:
-    """How a command ends with this result."""
+    """Return the exit code for a result."""
     if result.complete:
         return ExitCode.DONE
     return ExitCode.INCOMPLETE if result.error is None else max(ExitCode.INCOMPLETE, code_of(result.error))
 
 
 def applied_doc(vehicle: Vehicle, result: ApplyResult, *, full: bool) -> ApplyResultDoc:
-    """The result for one vehicle, for programs; values that it had already only on demand."""
+    """Return the JSON document of the result for one vehicle; unchanged values only if `full`."""
     from paramclient.documents.setup import ApplyResultDoc  # only here: loads pydantic
 
     return ApplyResultDoc.of(result, system=vehicle.system, component=vehicle.component, full=full)
 
 
 def interrupted_doc(vehicle: Vehicle, rows: Iterable[ApplyRow]) -> InterruptedDoc:
-    """The same for what was ended by somebody."""
+    """Return the JSON document of a set-up that Ctrl-C ended."""
     from paramclient.documents.setup import InterruptedDoc  # only here: loads pydantic
 
     return InterruptedDoc.of(rows, system=vehicle.system, component=vehicle.component)
@@ -127,25 +129,25 @@ def _applied_cells(row: ApplyRow) -> Cells:
     ]
 
 
-# what is to be done
+# Plans
 
 
 def show_planned(plans: Mapping[Vehicle, Plan], *, reboot: bool, full: bool) -> None:
-    """Print what would be sent, in its order, and what would not be and why."""
+    """Print the values that would be sent, in their order, and the reasons for all others."""
     _print(
         ["stage", "name", "before", "wanted", "status", "reason"],
         {vehicle: _planned_rows(plan, reboot=reboot, full=full) for vehicle, plan in plans.items()},
         right="stage",
     )
     for vehicle, plan in plans.items():
-        say(printable(f"{vehicle.who}: {_counted(plan.counts, PlanStatus, _PLAN_WORDS)}; nothing was sent"))
+        say(printable(f"{vehicle.label}: {_counted(plan.counts, PlanStatus, _PLAN_WORDS)}; nothing was sent"))
         if plan.reboot_for and not reboot:
             names = _listed(plan.reboot_for)
-            say(printable(f"{vehicle.who}: would take effect after a reboot: {names}"))
+            say(printable(f"{vehicle.label}: would take effect after a reboot: {names}"))
 
 
 def planned_code(plan: Plan, *, skip_invalid: bool) -> ExitCode:
-    """How `apply` would end, as far as that can be known."""
+    """Return the exit code of `apply` that is expected from the plan."""
     if plan.of(PlanStatus.INVALID):
         return ExitCode.INCOMPLETE if skip_invalid else ExitCode.USAGE
     is_missing = any(
@@ -155,7 +157,7 @@ def planned_code(plan: Plan, *, skip_invalid: bool) -> ExitCode:
 
 
 def planned_doc(vehicle: Vehicle, plan: Plan, *, full: bool) -> PlanDoc:
-    """The plan for one vehicle, for programs."""
+    """Return the JSON document of the plan for one vehicle."""
     from paramclient.documents.setup import PlanDoc  # only here: loads pydantic
 
     return PlanDoc.of(plan, system=vehicle.system, component=vehicle.component, full=full)
@@ -173,7 +175,7 @@ def _planned_rows(plan: Plan, *, reboot: bool, full: bool) -> Iterator[Cells]:
     if reboot and not has_started and (plan.reboot_for or plan.unstarted):
         yield [None, None, None, None, Coloured("reboot", "yellow"), "the vehicle reboots"]
     for row in plan.rows.values():
-        if row.status is not PlanStatus.SET and (full or _is_worth_telling(row)):
+        if row.status is not PlanStatus.SET and (full or _is_notable(row)):
             yield [None, *_planned_cells(row)]
 
 
@@ -187,15 +189,15 @@ def _planned_cells(row: PlanRow) -> Cells:
     ]
 
 
-def _is_worth_telling(row: PlanRow) -> bool:
+def _is_notable(row: PlanRow) -> bool:
     return row.status is not PlanStatus.UNCHANGED and row.differs
 
 
-# how it compares
+# Comparisons
 
 
 def show_verified(plans: Mapping[Vehicle, Plan], *, full: bool) -> None:
-    """Print what is not as it should be."""
+    """Print the parameters that differ; all parameters if `full`."""
     _print(
         ["name", "wanted", "now", "is", "reason"],
         {
@@ -208,16 +210,16 @@ def show_verified(plans: Mapping[Vehicle, Plan], *, full: bool) -> None:
         for row in plan.rows.values():
             words[row.standing] = words.get(row.standing, 0) + 1
         counted = ", ".join(f"{number} {word}" for word, number in sorted(words.items(), key=_by_word))
-        say(printable(f"{vehicle.who}: {counted or 'nothing to compare'}"))
+        say(printable(f"{vehicle.label}: {counted or 'nothing to compare'}"))
 
 
 def met_code(plan: Plan) -> ExitCode:
-    """Whether the vehicle is as it should be."""
+    """Return the exit code of a comparison."""
     return ExitCode.DONE if plan.is_met else ExitCode.DIFFERENT
 
 
 def verified_doc(vehicle: Vehicle, plan: Plan, *, full: bool) -> VerifiedDoc:
-    """How one vehicle compares, for programs."""
+    """Return the JSON document of the comparison of one vehicle."""
     from paramclient.documents.setup import VerifiedDoc  # only here: loads pydantic
 
     return VerifiedDoc.of(plan, system=vehicle.system, component=vehicle.component, full=full)
@@ -238,7 +240,7 @@ def _by_word(counted: tuple[str, int]) -> int:
     return list(_STANDING_STYLES).index(counted[0])
 
 
-# what these have in common
+# Shared by all tables
 
 _STYLES: Final = {
     ApplyStatus.SET: "green",
@@ -249,6 +251,7 @@ _STYLES: Final = {
     ApplyStatus.UNPROVEN: "yellow",
     ApplyStatus.FAILED: "bold red",
 }
+"""Styles of rich for each outcome."""
 _PLAN_STYLES: Final = {
     PlanStatus.SET: "green",
     PlanStatus.LATER: "yellow",
@@ -256,12 +259,15 @@ _PLAN_STYLES: Final = {
     PlanStatus.SKIPPED: "dim",
     PlanStatus.INVALID: "bold red",
 }
-_PLAN_WORDS: Final = {PlanStatus.SET: "to set", PlanStatus.LATER: "that may come to light"}
+"""Styles of rich for each planned action."""
+_PLAN_WORDS: Final = {PlanStatus.SET: "to set", PlanStatus.LATER: "that may be revealed"}
+"""Words for planned actions in the summary, where they differ from the status."""
 _STANDING_STYLES: Final = {"same": "", "different": "yellow", "missing": "red", "left out": "dim"}
+"""Styles of rich for each comparison; the keys are in the order of the summary."""
 
 
 def _print(columns: Sequence[str], tables: Mapping[Vehicle, Iterable[Cells]], *, right: str = "") -> None:
-    """One table for all; who it is stands in front where there are several."""
+    """Print one table for all vehicles; with several, the first column names the vehicle."""
     is_one = len(tables) == 1
     rows = [
         [*([] if is_one else [f"{vehicle.system}/{vehicle.component}"]), *cells]
@@ -285,14 +291,14 @@ def _like(row: ApplyRow | PlanRow) -> str:
 
 
 def _counted(counts: Mapping[Any, int], kinds: Iterable[Any], words: Mapping[Any, str] | None = None) -> str:
-    told = [f"{counts[kind]} {(words or {}).get(kind, kind)}" for kind in kinds if counts.get(kind)]
-    return ", ".join(told) or "nothing to set"
+    counted = [f"{counts[kind]} {(words or {}).get(kind, kind)}" for kind in kinds if counts.get(kind)]
+    return ", ".join(counted) or "nothing to set"
 
 
 def _listed(names: Sequence[str]) -> str:
-    more = len(names) - MOST_NAMED
-    return ", ".join(names[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+    more = len(names) - RESULT_NAMES_MAX
+    return ", ".join(names[:RESULT_NAMES_MAX]) + (f" and {more} more" if more > 0 else "")
 
 
-def _number(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
+def _number(count: int, noun: str) -> str:
+    return f"{count} {noun}{'' if count == 1 else 's'}"

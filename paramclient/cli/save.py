@@ -1,4 +1,4 @@
-"""The command save: the parameters of a vehicle, or those last known of one, into a file."""
+"""The subcommand save: writes the parameters of a vehicle, or its cached ones, to a file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.offline import tables_of
 from paramclient.cli.options import CacheOptions, LinkOptions
 from paramclient.cli.output import print_document, printable, progress_bar, report, say
-from paramclient.cli.sources import check_link, confirmed, names_vehicle
+from paramclient.cli.sources import check_link, collect_confirmed, names_vehicle
 from paramclient.client.component import Component
 from paramclient.errors import UsageError
 from paramclient.files import FileForm, write_file
@@ -41,28 +41,29 @@ async def save(
     refresh: bool = False,
     options: LinkOptions = _DEFAULTS,
 ) -> int:
-    """Write the parameters of a vehicle into a file, in the form of any ground station.
+    """Write the parameters of a vehicle to a file, in the file format of any ground station.
 
-    What is there is replaced when all of the new file is on the disk. A table that is not complete is not
-    written: exit code 1 says so, as it does with --changed where nothing differs or no defaults are known.
+    An existing file is replaced once the new one is completely on the disk. An incomplete table is not
+    written. Exit code 1: the table is incomplete, or with --changed, no parameter differs or the defaults are
+    not known.
 
     Args:
-        where: The link, such as udpin:0.0.0.0:14550 or sim:px4; or with no link a vehicle in the cache: its
-            system id, its hardware id in full, uid: and at least 6 digits of it, or its key.
-        file: The file. Its ending names the form: .params, .parm, .param, .pck, .json, .yaml.
-        form: The form, where the ending does not name it.
-        changed: Only what differs from the firmware's defaults.
-        all_: All components of the vehicle, where the form can hold several.
-        refresh: Download even what the cache has.
+        where: The link, such as udpin:0.0.0.0:14550 or sim:px4; or a vehicle in the cache: its system id, its
+            hardware id in full, uid: and at least 6 digits of it, or its key.
+        file: The file. Its ending determines the file format: .params, .parm, .param, .pck, .json, .yaml.
+        form: The file format, if the ending does not determine it.
+        changed: Write only parameters that differ from the firmware's defaults.
+        all_: Write all components of the vehicle, if the file format can hold several.
+        refresh: Download all parameters even if the cache is up to date.
     """
     form = form_of_name(str(file)) if form is None else form
     if form is FileForm.PX4_SCRIPT:
-        raise UsageError("start scripts of PX4 are read and not written; choose another form")
+        raise UsageError("start scripts of PX4 cannot be written, only read; choose another file format")
     if all_ and options.component is not None:
         raise UsageError("--all and --component exclude each other")
     if names_vehicle(where):
         if refresh:
-            raise UsageError("--refresh goes with a link")
+            raise UsageError(f"--refresh needs a link; {where!r} is a vehicle in the cache")
         sets, faults = _from_cache(where, options, all_=all_, changed=changed)
     else:
         check_link(where)
@@ -71,7 +72,7 @@ async def save(
         report(fault)
     if sets:
         await anyio.to_thread.run_sync(lambda: write_file(file, sets, form=form))
-        _tell(file, form, sets, as_json=options.json)
+        _show(file, form, sets, as_json=options.json)
     else:
         report(f"nothing was written to {file}")
     return ExitCode.INCOMPLETE if faults or not sets else ExitCode.DONE
@@ -80,18 +81,18 @@ async def save(
 async def _from_link(
     url: str, options: LinkOptions, *, all_: bool, refresh: bool, changed: bool
 ) -> tuple[list[ParamSet], list[str]]:
-    """What the components have given or confirmed in this session, and what is wrong with it."""
+    """Return the parameters received or confirmed in this session, and sentences on incomplete tables."""
     sets: list[ParamSet] = []
     faults: list[str] = []
     async with connect(url, options) as session:
         fetched, silent = await _fetch(session, all_=all_, refresh=refresh)
         faults += silent
         for component, result in fetched:
-            found = await confirmed(component, result, session.client.link.name, session.deadline)
+            found = await collect_confirmed(component, result, session.client.link.name, session.deadline)
             if found.missing:
-                who = f"{component.system}/{component.component}"
                 faults.append(
-                    f"{who} is incomplete: {len(found.missing)} of {result.count} parameters did not come"
+                    f"{component.system}/{component.component} is incomplete: {len(found.missing)} of "
+                    f"{result.count} parameters were not received"
                 )
             else:
                 faults += _add(sets, found.set, found.params, changed=changed)
@@ -101,37 +102,38 @@ async def _from_link(
 async def _fetch(
     session: Session, *, all_: bool, refresh: bool
 ) -> tuple[list[tuple[Component, FetchResult]], list[str]]:
-    """The components that are meant, with what their fetches brought; and who has not answered."""
+    """Return the components to save with the results of their fetches, and sentences on silent ones."""
     deadline = session.deadline
     if all_ and session.options.split_peers:
         raise UsageError("--all and --split-peers exclude each other: a file has each component once")
     if not all_:
-        with progress_bar(f"fetching {session.who}") as progress:
+        with progress_bar(f"fetching {session.label}") as progress:
             result = await session.component.fetch_all(
                 refresh=refresh, timeout=deadline.left(), progress=progress
             )
         return [(session.component, result)], []
     client, system = session.client, session.component.system
     everything = await client.fetch_all(system, refresh=refresh, timeout=deadline.left())
-    fetched = [(client.components[who], everything.results[who]) for who in sorted(everything.results)]
-    silent = [f"{who[0]}/{who[1]}: {everything.silent[who]}" for who in sorted(everything.silent)]
+    fetched = [(client.components[each], everything.results[each]) for each in sorted(everything.results)]
+    silent = [f"{each[0]}/{each[1]}: {everything.silent[each]}" for each in sorted(everything.silent)]
     return fetched, silent
 
 
 def _from_cache(
     vehicle: str, options: LinkOptions, *, all_: bool, changed: bool
 ) -> tuple[list[ParamSet], list[str]]:
-    """What was last known of a vehicle, and what is wrong with it."""
+    """Return the cached parameters of a vehicle, and sentences on incomplete tables."""
     if options.no_cache or options.system is not None or options.encoding or options.timeout is not None:
         raise UsageError(
-            f"--no-cache, --system, --encoding and --timeout go with a link; {vehicle!r} names none"
+            "--no-cache, --system, --encoding and --timeout need a link; "
+            f"{vehicle!r} is a vehicle in the cache"
         )
     tables = tables_of(CacheOptions(cache=options.cache), vehicle, options.component)
     if not all_ and len(tables) > 1:
         pilots = [table for table in tables if table.component == AUTOPILOT]
         if not pilots:
             known = ", ".join(f"{table.system}/{table.component}" for table in tables)
-            raise UsageError(f"no autopilot is among {known}; choose with --component, or take --all")
+            raise UsageError(f"no autopilot is among {known}; choose one with --component, or use --all")
         tables = pilots
     sets: list[ParamSet] = []
     faults: list[str] = []
@@ -148,7 +150,7 @@ def _from_cache(
 
 
 def _add(sets: list[ParamSet], whole: ParamSet, params: Iterable[Param], *, changed: bool) -> Sequence[str]:
-    """Take a set in, or what of it differs from the defaults; say what keeps that from being done."""
+    """Add a set, or with `changed` its non-default parameters; return the sentences on a failure."""
     try:
         sets.append(select_non_defaults(whole, params) if changed else whole)
     except UsageError as error:
@@ -156,7 +158,7 @@ def _add(sets: list[ParamSet], whole: ParamSet, params: Iterable[Param], *, chan
     return []
 
 
-def _tell(file: Path, form: FileForm, sets: Sequence[ParamSet], *, as_json: bool) -> None:
+def _show(file: Path, form: FileForm, sets: Sequence[ParamSet], *, as_json: bool) -> None:
     if as_json:
         from paramclient.documents.command import SavedDoc  # only here: loads pydantic
 

@@ -1,4 +1,4 @@
-"""The command that serves: one process holds the links, and others use them over HTTP."""
+"""The subcommand serve: runs the service, which shares links and cache over HTTP."""
 
 from __future__ import annotations
 
@@ -23,9 +23,10 @@ from paramclient.errors import UsageError
 __all__ = ["serve"]
 
 LIBRARIES: Final = ("fastapi", "prometheus_client", "uvicorn", "websockets")
-"""What the extra `service` installs."""
+"""Libraries that the extra `service` installs."""
 _UNSIGNED: Final = SigningOptions()
 _SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+"""Signals that stop the service in an orderly way."""
 
 
 async def serve(
@@ -47,33 +48,34 @@ async def serve(
     verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False,
     options: SigningOptions = _UNSIGNED,
 ) -> int:
-    """Hold links and the cache, and give them to programs and browsers over HTTP.
+    """Open links and the cache, and share them with programs and browsers over HTTP.
 
-    A link that is not there yet is opened when it can be, and again whenever it has dropped. It ends in good
-    order on SIGTERM and Ctrl-C.
+    A link that cannot be opened, or that has failed, is retried. The service stops in an orderly way on
+    SIGTERM and Ctrl-C.
 
     Args:
         links: The links, such as udpin:0.0.0.0:14550 or serial:/dev/ttyACM0:57600.
-        listen: Where to listen, HOST:PORT; port 0 lets the system choose.
-        cache: The cache file, or the postgresql:// URL of one that stations share, instead of the user's own.
+        listen: Address to listen on, HOST:PORT; with port 0, the system chooses the port.
+        cache: The cache file, or the postgresql:// URL of a shared cache. Default: the user's own cache.
         no_cache: Neither read nor write a cache.
-        fetch: Bring the tables of everyone who is heard up to date without being asked to.
-        listen_only: Send nothing to vehicles, and take what others on the links ask for.
-        token_file: The tokens of those who may use it, see `paramclient token`. Without one, and without
-            PARAMCLIENT_SERVICE_TOKEN_FILE or PARAMCLIENT_SERVICE_TOKEN in the environment, only this machine
+        fetch: Fetch the parameters of all vehicles that are heard.
+        listen_only: Send nothing to vehicles; receive the parameters that other stations on the links
+            request.
+        token_file: A file with access tokens, see `paramclient token`. Without it, and without
+            PARAMCLIENT_SERVICE_TOKEN_FILE or PARAMCLIENT_SERVICE_TOKEN in the environment, only this computer
             can connect.
-        read_only: Change nothing on any vehicle, whoever asks.
-        host: A name by which browsers and programs call this service, such as companion.local; may be given
+        read_only: Refuse all changes of vehicles.
+        host: A host name of this service for browsers and programs, such as companion.local; may be given
             several times.
-        allow_origin: A page elsewhere that may use it from a browser, such as https://station.example; may be
-            given several times. Without tokens it may read only.
-        trusted_proxy: The address of a reverse proxy, or its network such as 10.0.0.0/8, whose header
-            X-Forwarded-For or Forwarded says who asks; may be given several times.
-        system_id: Our own system id on the links, 255 without it.
-        component_id: Our own component id, 190 without it.
-        tls_cert: A certificate in PEM, to be served over TLS.
-        tls_key: Its key.
-        verbose: Tell on stderr what is done, step by step.
+        allow_origin: Origin of a web page that may use the service from a browser, such as
+            https://station.example; may be given several times. Without tokens, such a page can only read.
+        trusted_proxy: Address or network, such as 10.0.0.0/8, of a reverse proxy whose header X-Forwarded-For
+            or Forwarded names the client; may be given several times.
+        system_id: System id of the service on the links. Default: 255.
+        component_id: Component id of the service on the links. Default: 190.
+        tls_cert: A certificate file (PEM), to serve over TLS.
+        tls_key: The key file of the certificate (PEM).
+        verbose: Log each step on stderr.
     """
     if missing := [name for name in LIBRARIES if find_spec(name) is None]:
         raise UsageError(f"serving needs {' and '.join(missing)}: pip install 'paramclient[service]'")
@@ -82,7 +84,7 @@ async def serve(
     if no_cache and cache is not None:
         raise UsageError("--cache and --no-cache exclude each other")
     if not links:
-        raise UsageError("which links? Name at least one, such as udpin:0.0.0.0:14550")
+        raise UsageError("no link is given; name at least one, such as udpin:0.0.0.0:14550")
     hub = service.Hub(
         links,
         cache=not no_cache if cache is None else cache,
@@ -105,7 +107,7 @@ async def serve(
     settings = service.Settings(access=access)
 
     def listens(url: str) -> None:
-        gc.freeze()  # as when the command begins: a collection of all this takes as long as ten requests
+        gc.freeze()  # as at the start of the command: a full collection takes as long as ten requests
         print_line(f"serving on {url}")
 
     with _stopping() as stop:
@@ -115,7 +117,7 @@ async def serve(
 
 @contextmanager
 def _stopping() -> Iterator[anyio.Event]:
-    """What is set by a signal that asks us to end. A second one ends the process at once."""
+    """Yield an event that SIGINT or SIGTERM sets. A second signal ends the process immediately."""
     loop = asyncio.get_running_loop()
     stop = anyio.Event()
     before = {number: signal.getsignal(number) for number in _SIGNALS}

@@ -1,4 +1,4 @@
-"""The commands that set vehicles up: apply, verify, restore."""
+"""The subcommands apply, verify and restore."""
 
 from __future__ import annotations
 
@@ -43,9 +43,9 @@ from paramclient.cli.targets import (
     Targets,
     check_new,
     check_pattern,
-    of_vehicle,
+    describe,
+    fill_pattern,
     targets,
-    who,
 )
 from paramclient.client.component import Component
 from paramclient.errors import NoReply, NotInCache, ParamClientError, UnknownVehicle, UsageError
@@ -65,13 +65,13 @@ if TYPE_CHECKING:
 __all__ = ["apply", "restore", "verify"]
 
 Include: TypeAlias = Annotated[tuple[str, ...], Parameter(show_default=False)]
-Everybody: TypeAlias = Annotated[bool, Parameter(name="--all")]
+AllVehicles: TypeAlias = Annotated[bool, Parameter(name="--all")]
 Count: TypeAlias = Annotated[int | None, Parameter(validator=Number(gte=1, lte=255))]
 Result = TypeVar("Result")
 Found = TypeVar("Found")
 
-RATE_AFTER: Final = 0.5
-"""Seconds of writing after which it is worth telling how fast it goes."""
+RATE_DELAY: Final = 0.5
+"""Seconds of writing after which the rate is precise enough to be shown."""
 
 _OPTIONS: Final = LinkOptions()
 
@@ -89,7 +89,7 @@ async def apply(
     durable: bool = False,
     backup: str | None = None,
     over: Annotated[str | None, Parameter(name="--overlay")] = None,
-    everybody: Everybody = False,
+    all_vehicles: AllVehicles = False,
     expect: Count = None,
     dry_run: bool = False,
     metadata: MetadataChoice = None,
@@ -97,44 +97,46 @@ async def apply(
     yes: bool = False,
     options: LinkOptions = _OPTIONS,
 ) -> ExitCode:
-    """Bring a vehicle to the values of a parameter file, in an order that works, and prove each of them.
+    """Write the values of a parameter file to a vehicle, in an order that works, and verify each of them.
 
-    What it had before is kept in the cache, for `restore`. On a terminal it is shown what will be set, and
-    asked. Exit code 0 says that the vehicle has all of it, 1 that something is not as the file says. Ended
-    in the middle, the same call goes on from what the vehicle has. Where several vehicles are heard, --system
-    has to choose one, or --all takes all.
+    The state before is stored in the cache, for `restore`. On a terminal, the changes are shown and must be
+    confirmed. Exit code 0: the vehicle has all values of the file. Exit code 1: some values differ. After an
+    interruption, run the same command again to continue. If several vehicles are heard, --system must choose
+    one, or --all all of them.
 
     Args:
         url: The link, such as udpin:0.0.0.0:14550, or sim:ardupilot for a simulated vehicle.
         source: A parameter file; or a vehicle in the cache, as cache:VEHICLE.
-        include: A category of what is left out (identity, hardware, calibration, measured, counter, action,
-            read-only, out-of-range), or a name or pattern such as "COMPASS_OFS*". It may be given again.
-        reboot: Start the vehicle again where values count only from then on.
-        allow_armed: Go on although it is armed.
-        skip_invalid: Set the others although some values cannot be right.
+        include: Include a category that is left out by default (identity, hardware, calibration, measured,
+            counter, action, read-only, out-of-range), or a name or pattern such as "COMPASS_OFS*". May be
+            given several times.
+        reboot: Reboot the vehicle if values take effect after a reboot.
+        allow_armed: Continue if the vehicle is armed.
+        skip_invalid: Skip invalid values and write the remaining ones.
         force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
-        durable: End only when the values and their lines of history are on the disk, past a loss of power.
-        backup: A new file for what the vehicle has before; its ending tells the form. {uid} and {system} in
-            it stand for the vehicle's own.
-        over: A file that lies over the other, with {uid} or {system} in its name for the vehicle's own.
-        everybody: Every vehicle that is heard on the link, side by side.
-        expect: With --all, wait for so many vehicles, and fail with fewer.
-        dry_run: Print what would be sent, and send none of it.
-        metadata: A file that describes the parameters, or `vehicle` to ask the vehicle itself: for the ranges
-            of values, and for what counts only from the next start on.
-        full: Print also what is as it should be, or left out.
-        yes: Do not ask.
+        durable: End only when the values and their history are on the disk and survive a power loss.
+        backup: A new file for the vehicle's state before; its ending determines the file format. {uid} and
+            {system} in the name are replaced by the vehicle's ids.
+        over: A file whose parameters replace and extend those of SOURCE, with {uid} or {system} in its name
+            for the vehicle's ids.
+        all_vehicles: Set up all vehicles on the link, concurrently.
+        expect: With --all, wait for this number of vehicles, and fail with fewer.
+        dry_run: Print the values that would be sent, and send none of them.
+        metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for
+            the ranges of values, and for parameters that take effect after a reboot.
+        full: Also print parameters that are unchanged or left out.
+        yes: Do not ask for confirmation.
     """
-    check_pattern("--overlay", over, everybody=everybody)
-    check_pattern("--backup", backup, everybody=everybody)
+    check_pattern("--overlay", over, all_vehicles=all_vehicles)
+    check_pattern("--backup", backup, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
     values = Source(source, over, options, only=True)
     await values.open()
-    async with targets(url, options, everybody=everybody, expect=expect, only=True) as found:
+    async with targets(url, options, all_vehicles=all_vehicles, expect=expect, only=True) as found:
         wanted = await values.wanted(found.vehicles)
         info = await _described(found, metadata, chosen)
         backups = await _backups(backup, found.vehicles)
-        show = _Show(found, as_json=options.json, is_fleet=everybody, full=full)
+        show = _Output(found, as_json=options.json, is_fleet=all_vehicles, full=full)
 
         async def plans() -> tuple[dict[Vehicle, Plan], dict[Vehicle, ParamClientError]]:
             compared = verify_all(found.vehicles, wanted, include=include, info=info, force=force)
@@ -144,11 +146,11 @@ async def apply(
         if dry_run:
             code = show.planned(*await plans(), reboot=reboot, skip_invalid=skip_invalid)
             return max(code, _armed(found, allow_armed=allow_armed))
-        if not yes and _is_asked(options) and not await _agrees(*await plans(), reboot=reboot, full=full):
+        if not yes and _can_confirm(options) and not await _confirm(*await plans(), reboot=reboot, full=full):
             return ExitCode.INCOMPLETE
         if options.no_cache and backup is None and not url.startswith("sim:"):
-            say("what the vehicle has before is kept nowhere: --no-cache, and no --backup")
-        with show.ended_by_somebody(f"setting {_title(found)}") as tell:
+            say("the state before is not stored: --no-cache is given, and --backup is not")
+        with show.progress_until_interrupted(f"setting {_title(found)}") as progress:
             fleet = await apply_to_all(
                 found.vehicles,
                 wanted,
@@ -161,7 +163,7 @@ async def apply(
                 durable=durable,
                 backup=None if backup is None else lambda each: backups[each.system, each.component],
                 timeout=found.deadline.left(),
-                progress=tell,
+                progress=progress,
                 before_writing=lambda _: found.check_only(),
             )
         return show.applied(show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors))
@@ -174,36 +176,37 @@ async def verify(
     *,
     include: Include = (),
     over: Annotated[str | None, Parameter(name="--overlay")] = None,
-    everybody: Everybody = False,
+    all_vehicles: AllVehicles = False,
     expect: Count = None,
     metadata: MetadataChoice = None,
     full: bool = False,
     options: LinkOptions = _OPTIONS,
 ) -> ExitCode:
-    """Compare a vehicle with a parameter file; nothing is set.
+    """Compare a vehicle with a parameter file. Writes nothing.
 
-    What the file does not name is not looked at, and what `apply` leaves out need not agree. Exit code 0
-    says that the vehicle is as the file says, 1 that it is not.
+    Parameters that the file does not name are ignored, and parameters that `apply` leaves out may differ.
+    Exit code 0: the vehicle has all values of the file. Exit code 1: some values differ.
 
     Args:
         url: The link.
         source: A parameter file; or a vehicle in the cache, as cache:VEHICLE.
-        include: A category of what is left out, or a name or pattern, as with apply.
-        over: A file that lies over the other, with {uid} or {system} in its name for the vehicle's own.
-        everybody: Every vehicle that is heard on the link, side by side.
-        expect: With --all, wait for so many vehicles, and fail with fewer.
-        metadata: A file that describes the parameters, or `vehicle` to ask the vehicle itself: for the ranges
-            of values, and for what counts only from the next start on.
-        full: Print also what is as it should be, or left out.
+        include: Include a category that is left out by default, or a name or pattern, as with apply.
+        over: A file whose parameters replace and extend those of SOURCE, with {uid} or {system} in its name
+            for the vehicle's ids.
+        all_vehicles: Compare all vehicles on the link, concurrently.
+        expect: With --all, wait for this number of vehicles, and fail with fewer.
+        metadata: A file that describes parameters, or vehicle to download the vehicle's own metadata: for
+            the ranges of values, and for parameters that take effect after a reboot.
+        full: Also print parameters that have the wanted value or are left out.
     """
-    check_pattern("--overlay", over, everybody=everybody)
+    check_pattern("--overlay", over, all_vehicles=all_vehicles)
     chosen = from_file(metadata)
     values = Source(source, over, options, only=False)
     await values.open()
-    async with targets(url, options, everybody=everybody, expect=expect, only=False) as found:
+    async with targets(url, options, all_vehicles=all_vehicles, expect=expect, only=False) as found:
         wanted = await values.wanted(found.vehicles)
         info = await _described(found, metadata, chosen)
-        show = _Show(found, as_json=options.json, is_fleet=everybody, full=full)
+        show = _Output(found, as_json=options.json, is_fleet=all_vehicles, full=full)
         fleet = await _within(found, verify_all(found.vehicles, wanted, include=include, info=info))
         return show.verified(show.by_vehicle(fleet.results), show.by_vehicle(fleet.errors))
 
@@ -223,31 +226,31 @@ async def restore(
     yes: bool = False,
     options: LinkOptions = _OPTIONS,
 ) -> ExitCode:
-    """Bring an earlier state of a vehicle back, with its own identity and calibration.
+    """Restore an earlier state of a vehicle, with its own identity and calibration.
 
-    What the vehicle has and the state does not is left alone. On a terminal it is shown what will be set, and
-    asked. The exit codes are those of apply.
+    Parameters that the state does not have are not changed. On a terminal, the changes are shown and must be
+    confirmed. The exit codes are those of apply.
 
     Args:
         url: The link.
-        when: A moment, such as '2h ago' or '2026-11-20 14:00'; the number of a snapshot, from `history
-            VEHICLE --snapshots`; or the file of a backup. Without it, the state before the last apply.
-        include: A category of what is left out, or a name or pattern, as with apply.
-        reboot: Start the vehicle again where values count only from then on.
-        allow_armed: Go on although it is armed.
+        when: A time, such as '2h ago' or '2026-11-20 14:00'; the number of a snapshot, from `history VEHICLE
+            --snapshots`; or a backup file. Default: the state before the last apply.
+        include: Include a category that is left out by default, or a name or pattern, as with apply.
+        reboot: Reboot the vehicle if values take effect after a reboot.
+        allow_armed: Continue if the vehicle is armed.
         force: Send NaN and infinity also to PX4, which cannot save them and may stop, and to ArduPilot.
-        backup: A new file for what the vehicle has now.
-        dry_run: Print what would be sent, and send none of it.
-        full: Print also what is as it should be, or left out.
-        yes: Do not ask.
+        backup: A new file for the vehicle's present state.
+        dry_run: Print the values that would be sent, and send none of them.
+        full: Also print parameters that are unchanged or left out.
+        yes: Do not ask for confirmation.
     """
-    async with targets(url, options, everybody=False, expect=None, only=True) as found:
+    async with targets(url, options, all_vehicles=False, expect=None, only=True) as found:
         [vehicle] = found.vehicles
-        state = await _state(found, vehicle, when, options)
+        state = await _load_state(found, vehicle, when, options)
         say(printable(f"the state: {described(state)}"))
         backups = await _backups(backup, found.vehicles)
         info = await _described(found, None, None)
-        show = _Show(found, as_json=options.json, is_fleet=False, full=full)
+        show = _Output(found, as_json=options.json, is_fleet=False, full=full)
         address = (vehicle.system, vehicle.component)
 
         async def plans() -> tuple[dict[Vehicle, Plan], dict[Vehicle, ParamClientError]]:
@@ -258,9 +261,9 @@ async def restore(
         if dry_run:
             code = show.planned(*await plans(), reboot=reboot, skip_invalid=True)
             return max(code, _armed(found, allow_armed=allow_armed))
-        if not yes and _is_asked(options) and not await _agrees(*await plans(), reboot=reboot, full=full):
+        if not yes and _can_confirm(options) and not await _confirm(*await plans(), reboot=reboot, full=full):
             return ExitCode.INCOMPLETE
-        with show.ended_by_somebody(f"restoring {_title(found)}") as tell:
+        with show.progress_until_interrupted(f"restoring {_title(found)}") as progress:
             result = await restore_to(
                 vehicle,
                 state,
@@ -271,43 +274,46 @@ async def restore(
                 force=force,
                 backup=backups.get(address),
                 timeout=found.deadline.left(),
-                progress=lambda how_far: tell(vehicle, how_far),
+                progress=lambda state: progress(vehicle, state),
                 before_writing=found.check_only,
             )
         return show.applied(show.by_vehicle({address: result}), {})
 
 
-# what goes before
+# Preparation
 
 
-async def _state(found: Targets, vehicle: Component, when: str | None, options: LinkOptions) -> ParamSet:
-    """The state that is to come back."""
+async def _load_state(found: Targets, vehicle: Component, when: str | None, options: LinkOptions) -> ParamSet:
+    """Return the state to restore."""
     if when is not None and is_file(when):
         return open_file(when).choose(options.component)
     moment = None if when is None else parse_when(when, time.time())
     cache = found.client.cache
     if cache is None:
-        raise UsageError("earlier states are in the cache, and --no-cache excludes that; or name a file")
+        raise UsageError(
+            "earlier states are in the cache, which --no-cache excludes; leave out --no-cache, or name a "
+            "backup file"
+        )
     await wait_for_identity(vehicle)
     await found.client._writer.write_all()
     key, component = vehicle.identity.key, vehicle.component
-    return await anyio.to_thread.run_sync(lambda: _kept(cache, key, component, moment))
+    return await anyio.to_thread.run_sync(lambda: _state_at(cache, key, component, moment))
 
 
-def _kept(cache: ParamCache, key: str, component: int, moment: float | None) -> ParamSet:
+def _state_at(cache: ParamCache, key: str, component: int, moment: float | None) -> ParamSet:
     if moment is None:
         return load_state_before_apply(cache, key, component)
     try:
         return cache.state_at(key, component, moment)
-    except UnknownVehicle:  # the user named no vehicle of the cache: this one was heard on the link
-        what = f"the cache {cache.place} has no earlier state of {key}, component {component}"
-        raise NotInCache(what) from None
+    except UnknownVehicle:  # the vehicle was heard on the link; the user named none of the cache
+        message = f"the cache {cache.place} has no earlier state of {key}, component {component}"
+        raise NotInCache(message) from None
 
 
 async def _described(
     found: Targets, choice: str | None, chosen: Metadata | None
 ) -> Callable[[Component], Metadata | None]:
-    """What is known of each vehicle's parameters."""
+    """Return a function that returns the metadata of a vehicle."""
     known = {
         (each.system, each.component): chosen
         or await known_of_session(replace(found.session, component=each), choice)
@@ -317,17 +323,26 @@ async def _described(
 
 
 async def _backups(pattern: str | None, vehicles: list[Component]) -> dict[Address, Path]:
-    """The files for what each of them has before; none of them is there yet."""
+    """Return the backup file of each vehicle by address.
+
+    Raises:
+        UsageError: the pattern gives several vehicles one file.
+        FileError: one of the files exists.
+    """
     if pattern is None:
         return {}
-    names = {(each.system, each.component): await of_vehicle(pattern, each) for each in vehicles}
+    names = {(each.system, each.component): await fill_pattern(pattern, each) for each in vehicles}
     if len(set(names.values())) < len(names):
         raise UsageError(f"--backup {pattern} names one file for several vehicles")
     return {address: check_new(name) for address, name in names.items()}
 
 
 async def _within(found: Targets, work: Awaitable[Result]) -> Result:
-    """Do it in the time that is left."""
+    """Await `work` until the deadline of the command.
+
+    Raises:
+        NoReply: the deadline has passed.
+    """
     left = found.deadline.left()
     with anyio.move_on_after(left):
         return await work
@@ -335,47 +350,47 @@ async def _within(found: Targets, work: Awaitable[Result]) -> Result:
 
 
 def _armed(found: Targets, *, allow_armed: bool) -> ExitCode:
-    """Tell of vehicles on which nothing would be set for now."""
+    """Report armed vehicles, to which `apply` would write nothing; return the exit code."""
     armed = [] if allow_armed else [each for each in found.vehicles if each.is_armed]
     for vehicle in armed:
-        report(f"{who(vehicle)} is armed; nothing would be set now without --allow-armed")
+        report(f"{describe(vehicle)} is armed; nothing would be set now without --allow-armed")
     return ExitCode.INCOMPLETE if armed else ExitCode.DONE
 
 
-def _is_asked(options: LinkOptions) -> bool:
-    """Whether there is somebody to ask."""
+def _can_confirm(options: LinkOptions) -> bool:
+    """Return whether a user at a terminal can confirm the changes."""
     return not options.json and sys.stdin.isatty() and sys.stderr.isatty()
 
 
-async def _agrees(
+async def _confirm(
     plans: Mapping[Vehicle, Plan], errors: Mapping[Vehicle, ParamClientError], *, reboot: bool, full: bool
 ) -> bool:
-    """Show what will be sent, and ask. Nobody is asked where there is nothing to send."""
+    """Show the changes and ask for confirmation. Return true without a question if there are none."""
     for vehicle, error in errors.items():
-        report(f"{vehicle.who}: {error}")
+        report(f"{vehicle.label}: {error}")
     if not any(plan.steps or (reboot and plan.unstarted) for plan in plans.values()):
         return True
     show_planned(plans, reboot=reboot, full=full)
     sys.stderr.write("go on? [y/N] ")
     sys.stderr.flush()
-    await anyio.wait_readable(sys.stdin)  # a thread that reads could not be ended by Ctrl-C
+    await anyio.wait_readable(sys.stdin)  # Ctrl-C could not end a thread that reads
     return sys.stdin.readline().strip().lower() in ("y", "yes")
 
 
 def _title(found: Targets) -> str:
     many = len(found.vehicles)
-    return who(found.vehicles[0]) if many == 1 else f"{many} vehicles"
+    return describe(found.vehicles[0]) if many == 1 else f"{many} vehicles"
 
 
-# what comes of it
+# Results
 
 
-class _Show:
-    """Prints what came of a command, for one vehicle or for all of them, and gives the exit code."""
+class _Output:
+    """Prints the results of a subcommand for one vehicle or several, and returns the exit code."""
 
     def __init__(self, found: Targets, *, as_json: bool, is_fleet: bool, full: bool) -> None:
         self._vehicles = {
-            (each.system, each.component): Vehicle(each.system, each.component, who(each))
+            (each.system, each.component): Vehicle(each.system, each.component, describe(each))
             for each in found.vehicles
         }
         self._as_json = as_json
@@ -383,6 +398,7 @@ class _Show:
         self._full = full
 
     def by_vehicle(self, results: Mapping[Address, Found]) -> dict[Vehicle, Found]:
+        """Return results by vehicle instead of by address."""
         return {self._vehicles[address]: result for address, result in results.items()}
 
     def planned(
@@ -393,7 +409,8 @@ class _Show:
         reboot: bool,
         skip_invalid: bool,
     ) -> ExitCode:
-        return self._tell(
+        """Print plans; return the exit code that `apply` is expected to have."""
+        return self._print(
             plans,
             errors,
             lambda: show_planned(plans, reboot=reboot, full=self._full),
@@ -404,49 +421,51 @@ class _Show:
     def applied(
         self, results: Mapping[Vehicle, ApplyResult], errors: Mapping[Vehicle, ParamClientError]
     ) -> ExitCode:
-        return self._tell(
+        """Print the results of `apply` or `restore`; return the exit code."""
+        return self._print(
             results, errors, lambda: show_applied(results, full=self._full), applied_doc, applied_code
         )
 
     def verified(self, plans: Mapping[Vehicle, Plan], errors: Mapping[Vehicle, ParamClientError]) -> ExitCode:
-        return self._tell(
+        """Print comparisons; return the exit code."""
+        return self._print(
             plans, errors, lambda: show_verified(plans, full=self._full), verified_doc, met_code
         )
 
     @contextmanager
-    def ended_by_somebody(self, title: str) -> Iterator[Callable[[Component, ApplyProgress], None]]:
-        """What is to be told how far it is; it draws that, and tells what became of it on Ctrl-C."""
+    def progress_until_interrupted(self, title: str) -> Iterator[Callable[[Component, ApplyProgress], None]]:
+        """Yield a function that draws the progress; on cancellation, print the outcomes so far."""
         rows: dict[Vehicle, dict[str, ApplyRow]] = {}
         steps: dict[Vehicle, tuple[int, int]] = {}
         began = 0.0
         try:
             with progress_bar(title) as draw:
 
-                def tell(component: Component, how_far: ApplyProgress) -> None:
+                def update(component: Component, state: ApplyProgress) -> None:
                     nonlocal began
                     vehicle = self._vehicles[component.system, component.component]
-                    steps[vehicle] = (how_far.done, how_far.total)
-                    if how_far.row is not None:
-                        rows.setdefault(vehicle, {})[how_far.row.name] = how_far.row.so_far
+                    steps[vehicle] = (state.done, state.total)
+                    if state.row is not None:
+                        rows.setdefault(vehicle, {})[state.row.name] = state.row.so_far
                         began = began or anyio.current_time()
                     if draw is not None and began:
                         done, total = (sum(numbers) for numbers in zip(*steps.values(), strict=True))
                         seconds = anyio.current_time() - began
-                        rate = done / seconds if seconds > RATE_AFTER else 0.0
+                        rate = done / seconds if seconds > RATE_DELAY else 0.0
                         draw(Progress(done, total, rate, (total - done) / rate if rate else None))
 
-                yield tell
+                yield update
         except anyio.get_cancelled_exc_class():
-            told = {vehicle: list(each.values()) for vehicle, each in rows.items()}
+            outcomes = {vehicle: list(each.values()) for vehicle, each in rows.items()}
             if self._as_json:
                 self._print_documents(
-                    [interrupted_doc(each, told.get(each, [])) for each in self._vehicles.values()]
+                    [interrupted_doc(each, outcomes.get(each, [])) for each in self._vehicles.values()]
                 )
             else:
-                show_interrupted(told)
+                show_interrupted(outcomes)
             raise
 
-    def _tell(
+    def _print(
         self,
         results: Mapping[Vehicle, Result],
         errors: Mapping[Vehicle, ParamClientError],
@@ -454,26 +473,30 @@ class _Show:
         as_document: Callable[..., SetUpDoc],
         code: Callable[[Result], ExitCode],
     ) -> ExitCode:
-        """Print it in one form or the other; an error of a vehicle that is alone is the command's."""
+        """Print results and errors as tables or JSON; return the exit code.
+
+        Raises:
+            ParamClientError: the error of the vehicle, if the command is for one vehicle.
+        """
         if errors and not self._is_fleet:
             raise next(iter(errors.values()))
         if self._as_json:
-            told = [as_document(vehicle, result, full=self._full) for vehicle, result in results.items()]
-            self._print_documents(told, errors)
+            documents = [as_document(vehicle, result, full=self._full) for vehicle, result in results.items()]
+            self._print_documents(documents, errors)
         else:
             show()
         for vehicle, error in errors.items():
-            report(f"{vehicle.who}: {error}")
+            report(f"{vehicle.label}: {error}")
         codes = [*map(code, results.values()), *map(code_of, errors.values())]
         return max(codes, default=ExitCode.DONE)
 
     def _print_documents(
-        self, told: Sequence[SetUpDoc], errors: Mapping[Vehicle, ParamClientError] | None = None
+        self, documents: Sequence[SetUpDoc], errors: Mapping[Vehicle, ParamClientError] | None = None
     ) -> None:
         if not self._is_fleet:
-            print_document(told[0])
+            print_document(documents[0])
             return
         from paramclient.documents.setup import FleetSetupDoc  # only here: loads pydantic
 
         failed = {(vehicle.system, vehicle.component): error for vehicle, error in (errors or {}).items()}
-        print_document(FleetSetupDoc.of(told, failed))
+        print_document(FleetSetupDoc.of(documents, failed))

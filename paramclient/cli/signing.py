@@ -1,4 +1,4 @@
-"""The commands that give a vehicle its signing key, and take it away: signing setup, signing disable."""
+"""The subcommands signing setup and signing disable: set and remove the signing key of a vehicle."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Annotated, Final
 
 from cyclopts import Parameter
 
-from paramclient.cli.connection import HEARING_PATIENCE, Deadline
+from paramclient.cli.connection import VEHICLE_TIMEOUT, Deadline
 from paramclient.cli.exit_codes import ExitCode
 from paramclient.cli.options import Id, KeyOptions, Seconds
 from paramclient.cli.output import print_document, print_line, printable
@@ -24,32 +24,32 @@ from paramclient.protocol.wire import SigningKey, SigningPolicy
 
 __all__ = ["disable", "setup"]
 
-PROOF_PATIENCE: Final = 10.0
-"""Seconds in which a vehicle must answer in the new way, where the user sets no limit."""
+PROOF_TIMEOUT: Final = 10.0
+"""Seconds to wait for a response with the new signing state, without --timeout."""
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
 class VehicleOptions(KeyOptions):
-    """Which vehicle, and whether this may be sent to it. The texts below the fields are their help."""
+    """The vehicle, and the safety of the link. The texts below the fields are their help."""
 
     link_is_safe: bool = False
-    """Nobody else can listen on this link: a USB cable, a wire. Without it, you are asked."""
+    """Confirm that no other person or program can listen on this link: a USB cable, a wire. Default: ask."""
 
     system: Id = None
-    """The system to speak to, 1 to 255. Without it, the only one that is heard."""
+    """System id of the vehicle, 1 to 255. Default: the only one heard."""
 
     component: Id = None
-    """The component to speak to, 1 to 255. Without it, the autopilot."""
+    """Component id of the vehicle, 1 to 255. Default: the autopilot."""
 
     timeout: Seconds = None
-    """Seconds for everything together. Without it, 10 to hear the vehicle, and 10 for the proof."""
+    """Timeout for the whole command in seconds. Default: 10 for the first heartbeat, and 10 for the proof."""
 
     json: bool = False
-    """Print JSON, for programs."""
+    """Print JSON."""
 
     verbose: Annotated[bool, Parameter(name=("--verbose", "-v"))] = False
-    """Tell on stderr what is done, step by step; never the key."""
+    """Log each step on stderr, without the key."""
 
 
 _DEFAULTS: Final = VehicleOptions()
@@ -58,48 +58,53 @@ _DEFAULTS: Final = VehicleOptions()
 def setup(
     url: str, /, *, present_key: Path | None = None, options: VehicleOptions = _DEFAULTS
 ) -> Callable[[], Awaitable[int]]:
-    """Give a vehicle its signing key, and prove that it signs with it.
+    """Set the signing key of a vehicle, and verify that the vehicle signs with it.
 
-    The key is that of --signing-key, --signing-passphrase or the environment. It goes over the link in clear,
-    so only where nobody else can listen.
+    The key is that of --signing-key, --signing-passphrase or the environment. It is sent in clear text: use a
+    link on which no other person or program can listen.
 
     Args:
         url: The link, such as serial:/dev/ttyACM0:115200.
-        present_key: A file with the key that the vehicle has now, where it asks for that on this link.
+        present_key: A file with the vehicle's present key, if the vehicle requires signed frames on this
+            link.
     """
     key = options.key
     if key is None:
-        raise UsageError("which key? Name it with --signing-key FILE or --signing-passphrase")
+        raise UsageError("no key is given; name one with --signing-key FILE or --signing-passphrase")
     present = None if present_key is None else read_key(present_key)
-    _confirm(options, f"The key will go over {url} in clear.")
+    _confirm(options, f"The key will be sent over {url} in clear text.")
     return partial(_setup, url, options, key, present)
 
 
 def disable(url: str, /, *, options: VehicleOptions = _DEFAULTS) -> Callable[[], Awaitable[int]]:
-    """Let a vehicle sign no more, and take what is not signed, and prove it.
+    """Remove the signing key of a vehicle, and verify that it neither signs nor requires signed frames.
 
-    With the key that it has now (--signing-key, --signing-passphrase or the environment) where it asks for
-    that: PX4 does always, ArduPilot not over USB.
+    The present key (--signing-key, --signing-passphrase or the environment) is needed if the vehicle requires
+    signed frames: PX4 always does, ArduPilot not over USB.
 
     Args:
         url: The link.
     """
     key = options.key
-    _confirm(options, f"From then on the vehicle will obey everybody who reaches it. This goes over {url}.")
+    _confirm(options, f"The vehicle on {url} will then accept commands from any sender.")
     return partial(_disable, url, options, key)
 
 
-def _confirm(options: VehicleOptions, what: str) -> None:
-    """Ask whether the link is safe, unless that was said.
+def _confirm(options: VehicleOptions, consequence: str) -> None:
+    """Ask whether the link is safe, unless --link-is-safe is given.
 
     Raises:
-        UsageError: it is not, or there is nobody to ask.
+        UsageError: the answer is no, or stdin is not a terminal.
     """
     if options.link_is_safe:
         return
     if not sys.stdin.isatty():
-        raise UsageError("say --link-is-safe if nobody else can listen on this link; nothing was sent")
-    sys.stderr.write(f"{printable(what)} Is it sure that nobody else can listen or send there? [y/N] ")
+        raise UsageError(
+            "nothing was sent; add --link-is-safe if no other person or program can listen on this link"
+        )
+    sys.stderr.write(
+        f"{printable(consequence)} Can no other person or program listen or send on this link? [y/N] "
+    )
     sys.stderr.flush()
     if sys.stdin.readline().strip().lower() not in ("y", "yes"):
         raise UsageError("nothing was sent")
@@ -111,13 +116,11 @@ async def _setup(url: str, options: VehicleOptions, key: SigningKey, present: Si
     address = await _send(link, options, deadline, key, present)
     signing = Signing(key, SigningPolicy.ACCEPT_ALL)
     async with ParamClient(link, cache=False, signing=signing) as client:
-        vehicle = await _proof(client, address, deadline, "does not answer what is signed with the key")
+        vehicle = await _read_value(client, address, deadline, "does not answer requests signed with the key")
         report = client.signing_report()
         if report is None or address not in {(each.system, each.component) for each in report.streams}:
-            raise _refused(
-                address, "answers, but what it sends is not signed with the key: it has not taken it"
-            )
-    _tell(options, vehicle, key)
+            raise _refused(address, "answers, but does not sign with the key: it has not accepted the key")
+    _show(options, vehicle, key)
     return ExitCode.DONE
 
 
@@ -126,12 +129,12 @@ async def _disable(url: str, options: VehicleOptions, key: SigningKey | None) ->
     link = create_link(url)
     address = await _send(link, options, deadline, None, key)
     async with ParamClient(link, cache=False, traffic=True) as client:
-        vehicle = await _proof(client, address, deadline, "does not answer what is not signed")
-        before = _signed(client, address)
-        await _proof(client, address, deadline, "does not answer what is not signed")
-        if _signed(client, address) > before:
-            raise _refused(address, "goes on to sign; it may want this signed with the key that it has")
-    _tell(options, vehicle, None)
+        vehicle = await _read_value(client, address, deadline, "does not answer unsigned requests")
+        before = _count_signed(client, address)
+        await _read_value(client, address, deadline, "does not answer unsigned requests")
+        if _count_signed(client, address) > before:
+            raise _refused(address, "still signs; it may require its present key, see --signing-key")
+    _show(options, vehicle, None)
     return ExitCode.DONE
 
 
@@ -142,39 +145,42 @@ async def _send(
     key: SigningKey | None,
     present: SigningKey | None,
 ) -> tuple[int, int]:
-    """Send SETUP_SIGNING, signed with the key that the vehicle has where that is known; to whom it went."""
+    """Send SETUP_SIGNING, signed with the vehicle's present key if known; return the vehicle's address."""
     signing = None if present is None else Signing(present, SigningPolicy.ACCEPT_ALL)
     async with ParamClient(link, cache=False, signing=signing) as client:
-        patience = HEARING_PATIENCE if options.timeout is None else deadline.left()
-        vehicle = await client.only_component(options.system, options.component, timeout=patience)
+        timeout = VEHICLE_TIMEOUT if options.timeout is None else deadline.left()
+        vehicle = await client.only_component(options.system, options.component, timeout=timeout)
         await vehicle.setup_signing(key, link_is_safe=True)
         return vehicle.system, vehicle.component
 
 
-async def _proof(
-    client: ParamClient, address: tuple[int, int], deadline: Deadline, otherwise: str
+async def _read_value(
+    client: ParamClient, address: tuple[int, int], deadline: Deadline, failure: str
 ) -> Component:
-    """Read a value of the vehicle, as it would be read from now on."""
-    patience = deadline.left(PROOF_PATIENCE)
+    """Read a value of the vehicle with the signing of the client; return the vehicle.
+
+    Raises:
+        VehicleError: the vehicle did not answer; the message ends with `failure`.
+    """
     try:
-        vehicle = await client.component(*address, timeout=patience)
-        await vehicle.get(0, timeout=deadline.left(PROOF_PATIENCE))
+        vehicle = await client.component(*address, timeout=deadline.left(PROOF_TIMEOUT))
+        await vehicle.get(0, timeout=deadline.left(PROOF_TIMEOUT))
     except NoReply:
-        raise _refused(address, otherwise) from None
+        raise _refused(address, failure) from None
     return vehicle
 
 
-def _signed(client: ParamClient, address: tuple[int, int]) -> int:
+def _count_signed(client: ParamClient, address: tuple[int, int]) -> int:
     components = client.traffic_report().components
     return sum(each.signed for each in components if (each.system, each.component) == address)
 
 
-def _refused(address: tuple[int, int], what: str) -> VehicleError:
+def _refused(address: tuple[int, int], failure: str) -> VehicleError:
     system, component = address
-    return VehicleError(f"{system}/{component} {what}", system=system, component=component)
+    return VehicleError(f"{system}/{component} {failure}", system=system, component=component)
 
 
-def _tell(options: VehicleOptions, vehicle: Component, key: SigningKey | None) -> None:
+def _show(options: VehicleOptions, vehicle: Component, key: SigningKey | None) -> None:
     if options.json:
         from paramclient.documents.command import SignsDoc  # only here: loads pydantic
 
@@ -188,6 +194,6 @@ def _tell(options: VehicleOptions, vehicle: Component, key: SigningKey | None) -
             )
         )
         return
-    who = f"{vehicle.system}/{vehicle.component} {vehicle.autopilot}"
-    how = "does not sign any more" if key is None else f"signs with the key {key.fingerprint} now"
-    print_line(f"{who} {how}")
+    name = f"{vehicle.system}/{vehicle.component} {vehicle.autopilot}"
+    state = "no longer signs" if key is None else f"signs with the key {key.fingerprint} now"
+    print_line(f"{name} {state}")

@@ -1,4 +1,4 @@
-"""The command that plays a vehicle for other programs: sim."""
+"""The subcommand sim: runs a simulated vehicle for other programs."""
 
 from __future__ import annotations
 
@@ -22,80 +22,81 @@ if TYPE_CHECKING:
     from paramclient.sim import OtherStation, Vehicle
     from paramclient.sim.vehicle import VehicleOptions
 
-__all__ = ["Faults", "Misfortunes", "sim"]
+__all__ = ["Faults", "VehicleFaults", "sim"]
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
 class Faults:
-    """What `Air.symmetric` takes. The texts below the fields are their help."""
+    """Faults of the link, as `Air.symmetric` takes them. The texts below the fields are their help."""
 
     loss: float = 0.0
-    """The share of datagrams that never arrive, 0 to 1; this and the others count for each direction."""
+    """Share of lost datagrams, 0 to 1. This and the following options apply to each direction."""
 
     loss_burst: float = 1.0
-    """How many in a row are lost, on average: more than 1 for a link that fades."""
+    """Average number of consecutive lost datagrams; more than 1 for a fading link."""
 
     delay: float = 0.0
-    """Seconds on the way."""
+    """Delay in seconds."""
 
     jitter: float = 0.0
-    """Further seconds on the way, at random between 0 and this."""
+    """Maximum additional random delay in seconds."""
 
     duplicate: float = 0.0
-    """The share that arrives twice."""
+    """Share of datagrams that arrive twice, 0 to 1."""
 
     reorder: float = 0.0
-    """The share that is overtaken."""
+    """Share of datagrams that are overtaken by later ones, 0 to 1."""
 
     bit_errors: float = 0.0
-    """The chance of each single bit to arrive turned over."""
+    """Probability of each single bit to be inverted."""
 
     rate: float | None = None
-    """Bytes per second. Without it, no limit."""
+    """Limit in bytes per second. Default: no limit."""
 
     queue: int | None = None
-    """Bytes that may wait for their turn at --rate. Without it, no limit."""
+    """Bytes that may be queued at --rate. Default: no limit."""
 
     seed: int = 0
-    """Of the random numbers: the same faults for the same seed."""
+    """Seed of the random numbers: equal seeds give equal faults."""
 
 
 @Parameter(name="*")
 @dataclass(frozen=True, kw_only=True, slots=True)
-class Misfortunes:
-    """What befalls the vehicle. The texts below the fields are their help."""
+class VehicleFaults:
+    """Faults of the vehicle. The texts below the fields are their help."""
 
     dead: tuple[str, ...] = ()
-    """An index or a name that is never listed, and never answered when it is read; may be given again."""
+    """Index or name of a parameter that is never listed, and whose reads are never answered. May be given
+    several times."""
 
     list_stops_at: int | None = None
-    """After how many values the list falls silent. Without it, never."""
+    """Number of values after which the list stops. Default: never."""
 
     list_stops: float = 1
-    """How many lists --list-stops-at happens to; inf for all."""
+    """Number of lists that --list-stops-at applies to; inf for all."""
 
     boot_time: float = 0.0
-    """Seconds after each start in which it says that it boots, and does not send its list."""
+    """Seconds after each start in which the vehicle reports that it boots, and does not send its list."""
 
     reboot_at: int | None = None
-    """After how many values of a list it starts anew, once. Without it, never."""
+    """Number of listed values after which the vehicle reboots, once. Default: never."""
 
     reboot_down: float = 1.0
-    """Seconds for which it is off then, and when it was told to start again."""
+    """Seconds that the vehicle is off during each reboot."""
 
     armed: bool = False
-    """Say that it is armed: then it does not start again when it is told to."""
+    """Report that the vehicle is armed; it then refuses to reboot."""
 
     high_latency: bool = False
-    """Speak as on a satellite link: HIGH_LATENCY2 every 5 s, and no list."""
+    """Simulate a satellite link: HIGH_LATENCY2 every 5 s, and no list."""
 
     other_list_every: float | None = None
-    """Seconds after which another ground station asks for the list, again and again. Without it, never."""
+    """Interval in seconds at which another ground station requests the list. Default: never."""
 
     @property
     def options(self) -> VehicleOptions:
-        """What is said when the vehicle is made."""
+        """The arguments for the simulated vehicle."""
         return {
             "dead": [int(each) if each.isdecimal() else each for each in self.dead],
             "list_stops_at": self.list_stops_at,
@@ -106,8 +107,8 @@ class Misfortunes:
             "reboot_down": self.reboot_down,
         }
 
-    def befall(self, vehicle: Vehicle) -> list[OtherStation]:
-        """See to the rest; the other stations on the channel."""
+    def apply_to(self, vehicle: Vehicle) -> list[OtherStation]:
+        """Apply the faults that are no arguments; return the other stations on the channel."""
         from paramclient.sim import OtherStation
 
         if self.reboot_at is not None:
@@ -124,7 +125,7 @@ class Misfortunes:
 
 
 _NO_FAULTS: Final = Faults()
-_NO_MISFORTUNES: Final = Misfortunes()
+_NO_VEHICLE_FAULTS: Final = VehicleFaults()
 _Id = Annotated[int, Parameter(validator=Number(gte=1, lte=255))]
 
 
@@ -138,46 +139,50 @@ async def sim(
     param_error: bool = False,
     signing_key: Path | None = None,
     usb: bool = False,
-    misfortunes: Misfortunes = _NO_MISFORTUNES,
+    vehicle_faults: VehicleFaults = _NO_VEHICLE_FAULTS,
     faults: Faults = _NO_FAULTS,
 ) -> None:
     """Run a simulated vehicle for other programs, until Ctrl-C.
 
     Args:
-        autopilot: Which one.
-        link: Whom it speaks to, or where it listens; with port 0 the system chooses one, which is printed.
-        system: Its system id.
-        component: Its component id.
-        param_error: Answer what cannot be done with PARAM_ERROR, as newer firmware does.
-        signing_key: A file with the key with which it signs, and everybody else must.
-        usb: With a key, still take what is not signed, as ArduPilot does over USB.
+        autopilot: The firmware to simulate.
+        link: The link to send to or to listen on. With port 0, the system chooses the port, which is printed.
+        system: System id of the vehicle.
+        component: Component id of the vehicle.
+        param_error: Answer invalid requests with PARAM_ERROR, as newer firmware does.
+        signing_key: A file with the signing key: the vehicle signs its frames and requires signed ones.
+        usb: With a key, also accept unsigned frames, as ArduPilot does over USB.
     """
-    from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle  # only here: no other command needs them
+    from paramclient.sim import Air, ArduPilotVehicle, PX4Vehicle  # only here: other subcommands need none
 
     spec = parse_link(link)
     if spec.kind is LinkKind.SIM:
-        raise UsageError(f"{spec.name} is a vehicle itself; a simulated one needs a link to other programs")
+        raise UsageError(
+            f"{spec.name} is itself a simulated vehicle; sim needs a link to other programs, such as "
+            "udpout:127.0.0.1:14550"
+        )
     real = create_link(spec)
     make = PX4Vehicle if autopilot == "px4" else ArduPilotVehicle
-    options = misfortunes.options
+    options = vehicle_faults.options
     options.update({"param_error": param_error, "stream": real.is_stream, "usb": usb})
     if signing_key is not None:
         options.update({"signing_key": read_key(signing_key), "signing_timestamp": timestamp_now()})
     vehicle = make(system=system, component=component, **options)
-    air = Air.symmetric([vehicle], others=misfortunes.befall(vehicle), **asdict(faults))
+    air = Air.symmetric([vehicle], others=vehicle_faults.apply_to(vehicle), **asdict(faults))
     announcement = _Announcement(f"{autopilot} {system}/{component}", spec)
     await serve_endpoint(air, real, task_status=announcement)
 
 
 class _Announcement(TaskStatus[Link]):
-    """Prints where the vehicle is, as soon as the link is open."""
+    """Prints the link of the vehicle as soon as it is open."""
 
-    def __init__(self, who: str, spec: LinkSpec) -> None:
-        self._who = who
+    def __init__(self, vehicle: str, spec: LinkSpec) -> None:
+        self._vehicle = vehicle
         self._spec = spec
 
     def started(self, value: Link | None = None) -> None:
+        """Print the link, with the port that the system chose."""
         where = f"speaks to {self._spec}"
         if isinstance(value, UdpIn | TcpIn) and value.address is not None:
             where = f"listens on {replace(self._spec, port=value.address[1])}"
-        print_line(f"{self._who} {where}; Ctrl-C ends it")
+        print_line(f"{self._vehicle} {where}; Ctrl-C ends it")

@@ -1,13 +1,13 @@
-"""Where commands take parameters from: a file, a link, or a vehicle in the cache.
+"""Sources of parameters that an argument can name: a file, a vehicle in the cache, or a link.
 
-The form of a text alone says which of them it is, and whether there is a file of that name:
+The kind of source follows from the text, and from whether a file of that name exists:
 
-1. a file that exists, whatever its name looks like;
-2. `cache:VEHICLE`, or what can only be the name of a vehicle in the cache (see `paramclient.cache.lookup`):
-   a number is a system id, `uid:` and at least six digits are the beginning of a hardware id;
-3. anything else: a link.
+1. a file that exists, independent of its name;
+2. `cache:VEHICLE`, or a text that can only name a vehicle in the cache (see `paramclient.cache.lookup`): a
+   number is a system id, `uid:` and at least six digits are the beginning of a hardware id;
+3. any other text: a link.
 
-So `./1` is the file and `cache:1` the vehicle, if ever there are both.
+If both exist, `./1` is the file and `cache:1` the vehicle.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from paramclient.provision.vehicle_params import FetchedSet, collect_set, incomp
 __all__ = [
     "check_link",
     "choose",
-    "confirmed",
+    "collect_confirmed",
     "is_file",
     "names_vehicle",
     "open_file",
@@ -51,30 +51,32 @@ SOURCES: Final = f"""\
   cache:VEHICLE       last known of a vehicle: its system id, its hardware id in full, uid: and at least 6
                       digits of it, or its key; without cache: where it can be nothing else, as 1, uid:000200
 {FORMS}"""
+"""The accepted sources, for messages."""
 
 _CACHED: Final = "cache:"
+"""The prefix of a vehicle in the cache."""
 
 
 async def resolve(text: str, options: LinkOptions, *, only: bool = False) -> ParamSet:
-    """The parameters that a user's word stands for: of a file, of a vehicle in the cache, or of a link.
+    """Return the parameters of the source that an argument names: a file, a vehicle in the cache, or a link.
 
-    A link is opened and its whole table fetched, from the cache where the vehicle's hash confirms that.
+    Opens a link and fetches the whole table, from the cache if the vehicle's hash matches.
 
     Args:
-        text: see the top of this room.
+        text: the argument; see the docstring of this module.
         only: whether several vehicles on the link are an error, unless the options name one: for values that
             will be written.
-        options: `component` chooses in all three (without it the autopilot, or the only one there is);
-            `system`, `timeout` and `encoding` are for links.
+        options: `component` selects in all three (default: the autopilot, or the only component); `system`,
+            `timeout` and `encoding` are for links.
 
     Raises:
-        UsageError: it is none of the three; a file that cannot be read (FileError); options that exclude
-            each other.
+        UsageError: the text names none of the three; a file cannot be read (FileError); options exclude each
+            other.
         UnknownVehicle: the cache has no such vehicle or component.
         AmbiguousVehicle: several vehicles in the cache have this name; with `only`, several are on the link.
-        CacheError: the cache does not have its whole table.
-        VehicleError: some parameters did not come; the text names them.
-        NoReply: nobody was heard, or answered.
+        CacheError: the cached table is incomplete.
+        VehicleError: some parameters were not received; the message names them.
+        NoReply: no vehicle was heard, or it did not answer.
         LinkError: the link cannot be opened, or failed.
     """
     (params,) = await resolve_all([text], options, only=only)
@@ -82,7 +84,7 @@ async def resolve(text: str, options: LinkOptions, *, only: bool = False) -> Par
 
 
 async def resolve_all(texts: Sequence[str], options: LinkOptions, *, only: bool = False) -> list[ParamSet]:
-    """As `resolve`, for several: links side by side, and not before all the others are at hand.
+    """Resolve several sources, as `resolve` does: files and cached vehicles first, then links concurrently.
 
     A text that is given twice is resolved once. The first error ends all.
     """
@@ -101,7 +103,7 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions, *, only: bool 
     async def fetch(url: str) -> None:
         try:
             found[url] = await _from_link(url, options, is_alone=len(links) == 1, only=only)
-        except Exception as error:  # out of the group it would come wrapped
+        except Exception as error:  # raised here, the task group would wrap it in a group
             errors.append(error)
             tasks.cancel_scope.cancel()
 
@@ -114,23 +116,23 @@ async def resolve_all(texts: Sequence[str], options: LinkOptions, *, only: bool 
 
 
 def is_file(text: str) -> bool:
-    """Whether a word of the user names a file that is there. A device is none: it may be a link."""
-    with suppress(OSError, ValueError):  # too long for a name, or with a NUL: then it is none
+    """Return whether an argument names an existing file. A device is not a file: it may be a link."""
+    with suppress(OSError, ValueError):  # a text that is too long or has a NUL is not a file name
         path = Path(text)
         return path.is_file() or path.is_fifo()
     return False
 
 
 def names_vehicle(text: str) -> bool:
-    """Whether a word of the user names a vehicle in the cache. It need not be there."""
+    """Return whether an argument has the form of a name of a vehicle in the cache."""
     return text.startswith(_CACHED) or is_vehicle_name(text)
 
 
 def check_link(text: str) -> None:
-    """See that a word that is neither a file nor a cached vehicle names a link.
+    """Check that an argument that is neither a file nor a cached vehicle names a link.
 
     Raises:
-        UsageError: it does not; the text says what there is.
+        UsageError: it does not; the message lists the accepted sources.
     """
     try:
         if not names_service(text):
@@ -138,12 +140,14 @@ def check_link(text: str) -> None:
     except UsageError as error:
         problem = str(error).splitlines()[0]
         raise UsageError(
-            f"no such file, and no cached vehicle; {problem}\naccepted forms:\n{SOURCES}"
+            f"no such file, and no cached vehicle; {problem}\naccepted sources:\n{SOURCES}"
         ) from None
 
 
-async def confirmed(component: Component, result: FetchResult, link: str, deadline: Deadline) -> FetchedSet:
-    """What of a fetched table was given or confirmed in this session; see `collect_set`.
+async def collect_confirmed(
+    component: Component, result: FetchResult, link: str, deadline: Deadline
+) -> FetchedSet:
+    """Return the parameters received or confirmed in this session; see `collect_set`. Reports the notes.
 
     Raises:
         LinkError: the link failed.
@@ -154,10 +158,10 @@ async def confirmed(component: Component, result: FetchResult, link: str, deadli
 
 
 def open_file(path: str) -> ParamFile:
-    """A parameter file, whole; what its reader should know is told on stderr.
+    """Read a parameter file, and report its notes on stderr.
 
     Raises:
-        FileError: it cannot be read.
+        FileError: the file cannot be read.
     """
     file = read_file(path)
     for note in file.notes:
@@ -166,25 +170,25 @@ def open_file(path: str) -> ParamFile:
 
 
 def choose(file: ParamFile, component: int | None, system: int | None) -> ParamSet:
-    """What a file has for a component; the system counts only in a file that has several.
+    """Return a file's parameters for a component; `system` selects only in a file of several systems.
 
     Raises:
-        FileError: it has nothing for it.
+        FileError: the file has no parameters for it.
     """
     is_of_several = len({each.system for each in file.sets}) > 1
     return file.choose(component, system=system if is_of_several else None)
 
 
 def tables_in(cache: ParamCache, vehicle: str | None, component: int | None) -> list[CachedSummary]:
-    """Return the tables in the cache that the user means. All commands find cached vehicles by this function.
+    """Return the tables in the cache that an argument names. All subcommands use this function.
 
     Args:
         cache: the cache.
-        vehicle: the vehicle as the user names it, also with `cache:` before it; None for all vehicles.
-        component: the table of this component only.
+        vehicle: the name of the vehicle, also with the prefix `cache:`; None for all vehicles.
+        component: return only the table of this component.
 
     Raises:
-        UsageError: the name is empty, as an unset variable of a script is.
+        UsageError: the name is empty, such as an unset variable of a script.
         UnknownVehicle: no vehicle in the cache has this name, or none of its tables is of this component.
         AmbiguousVehicle: several vehicles have this name.
     """
@@ -196,7 +200,7 @@ def tables_in(cache: ParamCache, vehicle: str | None, component: int | None) -> 
     if not chosen and (known or vehicle is not None):
         held = [f"{each.system}/{each.component} ({each.key})" for each in known]
         raise UnknownVehicle(
-            f"component {component} is not in the cache {cache.place}, which holds {', '.join(held)}",
+            f"component {component} is not in the cache {cache.place}, which has {', '.join(held)}",
             vehicles=held,
         )
     return chosen
@@ -208,24 +212,24 @@ def _from_file(path: str, options: LinkOptions) -> ParamSet:
 
 def _from_cache(vehicle: str, options: LinkOptions) -> ParamSet:
     if options.place is False:
-        raise UsageError(f"{vehicle!r} is a vehicle in the cache, and --no-cache excludes that")
+        raise UsageError(f"{vehicle!r} is a vehicle in the cache, which --no-cache excludes")
     with ParamCache(options.cache) as cache:
         tables = tables_in(cache, vehicle, options.component)
         table = next((each for each in tables if each.component == AUTOPILOT), tables[0])
         if options.component is None and len(tables) > 1 and table.component != AUTOPILOT:
             known = ", ".join(f"{each.system}/{each.component}" for each in tables)
-            raise UsageError(f"no autopilot is among {known}; choose with --component")
+            raise UsageError(f"no autopilot is among {known}; choose one with --component")
         return load_cached_set(cache, table.key, table.component, note=report)
 
 
 async def _from_link(url: str, options: LinkOptions, *, is_alone: bool, only: bool) -> ParamSet:
-    """The whole table of a component; progress is drawn for a link that is alone, as two would mingle."""
+    """Return the whole table of a component. Draws the progress only if `is_alone`: two bars would mix."""
     async with connect(url, options, only=only) as session:
         component, deadline = session.component, session.deadline
         link = session.client.link.name
-        with progress_bar(f"fetching {session.who}") if is_alone else nullcontext() as progress:
+        with progress_bar(f"fetching {session.label}") if is_alone else nullcontext() as progress:
             result = await component.fetch_all(timeout=deadline.left(), progress=progress)
-        found = await confirmed(component, result, link, deadline)
+        found = await collect_confirmed(component, result, link, deadline)
         if found.missing:
             raise incomplete_error(component, found.missing)
         return found.set

@@ -1,4 +1,4 @@
-"""Whom a set-up is about: one vehicle on a link or all of them, and what each of them shall have."""
+"""The vehicles of a set-up, one or all on a link, and the wanted parameters of each."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Final, TypeAlias
 
 import anyio
 
-from paramclient.cli.connection import HEARING_PATIENCE, Deadline, Session, connect
+from paramclient.cli.connection import VEHICLE_TIMEOUT, Deadline, Session, connect
 from paramclient.cli.options import LinkOptions
 from paramclient.cli.sources import choose, is_file, open_file, resolve
 from paramclient.client.client import ParamClient
@@ -21,24 +21,41 @@ from paramclient.model.paramset import ParamSet
 from paramclient.provision import overlay
 from paramclient.provision.inspection import wait_for_identity
 
-__all__ = ["Address", "Source", "Targets", "check_new", "check_pattern", "of_vehicle", "targets", "who"]
+__all__ = [
+    "Address",
+    "Source",
+    "Targets",
+    "check_new",
+    "check_pattern",
+    "describe",
+    "fill_pattern",
+    "targets",
+]
 
 Address: TypeAlias = tuple[int, int]
+"""System id and component id."""
 
-LISTENING_TIME: Final = 3.0
-"""Seconds in which every vehicle has been heard, also on a link that loses two heartbeats of three."""
-PAUSE: Final = 0.05
-"""Seconds between two looks whether all that are expected have been heard."""
-PLACES: Final = ("{uid}", "{system}")
+FLEET_LISTENING_TIME: Final = 3.0
+"""Seconds in which every vehicle is heard, also on a link that loses two of three heartbeats."""
+POLL_INTERVAL: Final = 0.05
+"""Seconds between two checks whether all expected vehicles have been heard."""
+PLACEHOLDERS: Final = ("{uid}", "{system}")
+"""Placeholders in file names, which are replaced by the ids of the vehicle."""
 
 
 @dataclass(frozen=True, slots=True)
 class Targets:
-    """An open client, and the vehicles that the command is about."""
+    """An open client, and the vehicles to set up.
+
+    Attributes:
+        session: the open client, with the first vehicle.
+        vehicles: the vehicles.
+        all_vehicles: whether these are all vehicles on the link (--all).
+    """
 
     session: Session
     vehicles: list[Component]
-    everybody: bool
+    all_vehicles: bool
 
     @property
     def client(self) -> ParamClient:
@@ -47,55 +64,57 @@ class Targets:
 
     @property
     def deadline(self) -> Deadline:
-        """The moment at which everything is to be over."""
+        """The deadline of the command."""
         return self.session.deadline
 
     async def check_only(self) -> None:
-        """See `Session.check_only`; with `everybody` every vehicle is named."""
-        if not self.everybody:
+        """See `Session.check_only`; does nothing with --all, which names every vehicle."""
+        if not self.all_vehicles:
             await self.session.check_only()
 
 
 @asynccontextmanager
 async def targets(
-    url: str, options: LinkOptions, *, everybody: bool, expect: int | None, only: bool
+    url: str, options: LinkOptions, *, all_vehicles: bool, expect: int | None, only: bool
 ) -> AsyncIterator[Targets]:
-    """Open a link and wait for the vehicle that the options name, or listen for all that are there.
+    """Open a link and wait for the vehicle that the options name, or for all vehicles on the link.
 
     Args:
         url: the link.
-        options: which vehicle.
-        everybody: all of them.
-        expect: how many are waited for.
-        only: as in `connect`: for commands that write. With `everybody` every vehicle is named.
+        options: they name the vehicle.
+        all_vehicles: wait for all vehicles.
+        expect: the number of vehicles to wait for, or None.
+        only: as in `connect`, for subcommands that write. Ignored with `all_vehicles`.
 
     Raises:
         UsageError: no such link, or options that exclude each other.
-        AmbiguousVehicle: with `only`, several vehicles were heard, and none is named.
-        NoReply: nobody was heard, or fewer than expected.
+        AmbiguousVehicle: with `only`, several vehicles were heard, and the options name none.
+        NoReply: no vehicle was heard, or fewer than expected.
         LinkError: the link cannot be opened, or failed.
     """
-    if everybody and options.system is not None:
+    if all_vehicles and options.system is not None:
         raise UsageError("--all and --system exclude each other")
-    if everybody and options.split_peers:
-        raise UsageError("--all and --split-peers exclude each other: files and results go by system id")
-    if expect is not None and not everybody:
-        raise UsageError("--expect goes with --all")
-    async with connect(url, options, only=only and not everybody) as session:
+    if all_vehicles and options.split_peers:
+        raise UsageError(
+            "--all and --split-peers exclude each other: files and results are identified by system id"
+        )
+    if expect is not None and not all_vehicles:
+        raise UsageError("--expect needs --all")
+    async with connect(url, options, only=only and not all_vehicles) as session:
         vehicles = [session.component]
-        if everybody:
-            vehicles = await _all_heard(session.client, options.component, expect, session.deadline)
-        yield Targets(session, vehicles, everybody)
+        if all_vehicles:
+            vehicles = await _find_vehicles(session.client, options.component, expect, session.deadline)
+        yield Targets(session, vehicles, all_vehicles)
 
 
 class Source:
-    """What vehicles shall have: one set for all of them, or those of a file that has one for each system.
+    """The wanted parameters of vehicles: one set for all, or those of a file with a set for each system.
 
     Args:
         text: a file, or another source of parameters (see `paramclient.cli.sources`).
-        over: the name of a file that lies over it, with `{uid}` or `{system}` for the vehicle's own; or None.
-        options: `component` chooses in files.
-        only: as in `connect`, where it is a link: its values will be written.
+        over: the name of an overlay file, with the placeholders `{uid}` or `{system}`; or None.
+        options: `component` selects the component in files.
+        only: as in `connect`, if the source is a link: its values will be written.
     """
 
     def __init__(self, text: str, over: str | None, options: LinkOptions, *, only: bool) -> None:
@@ -107,7 +126,7 @@ class Source:
         self._set: ParamSet | None = None
 
     async def open(self) -> None:
-        """Read it, or fetch it; the overlays are read when it is known of whom.
+        """Read the file, or fetch the source. The overlays are read later, for each vehicle.
 
         Raises:
             ParamClientError: as from `resolve`.
@@ -118,11 +137,11 @@ class Source:
             self._set = await resolve(self._text, self._options, only=self._only)
 
     async def wanted(self, vehicles: list[Component]) -> dict[Address, ParamSet]:
-        """What each of them shall have, by address.
+        """Return the wanted parameters of each vehicle by address.
 
         Raises:
-            FileError: there is nothing for one of them, or its overlay cannot be read.
-            UsageError: an overlay is named by a hardware id that the vehicle does not give.
+            FileError: the file has no set for a vehicle, or its overlay cannot be read.
+            UsageError: an overlay is named by hardware id, and the vehicle reports none.
         """
         return {(each.system, each.component): await self._of(each) for each in vehicles}
 
@@ -131,72 +150,72 @@ class Source:
         assert base is not None
         if self._over is None:
             return base
-        path = await of_vehicle(self._over, vehicle)
+        path = await fill_pattern(self._over, vehicle)
         if not is_file(path):
-            raise FileError(
-                f"there is no such file, which was to be laid over for {who(vehicle)}", source=path
-            )
+            raise FileError(f"no such file, which --overlay names for {describe(vehicle)}", source=path)
         return overlay(base, self._choose(open_file(path), vehicle))
 
     def _choose(self, file: ParamFile, vehicle: Component) -> ParamSet:
         return choose(file, self._options.component, vehicle.system)
 
 
-async def of_vehicle(pattern: str, vehicle: Component) -> str:
-    """A file's name, with the vehicle's own ids in the places for them.
+async def fill_pattern(pattern: str, vehicle: Component) -> str:
+    """Return a file name with the placeholders replaced by the vehicle's ids.
 
     Raises:
-        UsageError: it wants the hardware id, and the vehicle does not give one.
+        UsageError: the name has `{uid}`, and the vehicle reports no hardware id.
     """
     if "{uid}" in pattern:
         await wait_for_identity(vehicle)
         uid = vehicle.identity.uid
         if uid is None:
-            raise UsageError(f"{who(vehicle)} does not say its hardware id, which {pattern} needs")
+            raise UsageError(f"{describe(vehicle)} does not report a hardware id, which {pattern} needs")
         pattern = pattern.replace("{uid}", uid)
     return pattern.replace("{system}", str(vehicle.system))
 
 
-def check_pattern(option: str, pattern: str | None, *, everybody: bool) -> None:
-    """See that a file's name gives each vehicle a file of its own, where there are several.
+def check_pattern(option: str, pattern: str | None, *, all_vehicles: bool) -> None:
+    """Check that a file name has a placeholder if there may be several vehicles.
 
     Raises:
-        UsageError: it does not.
+        UsageError: it has none.
     """
-    if pattern is not None and everybody and not any(place in pattern for place in PLACES):
-        raise UsageError(f"{option} needs {' or '.join(PLACES)} in the name, to go with --all: {pattern}")
+    if pattern is not None and all_vehicles and not any(place in pattern for place in PLACEHOLDERS):
+        raise UsageError(
+            f"with --all, {option} needs {' or '.join(PLACEHOLDERS)} in the file name: {pattern}"
+        )
 
 
 def check_new(path: str) -> Path:
-    """A file that is to be written, and is not there: it may be the only copy of an earlier state.
+    """Return the path of a new file. An existing file may be the only copy of an earlier state.
 
     Raises:
-        FileError: it is there.
+        FileError: the file exists.
     """
     if Path(path).exists():
         raise FileError(
-            "is there already, and may be what an earlier run has kept; choose another name", source=path
+            "exists already, and may be the backup of an earlier run; choose another name", source=path
         )
     return Path(path)
 
 
-def who(vehicle: Component) -> str:
-    """A vehicle in words: `1/1 px4`."""
+def describe(vehicle: Component) -> str:
+    """Return a vehicle in words: `1/1 px4`."""
     return f"{vehicle.system}/{vehicle.component} {vehicle.autopilot}"
 
 
-async def _all_heard(
+async def _find_vehicles(
     client: ParamClient, component: int | None, expect: int | None, deadline: Deadline
 ) -> list[Component]:
-    patience = deadline.left(LISTENING_TIME if expect is None else HEARING_PATIENCE)
-    with anyio.move_on_after(patience):
+    timeout = deadline.left(FLEET_LISTENING_TIME if expect is None else VEHICLE_TIMEOUT)
+    with anyio.move_on_after(timeout):
         while expect is None or len(_vehicles(client, component)) < expect:
             client._check_open()
-            await anyio.sleep(PAUSE)
+            await anyio.sleep(POLL_INTERVAL)
     found = _vehicles(client, component)
     if expect is not None and len(found) < expect:
-        heard = ", ".join(map(who, found)) or "nobody"
-        raise NoReply(f"{expect} vehicles (heard: {heard})", attempts=0, waited=patience or 0.0)
+        heard = ", ".join(map(describe, found)) or "none"
+        raise NoReply(f"{expect} vehicles (heard: {heard})", attempts=0, waited=timeout or 0.0)
     return found
 
 

@@ -1,4 +1,4 @@
-"""The command that makes tokens for those who may use the service."""
+"""The subcommand token: creates an access token for the service."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ __all__ = ["token"]
 
 
 def token(name: str, /, *, file: Path, read: bool = False) -> None:
-    """Make a token for somebody who may use `paramclient serve`, and print it, this once.
+    """Create an access token for `paramclient serve`, and print it once.
 
-    The file gets its digest alone, with the name that will stand in the history, and is made if it is not
-    there. Take the line out, and from the next start of the service on the token is none.
+    The token file stores only its digest, with the name for the history; the file is created if it does not
+    exist. To revoke the token, remove its line and restart the service.
 
     Args:
-        name: For whom, such as anna or bench-laptop.
-        file: The file of tokens, as serve --token-file takes it.
-        read: It allows to read only.
+        name: The user or computer, such as anna or bench-laptop.
+        file: The token file of serve --token-file.
+        read: Allow only reading.
     """
     if find_spec("fastapi") is None:
         raise UsageError("the service needs fastapi: pip install 'paramclient[service]'")
     from paramclient.service.tokens import add_token  # only here: needs the extra
 
     made = add_token(file, name, "read" if read else "write")
-    say(f"{name} may {'read' if read else 'read and write'} with this token, which is shown this once:")
+    say(f"token for {name} ({'read' if read else 'read and write'}), which is shown only once:")
     print_line(made)

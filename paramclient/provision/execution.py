@@ -66,7 +66,7 @@ DEFAULT_SYSTEM_ID: Final = 1
 VERIFY_DELAY: Final = 1.2
 """Seconds between the last write and the read that verifies it: modules of PX4 clamp values up to 815 ms
 after the acknowledgement, and set other parameters up to 1 s after it (measured)."""
-HEARTBEAT_TIMEOUT: Final = 3.0
+ARMED_STATE_TIMEOUT: Final = 3.0
 """Seconds to wait for a heartbeat with the armed flag: heartbeats come once a second, and some are lost."""
 SYSTEM_CHANGE_TIMEOUT: Final = 10.0
 """Seconds to wait for the vehicle under its new system id; ArduPilot sends its next heartbeat under it."""
@@ -499,7 +499,7 @@ class ApplyRun:
         if self._allow_armed:
             return
         component = self._component
-        with anyio.move_on_after(HEARTBEAT_TIMEOUT):
+        with anyio.move_on_after(ARMED_STATE_TIMEOUT):
             while component.is_armed is None and component.state != "lost":  # noqa: ASYNC110 - no event
                 await anyio.sleep(POLL_INTERVAL)
         own = [each for each in component._client.components.values() if each.system == component.system]
@@ -508,7 +508,7 @@ class ApplyRun:
         elif component.is_armed is None and component.state != "lost":
             message = (
                 f"{self._address} does not report whether it is armed (no heartbeat within "
-                f"{HEARTBEAT_TIMEOUT:g} s); nothing is set then"
+                f"{ARMED_STATE_TIMEOUT:g} s); nothing is set then"
             )
         else:
             return

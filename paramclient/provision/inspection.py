@@ -34,7 +34,7 @@ __all__ = [
     "verify",
 ]
 
-IDENTITY_TIMEOUT: Final = 10.0
+SETUP_IDENTITY_TIMEOUT: Final = 10.0
 """Seconds to wait for the identity of a vehicle. The identification usually ends sooner, after a few
 requests."""
 EARLY_READS_MAX: Final = 36
@@ -202,8 +202,8 @@ async def reread(component: Component, inspection: Inspection, names: Iterable[s
 
 
 async def wait_for_identity(component: Component) -> None:
-    """Wait until the vehicle is identified, at most `IDENTITY_TIMEOUT`: the cache key is its identity."""
-    with anyio.move_on_after(IDENTITY_TIMEOUT):
+    """Wait until the vehicle is identified, at most `SETUP_IDENTITY_TIMEOUT`, as the cache key requires."""
+    with anyio.move_on_after(SETUP_IDENTITY_TIMEOUT):
         station = component._client._station
         while station.identity_of(component._machine) is None:  # noqa: ASYNC110 - no event
             await anyio.sleep(POLL_INTERVAL)

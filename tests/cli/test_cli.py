@@ -1,4 +1,4 @@
-"""The command: what it prints for programs and for people, how it ends, and what it never prints."""
+"""The command line: JSON, tables, exit codes, signals, help, and escaped text from the wire."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ from tests.flying import flying
 from tests.shell import swiftly
 
 ROOT = Path(__file__).parents[2]
-PATIENCE = 60.0  # seconds after which a test gives up; nothing waits that long when all is well
+PATIENCE = 60.0  # seconds after which a test fails; a passing test never waits that long
 ESCAPE = "\x1b"
 
 FETCH_KEYS = [
@@ -55,26 +55,26 @@ HASH = "cf579589"
 
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Runs the command in this process, on a clock that leaps."""
+    """Run the command line in this process, on simulated time."""
     leaping(monkeypatch)
     return in_process(capsys)
 
 
 @pytest.fixture
 def live_command(capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs the command in this process in real time, for sockets with another process at the far end."""
+    """Run the command line in this process in real time, for sockets to another process."""
     return in_process(capsys)
 
 
 @pytest.fixture
 def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Puts a simulated vehicle, or any link, behind every URL; gives a URL."""
+    """Connect every URL to a simulated vehicle or a link; return a URL."""
     return behind(monkeypatch, "sim:custom")
 
 
 @pytest.fixture(scope="session")
 def warm_cache(tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """A cache file with the table of `sim:px4`."""
+    """Return a cache file with the table of `sim:px4`."""
     path = tmp_path_factory.mktemp("warm") / "cache.sqlite3"
     assert run(["fetch", "sim:px4", "--cache", str(path)]) == 0
     return path.read_bytes()
@@ -82,7 +82,7 @@ def warm_cache(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 
 @pytest.fixture
 def warm(warm_cache: bytes, tmp_path: Path) -> Path:
-    """The same for one test alone."""
+    """Return a copy of the warm cache for one test."""
     path = tmp_path / "warm.sqlite3"
     path.touch(mode=0o600)
     path.write_bytes(warm_cache)
@@ -90,7 +90,7 @@ def warm(warm_cache: bytes, tmp_path: Path) -> Path:
 
 
 def key_of(cache: Path) -> str:
-    """The key of the vehicle that was seen last."""
+    """Return the key of the vehicle that was heard last."""
     return ParamCache(cache).vehicles()[0].key
 
 
@@ -106,7 +106,7 @@ PLAIN = {
 
 @contextmanager
 def process(*arguments: object, **options: Any) -> Iterator[subprocess.Popen[str]]:
-    """The command as a process of its own, which is gone afterwards."""
+    """Run the command line in a new process, which is killed afterwards."""
     words = [sys.executable, "-m", "paramclient", *map(str, arguments)]
     options = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "env": PLAIN, **options}
     with subprocess.Popen(words, cwd=ROOT, text=True, **options) as started:
@@ -121,7 +121,7 @@ def process(*arguments: object, **options: Any) -> Iterator[subprocess.Popen[str
 
 
 def ended(started: subprocess.Popen[str]) -> Outcome:
-    """Wait for its end."""
+    """Wait for the end of a process."""
     out, err = started.communicate(timeout=PATIENCE)
     return Outcome(started.returncode, out or "", err or "")
 
@@ -132,7 +132,7 @@ def run_process(*arguments: object, **options: Any) -> Outcome:
 
 
 def line_of(stream: Any) -> str:
-    """The next line that a process prints."""
+    """Return the next line that a process prints."""
     line = str(stream.readline())
     assert line.endswith("\n"), "the process has ended"
     return line
@@ -140,7 +140,7 @@ def line_of(stream: Any) -> str:
 
 @contextmanager
 def simulated(*arguments: str) -> Iterator[str]:
-    """`sim` in a process of its own on a port that the system chooses; gives the URL to reach it."""
+    """Run `sim` in a new process on a port that the system chooses; return its URL."""
     with process("sim", *arguments, "--link", "udpin:127.0.0.1:0") as started:
         found = re.search(r" listens on udpin:127\.0\.0\.1:([0-9]+);", line_of(started.stdout))
         assert found is not None
@@ -224,7 +224,7 @@ def test_every_value_is_strict_json(command: Command, put: Callable[[Endpoint], 
     }
 
 
-def test_people_see_a_table_and_a_summary(command: Command, warm: Path) -> None:
+def test_fetch_prints_a_table_and_a_summary(command: Command, warm: Path) -> None:
     fetched = command("fetch", "sim:px4", "--cache", warm)
     assert fetched.code == 0
     header, *rows = fetched.words
@@ -242,7 +242,7 @@ def test_people_see_a_table_and_a_summary(command: Command, warm: Path) -> None:
     )
 
 
-def test_people_see_what_a_bad_link_has_cost(command: Command) -> None:
+def test_fetch_prints_the_cost_of_a_lossy_link(command: Command) -> None:
     fetched = command("fetch", "sim:px4?loss=0.1&delay=0.01&seed=1", "--no-cache")
     assert fetched.code == 0
     found = re.fullmatch(
@@ -256,25 +256,25 @@ def test_people_see_what_a_bad_link_has_cost(command: Command) -> None:
 
 
 class Gappy(GenericVehicle):
-    """Never sends one of its parameters."""
+    """A vehicle that never sends one of its parameters."""
 
     def _send_value(self, entry: Entry, **where: Any) -> None:
         if entry.name != "B":
             super()._send_value(entry, **where)
 
 
-def test_what_did_not_come_is_named(command: Command, put: Callable[[Endpoint], str]) -> None:
+def test_missing_parameters_are_named(command: Command, put: Callable[[Endpoint], str]) -> None:
     url = put(Gappy({"A": 1, "B": 2, "C": 3}))
     fetched = command("fetch", url, "--json", "--no-cache", "--timeout", 5)
     assert fetched.code == 1
     assert fetched.json["missing"] == [1]
     assert (fetched.json["count"], fetched.json["received"]) == (3, 2)
     assert list(fetched.json["params"]) == ["A", "C"]
-    assert "paramclient: incomplete: index 1 did not come\n" in fetched.err
+    assert "paramclient: incomplete: index 1 of " in fetched.err
 
 
-class Secretive(PX4Vehicle):
-    """Tells a value that its hash does not cover in the list only."""
+class ListOnlyValues(PX4Vehicle):
+    """A vehicle that sends a value that its hash does not cover only in the list."""
 
     secret = next(row.name for row in px4_table() if row.volatile)
 
@@ -283,18 +283,18 @@ class Secretive(PX4Vehicle):
             super()._send_value(entry, **where)
 
 
-def test_a_value_that_only_the_cache_knows_is_missing(
+def test_a_value_that_is_only_cached_is_missing(
     command: Command, put: Callable[[Endpoint], str], tmp_path: Path
 ) -> None:
     cache = tmp_path / "cache.sqlite3"
-    url = put(Secretive())
+    url = put(ListOnlyValues())
     known = command("fetch", url, "--json", "--cache", cache).json
     fetched = command("fetch", url, "--json", "--cache", cache, "--timeout", 2)
     assert fetched.code == 1
     assert fetched.json["source"] == "cache"
-    assert fetched.json["missing"] == [known["params"][Secretive.secret]["index"]]
+    assert fetched.json["missing"] == [known["params"][ListOnlyValues.secret]["index"]]
     assert fetched.json["received"] == len(fetched.json["params"]) == 902
-    assert Secretive.secret not in fetched.json["params"]
+    assert ListOnlyValues.secret not in fetched.json["params"]
 
 
 def test_the_system_and_the_component_can_be_chosen(command: Command) -> None:
@@ -314,7 +314,7 @@ def test_the_encoding_can_be_chosen(command: Command) -> None:
 # get
 
 
-def test_get_gives_the_same_shape_as_fetch(command: Command) -> None:
+def test_get_prints_the_same_members_as_fetch(command: Command) -> None:
     got = command("get", "sim:px4", "MC_ROLL_P", "SYS_AUTOSTART", "--json", "--no-cache")
     assert (got.code, got.err) == (0, "")
     assert got.json == {
@@ -325,7 +325,7 @@ def test_get_gives_the_same_shape_as_fetch(command: Command) -> None:
     }
 
 
-def test_get_tells_what_failed_beside_what_came(command: Command) -> None:
+def test_get_prints_errors_and_received_values(command: Command) -> None:
     got = command("get", "sim:px4?param_error=1", "NOPE", "MC_ROLL_P", "--json", "--no-cache")
     assert got.code == 1
     assert list(got.json) == ["params", "errors"]
@@ -341,7 +341,7 @@ def test_get_tells_what_failed_beside_what_came(command: Command) -> None:
 # set
 
 
-def test_set_tells_what_the_vehicle_made_of_it(command: Command) -> None:
+def test_set_prints_the_value_that_the_vehicle_reports(command: Command) -> None:
     done = command("set", "sim:ardupilot", "RTL_ALT", 1234.7, "RTL_ALT", 99, "--json", "--no-cache")
     assert done.code == 0
     assert done.json == {
@@ -371,7 +371,7 @@ def test_nan_can_be_forced(command: Command) -> None:
     ]
 
 
-def test_settle_tells_what_modules_of_px4_make_of_a_value_within_a_second(command: Command) -> None:
+def test_settle_shows_values_that_px4_modules_clamp_within_a_second(command: Command) -> None:
     wanted = ("MPC_TILTMAX_LND", 80, "MC_ROLL_P", 6.25)
     at_once = command("set", "sim:px4", *wanted, "--json", "--no-cache")
     assert [each["status"] for each in at_once.json["results"]] == ["accepted", "accepted"]
@@ -384,27 +384,27 @@ def test_settle_tells_what_modules_of_px4_make_of_a_value_within_a_second(comman
     assert command("set", "sim:px4", *wanted, "--settle", -1, "--no-cache").code == 2
 
 
-class Stubborn(GenericVehicle):
-    """Keeps what it has, without a reason."""
+class Unchanging(GenericVehicle):
+    """A vehicle that keeps its values without a reason."""
 
     def _write(self, entry: Entry, bits: int) -> None:
         pass
 
 
 class Mistyped(GenericVehicle):
-    """Says of every set that its type is wrong."""
+    """A vehicle that reports a wrong type for every set."""
 
     def _on_set(self, request: wire.ParamSet, sender: wire.Frame) -> None:
         self._refuse(ParamErrorCode.TYPE_MISMATCH, request, sender)
 
 
-class Mute(GenericVehicle):
-    """Is there, and answers nothing about parameters."""
+class SilentOnParams(GenericVehicle):
+    """A vehicle with heartbeats that answers no parameter requests."""
 
     def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
         pass
 
-    _on_set = _on_read  # type: ignore[assignment]  # it looks at neither
+    _on_set = _on_read  # type: ignore[assignment]  # the message is ignored
 
 
 @pytest.mark.parametrize(
@@ -416,13 +416,13 @@ class Mute(GenericVehicle):
         ),
         (PX4Vehicle(param_error=True), "NOPE", 5, None, "unknown", 1),
         (Mistyped({"A": 1}, param_error=True), "A", 5, None, "mismatch", 1),
-        (Stubborn({"A": 0.1}), "A", 5, 0.1, "not-applied", 1),
-        (Mute({"A": 1}), "A", 5, None, "no-reply", 3),
+        (Unchanging({"A": 0.1}), "A", 5, 0.1, "not-applied", 1),
+        (SilentOnParams({"A": 1}), "A", 5, None, "no-reply", 3),
         (GenericVehicle([SimParam("A", ParamType.UINT8, 1)]), "A", 300, None, "invalid", 2),
     ],
     ids=["refused", "unknown", "mismatch", "not-applied", "no-reply", "invalid"],
 )
-def test_a_set_that_fails_tells_why(
+def test_a_failed_set_prints_its_reason(
     command: Command,
     put: Callable[[Endpoint], str],
     vehicle: Endpoint,
@@ -432,7 +432,7 @@ def test_a_set_that_fails_tells_why(
     status: str,
     code: int,
 ) -> None:
-    # no time is set where the vehicle answers: then only the answer can end the command
+    # without a timeout, only the answer of the vehicle can end the command
     limit = ["--timeout", 2] if status == "no-reply" else []
     done = command("set", put(vehicle), name, value, "--json", "--no-cache", *limit)
     assert done.code == code
@@ -442,7 +442,7 @@ def test_a_set_that_fails_tells_why(
     assert done.err == f"paramclient: {name}: {reason}\n"
 
 
-def test_a_change_too_small_for_px4_is_told(command: Command, put: Callable[[Endpoint], str]) -> None:
+def test_a_change_too_small_for_px4_is_reported(command: Command, put: Callable[[Endpoint], str]) -> None:
     link = put(PX4Vehicle(table={"A": 0.5}))
     done = command("set", link, "A", 0.50000006, "--no-cache")
     assert done.code == 0
@@ -453,7 +453,9 @@ def test_a_change_too_small_for_px4_is_told(command: Command, put: Callable[[End
     assert "note" not in command("set", link, "A", 0.75, "--json", "--no-cache").json["results"][0]
 
 
-def test_all_sets_are_tried_and_the_worst_counts(command: Command, put: Callable[[Endpoint], str]) -> None:
+def test_all_sets_are_tried_for_the_highest_exit_code(
+    command: Command, put: Callable[[Endpoint], str]
+) -> None:
     vehicle = GenericVehicle([SimParam("A", ParamType.UINT8, 1), SimParam("B", 6, 1)], param_error=True)
     done = command("set", put(vehicle), "NOPE", 1, "A", 300, "B", 2, "--json", "--no-cache")
     assert [result["status"] for result in done.json["results"]] == ["unknown", "invalid", "accepted"]
@@ -479,7 +481,7 @@ def test_all_sets_are_tried_and_the_worst_counts(command: Command, put: Callable
         ("F", "INF", float("inf")),
     ],
 )
-def test_numbers_are_read_exactly(
+def test_numbers_are_parsed_exactly(
     command: Command, put: Callable[[Endpoint], str], name: str, text: str, held: float
 ) -> None:
     table = [SimParam("I", ParamType.INT32, 1), SimParam("U", ParamType.UINT32, 1), SimParam("F", 9, 1.0)]
@@ -493,7 +495,7 @@ def test_numbers_are_read_exactly(
     "text",
     ["true", "", " 1", "1_000", "0x", "--5", "nano", "1e999", "0b1", "\u0661", "1,5", "--jsno", "9" * 400],
 )
-def test_what_is_no_number_is_not_sent(command: Command, put: Callable[[Endpoint], str], text: str) -> None:
+def test_a_value_must_be_a_number(command: Command, put: Callable[[Endpoint], str], text: str) -> None:
     vehicle = GenericVehicle({"A": 1})
     done = command("set", put(vehicle), "A", text, "--no-cache")
     assert (done.code, done.out) == (2, "")
@@ -506,7 +508,7 @@ def test_what_is_no_number_is_not_sent(command: Command, put: Callable[[Endpoint
 
 
 @pytest.mark.parametrize("policy", ["cache-only", "hash-only"])
-def test_fetch_may_ask_for_little(
+def test_fetch_obeys_the_policy(
     command: Command, put: Callable[[Endpoint], str], tmp_path: Path, policy: str
 ) -> None:
     cache = tmp_path / "cache.sqlite3"
@@ -549,10 +551,10 @@ def test_a_policy_and_refresh_exclude_each_other(command: Command) -> None:
     assert unknown.code == 2
 
 
-# what differs from the defaults
+# Differences from the defaults
 
 
-def test_fetch_prints_what_differs_from_the_defaults(command: Command) -> None:
+def test_fetch_prints_parameters_that_differ_from_the_defaults(command: Command) -> None:
     shown = command("fetch", "sim:ardupilot", "--changed", "--no-cache")
     assert shown.code == 0
     assert shown.words[0] == ["name", "value", "type", "index", "trust", "default"]
@@ -569,7 +571,7 @@ def test_fetch_prints_what_differs_from_the_defaults(command: Command) -> None:
     )
 
 
-def test_without_defaults_there_is_nothing_to_differ_from(command: Command, warm: Path) -> None:
+def test_changed_without_defaults_fails(command: Command, warm: Path) -> None:
     for arguments in (("fetch", "sim:px4", "--changed"), ("show", "--changed")):
         shown = command(*arguments, "--cache", warm)
         assert (shown.code, shown.out) == (1, "")
@@ -580,7 +582,7 @@ def test_without_defaults_there_is_nothing_to_differ_from(command: Command, warm
         assert (found.json["components"][0] if "show" in arguments else found.json)["params"] == {}
 
 
-def test_show_prints_what_differs_from_the_defaults(command: Command, tmp_path: Path) -> None:
+def test_show_prints_parameters_that_differ_from_the_defaults(command: Command, tmp_path: Path) -> None:
     cache = tmp_path / "cache.sqlite3"
     assert command("fetch", "sim:ardupilot", "--cache", cache).code == 0
     shown = command("show", "--changed", "--cache", cache)
@@ -600,7 +602,7 @@ def test_show_prints_what_differs_from_the_defaults(command: Command, tmp_path: 
 # fetch with a sample
 
 
-def test_a_sample_may_be_enough_and_says_how_sure_that_is(command: Command, tmp_path: Path) -> None:
+def test_a_sample_may_suffice_and_its_confidence_is_printed(command: Command, tmp_path: Path) -> None:
     cache = tmp_path / "cache.sqlite3"
     arguments = ("fetch", "sim:ardupilot", "--cache", cache, "--accept", "sampled")
     first = command(*arguments, "--json")
@@ -621,7 +623,7 @@ def test_a_sample_may_be_enough_and_says_how_sure_that_is(command: Command, tmp_
     assert "4% for 1 and 36% for 10 and 99% for 100" in shown.err
 
 
-def test_a_sample_needs_to_be_accepted(command: Command) -> None:
+def test_sample_needs_accept_sampled(command: Command) -> None:
     refused = command("fetch", "sim:ardupilot", "--sample", 5, "--no-cache")
     assert (refused.code, refused.out) == (2, "")
     assert "--accept sampled" in refused.err
@@ -652,7 +654,7 @@ def test_watch_prints_lines_of_json_as_values_change(live_command: Command, tmp_
     assert (outcome.code, outcome.out, outcome.err) == (130, "", "")
 
 
-def test_watch_without_names_brings_the_table_first(live_command: Command, tmp_path: Path) -> None:
+def test_watch_without_names_fetches_the_table_first(live_command: Command, tmp_path: Path) -> None:
     cache = tmp_path / "cache.sqlite3"
     with simulated("px4", "--system", "3") as url, process("watch", url, "--cache", cache) as watching:
         assert line_of(watching.stderr) == "watching 903 parameters of 3/1 px4\n"
@@ -661,20 +663,20 @@ def test_watch_without_names_brings_the_table_first(live_command: Command, tmp_p
         assert re.fullmatch(r"[0-9T:.-]+Z  MC_ROLL_P  4\.0 -> 6\.1  \(vehicle\)\n", line)
         watching.send_signal(signal.SIGTERM)
         assert ended(watching) == Outcome(143, "", "")
-    # what it had learnt by then was kept
+    # the parameters received by then were cached
     [kept] = live_command("show", "3", "--json", "--cache", cache).json["components"]
     assert kept["params"]["MC_ROLL_P"]["value"] == 6.1
     assert len(kept["params"]) == 903
 
 
-def test_watch_ends_by_itself_after_its_time(command: Command) -> None:
+def test_watch_ends_after_its_timeout(command: Command) -> None:
     watched = command("watch", "sim:px4", "MC_ROLL_P", "--timeout", 3, "--no-cache")
     assert (watched.code, watched.out) == (0, "")
     unknown = command("watch", "sim:px4?param_error=1", "NOPE", "--no-cache")
     assert (unknown.code, unknown.out) == (1, "")
 
 
-def test_watch_tells_what_has_changed_since_the_cache_was_written(
+def test_watch_prints_changes_since_the_cache_was_written(
     command: Command, put: Callable[[Endpoint], str], tmp_path: Path
 ) -> None:
     cache = tmp_path / "cache.sqlite3"
@@ -687,8 +689,8 @@ def test_watch_tells_what_has_changed_since_the_cache_was_written(
     assert (change["name"], change["old"], change["new"]) == ("B", 2, 3)
 
 
-def goings_and_comings() -> PX4Vehicle:
-    """A vehicle that is away from 2 s on for 8 s, and comes back with another value of B."""
+def vehicle_lost_and_found() -> PX4Vehicle:
+    """Return a vehicle that is lost after 2 s for 8 s, and returns with another value of B."""
 
     class Restless(PX4Vehicle):
         begun_at: float | None = None
@@ -707,10 +709,10 @@ def goings_and_comings() -> PX4Vehicle:
 
 @pytest.mark.parametrize("as_json", [True, False])
 @swiftly
-async def test_watch_tells_what_becomes_of_the_vehicle(
+async def test_watch_prints_events_of_the_vehicle(
     put: Callable[[Endpoint], str], capsys: pytest.CaptureFixture[str], as_json: bool
 ) -> None:
-    url = put(goings_and_comings())
+    url = put(vehicle_lost_and_found())
     options = LinkOptions(json=as_json, no_cache=True, timeout=20.0)
     assert await vehicle_commands.watch(url, options=options) == 0
     printed = capsys.readouterr()
@@ -721,9 +723,9 @@ async def test_watch_tells_what_becomes_of_the_vehicle(
         assert told[0] == "1/1 lost: not heard for 5.0 s"
         assert re.fullmatch(r"1/1 found after \d\d?\.\d s", told[1])
         assert told[2:] == [
-            "1/1 has started again",
+            "1/1 rebooted",
             "B  2 -> 3  (vehicle)",
-            "1/1 resynced: 1 had moved",
+            "1/1 resynced: 1 value had changed",
         ]
         return
     lost, found, rebooted, change, resynced = (strict(line) for line in lines)
@@ -740,10 +742,10 @@ async def test_watch_tells_what_becomes_of_the_vehicle(
 
 
 @swiftly
-async def test_watch_tells_of_its_own_vehicle_alone(
+async def test_watch_prints_only_events_of_its_own_vehicle(
     put: Callable[[Endpoint], str], capsys: pytest.CaptureFixture[str]
 ) -> None:
-    other = goings_and_comings()
+    other = vehicle_lost_and_found()
     other.system = 2
     url = put(Air([PX4Vehicle(table={"A": 1}), other]))
     assert await vehicle_commands.watch(url, options=LinkOptions(no_cache=True, timeout=20.0)) == 0
@@ -751,21 +753,21 @@ async def test_watch_tells_of_its_own_vehicle_alone(
 
 
 @swiftly
-async def test_watch_may_only_listen(
+async def test_watch_can_only_listen(
     put: Callable[[Endpoint], str], capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    vehicle = goings_and_comings()
+    vehicle = vehicle_lost_and_found()
     url = put(vehicle)
     options = LinkOptions(cache=str(tmp_path / "cache.sqlite3"), timeout=20.0)
     assert await vehicle_commands.watch(url, policy=Policy.CACHE_ONLY, options=options) == 0
     printed = capsys.readouterr()
     assert printed.err == "watching 0 parameters of 1/1 px4\n"
-    assert len(printed.out.splitlines()) == 3, "lost, found, has started again"
+    assert len(printed.out.splitlines()) == 3, "lost, found, rebooted"
     assert vehicle.requests.keys() == {"HEARTBEAT", "COMMAND_LONG"}
 
 
 @pytest.mark.parametrize("is_json", [True, False])
-def test_a_link_that_fails_under_watch_is_told_once(
+def test_a_link_that_fails_during_watch_is_reported_once(
     command: Command, put: Callable[[Endpoint | SimLink], str], is_json: bool
 ) -> None:
     class Failing(SimLink):
@@ -817,7 +819,7 @@ def test_link_prints_one_object_with_exactly_these_keys(live_command: Command) -
 
 
 class Modem(PX4Vehicle):
-    """A vehicle with a telemetry radio, and with a message that no dialect has."""
+    """A vehicle with a telemetry radio, and with a message that is in no dialect."""
 
     def data_to_send(self) -> list[bytes]:
         frames = super().data_to_send()
@@ -828,7 +830,7 @@ class Modem(PX4Vehicle):
         return frames
 
 
-def test_people_see_what_is_heard(command: Command, put: Callable[[Endpoint], str]) -> None:
+def test_link_prints_a_table_of_components(command: Command, put: Callable[[Endpoint], str]) -> None:
     heard = command("link", put(Modem(telemetry=20)), "--seconds", 2)
     assert (heard.code, heard.err) == (0, "")
     lines = heard.out.splitlines()
@@ -853,7 +855,7 @@ def test_people_see_what_is_heard(command: Command, put: Callable[[Endpoint], st
     assert len(lines) == 10
 
 
-def test_a_link_on_which_nothing_is_heard_is_code_3(live_command: Command, put: Callable[..., str]) -> None:
+def test_a_silent_link_is_exit_code_3(live_command: Command, put: Callable[..., str]) -> None:
     silent = live_command("link", "udpin:127.0.0.1:0", "--seconds", 0.3, "--json")
     assert (silent.code, silent.out) == (3, "")
     assert re.fullmatch(r"paramclient: no reply: anything on udpin:127\.0\.0\.1:0 in [0-9.]+ s\n", silent.err)
@@ -867,7 +869,7 @@ def test_a_link_on_which_nothing_is_heard_is_code_3(live_command: Command, put: 
     assert re.search(r"anything on sim:custom \(but [0-9,]+ other bytes\) in", noisy.err)
 
 
-def test_a_link_that_fails_while_it_is_looked_at_is_code_4(command: Command, put: Callable[..., str]) -> None:
+def test_a_link_that_fails_during_link_is_exit_code_4(command: Command, put: Callable[..., str]) -> None:
     class Failing(SimLink):
         async def receive(self) -> list[tuple[Peer, bytes]]:
             raise LinkError(f"{self.name}: gone", link=self.name)
@@ -876,14 +878,14 @@ def test_a_link_that_fails_while_it_is_looked_at_is_code_4(command: Command, put
     assert (failed.code, failed.out, failed.err) == (4, "", "paramclient: sim:custom: gone\n")
 
 
-def test_the_round_trip_is_measured_where_nobody_says_who_he_is(
+def test_the_round_trip_is_measured_without_identification(
     command: Command, put: Callable[[Endpoint], str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class Shy(PX4Vehicle):
         def _on_command(self, *_: object) -> None:
             pass
 
-    monkeypatch.setattr("paramclient.cli.link.FIRST_MEASURE", 0.2)
+    monkeypatch.setattr("paramclient.cli.link.MEASURE_DELAY", 0.2)
     vehicle = Shy()
     heard = command("link", put(vehicle), "--seconds", 2, "--json")
     [component] = heard.json["components"]
@@ -897,7 +899,7 @@ def test_link_is_live_on_a_terminal() -> None:
     assert shown.out.count("round trip") >= 3
     assert shown.out.count("\x1b[?25l") == shown.out.count("\x1b[?25h") > 0  # the cursor is back
     *_, last = shown.out.split("heartbeat")
-    assert "px4 quadrotor" in last  # and the last table stands
+    assert "px4 quadrotor" in last  # the last table stays
     assert "1/1 standby: " in last
     waiting = on_terminal("link", "udpin:127.0.0.1:0", "--seconds", 0.5)
     assert waiting.code == 3
@@ -928,10 +930,10 @@ def test_a_live_link_ends_with_ctrl_c() -> None:
         os.close(ours)
 
 
-# with no link
+# Without a link
 
 
-def test_show_gives_the_table_as_it_was(command: Command, warm: Path) -> None:
+def test_show_prints_the_cached_table(command: Command, warm: Path) -> None:
     shown = command("show", "--json", "--cache", warm)
     assert (shown.code, shown.err) == (0, "")
     assert list(shown.json) == ["components"]
@@ -951,7 +953,7 @@ def test_show_gives_the_table_as_it_was(command: Command, warm: Path) -> None:
     assert table.err.startswith(f"903 parameters of 1/1 px4 ({key_of(warm)}), synced 20")
 
 
-def test_show_lists_several_vehicles_and_finds_one(command: Command, warm: Path) -> None:
+def test_show_lists_several_vehicles_and_prints_one(command: Command, warm: Path) -> None:
     assert command("get", "sim:ardupilot?system=2", "RTL_ALT", "--cache", warm).code == 0
     listed = command("show", "--cache", warm)
     assert [row[:2] for row in listed.words] == [
@@ -969,7 +971,7 @@ def test_show_lists_several_vehicles_and_finds_one(command: Command, warm: Path)
     assert [row[0] for row in command("show", "2", "--cache", warm).words] == ["name", "RTL_ALT"]
 
 
-def test_show_says_when_there_is_nothing(command: Command, warm: Path, tmp_path: Path) -> None:
+def test_show_reports_an_empty_cache(command: Command, warm: Path, tmp_path: Path) -> None:
     nowhere = tmp_path / "nothing.sqlite3"
     assert command("show", "--json", "--cache", nowhere).json == {"components": []}
     empty = command("show", "--cache", nowhere)
@@ -981,7 +983,7 @@ def test_show_says_when_there_is_nothing(command: Command, warm: Path, tmp_path:
     assert not nowhere.exists()
 
 
-def test_a_name_that_fits_two_vehicles_chooses_none(command: Command, warm: Path) -> None:
+def test_an_ambiguous_name_chooses_no_vehicle(command: Command, warm: Path) -> None:
     assert command("get", "sim:ardupilot", "RTL_ALT", "--cache", warm).code == 0
     for arguments in (["show", "1"], ["cache", "history", "1"], ["cache", "remove", "1"]):
         outcome = command(*arguments, "--cache", warm)
@@ -991,7 +993,7 @@ def test_a_name_that_fits_two_vehicles_chooses_none(command: Command, warm: Path
     assert len(ParamCache(warm).vehicles()) == 2
 
 
-def test_the_cache_can_be_looked_into(command: Command, warm: Path) -> None:
+def test_cache_list_and_path_print_the_cache(command: Command, warm: Path) -> None:
     assert command("set", "sim:px4", "MC_ROLL_P", 6.5, "MC_YAW_P", 3, "--cache", warm).code == 0
 
     assert command("cache", "path", "--cache", warm).out == f"{warm}\n"
@@ -1017,7 +1019,7 @@ def test_the_cache_can_be_looked_into(command: Command, warm: Path) -> None:
     ]
 
 
-def test_a_vehicle_can_be_forgotten(command: Command, warm: Path) -> None:
+def test_a_vehicle_can_be_removed(command: Command, warm: Path) -> None:
     key = key_of(warm)
     assert command("cache", "remove", "1", "--component", 9, "--cache", warm).code == 2
     removed = command("cache", "remove", "1", "--json", "--cache", warm)
@@ -1026,7 +1028,7 @@ def test_a_vehicle_can_be_forgotten(command: Command, warm: Path) -> None:
     assert command("cache", "remove", "1", "--cache", warm).code == 2
 
 
-# how it ends
+# Exit codes and signals
 
 
 @pytest.mark.parametrize(
@@ -1048,7 +1050,7 @@ def test_a_vehicle_can_be_forgotten(command: Command, warm: Path) -> None:
         (["set", "sim:px4"], "pairs"),
         (["watch", "sim:px4", "ÄÖÜ"], "ASCII"),
         (["sim", "px5"], "px4"),
-        (["sim", "px4", "--link", "sim:px4"], "vehicle itself"),
+        (["sim", "px4", "--link", "sim:px4"], "itself a simulated vehicle"),
         (["sim", "px4", "--loss", "2", "--link", "tcp:127.0.0.1:1"], "loss"),
         (["sim", "px4", "--dead", "NOPE", "--link", "tcp:127.0.0.1:1"], "NOPE"),
         (["sim", "px4", "--list-stops-at", "-1", "--link", "tcp:127.0.0.1:1"], "list_stops_at"),
@@ -1057,7 +1059,7 @@ def test_a_vehicle_can_be_forgotten(command: Command, warm: Path) -> None:
         (["cache", "history"], "VEHICLE"),
     ],
 )
-def test_bad_arguments_are_code_2_and_one_line(command: Command, arguments: list[str], text: str) -> None:
+def test_bad_arguments_are_exit_code_2(command: Command, arguments: list[str], text: str) -> None:
     outcome = command(*arguments)
     assert (outcome.code, outcome.out) == (2, "")
     assert outcome.err.startswith("paramclient: ")
@@ -1065,21 +1067,21 @@ def test_bad_arguments_are_code_2_and_one_line(command: Command, arguments: list
     assert text in outcome.err
 
 
-def test_a_bad_link_name_tells_the_forms(command: Command) -> None:
+def test_a_bad_link_name_lists_the_accepted_forms(command: Command) -> None:
     outcome = command("fetch", "carrier-pigeon", "--no-cache")
     assert (outcome.code, outcome.out) == (2, "")
     assert outcome.err.startswith("paramclient: link name 'carrier-pigeon': ")
     assert "\n  udpin:HOST:PORT " in outcome.err
 
 
-def test_a_vehicle_that_is_not_there_is_code_3(live_command: Command) -> None:
+def test_a_missing_vehicle_is_exit_code_3(live_command: Command) -> None:
     outcome = live_command("fetch", "udpin:127.0.0.1:0", "--timeout", 0.1, "--no-cache", "--json")
     assert (outcome.code, outcome.out) == (3, "")
     assert outcome.err == "paramclient: no reply: an autopilot in 0.1 s\n"
 
 
-def test_a_vehicle_that_does_not_answer_is_code_3(command: Command, put: Callable[[Endpoint], str]) -> None:
-    class Deaf(Mute):
+def test_a_vehicle_without_answers_is_exit_code_3(command: Command, put: Callable[[Endpoint], str]) -> None:
+    class Deaf(SilentOnParams):
         def _on_list(self) -> None:
             pass
 
@@ -1087,7 +1089,7 @@ def test_a_vehicle_that_does_not_answer_is_code_3(command: Command, put: Callabl
     assert (outcome.code, outcome.out) == (3, "")
 
 
-def test_a_link_that_fails_is_code_4(live_command: Command, put: Callable[..., str]) -> None:
+def test_a_failed_link_is_exit_code_4(live_command: Command, put: Callable[..., str]) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
@@ -1110,7 +1112,7 @@ def test_a_link_that_fails_is_code_4(live_command: Command, put: Callable[..., s
     assert [result["status"] for result in done.json["results"]] == ["link", "link"]
 
 
-def test_a_cache_that_fails_is_code_5_and_only_a_warning_for_fetch(
+def test_a_failed_cache_is_exit_code_5_and_only_a_warning_for_fetch(
     command: Command, put: Callable[[Endpoint], str], tmp_path: Path
 ) -> None:
     for arguments in (["show"], ["show", "--json"], ["cache", "list"], ["cache", "history", "1"]):
@@ -1125,7 +1127,7 @@ def test_a_cache_that_fails_is_code_5_and_only_a_warning_for_fetch(
     assert "not written to the cache, and lost: 1 value" in told
 
 
-def test_every_error_has_a_code_and_every_failed_set_a_word() -> None:
+def test_every_error_has_an_exit_code_and_a_status() -> None:
     def kinds(error: type[ParamClientError]) -> Iterator[type[ParamClientError]]:
         yield error
         for each in error.__subclasses__():
@@ -1142,8 +1144,8 @@ def test_every_error_has_a_code_and_every_failed_set_a_word() -> None:
     assert code_of(ClientClosed("", link="")) == ExitCode.LINK
 
 
-def test_signals_are_handled_as_before_afterwards(command: Command, put: Callable[[Endpoint], str]) -> None:
-    class Interrupting(Mute):
+def test_signal_handlers_are_restored(command: Command, put: Callable[[Endpoint], str]) -> None:
+    class Interrupting(SilentOnParams):
         def _on_read(self, request: wire.ParamRequestRead, sender: wire.Frame) -> None:
             signal.raise_signal(signal.SIGTERM)
 
@@ -1160,12 +1162,12 @@ def test_a_fetch_that_is_interrupted_ends_cleanly(number: int, code: int, tmp_pa
         listener.settimeout(PATIENCE)
         url = f"udpout:127.0.0.1:{listener.getsockname()[1]}"
         with process("fetch", url, "--cache", tmp_path / "cache.sqlite3") as fetching:
-            listener.recv(100)  # the client is at work
+            listener.recv(100)  # the client has sent a request
             fetching.send_signal(number)
             assert ended(fetching) == Outcome(code, "", "")
 
 
-def test_a_fetch_that_is_interrupted_in_a_file_has_it_closed_on_board() -> None:
+def test_a_fetch_interrupted_in_a_file_closes_it_on_the_vehicle() -> None:
     vehicle = ArduPilotVehicle(live_period=0)
     with flying(Air.symmetric([vehicle], delay=0.05)) as url:
         with process("fetch", url, "--no-cache") as fetching:
@@ -1185,7 +1187,7 @@ def test_a_second_signal_does_not_wait(live_command: Command, warm: Path) -> Non
     with simulated("px4") as url, process("watch", url, "MC_ROLL_P", "--cache", warm) as watching:
         line_of(watching.stderr)
         with sqlite3.connect(warm) as other:
-            other.execute("BEGIN IMMEDIATE")  # closing has to wait: the change cannot be written
+            other.execute("BEGIN IMMEDIATE")  # the client cannot write the change, so that its end waits
             assert live_command("set", url, "MC_ROLL_P", 6, "--no-cache").code == 0
             line_of(watching.stdout)
             deadline = time.monotonic() + PATIENCE
@@ -1206,8 +1208,8 @@ def test_sim_ends_cleanly() -> None:
         assert ended(started) == Outcome(130, "", "")
 
 
-class FarEnd:
-    """Speaks to a simulated vehicle in another process: takes its messages until one is what was wanted."""
+class RemoteEnd:
+    """Communicates with a simulated vehicle in another process: receives messages until one matches."""
 
     def __init__(self, url: str) -> None:
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -1235,7 +1237,7 @@ class FarEnd:
 
 def test_sim_with_dead_indices_and_lists_that_stop() -> None:
     misfortunes = ["--dead", "3", "--dead", "ATT_EN", "--list-stops-at", 10, "--list-stops", "inf"]
-    with simulated("px4", *map(str, misfortunes)) as url, FarEnd(url) as far:
+    with simulated("px4", *map(str, misfortunes)) as url, RemoteEnd(url) as far:
         dead = PX4Vehicle().param("ATT_EN").index
         far.ask(wire.ParamRequestList(1, 1))
         for _ in range(2):
@@ -1255,7 +1257,7 @@ def test_sim_that_boots_and_reboots_in_mid_stream() -> None:
         return lambda _, message: isinstance(message, wire.Heartbeat) and message.system_status == status
 
     misfortunes = ["--boot-time", "1", "--reboot-at", "50", "--reboot-down", "0.2"]
-    with simulated("ardupilot", *misfortunes) as url, FarEnd(url) as far:
+    with simulated("ardupilot", *misfortunes) as url, RemoteEnd(url) as far:
         far.ask(wire.Heartbeat(6, 8))
         far.until(says(3))
         far.ask(wire.ParamRequestList(1, 1))
@@ -1265,7 +1267,7 @@ def test_sim_that_boots_and_reboots_in_mid_stream() -> None:
 
 def test_sim_on_a_satellite_link_beside_another_station() -> None:
     misfortunes = ["--system", "7", "--high-latency", "--other-list-every", "0.2"]
-    with simulated("px4", *misfortunes) as url, FarEnd(url) as far:
+    with simulated("px4", *misfortunes) as url, RemoteEnd(url) as far:
         far.ask(wire.Heartbeat(6, 8))
         heard = set()
 
@@ -1279,7 +1281,7 @@ def test_sim_on_a_satellite_link_beside_another_station() -> None:
         assert {kind for system, kind in heard if system == 7} == {wire.HighLatency2}
 
 
-def test_a_closed_pipe_ends_it_without_a_word(warm: Path) -> None:
+def test_a_closed_pipe_ends_the_command_silently(warm: Path) -> None:
     for arguments in (["fetch", "sim:px4"], ["fetch", "sim:px4", "--json"], ["show"], ["cache", "path"]):
         reading, writing = os.pipe()
         os.close(reading)
@@ -1290,17 +1292,17 @@ def test_a_closed_pipe_ends_it_without_a_word(warm: Path) -> None:
         assert (outcome.code, outcome.err) == (141, "")
 
 
-def test_a_full_disk_is_told(warm: Path) -> None:
+def test_a_full_disk_is_reported(warm: Path) -> None:
     with Path("/dev/full").open("w") as full:
         outcome = run_process("show", "--json", "--cache", warm, stdout=full)
     assert outcome.code == 1
     assert outcome.err == "paramclient: cannot write the output: No space left on device\n"
 
 
-# what it needs, and what it loads
+# Extras and lazy loading
 
 
-def test_without_the_extra_it_says_what_to_install() -> None:
+def test_without_the_extra_the_message_names_it() -> None:
     program = """if True:
         import sys
         sys.modules["cyclopts"] = sys.modules["rich"] = None
@@ -1318,7 +1320,7 @@ def test_without_the_extra_it_says_what_to_install() -> None:
 
 
 def printed_by(program: str) -> str:
-    """What a Python program of its own prints."""
+    """Return the output of a Python program in a new process."""
     return subprocess.run(
         [sys.executable, "-c", program],
         cwd=ROOT,
@@ -1329,14 +1331,14 @@ def printed_by(program: str) -> str:
     ).stdout
 
 
-def test_rich_and_the_simulators_load_only_where_they_are_needed() -> None:
+def test_rich_and_the_simulators_load_only_if_needed() -> None:
     program = (
         "import sys, paramclient.cli; print([n for n in ('rich', 'paramclient.sim') if n in sys.modules])"
     )
     assert printed_by(program) == "[]\n"
 
 
-def test_the_module_is_the_command() -> None:
+def test_the_module_runs_the_command_line() -> None:
     assert run_process("--version") == Outcome(0, f"paramclient {paramclient.__version__}\n", "")
 
 
@@ -1360,11 +1362,11 @@ def test_help_has_examples(command: Command, arguments: Sequence[str]) -> None:
         assert command().out == helped.out
 
 
-# what people see
+# Output
 
 
 class Hostile:
-    """A vehicle whose names are what a terminal would obey.
+    """A vehicle whose names contain escape sequences of terminals.
 
     Everything goes to and from a plain vehicle; only the names are exchanged on the way.
     """
@@ -1396,13 +1398,13 @@ class Hostile:
         return data
 
 
-def test_nothing_from_the_wire_reaches_the_terminal_as_it_came(
+def test_text_from_the_wire_is_escaped(
     command: Command, put: Callable[[Endpoint], str], tmp_path: Path
 ) -> None:
     cache = tmp_path / "cache.sqlite3"
     url = put(Hostile())
     for outcome in (fetched := command("fetch", url, "--cache", cache), command("show", "--cache", cache)):
-        assert [row[0] for row in outcome.words[1:]] == ["[red]B[/red]"]  # the others are no usable names
+        assert [row[0] for row in outcome.words[1:]] == ["[red]B[/red]"]  # all other names are unusable
         assert (outcome.out + outcome.err).replace("\n", "").isprintable()
         assert (outcome.out + outcome.err).isascii()
     assert fetched.code == 1
@@ -1429,7 +1431,7 @@ def test_unprintable_text_is_escaped() -> None:
 
 
 def on_terminal(*arguments: object, **environment: str) -> Outcome:
-    """The command with its stdout and stderr on one terminal."""
+    """Run the command line with stdout and stderr on one terminal."""
     ours, theirs = pty.openpty()
     printed = b""
     try:
@@ -1437,7 +1439,7 @@ def on_terminal(*arguments: object, **environment: str) -> Outcome:
             *arguments, stdout=theirs, stderr=theirs, env={**PLAIN, "TERM": "xterm", **environment}
         ) as started:
             os.close(theirs)
-            # the terminal is at its end when the last one who has it open goes
+            # the terminal ends when the last process closes it
             while select.select([ours], [], [], PATIENCE)[0]:
                 try:
                     printed += os.read(ours, 65536)
@@ -1460,7 +1462,7 @@ def test_progress_is_drawn_on_a_terminal(tmp_path: Path) -> None:
     assert not re.search(r"\x1b\[(3|9)[0-9]m", plain.out)
 
 
-def test_nothing_is_drawn_for_what_takes_no_time(warm: Path) -> None:
+def test_no_progress_is_drawn_for_a_cache_hit(warm: Path) -> None:
     shown = on_terminal("fetch", "sim:px4", "--cache", warm)
     assert shown.code == 0
     assert "from cache in" in shown.out

@@ -1,4 +1,4 @@
-"""The command diff: what it compares, what it prints, how it ends; and where its parameters come from."""
+"""The subcommand diff: sources, comparison, output and exit codes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def cache(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], cache: Path) -> Command:
-    """Runs the command in this process, with a cache of its own."""
+    """Run the command line in this process, with a new cache."""
     return in_process(capsys, "--cache", str(cache))
 
 
@@ -276,7 +276,7 @@ def test_a_vehicle_without_a_hardware_id_is_named_by_its_key(command: Command, c
         (
             ["1", "1", "--component", "9"],
             2,
-            "which holds 1/1 (uid:aa00000000000001)",
+            "which has 1/1 (uid:aa00000000000001)",
         ),
         (
             ["quad.params", "1"],
@@ -292,7 +292,7 @@ def test_a_vehicle_without_a_hardware_id_is_named_by_its_key(command: Command, c
         (["1"], 2, "RIGHT"),
     ],
 )
-def test_a_word_that_means_nothing_is_told(command: Command, words: list[str], code: int, text: str) -> None:
+def test_an_unknown_source_is_an_error(command: Command, words: list[str], code: int, text: str) -> None:
     outcome = command("diff", *words)
     assert (outcome.code, outcome.out) == (code, "")
     assert text in outcome.err
@@ -335,7 +335,7 @@ ROWS = ("A_SAME\t1\t6", "B_FLOAT\t0.100000001490116119\t9", "C_LEFT\t5\t6")
 
 @pytest.fixture
 def write(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., str]:
-    """Writes a file of these lines into the folder in which the command runs."""
+    """Write a file of these lines to the working directory."""
     monkeypatch.chdir(tmp_path)
 
     def place(name: str, *lines: str) -> str:
@@ -363,7 +363,7 @@ def test_files_of_two_stations_can_be_the_same(command: Command, write: Callable
     assert changed.json["right"]["count"] == 3
 
 
-def test_a_file_is_held_against_a_vehicle(
+def test_a_file_is_compared_with_a_vehicle(
     command: Command, write: Callable[..., str], vehicles: dict[str, Vehicle]
 ) -> None:
     vehicles["tcp:one:1"] = GenericVehicle({"A": 1, "B": 0.1})
@@ -372,7 +372,7 @@ def test_a_file_is_held_against_a_vehicle(
 
 
 @pytest.mark.usefixtures("two")
-def test_a_file_that_exists_wins(command: Command, write: Callable[..., str], tmp_path: Path) -> None:
+def test_an_existing_file_has_precedence(command: Command, write: Callable[..., str], tmp_path: Path) -> None:
     for name in ("1", "aa0000", "tcp:one:1"):
         write(name, "A 1")
         outcome = command("diff", name, "cache:1", "--json")
@@ -393,14 +393,14 @@ def test_a_component_of_a_file_can_be_chosen(command: Command, write: Callable[.
     assert command("diff", fleet, second, "--system", 2).code == 0
 
 
-def test_a_damaged_file_is_code_2(command: Command, write: Callable[..., str]) -> None:
+def test_a_damaged_file_is_exit_code_2(command: Command, write: Callable[..., str]) -> None:
     write("\x1bquad.param", "A,1", "B,one")
     outcome = command("diff", "\x1bquad.param", "\x1bquad.param")
     assert (outcome.code, outcome.out) == (2, "")
     assert outcome.err.startswith("paramclient: \\x1bquad.param:2: ")
 
 
-def test_a_pipe_is_no_file(command: Command, tmp_path: Path) -> None:
+def test_a_pipe_is_not_a_parameter_file(command: Command, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     outcome = command("diff", tmp_path / "pipe", "1")
     assert (outcome.code, outcome.out) == (2, "")
@@ -433,7 +433,7 @@ def test_show_prints_a_file(command: Command, write: Callable[..., str]) -> None
     assert command("show", path, "--component", 7).code == 2
 
 
-def test_show_prints_comments_and_what_differs_from_the_defaults(
+def test_show_prints_comments_and_changed_parameters_of_a_file(
     command: Command, write: Callable[..., str]
 ) -> None:
     plain = write("quad.param", "A,1", "# why", "B,2")
@@ -451,7 +451,7 @@ def test_show_prints_comments_and_what_differs_from_the_defaults(
 
 
 @pytest.mark.usefixtures("two")
-def test_show_finds_a_cached_vehicle_beside_a_file(command: Command, write: Callable[..., str]) -> None:
+def test_show_finds_a_cached_vehicle_despite_a_file(command: Command, write: Callable[..., str]) -> None:
     write("1", "A 1")
     assert "file" in command("show", "1", "--json").json
     [component] = command("show", "cache:1", "--json").json["components"]
@@ -462,7 +462,7 @@ def test_show_finds_a_cached_vehicle_beside_a_file(command: Command, write: Call
 
 
 class Gappy(GenericVehicle):
-    """Never sends one of its parameters."""
+    """A vehicle that never sends one of its parameters."""
 
     def _send_value(self, entry: Entry, **where: Any) -> None:
         if entry.name != "B":
@@ -471,17 +471,17 @@ class Gappy(GenericVehicle):
 
 @pytest.fixture
 def vehicles(monkeypatch: pytest.MonkeyPatch) -> dict[str, Vehicle]:
-    """What is behind which URL; nothing is behind all others."""
+    """Return the vehicles by URL; all other URLs have none."""
     known: dict[str, Vehicle] = {}
 
     def client(url: str, **options: Any) -> ParamClient:
-        return ParamClient(SimLink(known.pop(url), url), **options)  # each of them is asked once
+        return ParamClient(SimLink(known.pop(url), url), **options)  # each link is opened once
 
     monkeypatch.setattr(connection, "ParamClient", client)
     return known
 
 
-def test_two_links_are_fetched_side_by_side(command: Command, vehicles: dict[str, Vehicle]) -> None:
+def test_two_links_are_fetched_concurrently(command: Command, vehicles: dict[str, Vehicle]) -> None:
     vehicles["tcp:one:1"] = GenericVehicle({"A": 1, "B": 2})
     vehicles["tcp:two:1"] = GenericVehicle({"A": 1, "B": 3}, system=7)
     outcome = command("diff", "tcp:one:1", "tcp:two:1", "--base", "tcp:one:1", "--json")
@@ -494,24 +494,24 @@ def test_two_links_are_fetched_side_by_side(command: Command, vehicles: dict[str
     assert outcome.json["right"]["source"] == "link tcp:two:1"
 
 
-def test_what_a_link_did_not_bring_is_named(command: Command, vehicles: dict[str, Vehicle]) -> None:
+def test_parameters_missing_from_a_link_are_named(command: Command, vehicles: dict[str, Vehicle]) -> None:
     vehicles["tcp:one:1"] = Gappy({"A": 1, "B": 2})
     outcome = command("diff", "tcp:one:1", "tcp:one:1", "--timeout", 1)
     assert (outcome.code, outcome.out) == (1, "")
     assert "1/1 generic on tcp:one:1 is incomplete: index 1 did not come" in outcome.err
 
 
-def test_one_link_that_fails_ends_all(command: Command) -> None:
+def test_a_failed_link_ends_the_comparison(command: Command) -> None:
     began = time.monotonic()
     outcome = command("diff", "udpin:127.0.0.1:0", "tcp:127.0.0.1:1", "--timeout", PATIENCE)
     assert (outcome.code, outcome.out) == (4, "")
-    assert time.monotonic() - began < PATIENCE  # what is never heard on the other one is not waited for
+    assert time.monotonic() - began < PATIENCE  # the silent link was not waited for
 
 
-def test_a_link_gives_what_the_vehicle_has_confirmed(
+def test_a_link_provides_only_confirmed_values(
     command: Command, vehicles: dict[str, Vehicle], cache: Path
 ) -> None:
-    """After a hash hit: what the hash does not cover is read afresh, what is not listed was known once."""
+    """After a hash match, values that the hash does not cover are read; unlisted ones are only cached."""
 
     def quad(volatile: float) -> PX4Vehicle:
         table = [
@@ -535,8 +535,8 @@ def test_a_link_gives_what_the_vehicle_has_confirmed(
     }
 
 
-def test_no_link_is_opened_before_all_else_is_right(command: Command, vehicles: dict[str, Vehicle]) -> None:
-    """`vehicles` has none, so opening any would fail."""
+def test_links_are_opened_after_all_other_checks(command: Command, vehicles: dict[str, Vehicle]) -> None:
+    """`vehicles` is empty, so that opening a link would fail."""
     assert command("diff", "tcp:one:1", "9").code == 2
     assert command("diff", "tcp:one:1", "quad.params").code == 2
 
@@ -571,7 +571,7 @@ def test_a_terminal_gets_colours(cache: Path) -> None:
             while select.select([ours], [], [], PATIENCE)[0]:
                 try:
                     printed += os.read(ours, 65536)
-                except OSError:  # the terminal is at its end when the last one who has it open goes
+                except OSError:  # the terminal ends when the last process closes it
                     break
             started.communicate(timeout=PATIENCE)
     finally:
@@ -580,14 +580,14 @@ def test_a_terminal_gets_colours(cache: Path) -> None:
     coloured = set(re.findall(r"\x1b\[([0-9;]+)m *([^\x1b]+)\x1b", printed.decode()))
     yellow, red, green, bold_red = "33", "31", "32", "1;31"
     assert coloured >= {
-        *((bold_red, "123456789"), (bold_red, "987654321")),  # the values that are in conflict
+        *((bold_red, "123456789"), (bold_red, "987654321")),  # the conflicting values
         *((yellow, "2"), (red, "5"), (green, "6")),
     }
-    assert not any(text in ("1", "0") for _, text in coloured)  # neither what has not moved nor the base
+    assert not any(text in ("1", "0") for _, text in coloured)  # neither unchanged values nor the base
 
 
 @pytest.mark.usefixtures("two")
-def test_an_output_that_nobody_reads_ends_it(cache: Path) -> None:
+def test_a_closed_output_ends_the_command(cache: Path) -> None:
     ours, theirs = os.pipe()
     os.close(ours)
     with start(cache, theirs) as started:

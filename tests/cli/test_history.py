@@ -1,4 +1,4 @@
-"""The commands history and fleet diff, and the moments that people write."""
+"""The subcommands history and fleet diff, and the parsing of times."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def path(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def command(path: Path, capsys: pytest.CaptureFixture[str]) -> Command:
-    """Runs the command in this process, with a cache of its own."""
+    """Run the command line in this process, with a new cache."""
     return in_process(capsys, "--cache", str(path))
 
 
@@ -65,8 +65,8 @@ def at(text: str) -> float:
         ("2 WEEKS AGO", "2026-11-06T23:00Z"),
     ],
 )
-def test_a_moment_is_read_as_people_write_it(text: str, moment: str) -> None:
-    """Eleven in the evening in Greenwich is tomorrow where the user is: his days count."""
+def test_times_are_parsed(text: str, moment: str) -> None:
+    """23:00 in Greenwich is the next day in the time zone of the user, whose days apply."""
     now = at("2026-11-20T23:00Z")
     assert parse_time(text, now, EAST) == parse_when(text, now, EAST) == at(moment)
 
@@ -81,25 +81,25 @@ def test_a_moment_is_read_as_people_write_it(text: str, moment: str) -> None:
         *("14:00 25:00", "1h yesterday", "2026-11-20T14:00+99:00"),
     ],
 )  # fmt: skip
-def test_what_is_no_moment_is_an_error_that_says_how_one_is_written(text: str) -> None:
-    with pytest.raises(UsageError, match=r"is no time: a time is written as 2026-11-20T14:00Z"):
+def test_an_invalid_time_is_an_error_that_lists_the_formats(text: str) -> None:
+    with pytest.raises(UsageError, match=r"is not a time: a time is written as 2026-11-20T14:00Z"):
         parse_time(text, NOW, EAST)
 
 
 @pytest.mark.parametrize("text", ["2027-01-01", "23:59", "today 12:00"])
-def test_the_future_is_not_known(text: str) -> None:
+def test_a_time_in_the_future_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="is in the future"):
         parse_when(text, at("2026-11-20T08:00Z"), UTC)
 
 
-def test_a_number_alone_is_a_snapshot() -> None:
+def test_a_number_is_a_snapshot() -> None:
     assert (parse_when("12", NOW), type(parse_when(" 12 ", NOW))) == (12, int)
     assert parse_when("20261120", NOW) == 20261120
-    with pytest.raises(UsageError, match="is no time"):
+    with pytest.raises(UsageError, match="is not a time"):
         parse_when("9" * 19, NOW)
 
 
-def test_without_a_zone_it_is_that_of_this_computer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_default_time_zone_is_that_of_this_computer(monkeypatch: pytest.MonkeyPatch) -> None:
     try:
         monkeypatch.setenv("TZ", "XYZ-3")
         time.tzset()
@@ -113,12 +113,12 @@ def test_without_a_zone_it_is_that_of_this_computer(monkeypatch: pytest.MonkeyPa
 # history
 
 
-HOUR_AGO = float(int(time.time()) - 3600)  # when the tests were collected: what follows may take its time
+HOUR_AGO = float(int(time.time()) - 3600)  # at the collection of the tests, which may run much later
 
 
 @pytest.fixture
 def known(path: Path) -> None:
-    """A vehicle that has changed a little in the last hour."""
+    """A vehicle with some changes in the last hour."""
     with ParamCache(path) as cache:
         for number, items in enumerate(([("A", 1), ("B", 1)], [("A", 2)], [("B", 2)])):
             at = HOUR_AGO + 600 * number
@@ -130,7 +130,7 @@ def known(path: Path) -> None:
 
 
 @pytest.mark.usefixtures("known")
-def test_changes_are_told_as_in_the_cache_and_since_a_moment(command: Command) -> None:
+def test_history_prints_the_cached_changes_since_a_time(command: Command) -> None:
     for words in (["history"], ["cache", "history"]):
         found = command(*words, "1", "--json").json["history"]
         assert [(each["component"], each["name"], each["old"], each["new"]) for each in found] == [
@@ -177,15 +177,15 @@ def test_snapshots_are_listed_with_their_numbers(command: Command) -> None:
 @pytest.mark.parametrize(
     ("arguments", "code", "text"),
     [
-        (["1", "--since", "soon"], 2, "'soon' is no time: a time is written as"),
+        (["1", "--since", "soon"], 2, "'soon' is not a time: a time is written as"),
         (["1", "--since", "2099-01-01"], 2, "is in the future"),
-        (["1", "A", "--snapshots"], 2, "it takes no parameter's name"),
+        (["1", "A", "--snapshots"], 2, "takes no parameter name"),
         (["1", "A_NAME_THAT_IS_TOO_LONG"], 2, "a param_id holds 16"),
         (["1", "--limit", "0"], 2, "limit"),
         (["9"], 2, "vehicle 9 is not in the cache"),
     ],
 )
-def test_what_cannot_be_told_is_an_error(
+def test_invalid_arguments_of_history_are_errors(
     command: Command, arguments: list[str], code: int, text: str
 ) -> None:
     failed = command("history", *arguments)
@@ -214,7 +214,7 @@ def three(path: Path) -> None:
         cache.save(whole_table(1, second, component=154))
 
 
-def test_who_differs_is_told_and_since_when(path: Path, command: Command) -> None:
+def test_fleet_diff_prints_differing_vehicles_with_the_time(path: Path, command: Command) -> None:
     three(path)
     same = command("fleet", "diff", "F")
     assert (same.code, same.out, same.err) == (0, "", "no parameter differs among 3 vehicles\n")
@@ -231,7 +231,7 @@ def test_who_differs_is_told_and_since_when(path: Path, command: Command) -> Non
     assert (alone.code, alone.err) == (0, "no parameter differs among 1 vehicle\n")
 
 
-def test_most_of_them_are_one_line(path: Path, command: Command) -> None:
+def test_the_most_common_value_is_one_row(path: Path, command: Command) -> None:
     three(path)
     with ParamCache(path) as cache:
         cache.save(update(stored("A", 1), identity=replace(PX4, system=4, uid="0004")))
@@ -244,7 +244,7 @@ def test_most_of_them_are_one_line(path: Path, command: Command) -> None:
     ]
 
 
-def test_vehicles_are_held_against_a_file(path: Path, tmp_path: Path, command: Command) -> None:
+def test_vehicles_are_compared_with_a_file(path: Path, tmp_path: Path, command: Command) -> None:
     three(path)
     file = tmp_path / "wanted.param"
     file.write_text("A,5\nF,0.1\nNONE,1\n")
@@ -262,7 +262,7 @@ def test_vehicles_are_held_against_a_file(path: Path, tmp_path: Path, command: C
     assert command("fleet", "diff", file).code == 1
 
 
-def test_the_same_for_programs(path: Path, tmp_path: Path, command: Command) -> None:
+def test_fleet_diff_prints_json(path: Path, tmp_path: Path, command: Command) -> None:
     three(path)
     told = command("fleet", "diff", "A", "F", "--json")
     assert told.code == 1
@@ -306,7 +306,7 @@ def test_the_same_for_programs(path: Path, tmp_path: Path, command: Command) -> 
         (["A_NAME_THAT_IS_TOO_LONG"], 2, "a param_id holds 16"),
     ],
 )
-def test_what_cannot_be_compared_is_an_error(
+def test_invalid_arguments_of_fleet_diff_are_errors(
     path: Path, command: Command, words: list[str], code: int, text: str
 ) -> None:
     three(path)

@@ -1,4 +1,4 @@
-"""The command where parameters are described: names for values, units and meanings, help."""
+"""Metadata in the command line: names of values, units, meanings, descriptions."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ XML = DATA / "apm.pdef.xml"
 
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Runs the command in this process, on a clock that leaps."""
+    """Run the command line in this process, on simulated time."""
     leaping(monkeypatch)
     return in_process(capsys)
 
 
 @pytest.fixture
 def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Puts a simulated vehicle behind every URL; gives a URL."""
+    """Connect every URL to a simulated vehicle; return a URL."""
     return behind(monkeypatch, "sim:custom")
 
 
 def quad(*, metadata: bool = True, ftp: bool = False) -> PX4Vehicle:
-    """A vehicle with few parameters, some of which the simulator knows more of."""
+    """Return a vehicle with few parameters, some of which have metadata."""
     table = [
         SimParam("COM_FLTMODE1", ParamType.INT32, -1),
         SimParam("EKF2_GPS_CTRL", ParamType.INT32, 7),
@@ -54,7 +54,7 @@ def copter(system: int = 1) -> ArduPilotVehicle:
 # set
 
 
-def test_a_name_is_set_that_the_vehicle_itself_has_for_a_value(command: Command, put: Any) -> None:
+def test_set_accepts_value_names_of_the_vehicle(command: Command, put: Any) -> None:
     vehicle = quad()
     done = command(
         "set", put(vehicle), "COM_FLTMODE1=return", "EKF2_GPS_CTRL=Position|Heading", "--json", "--no-cache"
@@ -73,16 +73,16 @@ def test_a_name_is_set_that_the_vehicle_itself_has_for_a_value(command: Command,
     assert second["text"] == "Position|Heading"
 
 
-def test_a_name_is_set_that_a_file_has_for_a_value(command: Command, put: Any) -> None:
+def test_set_accepts_value_names_of_a_file(command: Command, put: Any) -> None:
     vehicle = copter()
     done = command("set", put(vehicle), "FLTMODE1=Loiter", "tst_log=imu+gps", "--metadata", XML, "--no-cache")
     assert done.code == 0
     assert vehicle.values["FLTMODE1"] == 5
     assert vehicle.values["TST_LOG"] == 9
-    assert vehicle.requests["COMMAND_LONG"] <= 1  # it was not asked to describe itself
+    assert vehicle.requests["COMMAND_LONG"] <= 1  # its metadata was not requested
 
 
-def test_numbers_may_stand_behind_an_equals_sign(command: Command, put: Any) -> None:
+def test_numbers_may_follow_an_equals_sign(command: Command, put: Any) -> None:
     vehicle = quad(metadata=False)
     done = command("set", put(vehicle), "COM_FLTMODE1=3", "MC_ROLL_P", 4.25, "MAV_SYS_ID=0x7", "--no-cache")
     assert done.code == 0
@@ -97,18 +97,16 @@ def test_numbers_may_stand_behind_an_equals_sign(command: Command, put: Any) -> 
             r"FLTMODE1: 'Loitr' is not a number, nor one of its values: Stabilize (0), Loiter (5)",
         ),
         (["TST_LOG=7", "FLTMODE1=x", "TST_ALT=1"], "FLTMODE1: 'x' is not a number"),
-        (["NONE=On"], "NONE: 'On' is no number, and NONE is not described"),
+        (["NONE=On"], "NONE: 'On' is not a number, and no metadata describes NONE"),
         (["TST_ALT=high"], "and its values have no names"),
-        (["FLTMODE1="], "FLTMODE1: there is no value behind the equals sign"),
-        (["FLTMODE1", "Loiter"], "FLTMODE1: 'Loiter' is no number; 12, 0x1F"),
+        (["FLTMODE1="], "FLTMODE1: there is no value after the equals sign"),
+        (["FLTMODE1", "Loiter"], "FLTMODE1: 'Loiter' is not a number, such as 12, 0x1F"),
         (["=5"], "a parameter name has at least one character"),
         (["FLTMODE1=1e999"], "FLTMODE1: 1e999 is beyond the range of a float"),
         (["FLTMODE1=5", "TST_LOG"], "set takes pairs of NAME and VALUE, or NAME=VALUE"),
     ],
 )
-def test_nothing_is_sent_where_a_name_is_wrong(
-    command: Command, put: Any, words: list[str], said: str
-) -> None:
+def test_nothing_is_sent_with_a_wrong_name(command: Command, put: Any, words: list[str], said: str) -> None:
     vehicle = copter()
     done = command("set", put(vehicle), *words, "--metadata", XML, "--no-cache")
     assert (done.code, done.out) == (2, "")
@@ -117,7 +115,7 @@ def test_nothing_is_sent_where_a_name_is_wrong(
     assert not vehicle.requests
 
 
-def test_names_of_a_vehicle_that_does_not_describe_itself(command: Command, put: Any) -> None:
+def test_value_names_need_metadata(command: Command, put: Any) -> None:
     vehicle = copter()
     done = command("set", put(vehicle), "TST_LOG", 3, "FLTMODE1=Loiter", "--no-cache")
     assert (done.code, done.out) == (2, "")
@@ -125,7 +123,7 @@ def test_names_of_a_vehicle_that_does_not_describe_itself(command: Command, put:
     assert not vehicle.requests["PARAM_SET"]
 
 
-def test_a_wrong_name_is_not_sent_to_a_vehicle_that_describes_itself(command: Command, put: Any) -> None:
+def test_an_unknown_value_name_is_not_sent(command: Command, put: Any) -> None:
     vehicle = quad()
     done = command("set", put(vehicle), "MC_ROLL_P", 3, "COM_FLTMODE1=Retrun", "--no-cache")
     assert (done.code, done.out) == (2, "")
@@ -133,8 +131,8 @@ def test_a_wrong_name_is_not_sent_to_a_vehicle_that_describes_itself(command: Co
     assert not vehicle.requests["PARAM_SET"]
 
 
-def test_a_value_outside_the_range_is_warned_of_and_sent(command: Command, put: Any) -> None:
-    """The range is what the developers mean; what is right the vehicle says."""
+def test_a_value_outside_of_the_range_is_sent_with_a_warning(command: Command, put: Any) -> None:
+    """The range of the metadata is advice; the vehicle decides."""
     vehicle = quad()
     done = command("set", put(vehicle), "MC_ROLL_P=40", "--metadata", "vehicle", "--no-cache")
     assert done.code == 0
@@ -142,10 +140,10 @@ def test_a_value_outside_the_range_is_warned_of_and_sent(command: Command, put: 
     assert vehicle.values["MC_ROLL_P"] == 40
 
 
-def test_what_needs_a_reboot_is_said(command: Command, put: Any) -> None:
+def test_set_names_parameters_that_need_a_reboot(command: Command, put: Any) -> None:
     words = ("MAV_SYS_ID=2", "MC_ROLL_P=4", "--metadata", "vehicle", "--no-cache")
     done = command("set", put(quad()), *words)
-    assert "to count when the vehicle has started again: MAV_SYS_ID\n" in done.err
+    assert "takes effect after a reboot: MAV_SYS_ID\n" in done.err
     done = command("set", put(quad()), *words, "--json")
     assert [each.get("reboot_required") for each in done.json["results"]] == [True, None]
 
@@ -153,7 +151,7 @@ def test_what_needs_a_reboot_is_said(command: Command, put: Any) -> None:
 # get
 
 
-def test_get_tells_meaning_and_units(command: Command, put: Any) -> None:
+def test_get_prints_meaning_and_units(command: Command, put: Any) -> None:
     done = command(
         *("get", put(quad()), "EKF2_GPS_CTRL", "MC_ROLL_P", "COM_FLTMODE1"),
         *("--metadata", "vehicle", "--no-cache"),
@@ -167,7 +165,7 @@ def test_get_tells_meaning_and_units(command: Command, put: Any) -> None:
     ]
 
 
-def test_get_has_more_fields_in_json_where_something_is_known(command: Command, put: Any) -> None:
+def test_get_has_more_members_in_json_with_metadata(command: Command, put: Any) -> None:
     url = put(quad())
     plain = command("get", url, "MC_ROLL_P", "--json", "--no-cache").json["params"]["MC_ROLL_P"]
     assert set(plain) == {"value", "type", "index", "bits"}
@@ -193,8 +191,8 @@ def test_get_has_more_fields_in_json_where_something_is_known(command: Command, 
     assert mode["metadata"]["values"]["5"] == "Return"
 
 
-def test_what_a_vehicle_said_once_is_known_from_then_on(command: Command, put: Any, tmp_path: Path) -> None:
-    """For its firmware, with no further question, also with no link."""
+def test_downloaded_metadata_is_stored(command: Command, put: Any, tmp_path: Path) -> None:
+    """The stored metadata is used for its firmware without a request, also without a link."""
     cache = ("--cache", tmp_path / "cache.sqlite3")
     plain = command("get", put(quad()), "MC_ROLL_P", *cache)
     assert "units" not in plain.out
@@ -210,7 +208,7 @@ def test_what_a_vehicle_said_once_is_known_from_then_on(command: Command, put: A
     assert "Gain from the error of the roll angle" in done.out
 
 
-def test_a_name_is_never_taken_from_what_was_kept_alone(command: Command, put: Any, tmp_path: Path) -> None:
+def test_the_vehicle_must_confirm_stored_value_names(command: Command, put: Any, tmp_path: Path) -> None:
     """The vehicle confirms it by its checksum: a firmware may have been built from other sources."""
     cache = ("--cache", tmp_path / "cache.sqlite3")
     assert command("get", put(quad()), "MC_ROLL_P", "--metadata", "vehicle", *cache).code == 0
@@ -227,7 +225,7 @@ def test_a_name_is_never_taken_from_what_was_kept_alone(command: Command, put: A
 # diff
 
 
-def test_diff_says_what_values_mean_and_their_units(command: Command, tmp_path: Path) -> None:
+def test_diff_prints_meaning_and_units(command: Command, tmp_path: Path) -> None:
     left, right = tmp_path / "left.param", tmp_path / "right.param"
     left.write_text("FLTMODE1,5\nTST_ALT,100\n")
     right.write_text("FLTMODE1,6\nTST_ALT,120\n")
@@ -246,9 +244,7 @@ def test_diff_says_what_values_mean_and_their_units(command: Command, tmp_path: 
     assert "units" not in plain.out
 
 
-def test_diff_knows_what_was_kept_for_the_firmware_of_a_side(
-    command: Command, put: Any, tmp_path: Path
-) -> None:
+def test_diff_uses_stored_metadata_of_each_side(command: Command, put: Any, tmp_path: Path) -> None:
     cache = ("--cache", tmp_path / "cache.sqlite3")
     assert command("get", put(quad()), "MC_ROLL_P", "--metadata", "vehicle", *cache).code == 0
     file = tmp_path / "wanted.param"
@@ -260,13 +256,13 @@ def test_diff_knows_what_was_kept_for_the_firmware_of_a_side(
     assert "1/s" in done.out
 
 
-def test_diff_takes_a_file_that_describes_parameters_and_not_a_vehicle(command: Command) -> None:
+def test_metadata_of_diff_is_a_file_and_not_a_vehicle(command: Command) -> None:
     done = command("diff", "a.param", "b.param", "--metadata", "vehicle")
     assert done.code == 2
-    assert "it takes a file" in done.err
+    assert "here --metadata takes a file" in done.err
 
 
-def test_where_nothing_is_kept_nothing_is_looked_for(
+def test_without_stored_metadata_there_is_no_wait(
     command: Command, put: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def forbidden(*_: object) -> None:
@@ -277,7 +273,7 @@ def test_where_nothing_is_kept_nothing_is_looked_for(
     assert command("get", put(quad()), "MC_ROLL_P", "--no-cache").code == 0
 
 
-def test_a_vehicle_that_cannot_give_its_file(command: Command, put: Any) -> None:
+def test_a_vehicle_whose_metadata_file_is_missing(command: Command, put: Any) -> None:
     vehicle = quad()
     del vehicle.files[PARAMETER_FILE]
     done = command("get", put(vehicle), "MC_ROLL_P", "--metadata", "vehicle", "--no-cache")
@@ -286,7 +282,7 @@ def test_a_vehicle_that_cannot_give_its_file(command: Command, put: Any) -> None
 
 
 @pytest.mark.parametrize("words", [["get", "sim:px4", "A"], ["set", "sim:px4", "A=1"], ["show"]])
-def test_a_file_that_is_none_is_code_2(command: Command, tmp_path: Path, words: list[str]) -> None:
+def test_an_invalid_metadata_file_is_exit_code_2(command: Command, tmp_path: Path, words: list[str]) -> None:
     cache = ("--cache", tmp_path / "cache.sqlite3")
     (tmp_path / "a.xml").write_text("<html/>")
     for file, said in (("none.xml", "cannot be read"), ("a.xml", "begins with <html>")):
@@ -301,13 +297,13 @@ def test_a_file_that_is_none_is_code_2(command: Command, tmp_path: Path, words: 
 
 @pytest.fixture
 def shown(command: Command, put: Any, tmp_path: Path) -> tuple[object, ...]:
-    """The options with which `show` finds the table of a vehicle."""
+    """Return the options with which `show` finds the table of a vehicle."""
     cache = ("--cache", tmp_path / "cache.sqlite3")
     assert command("fetch", put(copter()), *cache).code == 0
     return cache
 
 
-def test_show_prints_what_is_known_of_a_parameter(command: Command, shown: tuple[object, ...]) -> None:
+def test_show_prints_the_metadata_of_a_parameter(command: Command, shown: tuple[object, ...]) -> None:
     done = command("show", "1", "FLTMODE1", "TST_ALT", "--metadata", XML, *shown)
     assert done.code == 0
     lines = done.out.splitlines()
@@ -326,13 +322,11 @@ def test_show_prints_what_is_known_of_a_parameter(command: Command, shown: tuple
         "  How high to return",
         "  range: 30 to 3000.5 cm",
         "  step: 1 cm",
-        "  reboot: a new value counts when the vehicle has started again",
+        "  reboot: a change takes effect after a reboot",
     ]
 
 
-def test_show_prints_single_parameters_that_nobody_describes(
-    command: Command, shown: tuple[object, ...]
-) -> None:
+def test_show_prints_single_parameters_without_metadata(command: Command, shown: tuple[object, ...]) -> None:
     done = command("show", "1", "TST_LOG", *shown)
     assert done.code == 0
     assert [line.split()[:2] for line in done.out.splitlines()] == [["name", "value"], ["TST_LOG", "1"]]
@@ -343,7 +337,7 @@ def test_show_prints_single_parameters_that_nobody_describes(
     assert "not among the cached parameters: NONE" in done.err
 
 
-def test_show_of_a_whole_table_tells_meanings(command: Command, shown: tuple[object, ...]) -> None:
+def test_show_of_a_whole_table_prints_meanings(command: Command, shown: tuple[object, ...]) -> None:
     done = command("show", "--metadata", XML, *shown)
     assert "Stabilize" in done.out
     assert "lowest" not in done.out
@@ -363,13 +357,13 @@ def test_show_of_a_parameter_file_has_no_names(command: Command, tmp_path: Path)
         assert "go with a vehicle in the cache" in done.err
 
 
-def test_show_speaks_to_no_vehicle(command: Command, shown: tuple[object, ...]) -> None:
+def test_show_refuses_metadata_of_the_vehicle(command: Command, shown: tuple[object, ...]) -> None:
     done = command("show", "--metadata", "vehicle", *shown)
     assert (done.code, done.out) == (2, "")
     assert "needs a link" in done.err
 
 
-def test_what_a_file_says_cannot_command_the_terminal(
+def test_text_of_a_metadata_file_is_escaped(
     command: Command, shown: tuple[object, ...], tmp_path: Path
 ) -> None:
     nasty = {

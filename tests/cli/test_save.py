@@ -1,4 +1,4 @@
-"""The command save: what it writes, what it refuses to write, and what it says of it."""
+"""The subcommand save: written files, refused tables, messages."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ ODD = [
 
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Runs the command in this process, on a clock that leaps."""
+    """Run the command line in this process, on simulated time."""
     leaping(monkeypatch)
     return in_process(capsys)
 
 
 @pytest.fixture
 def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Puts a simulated vehicle behind every URL; gives a URL."""
+    """Connect every URL to a simulated vehicle; return a URL."""
     return behind(monkeypatch, "sim:px4")
 
 
-def test_save_writes_what_the_vehicle_has(
+def test_save_writes_the_parameters_of_the_vehicle(
     command: Command, put: Callable[[Endpoint], str], tmp_path: Path
 ) -> None:
     path = tmp_path / "quad.json"
@@ -51,9 +51,7 @@ def test_save_writes_what_the_vehicle_has(
     assert json.loads(path.read_text())["sets"][0]["source"] == "link sim:px4"
 
 
-def test_save_prints_json_for_programs(
-    command: Command, put: Callable[[Endpoint], str], tmp_path: Path
-) -> None:
+def test_save_prints_json(command: Command, put: Callable[[Endpoint], str], tmp_path: Path) -> None:
     path = tmp_path / "quad.txt"
     saved = command("save", put(GenericVehicle(ODD)), path, "--form", "qgc", "--json", "--no-cache")
     assert (saved.code, saved.err) == (0, "")
@@ -65,8 +63,8 @@ def test_save_prints_json_for_programs(
     assert read_file(path).form is FileForm.QGC
 
 
-def test_save_brings_a_cached_table_up_to_date(command: Command, tmp_path: Path) -> None:
-    """PX4 leaves volatile values out of its hash; they are read afresh and stand in the file too."""
+def test_save_updates_a_cached_table(command: Command, tmp_path: Path) -> None:
+    """PX4 leaves volatile values out of its hash; they are read again, and are in the file."""
     cache = tmp_path / "cache.sqlite3"
     for path in (tmp_path / "a.params", tmp_path / "b.params"):
         assert command("save", "sim:px4", path, "--cache", cache).code == 0
@@ -89,7 +87,7 @@ def test_save_needs_no_link_for_a_vehicle_in_the_cache(command: Command, tmp_pat
         params = read_file(path).choose()
         assert params.identity == vehicle.identity
         path.unlink()
-    # of the cached table, and not of the moment
+    # the time of the cached table, not the present time
     (table,) = ParamCache(cache).components()
     assert table.synced_at is not None
     assert params.at == pytest.approx(table.synced_at, abs=1e-5)
@@ -98,17 +96,20 @@ def test_save_needs_no_link_for_a_vehicle_in_the_cache(command: Command, tmp_pat
 @pytest.mark.parametrize(
     ("options", "problem"),
     [
-        (["--no-cache"], "--no-cache, --system, --encoding and --timeout go with a link; '1' names none"),
-        (["--timeout", "3"], "go with a link"),
-        (["--system", "1"], "go with a link"),
-        (["--encoding", "bytewise"], "go with a link"),
-        (["--refresh"], "--refresh goes with a link"),
+        (
+            ["--no-cache"],
+            "--no-cache, --system, --encoding and --timeout need a link; '1' is a vehicle in the cache",
+        ),
+        (["--timeout", "3"], "need a link"),
+        (["--system", "1"], "need a link"),
+        (["--encoding", "bytewise"], "need a link"),
+        (["--refresh"], "--refresh needs a link"),
         (["--all", "--component", "1"], "--all and --component exclude each other"),
-        (["--form", "px4-script"], "are read and not written"),
+        (["--form", "px4-script"], "cannot be written, only read"),
         (["--form", "exe"], "exe"),
     ],
 )
-def test_options_that_mean_nothing_are_refused(
+def test_useless_options_are_refused(
     options: list[str], problem: str, command: Command, tmp_path: Path
 ) -> None:
     saved = command("save", "1", tmp_path / "quad.param", *options)
@@ -132,23 +133,23 @@ def test_options_that_mean_nothing_are_refused(
         ("system:1@udpin:0.0.0.0:14550", False),
     ],
 )
-def test_a_link_and_a_vehicle_are_told_apart(where: str, is_link: bool) -> None:
+def test_links_and_cached_vehicles_are_distinguished(where: str, is_link: bool) -> None:
     assert names_vehicle(where) is not is_link
 
 
-def test_nobody_is_asked_where_the_file_cannot_be(command: Command, tmp_path: Path) -> None:
+def test_an_invalid_file_name_fails_before_the_link_is_opened(command: Command, tmp_path: Path) -> None:
     saved = command("save", "tcp:127.0.0.1:1", tmp_path / "quad.txt")
     assert saved.code == 2
     assert "unknown file extension '.txt'" in saved.err
 
 
-def test_a_vehicle_that_is_not_in_the_cache_says_so(command: Command, tmp_path: Path) -> None:
+def test_a_vehicle_that_is_not_in_the_cache_is_an_error(command: Command, tmp_path: Path) -> None:
     saved = command("save", "7", tmp_path / "quad.param", "--cache", tmp_path / "cache.sqlite3")
     assert (saved.code, saved.out) == (2, "")
     assert not (tmp_path / "quad.param").exists()
 
 
-def test_save_writes_what_differs_from_the_defaults(command: Command, tmp_path: Path) -> None:
+def test_save_writes_parameters_that_differ_from_the_defaults(command: Command, tmp_path: Path) -> None:
     cache = tmp_path / "cache.sqlite3"
     for where in ("sim:ardupilot", "1"):
         path = tmp_path / "quad.param"
@@ -168,7 +169,7 @@ def test_without_defaults_nothing_is_written(command: Command, tmp_path: Path) -
     assert path.read_bytes() == b"OLD,1\n"
 
 
-def test_where_nothing_differs_nothing_is_written(
+def test_nothing_is_written_if_no_parameter_differs(
     command: Command, put: Callable[[Endpoint], str], tmp_path: Path
 ) -> None:
     vehicle = ArduPilotVehicle(table=[SimParam("A", ParamType.INT8, 1, default=1)])
@@ -181,12 +182,12 @@ def test_where_nothing_differs_nothing_is_written(
 def test_an_incomplete_table_is_not_written(
     command: Command, put: Callable[[Endpoint], str], tmp_path: Path
 ) -> None:
-    """A file that lacks some parameters would look like one of a vehicle that has no more."""
+    """A file without some parameters would look like that of a vehicle that does not have them."""
     cache, path = tmp_path / "cache.sqlite3", tmp_path / "quad.param"
     vehicle = GenericVehicle([SimParam(f"P{at}", ParamType.INT32, at) for at in range(20)], dead=[5])
     saved = command("save", put(vehicle), path, "--cache", cache)
     assert (saved.code, saved.out) == (1, "")
-    assert "1/1 is incomplete: 1 of 20 parameters did not come" in saved.err
+    assert "1/1 is incomplete: 1 of 20 parameters were not received" in saved.err
     assert not path.exists()
     cached = command("save", "1", path, "--cache", cache)
     assert (cached.code, cached.out) == (1, "")
@@ -194,7 +195,7 @@ def test_an_incomplete_table_is_not_written(
     assert not path.exists()
 
 
-def test_all_components_of_a_vehicle_go_into_one_file(
+def test_all_components_of_a_vehicle_are_written_to_one_file(
     command: Command, put: Callable[[Endpoint], str], tmp_path: Path
 ) -> None:
     cache = tmp_path / "cache.sqlite3"
@@ -222,7 +223,7 @@ def test_all_components_of_a_vehicle_go_into_one_file(
     assert not (tmp_path / "all.param").exists()
 
 
-def test_without_an_autopilot_someone_has_to_be_named(
+def test_without_an_autopilot_a_component_must_be_chosen(
     command: Command, put: Callable[[Endpoint], str], tmp_path: Path
 ) -> None:
     cache = tmp_path / "cache.sqlite3"
@@ -231,16 +232,16 @@ def test_without_an_autopilot_someone_has_to_be_named(
         assert command("fetch", url, "--component", each, "--cache", cache).code == 0
     saved = command("save", "1", tmp_path / "quad.param", "--cache", cache)
     assert saved.code == 2
-    assert "no autopilot is among 1/100, 1/101; choose with --component, or take --all" in saved.err
+    assert "no autopilot is among 1/100, 1/101; choose one with --component, or use --all" in saved.err
 
 
-def test_what_the_disk_refuses_ends_the_command(command: Command, tmp_path: Path) -> None:
+def test_a_disk_error_ends_the_command(command: Command, tmp_path: Path) -> None:
     saved = command("save", "sim:px4", tmp_path / "none" / "quad.param", "--no-cache")
     assert (saved.code, saved.out) == (2, "")
     assert "quad.param: cannot be written: No such file or directory" in saved.err
 
 
-def test_a_name_that_is_no_text_reaches_no_terminal(command: Command, tmp_path: Path) -> None:
+def test_an_unprintable_file_name_is_escaped(command: Command, tmp_path: Path) -> None:
     path = tmp_path / "\x1b[31m.param"
     saved = command("save", "sim:px4", path, "--no-cache")
     assert saved.code == 0
@@ -248,10 +249,10 @@ def test_a_name_that_is_no_text_reaches_no_terminal(command: Command, tmp_path: 
     assert path.exists()
 
 
-def test_a_value_that_is_only_last_known_is_not_written(
+def test_a_value_that_is_only_cached_is_not_written(
     command: Command, put: Callable[[Endpoint], str], tmp_path: Path
 ) -> None:
-    """No hash speaks for a volatile value: where the vehicle does not give it, nobody knows what it is."""
+    """No hash covers a volatile value: unless the vehicle sends it, it is unknown."""
     cache, path = tmp_path / "cache.sqlite3", tmp_path / "quad.param"
     rows = [SimParam("A", ParamType.INT32, 1), SimParam("CAL_ACC0_XOFF", ParamType.INT32, 2, volatile=True)]
     assert command("save", put(PX4Vehicle(table=rows)), path, "--cache", cache).code == 0
@@ -259,5 +260,5 @@ def test_a_value_that_is_only_last_known_is_not_written(
     silent = PX4Vehicle(table=rows, dead=["CAL_ACC0_XOFF"])
     saved = command("save", put(silent), path, "--cache", cache)
     assert (saved.code, saved.out) == (1, "")
-    assert "1/1 is incomplete: 1 of 2 parameters did not come" in saved.err
+    assert "1/1 is incomplete: 1 of 2 parameters were not received" in saved.err
     assert not path.exists()

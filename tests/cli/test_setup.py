@@ -1,4 +1,4 @@
-"""The commands apply, verify and restore: what they print, what they send, how they end."""
+"""The subcommands apply, verify and restore: output, writes and exit codes."""
 
 from __future__ import annotations
 
@@ -44,25 +44,25 @@ def cache(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def in_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Runs commands on a loop whose clock leaps: what they wait for takes no time."""
+    """Run commands on simulated time."""
     leaping(monkeypatch)
 
 
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], cache: Path, in_no_time: None) -> Command:
-    """Runs the command in this process, with a cache of its own."""
+    """Run the command line in this process, with a new cache."""
     return in_process(capsys, "--cache", str(cache))
 
 
 @pytest.fixture
 def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Puts simulated vehicles behind every URL; gives a URL."""
+    """Connect every URL to simulated vehicles; return a URL."""
     return behind(monkeypatch, "udpin:0.0.0.0:14550")
 
 
 @pytest.fixture
 def file(tmp_path: Path) -> Callable[..., Path]:
-    """Writes a parameter file; gives its path."""
+    """Write a parameter file; return its path."""
 
     def write(text: str = FILE, name: str = "quad.param") -> Path:
         path = tmp_path / name
@@ -80,7 +80,7 @@ def copter(**options: Any) -> ArduPilotVehicle:
 # apply
 
 
-def test_apply_sets_what_differs_and_proves_it(
+def test_apply_sets_and_verifies_values_that_differ(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     vehicle = copter()
@@ -102,7 +102,7 @@ def test_apply_sets_what_differs_and_proves_it(
     assert vehicle.requests["PARAM_SET"] == 2
 
 
-def test_apply_tells_programs_everything(
+def test_apply_prints_json(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     outcome = command("apply", put(copter()), file(FILE + "NO_SUCH,1\nRTL_ALTT,3\n"), "--json")
@@ -143,7 +143,7 @@ def test_apply_tells_programs_everything(
     assert full["params"]["WPNAV_ACCEL"]["status"] == "unchanged"
 
 
-def test_names_that_are_not_there_come_with_those_that_are(
+def test_missing_names_are_printed_with_similar_ones(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     outcome = command("apply", put(copter()), file("RTL_ALTT,3\n"))
@@ -151,19 +151,19 @@ def test_names_that_are_not_there_come_with_those_that_are(
     assert outcome.rows[1] == ["RTL_ALTT", "3", "skipped", "not on this vehicle (did you mean RTL_ALT?)"]
 
 
-def test_what_the_vehicle_makes_of_a_value_is_told(
+def test_adjusted_values_are_reported(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     class Limiting(GenericVehicle):
         def _write(self, entry: Entry, bits: int) -> None:
             super()._write(entry, min(bits, 1000) if entry.name == "RTL_ALT" else bits)
 
-    class Stubborn(Limiting):
+    class Unchanging(Limiting):
         def _on_set(self, request: Any, sender: Any) -> None:
             if request.param_id != "B_B":
                 super()._on_set(request, sender)
 
-    vehicle = Stubborn({"RTL_ALT": 5, "B_B": 1, "C_C": 1})
+    vehicle = Unchanging({"RTL_ALT": 5, "B_B": 1, "C_C": 1})
     outcome = command("apply", put(vehicle), file("RTL_ALT,2500\nB_B,2\nC_C,2\n"), "--component", 1)
     assert outcome.code == 1
     rows = {row[0]: row for row in outcome.rows}
@@ -172,7 +172,7 @@ def test_what_the_vehicle_makes_of_a_value_is_told(
     assert rows["C_C"][1:] == ["1", "2", "2", "set"]
 
 
-def test_what_cannot_be_right_is_found_before_anything_is_sent(
+def test_invalid_values_are_reported_before_anything_is_sent(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     vehicle = copter()
@@ -187,7 +187,7 @@ def test_what_cannot_be_right_is_found_before_anything_is_sent(
     assert vehicle.values["RTL_ALT"] == 2500
 
 
-def test_armed_vehicles_are_left_alone(
+def test_armed_vehicles_are_refused(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     vehicle = copter(armed=True)
@@ -212,7 +212,7 @@ def test_include_takes_categories_and_patterns(
     assert command("apply", put(copter()), file(), "--include", "nonsense").code == 2
 
 
-def test_reboot_is_only_done_when_asked_for(
+def test_the_vehicle_reboots_only_with_the_option(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     wanted = file("EK2_ENABLE,1\nEK2_GPS_TYPE,3\n")
@@ -227,11 +227,11 @@ def test_reboot_is_only_done_when_asked_for(
     assert (outcome.json["reboots"], outcome.json["reboot_required"]) == (1, [])
 
 
-# what would be sent
+# Dry runs and confirmation
 
 
 @pytest.mark.parametrize(("answer", "sets"), [("y", 2), ("yes", 2), ("n", 0), ("", 0)])
-def test_somebody_at_a_terminal_is_asked(
+def test_a_user_at_a_terminal_must_confirm(
     command: Command,
     put: Callable[[Endpoint], str],
     file: Callable[..., Path],
@@ -284,7 +284,7 @@ def test_dry_run_prints_what_would_be_sent_in_its_order(
     assert told["reboot_for"] == ["EK2_ENABLE"]
 
 
-def test_dry_run_is_not_done_with_what_is_missing(
+def test_a_dry_run_with_missing_parameters_is_incomplete(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     assert command("apply", put(copter()), file("NO_SUCH,1\n"), "--dry-run").code == 1
@@ -293,7 +293,7 @@ def test_dry_run_is_not_done_with_what_is_missing(
 # backups
 
 
-def test_backup_keeps_what_was_before(
+def test_the_backup_file_has_the_state_before(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
 ) -> None:
     vehicle = copter()
@@ -305,7 +305,7 @@ def test_backup_keeps_what_was_before(
     before = kept.read_bytes()
     outcome = command("apply", put(vehicle), file("RTL_ALT,99\n"), "--backup", backup)
     assert outcome.code == 2
-    assert "is there already" in outcome.err
+    assert "exists already" in outcome.err
     assert kept.read_bytes() == before
     assert vehicle.values["RTL_ALT"] == 2500
     back = command("restore", put(vehicle), kept)
@@ -313,19 +313,19 @@ def test_backup_keeps_what_was_before(
     assert vehicle.values == copter().values
 
 
-def test_it_is_said_when_nothing_is_kept(
+def test_a_warning_is_printed_if_the_state_before_is_not_stored(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
 ) -> None:
     outcome = command("apply", put(copter()), file(), "--no-cache")
-    assert "is kept nowhere" in outcome.err
+    assert "the state before is not stored" in outcome.err
     outcome = command("apply", put(copter()), file(), "--no-cache", "--backup", tmp_path / "b.json")
-    assert "is kept nowhere" not in outcome.err
+    assert "the state before is not stored" not in outcome.err
 
 
 # restore
 
 
-def test_restore_goes_back_behind_the_last_apply(
+def test_restore_reverts_the_last_apply(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     vehicle = copter()
@@ -343,12 +343,12 @@ def test_restore_goes_back_behind_the_last_apply(
     assert back.code == 0
     assert re.match(r"the state: 6 parameters of 1/1 ardupilot from snapshot 1 of uid:", back.err)
     assert vehicle.values == copter().values
-    vehicle.set_param("RTL_ALT", 77)  # had the restore been ended in the middle, say
+    vehicle.set_param("RTL_ALT", 77)  # as after an interrupted restore
     assert command("restore", put(vehicle)).code == 0
     assert vehicle.values == copter().values, "a restore is no apply that restore goes back behind"
 
 
-def test_restore_says_what_it_leaves_out_and_ends_well(
+def test_restore_prints_left_out_parameters_and_succeeds(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     vehicle = ArduPilotVehicle(
@@ -373,7 +373,7 @@ def test_restore_says_what_it_leaves_out_and_ends_well(
     assert vehicle.values == {"RTL_ALT": 1500, "BARO1_GND_PRESS": 94600.0, "INS_GYROFFS_X": 0.5}
 
 
-def test_restore_takes_a_moment_or_a_snapshot(
+def test_restore_takes_a_time_or_a_snapshot(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], cache: Path
 ) -> None:
     vehicle = copter()
@@ -398,7 +398,7 @@ def test_restore_takes_a_moment_or_a_snapshot(
         (["4"], "there is no snapshot 4 of uid:"),
     ],
 )
-def test_restore_needs_something_to_go_back_to(
+def test_restore_needs_a_stored_state(
     command: Command, put: Callable[[Endpoint], str], when: list[str], text: str
 ) -> None:
     outcome = command("restore", put(copter()), *when)
@@ -441,7 +441,7 @@ def test_simulated_links_work(command: Command, file: Callable[..., Path], kind:
     wanted = file(f"{name},4.5\n")
     url = f"sim:{kind}"
     assert command("apply", url, wanted, "--no-cache").code == 0
-    assert "kept nowhere" not in command("apply", url, wanted, "--no-cache").err
+    assert "the state before is not stored" not in command("apply", url, wanted, "--no-cache").err
     assert command("verify", url, file(f"{name},99\n")).code == 1
 
 
@@ -454,7 +454,7 @@ def fleet(**options: Any) -> tuple[Air, list[ArduPilotVehicle]]:
     return Air([*vehicles, camera], **options), vehicles
 
 
-def test_all_vehicles_are_set_side_by_side(
+def test_all_vehicles_are_set_concurrently(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
 ) -> None:
     air, vehicles = fleet()
@@ -480,7 +480,7 @@ def test_all_vehicles_are_set_side_by_side(
     assert {row[0] for row in outcome.rows[1:]} == {"1/1", "2/1", "3/1"}
 
 
-def test_one_exit_code_for_all_and_none_stops_the_others(
+def test_a_failed_vehicle_does_not_stop_the_others(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     air, vehicles = fleet()
@@ -499,7 +499,7 @@ def test_one_exit_code_for_all_and_none_stops_the_others(
     assert "3 vehicles (heard: 1/1 ardupilot, 2/1 ardupilot)" in outcome.err
 
 
-def test_a_fleet_needs_a_place_for_each_vehicles_own(
+def test_file_names_for_all_vehicles_need_a_placeholder(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], tmp_path: Path
 ) -> None:
     air, vehicles = fleet()
@@ -510,13 +510,13 @@ def test_a_fleet_needs_a_place_for_each_vehicles_own(
     file("RTL_ALT,3\n", "1.param")
     outcome = command("apply", put(air), file(), "--all", "--overlay", tmp_path / "{system}.param")
     assert outcome.code == 2
-    assert "laid over for 2/1 ardupilot" in outcome.err
+    assert "which --overlay names for 2/1 ardupilot" in outcome.err
     assert not any(vehicle.requests["PARAM_SET"] for vehicle in vehicles)
     assert command("verify", put(air), file(), "--all", "--system", 2).code == 2
     assert command("verify", put(air), file(), "--expect", 2).code == 2
 
 
-def test_a_file_of_several_systems_gives_each_its_own(
+def test_a_file_of_several_systems_has_a_set_for_each(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     air, vehicles = fleet()
@@ -525,7 +525,7 @@ def test_a_file_of_several_systems_gives_each_its_own(
     assert [vehicle.values["RTL_ALT"] for vehicle in vehicles] == [1000, 2000, 3000]
 
 
-def test_component_chooses_another_one(
+def test_component_chooses_another_component(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     air, _ = fleet()
@@ -534,11 +534,11 @@ def test_component_chooses_another_one(
     assert outcome.err.startswith("2/100 generic: 1 same")
 
 
-# ended in the middle
+# Interruptions
 
 
 @pytest.mark.parametrize("as_json", [False, True])
-def test_whoever_ends_it_learns_what_was_set(
+def test_ctrl_c_prints_the_outcomes_so_far(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path], as_json: bool
 ) -> None:
     class Interrupting(GenericVehicle):
@@ -569,7 +569,7 @@ def test_whoever_ends_it_learns_what_was_set(
     assert set(vehicle.values.values()) == {2}
 
 
-def test_a_vehicle_that_falls_silent_is_told_with_what_was_set(
+def test_a_silent_vehicle_is_reported_with_the_outcomes_so_far(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     class Dying(GenericVehicle):
@@ -588,10 +588,10 @@ def test_a_vehicle_that_falls_silent_is_told_with_what_was_set(
     assert "run it again" in command("apply", put(Dying(dict.fromkeys(names, 1))), wanted).err
 
 
-# what firmwares say of their parameters
+# Metadata
 
 
-def test_metadata_says_what_is_out_of_range_and_what_needs_a_start(
+def test_metadata_gives_ranges_and_reboots(
     command: Command, put: Callable[[Endpoint], str], file: Callable[..., Path]
 ) -> None:
     vehicle = copter()

@@ -1,4 +1,4 @@
-"""Names of vehicles in the cache: what each name means, and that every command keeps to it."""
+"""Names of vehicles in the cache: which vehicle each name finds, in every subcommand."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ KEPT = [
         ("system:5@udpin:0.0.0.0:14550", KEPT[5]),
     ],
 )
-def test_a_name_means_one_vehicle(name: str, found: CachedVehicle) -> None:
+def test_a_name_finds_one_vehicle(name: str, found: CachedVehicle) -> None:
     assert find_vehicle(KEPT, name, place="here") is found
     assert is_vehicle_name(name)
 
@@ -93,7 +93,7 @@ def test_a_name_means_one_vehicle(name: str, found: CachedVehicle) -> None:
         ("", "is not in the cache here. The cache holds"),
     ],
 )
-def test_a_name_that_no_vehicle_has_lists_those_that_there_are(name: str, reason: str) -> None:
+def test_an_unknown_name_lists_the_vehicles(name: str, reason: str) -> None:
     with pytest.raises(UnknownVehicle) as caught:
         find_vehicle(KEPT, name, place="here")
     assert reason in str(caught.value)
@@ -110,7 +110,7 @@ def test_a_name_that_no_vehicle_has_lists_those_that_there_are(name: str, reason
         ("uid:4a0000", [0, 2]),
     ],
 )
-def test_a_name_that_several_have_lists_these(name: str, fits: list[int]) -> None:
+def test_an_ambiguous_name_lists_the_matching_vehicles(name: str, fits: list[int]) -> None:
     with pytest.raises(AmbiguousVehicle) as caught:
         find_vehicle(KEPT, name, place="here")
     assert caught.value.vehicles == tuple(str(KEPT[each]) for each in fits)
@@ -121,7 +121,7 @@ def test_a_name_that_several_have_lists_these(name: str, fits: list[int]) -> Non
     )
 
 
-def test_a_system_or_a_component_narrows_a_name_and_never_widens_it() -> None:
+def test_system_and_component_only_narrow_a_name() -> None:
     assert find_vehicle(KEPT, "uid:4a0000", place="here", system=7) is KEPT[2]
     assert find_vehicle(KEPT, "uid:4a0000", place="here", component=154) is KEPT[0]
     assert find_vehicle(KEPT, None, place="here", component=154) is KEPT[0]
@@ -131,7 +131,7 @@ def test_a_system_or_a_component_narrows_a_name_and_never_widens_it() -> None:
         find_vehicle(KEPT, "3", place="here", system=4)
 
 
-def test_a_long_list_is_cut_and_says_so() -> None:
+def test_a_long_list_of_vehicles_is_shortened() -> None:
     many = [known(1 + number % 255, f"{number:016x}") for number in range(LISTED_MAX + 2)]
     with pytest.raises(UnknownVehicle, match="and 2 more; `paramclient cache list` shows all") as caught:
         find_vehicle(many, "uid:ffffff", place="here")
@@ -139,12 +139,12 @@ def test_a_long_list_is_cut_and_says_so() -> None:
     assert len(caught.value.vehicles) == LISTED_MAX + 2
 
 
-def test_an_empty_cache_says_so() -> None:
+def test_an_empty_cache_is_reported() -> None:
     with pytest.raises(UnknownVehicle, match=r"vehicle 4 is not in the cache here.* holds no vehicle\."):
         find_vehicle([], "4", place="here")
 
 
-# every command that takes a vehicle in the cache
+# All subcommands that take a vehicle in the cache
 
 
 @pytest.fixture
@@ -161,7 +161,7 @@ def cache(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def command(cache: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Runs the command in this process, on a clock that leaps, with this cache."""
+    """Run the command line in this process, on simulated time, with this cache."""
     leaping(monkeypatch)
     return in_process(capsys, "--cache", str(cache))
 
@@ -199,7 +199,7 @@ COMMANDS = [
     "name", ["4", "cache:4", "4a00", "4a000000", "uid:4a00", "9", "cache:9", "uid:c0ffee"]
 )
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
-def test_no_command_takes_a_number_for_a_hardware_id_or_one_vehicle_of_several(
+def test_no_subcommand_guesses_a_vehicle(
     command: Command, put: Put, cache: Path, tmp_path: Path, words: list[str], name: str
 ) -> None:
     vehicle = PX4Vehicle(table={"MC_ROLL_P": 4.0})
@@ -220,7 +220,7 @@ def test_no_command_takes_a_number_for_a_hardware_id_or_one_vehicle_of_several(
 
 @pytest.mark.parametrize("name", ["3", "cache:3", "uid:4a0000", f"cache:{FOUR}", f"uid:{FOUR}"])
 @pytest.mark.parametrize("words", COMMANDS, ids=" ".join)
-def test_every_command_takes_a_vehicle_by_each_kind_of_name(
+def test_every_subcommand_accepts_each_kind_of_name(
     command: Command, put: Put, cache: Path, tmp_path: Path, words: list[str], name: str
 ) -> None:
     put(PX4Vehicle(table={"MC_ROLL_P": 4.0}))

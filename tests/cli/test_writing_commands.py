@@ -1,4 +1,4 @@
-"""Commands that write, where several vehicles are on the link: nothing goes to one that was not named."""
+"""Subcommands that write, with several vehicles on the link: only a named vehicle is written to."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def cache(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def command(capsys: pytest.CaptureFixture[str], cache: Path, monkeypatch: pytest.MonkeyPatch) -> Command:
-    """Runs the command in this process, on a clock that leaps, with a cache of its own."""
+    """Run the command line in this process, on simulated time, with a new cache."""
     leaping(monkeypatch)
     cached, plain = in_process(capsys, "--cache", str(cache)), in_process(capsys)
     return lambda *words: (plain if words[0] == "signing" else cached)(*words)
@@ -51,7 +51,7 @@ def command(capsys: pytest.CaptureFixture[str], cache: Path, monkeypatch: pytest
 
 @pytest.fixture
 def put(monkeypatch: pytest.MonkeyPatch) -> Put:
-    """Puts simulated vehicles behind every link."""
+    """Connect every link to simulated vehicles."""
     place = behind(monkeypatch, URL)
 
     def both(far_end: Endpoint | SimLink | PeersLink) -> str:
@@ -64,7 +64,7 @@ def put(monkeypatch: pytest.MonkeyPatch) -> Put:
 
 @pytest.fixture
 def words(tmp_path: Path, cache: Path) -> Callable[[str], list[str]]:
-    """Gives the words of a command that writes; nothing that it needs is missing but the vehicle."""
+    """Return the arguments of a subcommand that writes; only the vehicle is not named."""
     file = tmp_path / "wanted.param"
     file.write_text("MC_ROLL_P,7.5\nMC_PITCH_P,7.5\n")
     key = tmp_path / "vehicle.key"
@@ -107,7 +107,7 @@ def copter(system: int = 2, **options: Any) -> ArduPilotVehicle:
 
 
 def untouched(*vehicles: Vehicle) -> bool:
-    """Whether nothing was written to any of them."""
+    """Return whether nothing was written to these vehicles."""
     return all(
         not each.requests["PARAM_SET"] and each.signing_key is None and dict(each.values) == TABLE
         for each in vehicles
@@ -116,7 +116,7 @@ def untouched(*vehicles: Vehicle) -> bool:
 
 @pytest.mark.parametrize("phase", [0.0, 0.35, 0.7, 0.99, 1.15])
 @pytest.mark.parametrize("name", [*WRITING, *SIGNING, *SHOWING])
-def test_with_two_vehicles_on_the_link_none_is_written_to(
+def test_with_two_vehicles_nothing_is_written(
     command: Command, put: Put, words: Callable[[str], list[str]], name: str, phase: float
 ) -> None:
     for first, second in ((0.0, phase), (phase, 0.0)):
@@ -131,7 +131,7 @@ def test_with_two_vehicles_on_the_link_none_is_written_to(
 
 @pytest.mark.parametrize("name", [*WRITING, *SIGNING])
 @pytest.mark.parametrize("system", [1, 2])
-def test_the_one_that_is_named_is_written_to_and_no_other(
+def test_only_the_named_vehicle_is_written_to(
     command: Command, put: Put, words: Callable[[str], list[str]], name: str, system: int
 ) -> None:
     one, two = px4(), copter()
@@ -150,7 +150,7 @@ def test_the_only_vehicle_need_not_be_named(
     command: Command, put: Put, words: Callable[[str], list[str]], name: str
 ) -> None:
     one = px4()
-    put(Tap(Air([one])))  # of which it is not known how many there are
+    put(Tap(Air([one])))  # the number of vehicles is not known
     done = command(*words(name))
     assert done.code == 0, done.err
     assert untouched(one) == (name == "signing disable")
@@ -169,7 +169,7 @@ def test_a_component_alone_names_no_vehicle(
 
 @pytest.mark.parametrize("name", [*WRITING, *SIGNING])
 @pytest.mark.parametrize("first", [1, 2])
-def test_two_autopilots_of_one_system_are_told_apart_by_the_component(
+def test_component_chooses_between_two_autopilots_of_a_system(
     command: Command, put: Put, words: Callable[[str], list[str]], name: str, first: int
 ) -> None:
     one, two = px4(), copter(1, component=2)
@@ -181,13 +181,13 @@ def test_two_autopilots_of_one_system_are_told_apart_by_the_component(
         "Choose one with --component.\n"
     )
     assert untouched(one, two)
-    if name in WRITING and name != "apply from the cache":  # which has no table of component 2
+    if name in WRITING and name != "apply from the cache":  # the cache has no table of component 2
         assert command(*words(name), "--component", 2, "--timeout", 30).code == 0
         assert (untouched(one), untouched(two)) == (True, False)
 
 
 @pytest.mark.parametrize("first", [0.0, 0.9])
-def test_a_system_alone_means_its_component_1_whichever_is_heard_first(
+def test_a_system_alone_means_its_component_1(
     command: Command, put: Put, words: Callable[[str], list[str]], first: float
 ) -> None:
     one, two = px4(), copter(1, component=2)
@@ -196,7 +196,7 @@ def test_a_system_alone_means_its_component_1_whichever_is_heard_first(
     assert (untouched(one), untouched(two)) == (False, True)
 
 
-def test_a_system_that_is_not_there_is_no_other(
+def test_a_missing_system_is_not_replaced_by_another(
     command: Command, put: Put, words: Callable[[str], list[str]]
 ) -> None:
     one = px4()
@@ -207,11 +207,11 @@ def test_a_system_that_is_not_there_is_no_other(
     assert untouched(one)
 
 
-# who comes and goes
+# Vehicles that appear and disappear
 
 
 @pytest.mark.parametrize("name", ["apply", "apply with a reboot", "apply from the cache", "restore"])
-def test_a_vehicle_that_comes_while_the_other_is_read_stops_the_write(
+def test_a_vehicle_that_appears_during_the_read_stops_the_write(
     command: Command, put: Put, cache: Path, words: Callable[[str], list[str]], name: str
 ) -> None:
     table = {**TABLE, **{f"PARAM_{number:03}": number for number in range(300)}}
@@ -227,7 +227,7 @@ def test_a_vehicle_that_comes_while_the_other_is_read_stops_the_write(
         assert not any(kept.snapshots(each.key) for each in found), "nothing to restore was kept"
 
 
-def test_a_vehicle_that_comes_while_the_other_describes_itself_stops_the_write(
+def test_a_vehicle_that_appears_during_the_metadata_download_stops_the_write(
     command: Command, put: Put, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one, two = px4(), copter()
@@ -242,7 +242,7 @@ def test_a_vehicle_that_comes_while_the_other_describes_itself_stops_the_write(
     assert untouched(one, two)
 
 
-def test_another_vehicle_in_the_place_of_one_that_vanished_is_not_written_to(
+def test_a_vehicle_that_replaces_a_lost_one_is_not_written_to(
     command: Command, put: Put, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one, two = px4(), copter()
@@ -255,13 +255,13 @@ def test_another_vehicle_in_the_place_of_one_that_vanished_is_not_written_to(
     done = command("set", URL, "MC_ROLL_P", "7.5")
     assert (done.code, done.out) == (2, "")
     assert done.err == (
-        "paramclient: 1/1 px4 was chosen and is not heard any more, 2/1 ardupilot is. Nothing was written. "
-        "Choose one with --system.\n"
+        "paramclient: 1/1 px4 was chosen and is no longer heard; 2/1 ardupilot is heard instead. "
+        "Nothing was written. Choose one with --system.\n"
     )
     assert untouched(one, two)
 
 
-def test_a_vehicle_that_vanished_before_is_not_there(
+def test_a_vehicle_lost_before_does_not_count(
     command: Command, put: Put, words: Callable[[str], list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     one, two = px4(), copter()
@@ -271,11 +271,11 @@ def test_a_vehicle_that_vanished_before_is_not_there(
     assert untouched(two)
 
 
-# whose values
+# Ambiguous sources
 
 
 @pytest.mark.parametrize("dry", [[], ["--dry-run"]])
-def test_values_are_not_taken_of_one_of_several_vehicles(
+def test_values_of_an_ambiguous_source_are_not_used(
     command: Command, monkeypatch: pytest.MonkeyPatch, dry: list[str]
 ) -> None:
     target, (one, two) = px4(5), (px4(), copter())
@@ -286,11 +286,11 @@ def test_values_are_not_taken_of_one_of_several_vehicles(
     assert untouched(target, one, two)
 
 
-# everybody
+# All vehicles
 
 
 @pytest.mark.parametrize("name", ["apply", "apply with a reboot", "apply from the cache"])
-def test_all_names_every_vehicle(
+def test_all_writes_to_every_vehicle(
     command: Command, put: Put, words: Callable[[str], list[str]], name: str
 ) -> None:
     one, two = px4(), copter()
@@ -303,7 +303,7 @@ def test_all_names_every_vehicle(
 
 
 class Watch:
-    """Notes when each PARAM_SET goes out, counted from the first heartbeat of a vehicle."""
+    """Records the time of each PARAM_SET since the first heartbeat of a vehicle."""
 
     def __init__(self, endpoint: Endpoint) -> None:
         self.tap = Tap(endpoint)
@@ -339,7 +339,7 @@ class Watch:
         (["--system", "1", "--component", "1"], 0.0, 0.1),
     ],
 )
-def test_a_write_waits_for_as_long_as_is_promised(
+def test_a_write_waits_for_the_documented_time(
     command: Command, put: Put, named: list[str], least: float, most: float
 ) -> None:
     watch = Watch(px4())
@@ -349,7 +349,7 @@ def test_a_write_waits_for_as_long_as_is_promised(
 
 
 @pytest.mark.parametrize("air", [lambda one: one, lambda one: Air([one]), lambda one: Air([Air([one])])])
-def test_a_simulated_link_with_one_vehicle_is_not_looked_at_for_a_second(
+def test_a_simulated_link_is_not_searched_for_a_second_vehicle(
     command: Command, monkeypatch: pytest.MonkeyPatch, air: Callable[[Vehicle], Endpoint]
 ) -> None:
     link = SimLink(air(px4()), "sim:px4")
@@ -359,7 +359,7 @@ def test_a_simulated_link_with_one_vehicle_is_not_looked_at_for_a_second(
     assert done.code == 0, done.err
 
 
-def test_who_sets_a_shorter_time_is_told_what_is_missing(command: Command, put: Put) -> None:
+def test_a_short_timeout_reports_the_remaining_wait(command: Command, put: Put) -> None:
     one = px4()
     put(Tap(one))
     done = command("set", URL, "MC_ROLL_P", "7.5", "--timeout", "1")
@@ -373,7 +373,7 @@ def test_who_sets_a_shorter_time_is_told_what_is_missing(command: Command, put: 
 
 @pytest.fixture
 def served(monkeypatch: pytest.MonkeyPatch) -> Callable[[Endpoint], None]:
-    """Puts simulated vehicles behind a service that has the link."""
+    """Connect simulated vehicles to a service."""
 
     def place(far_end: Endpoint) -> None:
         def client(url: str, **options: Any) -> ServedClient:
@@ -386,7 +386,7 @@ def served(monkeypatch: pytest.MonkeyPatch) -> Callable[[Endpoint], None]:
 
 @pytest.mark.parametrize("phase", [0.0, 0.9])
 @pytest.mark.parametrize("name", WRITING)
-def test_over_a_service_none_is_written_to_either(
+def test_over_a_service_nothing_is_written_to_two_vehicles(
     command: Command,
     served: Callable[[Endpoint], None],
     words: Callable[[str], list[str]],
@@ -403,7 +403,7 @@ def test_over_a_service_none_is_written_to_either(
     assert (untouched(one), untouched(two)) == (True, False)
 
 
-def test_a_generic_vehicle_is_one_too(command: Command, put: Put) -> None:
+def test_a_generic_vehicle_counts_as_a_vehicle(command: Command, put: Put) -> None:
     one, two = px4(), GenericVehicle(TABLE, system=3)
     put(Air([one, Late(two, 0.8)]))
     done = command("set", URL, "MC_ROLL_P", "7.5")

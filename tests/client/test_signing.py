@@ -584,7 +584,7 @@ def test_commands_sign_with_the_key_of_a_file_or_the_environment(
     code, _, err = command(*get, "--signing-passphrase", "--signing-key", key_file)
     assert (code, "exclude each other" in err) == (2, True)
     code, _, err = command(*get, "--signing-passphrase")
-    assert (code, "no terminal" in err) == (2, True)
+    assert (code, "needs a terminal" in err) == (2, True)
 
 
 def test_link_tells_of_signatures(put: Callable[[Vehicle], str], key_file: Path, command: Command) -> None:
@@ -608,7 +608,7 @@ def test_setup_and_disable_with_their_proof(
     assert vehicle.signing_key == KEY
     code, out, err = command("signing", "disable", url, "--link-is-safe", "--timeout", 2)
     assert (code, out) == (1, "")
-    assert "does not answer what is not signed" in err
+    assert "does not answer unsigned requests" in err
     assert vehicle.signing_key == KEY
     code, out, err = command("signing", "disable", url, *keyed, "--link-is-safe", "--json")
     assert (code, err) == (0, "")
@@ -634,7 +634,7 @@ def test_a_key_is_changed_with_the_one_before(
     setup = ("signing", "setup", put(vehicle), "--link-is-safe", "--timeout", 4, "--signing-key")
     fresh = a_file(tmp_path / "fresh.key", base64.b64encode(OTHER_KEY.secret))
     code, _, err = command(*setup, fresh)
-    assert (code, "1/1 does not answer what is signed with the key" in err) == (1, True)
+    assert (code, "1/1 does not answer requests signed with the key" in err) == (1, True)
     code, out, err = command(*setup, fresh, "--present-key", key_file)
     assert (code, err) == (0, "")
     assert OTHER_KEY.fingerprint in out
@@ -652,12 +652,12 @@ def test_a_vehicle_that_does_not_obey_is_found_out(
     monkeypatch.setattr(deaf, "_take_key", lambda *_: None)
     code, out, err = command("signing", "setup", put(deaf), "--signing-key", key_file, "--link-is-safe")
     assert (code, out) == (1, "")
-    assert "1/1 answers, but what it sends is not signed with the key" in err
+    assert "1/1 answers, but does not sign with the key" in err
     stubborn = signed_vehicle(usb=True)
     monkeypatch.setattr(stubborn, "_take_key", lambda *_: None)
     code, out, err = command("signing", "disable", put(stubborn), "--link-is-safe")
     assert (code, out) == (1, "")
-    assert "1/1 goes on to sign" in err
+    assert "1/1 still signs" in err
 
 
 def test_nothing_is_sent_before_the_link_is_said_to_be_safe(
@@ -668,9 +668,9 @@ def test_nothing_is_sent_before_the_link_is_said_to_be_safe(
     for arguments in (("setup", url, "--signing-key", key_file), ("disable", url)):
         code, out, err = command("signing", *arguments)
         assert (code, out) == (2, "")
-        assert "say --link-is-safe" in err
+        assert "add --link-is-safe" in err
     code, _, err = command("signing", "setup", url, "--link-is-safe")
-    assert (code, "which key?" in err) == (2, True)
+    assert (code, "no key is given" in err) == (2, True)
     assert vehicle.requests == {}
 
 
@@ -745,7 +745,9 @@ def test_a_passphrase_is_typed_unseen_and_the_link_confirmed(terminal: Callable[
     setup = terminal("signing", "setup", "sim:ardupilot", "--signing-passphrase")
     setup.until(b"Signing passphrase: ")
     setup.type("Schlüssel ✈\n".encode())
-    setup.until(b"sim:ardupilot in clear. Is it sure that nobody else can listen or send there? [y/N] ")
+    setup.until(
+        b"sim:ardupilot in clear text. Can no other person or program listen or send on this link? [y/N] "
+    )
     setup.type(b"yes\n")
     setup.until(b"now")
     assert setup.close() == 0

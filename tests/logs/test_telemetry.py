@@ -477,7 +477,7 @@ def test_the_command_line_imports_logs(tmp_path: Path, capsys: pytest.CaptureFix
     [table] = json.loads(told.out)["tables"]
     assert (table["file"], table["key"], table["params"], table["complete"]) == (str(good), KEY, 2, True)
     assert "bad.tlog is not a telemetry log" in told.err
-    assert "empty.tlog holds no parameters" in told.err
+    assert "empty.tlog has no parameters" in told.err
     assert run(["import", str(good), "--cache", str(cache)]) == 0
     assert "flight.tlog  1/1        generic         2  yes" in capsys.readouterr().out
     assert run(["show", "1", "--cache", str(cache)]) == 0

@@ -131,7 +131,7 @@ async def test_ctrl_c_ends_it_too_and_a_page_of_the_api_is_there() -> None:
 def test_what_cannot_be_served_is_said_in_a_sentence(capsys: pytest.CaptureFixture[str]) -> None:
     call = in_process(capsys)
     for words, what in (
-        ((), "which links"),
+        ((), "no link is given"),
         (("nonsense:",), "link name"),
         (("sim:px4", "--listen", "8765"), "HOST:PORT"),
         (("sim:px4", "--listen", "[::1"), "HOST:PORT"),

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import pytest
 
 from paramclient import CommandResult, UsageError
-from paramclient.cli.simulate import Misfortunes
+from paramclient.cli.simulate import VehicleFaults
 from paramclient.model.values import Encoding, ParamType, encode
 from paramclient.protocol import wire
 from paramclient.protocol.ftp.param_pck import PackedParam
@@ -299,6 +299,6 @@ def test_invalid_reboot_arguments_are_rejected() -> None:
 
 
 def test_sim_options_reach_the_vehicle() -> None:
-    options = Misfortunes(armed=True, reboot_down=7.0).options
+    options = VehicleFaults(armed=True, reboot_down=7.0).options
     assert (options["armed"], options["reboot_down"]) == (True, 7.0)
-    assert Misfortunes().options["armed"] is False
+    assert VehicleFaults().options["armed"] is False
