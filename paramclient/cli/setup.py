@@ -48,6 +48,7 @@ from paramclient.cli.targets import (
     who,
 )
 from paramclient.client.component import Component
+from paramclient.client.local import local
 from paramclient.errors import NoReply, NotInCache, ParamClientError, UnknownVehicle, UsageError
 from paramclient.metadata import Metadata
 from paramclient.model.paramset import ParamSet
@@ -289,7 +290,7 @@ async def _state(found: Targets, vehicle: Component, when: str | None, options: 
     if cache is None:
         raise UsageError("earlier states are in the cache, and --no-cache excludes that; or name a file")
     await identified(vehicle)
-    await found.client._writer.write_all()
+    await local(vehicle).client.cache_writer.write_all()
     key, component = vehicle.identity.key, vehicle.component
     return await anyio.to_thread.run_sync(lambda: _kept(cache, key, component, moment))
 

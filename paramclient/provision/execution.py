@@ -12,6 +12,7 @@ from typing import Final
 import anyio
 
 from paramclient.client.component import Component
+from paramclient.client.local import local
 from paramclient.errors import (
     AnotherVehicle,
     InvalidParameters,
@@ -152,7 +153,7 @@ class Run:
 
     async def prepare(self) -> None:
         """Look at the vehicle, plan, and store what it has. Nothing is written if that fails."""
-        if self._durable and self._component._client.cache is None:
+        if self._durable and local(self._component).client.cache is None:
             raise UsageError("durable needs a cache, and the client keeps none")
         check_component(self._wanted, self._component.component)
         plan({}, self._wanted, include=self._include, autopilot=self._component.autopilot)
@@ -175,7 +176,7 @@ class Run:
 
     async def work(self) -> None:
         """Write and prove until there is nothing left to do. Failures end it; see `result`."""
-        sync = self._component._machine.sync
+        sync = local(self._component).machine.sync
         sync.holds += 1  # a moved count leads to no download beside those of the run
         try:
             while True:
@@ -195,7 +196,8 @@ class Run:
                 else:
                     break
             if self._durable and self.sent:
-                await self._component._client._writer.write_durably(self._component._machine)
+                vehicle = local(self._component)
+                await vehicle.client.cache_writer.write_durably(vehicle.machine)
         except ParamClientError as error:
             if not self.sent:
                 raise
@@ -383,7 +385,7 @@ class Run:
     async def _write_system_id(self, step: Step) -> None:
         """Set the system id, and go on with the vehicle under its new one."""
         system = int(step.value) if not isinstance(step.value, bytes) else 0
-        client = self._component._client
+        client = local(self._component).client
         if any(self._is_another_with(system, known) for known in client.components.values()):
             reason = f"another one on this link is system {system}"
             self._settle(step, ApplyStatus.SKIPPED, step.before, reason, WRONG)
@@ -438,7 +440,7 @@ class Run:
         with suppress(ParamClientError):
             await component.set(step.name, step.value, asker=self._asker)
             acknowledged_at = anyio.current_time()
-            while component._machine.presence.beat_at < acknowledged_at + ID_CHANGE_TIME:  # noqa: ASYNC110 - nobody tells
+            while local(component).machine.presence.beat_at < acknowledged_at + ID_CHANGE_TIME:  # noqa: ASYNC110 - nobody tells
                 await anyio.sleep(LOOKING_PACE)
             return
         await anyio.sleep_forever()
@@ -483,7 +485,8 @@ class Run:
         with anyio.move_on_after(HEARTBEAT_PATIENCE):
             while component.is_armed is None and component.state != "lost":  # noqa: ASYNC110 - nobody tells
                 await anyio.sleep(LOOKING_PACE)
-        parts = [each for each in component._client.components.values() if each.system == component.system]
+        heard = local(component).client.components.values()
+        parts = [each for each in heard if each.system == component.system]
         if any(each.is_armed for each in parts):
             words = f"{self._address} is armed; nothing is set then"
         elif component.is_armed is None and component.state != "lost":
@@ -503,15 +506,15 @@ class Run:
 
     async def _store(self) -> None:
         """Keep what the vehicle has: in the file, and in the cache if anything is to be written."""
-        client, component, seen = self._component._client, self._component, self.seen
+        client, component, seen = local(self._component).client, self._component, self.seen
         if (path := self._backup) is not None:
             from paramclient.files import write_file
 
-            await client._writer.aside(lambda: write_file(path, seen.table))
+            await client.cache_writer.aside(lambda: write_file(path, seen.table))
         cache = client.cache
         if cache is not None and self.plan.steps:
-            await client._writer.write_all()  # so that history knows what is changed from
-            await client._writer.aside(
+            await client.cache_writer.write_all()  # so that history knows what is changed from
+            await client.cache_writer.aside(
                 lambda: cache.store_snapshot(
                     component.identity,
                     component.component,

@@ -11,6 +11,7 @@ from typing import Final, Self
 import anyio
 
 from paramclient.client.component import Component
+from paramclient.client.local import local
 from paramclient.errors import LinkError, NoReply, UsageError, VehicleError
 from paramclient.model.params import copy_params
 from paramclient.model.paramset import ParamSet, WrittenParam
@@ -103,7 +104,7 @@ async def look(
         NoReply: it did not answer.
         LinkError: the link failed, or the client was closed.
     """
-    component._machine.sync.expire_hash()  # what was announced before may have moved
+    local(component).machine.sync.expire_hash()  # what was announced before may have moved
     before = copy_params(component.params)
     with _Search(component, _probably_hidden(component, wanted).difference(absent)) as search:
         fetched = await component.fetch_all()
@@ -200,8 +201,8 @@ async def look_again(component: Component, seen: Seen, names: Iterable[str]) -> 
 async def identified(component: Component) -> None:
     """Wait until the vehicle has said who it is, or will not: what is stored goes under its name."""
     with anyio.move_on_after(IDENTITY_PATIENCE):
-        station = component._client._station
-        while station.identity_of(component._machine) is None:  # noqa: ASYNC110 - nobody tells
+        vehicle = local(component)
+        while vehicle.settled_identity is None:  # noqa: ASYNC110 - nobody tells
             await anyio.sleep(LOOKING_PACE)
 
 
@@ -287,7 +288,7 @@ def _not_covered(component: Component, fetched: FetchResult) -> Collection[str]:
         return ()
     if fetched.hash is None:  # the policy allowed no more, or some of it came before
         return component.params.keys()
-    return component._machine.table.unhashed()
+    return local(component).machine.table.unhashed()
 
 
 async def _ask(
@@ -336,19 +337,19 @@ class _Search:
     """
 
     def __init__(self, component: Component, names: Iterable[str]) -> None:
-        self._component = component
-        self._spelled = {name: component._machine.spelling(name) for name in names if _is_name(name)}
+        self._component = local(component)
+        self._spelled = {name: self._component.machine.spelling(name) for name in names if _is_name(name)}
         self._search: NameSearch | None = None
 
     def __enter__(self) -> Self:
         if self._spelled:
-            self._search = self._component._machine.search(self._spelled.values(), anyio.current_time())
-            self._component._client._wake(self._component._machine)
+            self._search = self._component.machine.search(self._spelled.values(), anyio.current_time())
+            self._component.wake()
         return self
 
     def __exit__(self, *exc: object) -> None:
         if self._search is not None:
-            self._component._machine.name_searches.cancel(self._search, anyio.current_time())
+            self._component.machine.name_searches.cancel(self._search, anyio.current_time())
 
     def leave_out(self, names: Iterable[str]) -> None:
         """Search no longer for these names, as the vehicle spells them."""
@@ -363,7 +364,7 @@ class _Search:
             LinkError: the link failed, or the client was closed.
         """
         if (search := self._search) is not None and search.open:
-            await self._component._wait(search, None, lambda: ("names", search.attempts))
+            await self._component.wait(search, None, lambda: ("names", search.attempts))
 
     def result(self) -> tuple[dict[str, Param], set[str]]:
         """What is there, and what is not.
@@ -388,7 +389,7 @@ def _probably_hidden(component: Component, wanted: ParamSet) -> frozenset[str]:
     requested in vain, so there are none where they are many, nor where the table comes as a list, which reads
     slow down.
     """
-    if component.autopilot != "ardupilot" or not component._machine.fetches.may_use_file():
+    if component.autopilot != "ardupilot" or not local(component).machine.fetches.may_use_file():
         return frozenset()
     cautions = cautions_for("ardupilot")
     switches = {name for name, each in wanted.items() if cautions.reveals(name) and each.value != 0}

@@ -136,7 +136,7 @@ def incomplete(component: Component, missing: Sequence[str]) -> VehicleError:
     who = f"{component.system}/{component.component} {component.autopilot}"
     rest = f" and {more} more" if more > 0 else ""
     return VehicleError(
-        f"{who} on {component._client.link.name} is incomplete: {shown}{rest} did not come",
+        f"{who} on {component.identity.link} is incomplete: {shown}{rest} did not come",
         system=component.system,
         component=component.component,
     )

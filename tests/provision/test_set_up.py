@@ -16,6 +16,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from paramclient import Component, ParamCache, ParamClient, read_file
+from paramclient.client.client import local_client
+from paramclient.client.link_client import LinkClient
+from paramclient.client.link_component import LinkComponent
 from paramclient.errors import (
     AnotherVehicle,
     CacheError,
@@ -861,7 +864,7 @@ async def test_who_does_not_say_whether_it_is_armed_may_be() -> None:
     async with a_client(vehicle) as client:
         component = await client.component()
         with (
-            mock.patch.object(Component, "is_armed", None),
+            mock.patch.object(LinkComponent, "is_armed", None),
             pytest.raises(VehicleArmed, match="1/1 does not say whether it is armed"),
         ):
             await apply(component, written(another()))
@@ -1117,7 +1120,7 @@ async def test_a_link_that_fails_while_the_system_id_changes_ends_it() -> None:
     broken = mock.AsyncMock(side_effect=LinkError("gone", link="x"))
     async with a_client(ardupilot()) as client:
         component = await client.component()
-        with mock.patch.object(ParamClient, "successor", broken):
+        with mock.patch.object(LinkClient, "successor", broken):
             result = await apply(component, written({"SYSID_THISMAV": 7}), include="identity")
         assert isinstance(result.error, LinkError)
         assert statuses(result) == {"SYSID_THISMAV": "failed"}
@@ -1253,7 +1256,7 @@ async def session_that_ends(story: Story, cache: ParamCache, *, frames: int, how
         else:
             scope.cancel()
         if how == "kill":  # what is not on disk by now never will be
-            client._writer._cache = None
+            local_client(client).cache_writer._cache = None
 
     tap = Ending(Air.symmetric([story.vehicle], **faults), frames, end)
     with scope:
